@@ -1,14 +1,14 @@
 """Accelerate: a loader of a mixture for its training loop::
 
-    loader = DataLoader(train, batch_sampler=train.batches(4), collate_fn=train.collate, num_workers=2)
-    loader = prepare(accelerator, loader)
-    for epoch in range(first, epochs):
+    loader = DataLoader(train, batch_sampler=train.batches(4), collate_fn=train.collate,
+    num_workers=2) loader = prepare(accelerator, loader) for epoch in range(first, epochs):
         train.set_epoch(epoch)
         for batch in loader: ...
 
-``accelerator.prepare(loader)`` would count the passes itself, from 0, whatever epoch was set or resumed, and repeat
-samples until all batches are full (``even_batches``). Here a pass is through the epoch that was set or resumed, or else
-the next one, and all processes together load each of its samples once.
+``accelerator.prepare(loader)`` would count the passes itself, from 0, whatever epoch was set or
+resumed, and repeat samples until all batches are full (``even_batches``). Here a pass is through
+the epoch that was set or resumed, or else the next one, and all processes together load each of its
+samples once.
 """
 
 from typing import Any
@@ -21,7 +21,9 @@ from lidar_synth.mixing import MixedBatches, MixedStream
 try:
     from accelerate.data_loader import prepare_data_loader
 except ImportError as error:
-    raise LibraryError(f"accelerate cannot be imported ({error})", "1.0 or later", "pip install accelerate") from error
+    raise LibraryError(
+        f"accelerate cannot be imported ({error})", "1.0 or later", "pip install accelerate"
+    ) from error
 
 
 def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
@@ -29,7 +31,8 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
 
     Args:
         accelerator: the ``Accelerator``; its processes have batches of the given size each.
-        loader: of a ``MixedScans`` with ``batch_sampler=train.batches(batch_size)``, or of a ``MixedStream``.
+        loader: of a ``MixedScans`` with ``batch_sampler=train.batches(batch_size)``, or of a
+            ``MixedStream``.
 
     Returns:
         Accelerate's own loader, which puts batches on the accelerator's device.

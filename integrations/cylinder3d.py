@@ -4,9 +4,10 @@
     LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
         --config_path config/mixed.yaml
 
-with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in place, so that every
-sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one that does. It counts
-epochs from 0 also when it starts from saved weights.
+with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in
+    place, so that every
+sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one
+that does. It counts epochs from 0 also when it starts from saved weights.
 """
 
 from functools import cache
@@ -30,7 +31,10 @@ from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
 
 NAME = "SemKITTI_mixed"
-USAGE = "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py ARGUMENTS"
+USAGE = (
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.cylinder3d "
+    "train_cylinder_asym.py ARGUMENTS"
+)
 _IDS = id_table(1, 0, np.uint8)
 
 
@@ -45,11 +49,14 @@ def register() -> Any:
         from dataloader.pc_dataset import SemKITTI_sk, register_dataset
     except ImportError as error:
         raise LibraryError(
-            f"Cylinder3D's dataloader cannot be imported ({error})", "its checkout on the path", "cd Cylinder3D"
+            f"Cylinder3D's dataloader cannot be imported ({error})",
+            "its checkout on the path",
+            "cd Cylinder3D",
         ) from error
 
     class Mixed(SemKITTI_sk):  # type: ignore[misc]
-        """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8, strength)."""
+        """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8,
+        strength)."""
 
         def __init__(self, data_path: str, imageset: str = "train", **options: Any) -> None:
             super().__init__(data_path, imageset, **options)
@@ -73,8 +80,11 @@ def register() -> Any:
             sample = index if self.mixed is None else self.mixed[index]
             if not isinstance(sample, Scan):
                 return super().__getitem__(sample)
-            points, label = points_of(sample), class_ids(sample, self._ids)[:, None]
-            return (points[:, :3], label, points[:, 3]) if self.return_ref else (points[:, :3], label)
+            points = points_of(sample)
+            label = class_ids(sample, self._ids)[:, None]
+            return (
+                (points[:, :3], label, points[:, 3]) if self.return_ref else (points[:, :3], label)
+            )
 
     Mixed.__name__ = NAME
     return register_dataset(Mixed)

@@ -1,7 +1,8 @@
 """Additional data for detectors: ground plane, camera view, difficulty, and a database of objects.
 
-KITTI's trainers use the points and boxes in the view of camera 2, and shift pasted objects to the ground by a plane
-``a x + b y + c z + d = 0`` in the rectified camera frame, whose normal points up (b < 0).
+KITTI's trainers use the points and boxes in the view of camera 2, and shift pasted objects to the
+ground by a plane ``a x + b y + c z + d = 0`` in the rectified camera frame, whose normal points up
+(b < 0).
 """
 
 import pickle
@@ -28,17 +29,20 @@ NEAR = 40.0
 """Maximum distance of ground returns for the plane, metres."""
 
 LEVELS = ((40, 0.15, 0), (25, 0.30, 1), (25, 0.50, 2))
-"""KITTI's easy, moderate and hard: minimum height in pixels, maximum truncation and occlusion (devkit's readme)."""
+"""KITTI's easy, moderate and hard: minimum height in pixels, maximum truncation and occlusion
+(devkit's readme)."""
 
 Origin = Literal["gravity", "bottom"]
-"""The reference point of a box: its centre of gravity (OpenPCDet) or the centre of its floor (MMDetection3D)."""
+"""The reference point of a box: its centre of gravity (OpenPCDet) or the centre of its floor
+(MMDetection3D)."""
 
 
 def ground_plane(scan: Scan) -> NDArray[np.float64]:
-    """Fit the ground plane: (4,) a, b, c, d in the sensor frame, with (a, b, c) of length 1 and pointing up.
+    """Fit the ground plane: (4,) a, b, c, d in the sensor frame, with (a, b, c) of length 1 and
+    pointing up.
 
-    It is fitted to the returns with ground labels, or without labels to the lowest return in each square of 2 m;
-    returns farther than 0.3 m from the plane are outliers.
+    It is fitted to the returns with ground labels, or without labels to the lowest return in each
+    square of 2 m; returns farther than 0.3 m from the plane are outliers.
 
     Raises:
         DataError: if there is no ground.
@@ -55,9 +59,13 @@ def ground_plane(scan: Scan) -> NDArray[np.float64]:
     for reach in (1.0, 0.5, 0.3, 0.3):
         close = np.abs(points[:, 2] - sides @ fit) < reach
         if close.sum() < 10:
-            raise DataError(f"scan {scan.id!r} has {close.sum()} returns of the ground", "ground for a plane")
+            raise DataError(
+                f"scan {scan.id!r} has {close.sum()} returns of the ground", "ground for a plane"
+            )
         fit = np.linalg.lstsq(sides[close], points[close, 2], rcond=None)[0]
-    plane: NDArray[np.float64] = np.array([-fit[0], -fit[1], 1, -fit[2]]) / np.linalg.norm([fit[0], fit[1], 1])
+    plane: NDArray[np.float64] = np.array([-fit[0], -fit[1], 1, -fit[2]]) / np.linalg.norm(
+        [fit[0], fit[1], 1]
+    )
     return plane
 
 
@@ -68,7 +76,8 @@ def _lowest(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def check_names(scan: Scan, classes: Collection[str]) -> None:
-    """Check that boxes have classes of the trainer, which would otherwise drop all of them silently.
+    """Check that boxes have classes of the trainer, which would otherwise drop all of them
+    silently.
 
     Raises:
         DataError: if there are boxes, but none of these classes.
@@ -100,7 +109,9 @@ def in_view(scan: Scan, camera: Calibration) -> Scan:
     def seen(points: NDArray[np.float32]) -> NDArray[np.bool_]:
         pixels, depth = camera.pixels(points)
         with np.errstate(invalid="ignore"):
-            inside: NDArray[np.bool_] = (pixels >= 0).all(1) & (pixels < np.array(size)).all(1) & (depth > 0)
+            inside: NDArray[np.bool_] = (
+                (pixels >= 0).all(1) & (pixels < np.array(size)).all(1) & (depth > 0)
+            )
         return inside
 
     part = scan[seen(scan.points)]
@@ -110,9 +121,11 @@ def in_view(scan: Scan, camera: Calibration) -> Scan:
 
 
 def difficulty(boxes: Boxes) -> NDArray[np.int32]:
-    """(M,) KITTI's level of each box: 0 easy, 1 moderate, 2 hard, -1 none of them, or unknown occlusion.
+    """(M,) KITTI's level of each box: 0 easy, 1 moderate, 2 hard, -1 none of them, or unknown
+    occlusion.
 
-    An unknown height in the image is computed from the box's height and distance with KITTI's focal length.
+    An unknown height in the image is computed from the box's height and distance with KITTI's focal
+    length.
     """
     known = (boxes.image_box >= 0).all(1)
     distance = np.maximum(np.hypot(boxes.values[:, 0], boxes.values[:, 1]), 1)
@@ -136,9 +149,10 @@ def write_gt_database(
 ) -> Path:
     """Write a bank of objects as the database of a trainer's GT sampling.
 
-    Points are relative to the trainer's reference point of the box. Both trainers read the list of objects as a pickle,
-    so that the package writes one; it never reads one. They leave out objects of difficulty -1, so an unknown occlusion
-    counts as none, and nuScenes' objects have difficulty 0, as MMDetection3D gives them.
+    Points are relative to the trainer's reference point of the box. Both trainers read the list of
+    objects as a pickle, so that the package writes one; it never reads one. They leave out objects
+    of difficulty -1, so an unknown occlusion counts as none, and nuScenes' objects have difficulty
+    0, as MMDetection3D gives them.
 
     Args:
         objects: of any source with boxes, ``ObjectBank.from_scans(source)``.
@@ -146,8 +160,9 @@ def write_gt_database(
         origin: ``"gravity"`` for OpenPCDet, ``"bottom"`` for MMDetection3D.
         folder: of the points, under the root.
         infos: name of the list, such as ``kitti_dbinfos_train.pkl``.
-        layout: ``"nuscenes"`` turns the objects to nuScenes' frame and gives them its names, points of five values
-            (intensity 0..255, time 0) and boxes with a velocity of zero; objects of classes that it lacks are left out.
+        layout: ``"nuscenes"`` turns the objects to nuScenes' frame and gives them its names, points
+            of five values (intensity 0..255, time 0) and boxes with a velocity of zero; objects of
+            classes that it lacks are left out.
 
     Returns:
         The list's file.
@@ -156,17 +171,23 @@ def write_gt_database(
         DataError: for nuScenes, on a name that ``nuscenes.NAMES`` does not have.
         FileError: if it cannot be written.
     """
-    root, found = Path(root), dict[str, list[dict[str, Any]]]()
+    root = Path(root)
+    found = dict[str, list[dict[str, Any]]]()
     nuscenes = layout == "nuscenes"
     shown = replace(objects.boxes, occlusion=objects.boxes.occlusion.clip(min=0))
     level = np.zeros(len(shown), np.int32) if nuscenes else difficulty(shown)
-    names = nuscenes_names(objects.boxes.names, "the bank of objects") if nuscenes else objects.boxes.names
+    names = (
+        nuscenes_names(objects.boxes.names, "the bank of objects")
+        if nuscenes
+        else objects.boxes.names
+    )
     boxes = (turned_boxes(objects.boxes) if nuscenes else objects.boxes).values
     for i, name in enumerate(names):
         if name is None:
             continue
         part = slice(objects.start[i], objects.start[i + 1])
-        box, points = boxes[i].copy(), objects.points[part].copy()
+        box = boxes[i].copy()
+        points = objects.points[part].copy()
         points = turned_points(points) if nuscenes else points
         if origin == "bottom":
             box[2] -= box[5] / 2
@@ -175,11 +196,26 @@ def write_gt_database(
         path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
         values = [points, objects.reflectance[part]]
         if nuscenes:
-            values = [points, objects.reflectance[part] * INTENSITY_MAX, np.zeros(len(points), np.float32)]
+            values = [
+                points,
+                objects.reflectance[part] * INTENSITY_MAX,
+                np.zeros(len(points), np.float32),
+            ]
             box = np.append(box, np.zeros(2, np.float32))
         write_file(root / path, np.column_stack(values).astype("<f4").tobytes())
-        facts = {"name": name, "path": path, "image_idx": scan, "gt_idx": int(objects.number[i]), "box3d_lidar": box}
-        facts |= {"num_points_in_gt": len(points), "difficulty": int(level[i]), "group_id": i, "score": -1.0}
+        facts = {
+            "name": name,
+            "path": path,
+            "image_idx": scan,
+            "gt_idx": int(objects.number[i]),
+            "box3d_lidar": box,
+        }
+        facts |= {
+            "num_points_in_gt": len(points),
+            "difficulty": int(level[i]),
+            "group_id": i,
+            "score": -1.0,
+        }
         found.setdefault(name, []).append(facts | {"bbox": objects.boxes.image_box[i]})
     write_file(root / infos, pickle.dumps(found))
     return root / infos

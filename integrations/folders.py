@@ -1,7 +1,9 @@
 """Export of a mixture as SemanticKITTI's or KITTI's folders, which every trainer reads.
 
-The folders are complete: labels for every scan (some trainers read a missing ``.label`` as "car"), and for detectors
-label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read them.
+The folders are complete: labels for every scan (some trainers read a missing ``.label`` as "car"),
+    and for detectors
+label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read
+them.
 """
 
 from dataclasses import replace
@@ -27,7 +29,8 @@ from lidar_synth.mixing import MixedScans
 
 COMPARED = 3
 """Synthetic samples by which an export that is resumed is compared with the one that began."""
-MANIFEST, SETTINGS = "mixture.csv", ".mixture.json"
+MANIFEST = "mixture.csv"
+SETTINGS = ".mixture.json"
 
 
 def export_mixture(
@@ -42,9 +45,9 @@ def export_mixture(
 ) -> int:
     """Write all samples of a mixture in an epoch; a rerun resumes an interrupted export.
 
-    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` lists frame, domain and id
-    of each, and the plan's hash. Scans for validation become sequence 08, or follow the mixture's in ``training`` and
-    are listed in ``ImageSets/val.txt``.
+    Scans are numbered by their positions, in sequence 00 or in ``training``. ``mixture.csv`` lists
+    frame, domain and id of each, and the plan's hash. Scans for validation become sequence 08, or
+    follow the mixture's in ``training`` and are listed in ``ImageSets/val.txt``.
 
     Args:
         mixed: a mixture of scans, with ``to_sample=lambda scan, rng: scan``.
@@ -59,34 +62,51 @@ def export_mixture(
         Number of scans written by this run.
 
     Raises:
-        ConfigError: on another layout, a mixture whose samples are not scans, or a folder with another
-            mixture or epoch.
+        ConfigError: on another layout, a mixture whose samples are not scans, or a folder with
+            another mixture or epoch.
         DataError: on a scan without labels (``"semantic_kitti"``) or boxes (``"kitti"``).
         FileError: if the folder cannot be written.
     """
     if layout not in ("semantic_kitti", "kitti"):
         raise ConfigError(f"layout {layout!r}", "'semantic_kitti' or 'kitti'")
-    root, count = Path(out), len(mixed)
+    root = Path(out)
+    count = len(mixed)
     camera = calibration or OBJECT_CAMERA
     held = [] if validation is None else validation
-    claim(root / SETTINGS, {
-        "plan": mixed.plan(epoch).hash, "samples": _first_synthetic(mixed, epoch), "layout": layout,
-        "projection": camera.projection.tolist(), "camera_from_sensor": camera.camera_from_sensor.tolist(),
-        "image": camera.image_size, **({} if validation is None else {"validation": len(held)}),
-    })  # fmt: skip
-    writer: Writer = SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
+    claim(
+        root / SETTINGS,
+        {
+            "plan": mixed.plan(epoch).hash,
+            "samples": _first_synthetic(mixed, epoch),
+            "layout": layout,
+            "projection": camera.projection.tolist(),
+            "camera_from_sensor": camera.camera_from_sensor.tolist(),
+            "image": camera.image_size,
+            **({} if validation is None else {"validation": len(held)}),
+        },
+    )
+    writer: Writer = (
+        SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
+    )
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
     for position in tqdm(range(count), unit="scan", disable=not progress):
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         written += _write(writer, scan, position, camera)
     first = 0 if layout == "semantic_kitti" else count
-    others: Writer = SemanticKITTIWriter(root, sequence="08") if layout == "semantic_kitti" else writer
+    others: Writer = (
+        SemanticKITTIWriter(root, sequence="08") if layout == "semantic_kitti" else writer
+    )
     for number in tqdm(range(len(held)), "validation", unit="scan", disable=not progress):
-        written += _write(others, replace(held[number], id=f"validation {number}"), first + number, camera)
+        written += _write(
+            others, replace(held[number], id=f"validation {number}"), first + number, camera
+        )
     writer.finish()
     if layout == "kitti" and validation is not None:
-        for split, frames in {"train": range(count), "val": range(count, count + len(held))}.items():
+        for split, frames in {
+            "train": range(count),
+            "val": range(count, count + len(held)),
+        }.items():
             listed = "".join(f"{frame:06d}\n" for frame in frames)
             write_file(root / "ImageSets" / f"{split}.txt", listed.encode())
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
@@ -94,13 +114,18 @@ def export_mixture(
 
 
 def _write(writer: Writer, scan: Scan, number: int, camera: Calibration) -> int:
-    """Write a scan with all that the layout needs; returns how many were written, 0 if it is complete."""
+    """Write a scan with all that the layout needs; returns how many were written, 0 if it is
+    complete."""
     if writer.complete(number):
         return 0
     kitti = isinstance(writer, KITTIObjectWriter)
     needed = "boxes" if kitti else "label"
     if getattr(scan, needed) is None:
-        raise DataError(f"scan {scan.id!r} has no {needed}", f"{needed} for this layout", "Choose a label policy.")
+        raise DataError(
+            f"scan {scan.id!r} has no {needed}",
+            f"{needed} for this layout",
+            "Choose a label policy.",
+        )
     if kitti:
         _write_plane(writer.root, f"{number:06d}", scan, camera)
     writer.write(scan, number, calibration=camera if kitti else None)
@@ -110,18 +135,22 @@ def _write(writer: Writer, scan: Scan, number: int, camera: Calibration) -> int:
 def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:
     scan = mixed.sample(epoch, position)
     if not isinstance(scan, Scan):
-        raise ConfigError(f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan")
+        raise ConfigError(
+            f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan"
+        )
     return scan
 
 
 def _first_synthetic(mixed: MixedScans, epoch: int) -> list[str]:
-    """Hashes of the first synthetic samples: they tell label policies and augmentations, which the plan leaves out."""
+    """Hashes of the first synthetic samples: they tell label policies and augmentations, which the
+    plan leaves out."""
     first = np.flatnonzero(mixed.plan(epoch).domain)[:COMPARED].tolist()
     return [scan_hash(_sample(mixed, epoch, position)) for position in first]
 
 
 def write_planes(root: str | Path, split: str = "trainval") -> int:
-    """Fit and write the ground planes that are missing in ``training/planes`` of KITTI's folder, for GT sampling.
+    """Fit and write the ground planes that are missing in ``training/planes`` of KITTI's folder,
+    for GT sampling.
 
     Returns:
         Number of planes written.
@@ -130,13 +159,18 @@ def write_planes(root: str | Path, split: str = "trainval") -> int:
         DataError: on a scan without ground or calibration.
         FileError: if they cannot be written.
     """
-    scans, written = KITTIObject(root, split), 0
-    for number, name in enumerate(tqdm(scans.ids, "fitting planes", unit="scan", leave=False, disable=None)):
+    scans = KITTIObject(root, split)
+    written = 0
+    for number, name in enumerate(
+        tqdm(scans.ids, "fitting planes", unit="scan", leave=False, disable=None)
+    ):
         frame = name.split("/")[1]
         if not (Path(root) / "training" / "planes" / f"{frame}.txt").is_file():
             camera = scans.calibration(number)
             if camera is None:
-                raise DataError(f"scan {name} of {root} has no calibration", f"training/calib/{frame}.txt")
+                raise DataError(
+                    f"scan {name} of {root} has no calibration", f"training/calib/{frame}.txt"
+                )
             _write_plane(Path(root), frame, scans[number], camera)
             written += 1
     return written

@@ -1,7 +1,8 @@
-"""Shared by the launchers: the script on the command line, and a trial of a trainer on a machine without a GPU.
+"""Shared by the launchers: the script on the command line, and a trial of a trainer on a machine
+without a GPU.
 
-Without a GPU, or with ``LIDAR_SYNTH_CPU=1``, what a trainer sends to a GPU stays on the CPU. That shows whether a
-configuration runs; no one trains so.
+Without a GPU, or with ``LIDAR_SYNTH_CPU=1``, what a trainer sends to a GPU stays on the CPU. That
+shows whether a configuration runs; no one trains so.
 """
 
 import logging
@@ -21,11 +22,13 @@ from torch.nn import functional
 from lidar_synth.errors import LidarSynthError
 
 CPU = "LIDAR_SYNTH_CPU"
-"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU, also where there is one; 0 does not."""
+"""Environment variable: 1 keeps on the CPU what a trainer sends to a GPU, also where there is one;
+0 does not."""
 
 
 def prepare_script(usage: str, *names: str) -> str:
-    """Take the trainer's script from the command line, as Python would, and set the removed names that it uses.
+    """Take the trainer's script from the command line, as Python would, and set the removed names
+    that it uses.
 
     Args:
         usage: a command, shown when there is no script.
@@ -75,8 +78,12 @@ def plain_errors() -> Iterator[None]:
 
 
 def stay_on_cpu() -> None:
-    """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make them on a GPU."""
-    print(f"lidar_synth: no GPU, or {CPU}=1: what this trainer sends to a GPU stays on the CPU", flush=True)
+    """Keep on the CPU what is sent to a GPU; class targets become int64, as these trainers make
+    them on a GPU."""
+    print(
+        f"lidar_synth: no GPU, or {CPU}=1: what this trainer sends to a GPU stays on the CPU",
+        flush=True,
+    )
     changed: dict[tuple[Any, str], Any] = {
         (torch.cuda, "set_device"): lambda device: None,
         (torch.Tensor, "get_device"): lambda self: self.device,
@@ -109,7 +116,8 @@ def _int64(loss: Any) -> Any:
 
 
 def _bias_after(forward: Any) -> Any:
-    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in evaluation."""
+    """spconv adds a bias after the convolution in training, and within it, which needs a GPU, in
+    evaluation."""
 
     @wraps(forward)
     def changed(self: Any, training: bool, *args: Any, **options: Any) -> Any:

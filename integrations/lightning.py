@@ -1,10 +1,12 @@
-"""Lightning: a ``LightningDataModule`` for mixtures, optionally with synthesis on the GPU after the batch transfer::
+"""Lightning: a ``LightningDataModule`` for mixtures, optionally with synthesis on the GPU after the
+batch transfer::
 
-    data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
-    trainer.fit(model, data)
+    data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8,
+    num_workers=4) trainer.fit(model, data)
 
-Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among ranks itself. Training
-begins in the epoch that is set on the mixture. A checkpoint within an epoch resumes after its last batch.
+Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among
+ranks itself. Training begins in the epoch that is set on the mixture. A checkpoint within an epoch
+resumes after its last batch.
 """
 
 from collections.abc import Iterator, Mapping
@@ -41,7 +43,8 @@ if lightning.__version__ in STOLEN:
 
 @dataclass(frozen=True)
 class Pending:
-    """A synthetic sample that is still to be made, after the batch transfer: its place in the plan and its number."""
+    """A synthetic sample that is still to be made, after the batch transfer: its place in the plan
+    and its number."""
 
     epoch: int
     position: int
@@ -88,11 +91,12 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         val, test: scans; None = no such loader.
         batch_size: number of samples in a batch, on each rank.
         num_workers: number of workers of each loader; they persist over the epochs.
-        on_device: whether the main process makes synthetic scans after the batch transfer, with generators on the
-            training device; otherwise workers, which have no GPU, make them.
+        on_device: whether the main process makes synthetic scans after the batch transfer, with
+            generators on the training device; otherwise workers, which have no GPU, make them.
 
     Raises:
-        ConfigError: on a ``MixedStream``; with ``on_device``, on synthetic sources that are not generators.
+        ConfigError: on a ``MixedStream``; with ``on_device``, on synthetic sources that are not
+            generators.
     """
 
     def __init__(
@@ -114,16 +118,22 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             )
         if on_device and not all(isinstance(source, Generated) for source in train.synthetic):
             raise ConfigError(
-                f"on_device with {[type(s).__name__ for s in train.synthetic]}", "a generator: load_generator(...)"
+                f"on_device with {[type(s).__name__ for s in train.synthetic]}",
+                "a generator: load_generator(...)",
             )
-        self.train, self.val, self.test = train, val, test
-        self.batch_size, self.num_workers, self.on_device = batch_size, num_workers, on_device
+        self.train = train
+        self.val = val
+        self.test = test
+        self.batch_size = batch_size
+        self.num_workers = num_workers
+        self.on_device = on_device
         self._resume: dict[str, Any] | None = None
         self._first = 0  # the epoch of the mixture in Lightning's epoch 0
         self._batches: _Epochs | None = None
 
     def train_dataloader(self) -> Any:
-        """Batches in the order of the plan, divided among ranks; resumes if a checkpoint was loaded."""
+        """Batches in the order of the plan, divided among ranks; resumes if a checkpoint was
+        loaded."""
         if self.trainer is not None and self.trainer.current_epoch == 0:
             self._first = self.train.epoch
         self._batches = _Epochs(self, MixedBatches(self.train, self.batch_size))
@@ -148,7 +158,8 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         return self._plain(self.test)
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
-        """Transfer a batch; an unfinished one is transferred later, when its synthetic samples are made."""
+        """Transfer a batch; an unfinished one is transferred later, when its synthetic samples are
+        made."""
         if isinstance(batch, Unfinished):
             return batch
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
@@ -158,7 +169,11 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         if not isinstance(batch, Unfinished):
             return batch
         for number, source in enumerate(self.train.synthetic):
-            wanted = [i for i, item in enumerate(batch) if isinstance(item, Pending) and item.source == number]
+            wanted = [
+                i
+                for i, item in enumerate(batch)
+                if isinstance(item, Pending) and item.source == number
+            ]
             scans = source.scans([batch[i].number for i in wanted]) if wanted else []  # type: ignore[attr-defined]
             for i, scan in zip(wanted, scans, strict=True):
                 batch[i] = self.train.finish(scan, batch[i].epoch, batch[i].position)
@@ -167,14 +182,18 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
     def state_dict(self) -> dict[str, Any]:
         """The progress of training, after the last batch that Lightning counts as processed."""
-        return make_state(self.train.mixture, 0, 0) if self._batches is None else self._batches.state_dict()
+        return (
+            make_state(self.train.mixture, 0, 0)
+            if self._batches is None
+            else self._batches.state_dict()
+        )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Resume from a checkpoint.
 
         Raises:
-            ConfigError: on a checkpoint of another mixture; or from the middle of an epoch with another batch size,
-                which Lightning would miscount.
+            ConfigError: on a checkpoint of another mixture; or from the middle of an epoch with
+                another batch size, which Lightning would miscount.
         """
         if set(state_dict) == {"seed"}:  # checkpoints before version 2 have no position
             state_dict = {"seed": state_dict["seed"], "epoch": 0, "position": 0}
@@ -194,19 +213,24 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
 
 class Unfinished(list[Any]):
-    """The samples of a batch whose synthetic ones are not made yet; no collate function returns this type."""
+    """The samples of a batch whose synthetic ones are not made yet; no collate function returns
+    this type."""
 
 
 class _Epochs:
-    """A batch sampler that reads the epoch from Lightning, and whose state follows Lightning's count of batches."""
+    """A batch sampler that reads the epoch from Lightning, and whose state follows Lightning's
+    count of batches."""
 
     def __init__(self, data: MixedData, batches: MixedBatches) -> None:
-        self._data, self._batches = data, batches
+        self._data = data
+        self._batches = batches
         self._epoch = batches.dataset.epoch  # the epoch that began last
-        self._least = 0  # the epoch of the loaded state; Lightning's count is one behind after the end of an epoch
+        # the epoch of the loaded state; Lightning's count is one behind after the end of an epoch
+        self._least = 0
 
     def __len__(self) -> int:
-        """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint to its count."""
+        """Number of batches in the complete epoch; Lightning adds the batches before a checkpoint
+        to its count."""
         return len(self._steps())
 
     def __iter__(self) -> Iterator[list[int]]:
@@ -215,11 +239,17 @@ class _Epochs:
         return iter(self._batches)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state after the processed batches, and the number of samples in a step of all ranks."""
-        steps, trainer = self._steps(), self._data.trainer
+        """The state after the processed batches, and the number of samples in a step of all
+        ranks."""
+        steps = self._steps()
+        trainer = self._data.trainer
         done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
         mixture = self._batches.dataset.mixture
-        place = (self._epoch, steps[done].start) if done < len(steps) else after_epoch(mixture, self._epoch)
+        place = (
+            (self._epoch, steps[done].start)
+            if done < len(steps)
+            else after_epoch(mixture, self._epoch)
+        )
         return make_state(mixture, *place) | {"step": steps.size, "first": self._data._first}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -231,7 +261,8 @@ class _Epochs:
         size = self._steps().size
         if state["position"] and state.get("step", size) != size:
             raise ConfigError(
-                f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for {size} a step",
+                f"a checkpoint from the middle of an epoch, {state['step']} samples a step, for "
+                f"{size} a step",
                 "the batch size and the number of devices with which it was saved",
                 "A checkpoint from the end of an epoch fits any.",
             )

@@ -1,4 +1,5 @@
-"""Shared parts of the integrations: mixtures from plain settings, a loader that sets the epoch, and class ids.
+"""Shared parts of the integrations: mixtures from plain settings, a loader that sets the epoch, and
+class ids.
 
 In a trainer's configuration, a mixture is a dict of settings::
 
@@ -12,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from lidar_synth.datasets.classes import FILE_CLASSES, IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID, Taxonomy
+from lidar_synth.datasets.classes import (
+    FILE_CLASSES,
+    IGNORE,
+    NAMES,
+    SEMANTIC_KITTI,
+    TRAIN_ID,
+    Taxonomy,
+)
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing.settings import OPTIONS, VARIABLE, mix, open_synthetic, read_settings
@@ -24,8 +32,8 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
     """Take the key ``classes`` out of settings: the class ids of the trainer's label files.
 
     Args:
-        settings: ``classes`` is a name of ``FILE_CLASSES`` or {class name of SemanticKITTI: id in the files}; classes
-            that it leaves out are unlabelled (0). By default SemanticKITTI's.
+        settings: ``classes`` is a name of ``FILE_CLASSES`` or {class name of SemanticKITTI: id in
+            the files}; classes that it leaves out are unlabelled (0). By default SemanticKITTI's.
 
     Raises:
         ConfigError: on another name, class or id.
@@ -33,17 +41,27 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
     given = settings.pop("classes", "semantic_kitti")
     if not isinstance(given, Mapping):
         if given not in FILE_CLASSES:
-            raise ConfigError(f"classes: {given}", f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}")
+            raise ConfigError(
+                f"classes: {given}", f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}"
+            )
         return FILE_CLASSES[given]
-    wrong = {n: i for n, i in given.items() if n not in TRAIN_ID or type(i) is not int or not 0 < i < 1 << 16}
+    wrong = {
+        n: i
+        for n, i in given.items()
+        if n not in TRAIN_ID or type(i) is not int or not 0 < i < 1 << 16
+    }
     if wrong or not given:
         raise ConfigError(f"classes: {wrong}", f"ids from 1 to 65535 by some of {', '.join(NAMES)}")
     return Taxonomy(
-        "classes", {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()}, tuple(given.get(n, 0) for n in NAMES)
+        "classes",
+        {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()},
+        tuple(given.get(n, 0) for n in NAMES),
     )
 
 
-def trainer_ids(learning_map: Mapping[int, int], taxonomy: Taxonomy, table: NDArray[Any]) -> NDArray[Any]:
+def trainer_ids(
+    learning_map: Mapping[int, int], taxonomy: Taxonomy, table: NDArray[Any]
+) -> NDArray[Any]:
     """(256,) a trainer's id by train id, through its own map of the ids in its label files.
 
     Args:
@@ -59,14 +77,17 @@ def trainer_ids(learning_map: Mapping[int, int], taxonomy: Taxonomy, table: NDAr
         return table
     classes = taxonomy.encode(np.arange(len(NAMES), dtype=np.uint8)).tolist()
     if missing := sorted({raw for raw in classes if raw} - set(learning_map)):
-        raise ConfigError(f"a map of classes without {missing}", f"the ids of {taxonomy.name}", "Set classes.")
+        raise ConfigError(
+            f"a map of classes without {missing}", f"the ids of {taxonomy.name}", "Set classes."
+        )
     ids = np.full_like(table, table[IGNORE])
     ids[: len(NAMES)] = [learning_map[raw] if raw else table[IGNORE] for raw in classes]
     return ids
 
 
 def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
-    """Refuse label policies with which a batch may have no valid label, because its loss would be NaN.
+    """Refuse label policies with which a batch may have no valid label, because its loss would be
+    NaN.
 
     Raises:
         ConfigError: on the policies ``none`` and ``ignore``.
@@ -75,7 +96,8 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
         raise ConfigError(
             f"labels={settings['labels']!r} for {trainer}",
             "labels for every synthetic scan: 'generated', 'condition', 'pseudo' or 'mix'",
-            "The trainer makes its own batches; a batch of only synthetic scans would have no valid label, and its "
+            "The trainer makes its own batches; a batch of only synthetic scans would have no "
+            "valid label, and its "
             "loss, a mean over no label, is NaN.",
         )
 
@@ -88,7 +110,8 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
         table: (256,) the trainer's id by train id, see ``id_table``.
 
     Raises:
-        DataError: on a scan without any valid label, because the loss of a batch of such scans would be NaN.
+        DataError: on a scan without any valid label, because the loss of a batch of such scans
+            would be NaN.
     """
     if scan.label is None or not (scan.label != IGNORE).any():
         raise DataError(
@@ -101,14 +124,16 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
 
 
 def id_table(first: int, ignore: int, dtype: Any) -> NDArray[Any]:
-    """(256,) a trainer's id by train id: 19 consecutive ids from ``first`` on, and ``ignore`` for all other labels."""
+    """(256,) a trainer's id by train id: 19 consecutive ids from ``first`` on, and ``ignore`` for
+    all other labels."""
     table = np.full(256, ignore, dtype)
     table[: len(NAMES)] = np.arange(first, first + len(NAMES))
     return table
 
 
 def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
-    """Check that a trainer's own map of SemanticKITTI's classes gives the same ids as synthetic labels have.
+    """Check that a trainer's own map of SemanticKITTI's classes gives the same ids as synthetic
+    labels have.
 
     Args:
         learning_map: the trainer's id by the file's class.
@@ -118,7 +143,11 @@ def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
         ConfigError: if the ids of a class, or of unlabelled points, differ.
     """
     classes = [*enumerate(SEMANTIC_KITTI.from_train or ()), (IGNORE, 0)]
-    wrong = [(raw, learning_map.get(raw), int(table[i])) for i, raw in classes if learning_map.get(raw) != table[i]]
+    wrong = [
+        (raw, learning_map.get(raw), int(table[i]))
+        for i, raw in classes
+        if learning_map.get(raw) != table[i]
+    ]
     if wrong:
         raise ConfigError(
             f"a map of classes with {', '.join(f'{raw}: {given}' for raw, given, _ in wrong)}",
@@ -134,7 +163,9 @@ def points_of(scan: Scan) -> NDArray[np.float32]:
     return points
 
 
-def inner(dataset: Any, names: tuple[str, ...] = ("dataset", "datasets", "point_cloud_dataset")) -> Iterator[Any]:
+def inner(
+    dataset: Any, names: tuple[str, ...] = ("dataset", "datasets", "point_cloud_dataset")
+) -> Iterator[Any]:
     """A dataset and all datasets that it wraps, recursively."""
     yield dataset
     for name in names:
@@ -145,13 +176,15 @@ def inner(dataset: Any, names: tuple[str, ...] = ("dataset", "datasets", "point_
 
 
 class EpochLoader(DataLoader[Any]):
-    """A ``DataLoader`` that sets its dataset's epoch before each pass, for trainers that do not call ``set_epoch``."""
+    """A ``DataLoader`` that sets its dataset's epoch before each pass, for trainers that do not
+    call ``set_epoch``."""
 
     passes = 0
 
     def __iter__(self) -> Any:
         for each in inner(self.dataset):
-            # Looked up in the class: a dataset that forwards unknown attributes would set the epoch twice.
+            # Looked up in the class: a dataset that forwards unknown attributes would set the epoch
+            # twice.
             if hasattr(type(each), "set_epoch"):
                 each.set_epoch(self.passes)
         self.passes += 1

@@ -1,13 +1,15 @@
-"""MMDetection3D 1.4: a file backend, datasets, a sampler and a hook, registered when a configuration imports this
-module::
+"""MMDetection3D 1.4: a file backend, datasets, a sampler and a hook, registered when a
+configuration imports this module::
 
     custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"])
     custom_hooks = [dict(type="SynthEpochHook")]
-    train_dataloader = dict(sampler=dict(_delete_=True, type="SynthSampler"), dataset=dict(ann_file=...))
+    train_dataloader = dict(sampler=dict(_delete_=True, type="SynthSampler"),
+    dataset=dict(ann_file=...))
 
-Segmentation uses the trainer's own datasets: the file backend serves points and labels of synthetic entries. Detection
-needs ``SynthKittiDataset`` or ``SynthNuScenesDataset``, whose synthetic entries get their boxes from the scan.
-``mmdet3d_infos.write_infos`` writes the list, ``tools/install_mmdet3d.sh`` installs the trainer.
+Segmentation uses the trainer's own datasets: the file backend serves points and labels of synthetic
+entries. Detection needs ``SynthKittiDataset`` or ``SynthNuScenesDataset``, whose synthetic entries
+get their boxes from the scan. ``mmdet3d_infos.write_infos`` writes the list,
+``tools/install_mmdet3d.sh`` installs the trainer.
 """
 
 import math
@@ -35,7 +37,13 @@ from lidar_synth.geometry.scan import Scan
 
 try:
     import mmdet3d
-    from mmdet3d.datasets import CBGSDataset, Det3DDataset, KittiDataset, NuScenesDataset, Seg3DDataset
+    from mmdet3d.datasets import (
+        CBGSDataset,
+        Det3DDataset,
+        KittiDataset,
+        NuScenesDataset,
+        Seg3DDataset,
+    )
     from mmdet3d.registry import DATA_SAMPLERS, DATASETS, HOOKS
     from mmdet3d.structures import LiDARInstance3DBoxes
     from mmengine.dataset import DefaultSampler
@@ -43,7 +51,9 @@ try:
     from mmengine.hooks import Hook
     from mmengine.runner import EpochBasedTrainLoop
 except ImportError as error:
-    raise LibraryError(f"mmdet3d cannot be imported ({error})", "1.4.0", "bash tools/install_mmdet3d.sh") from error
+    raise LibraryError(
+        f"mmdet3d cannot be imported ({error})", "1.4.0", "bash tools/install_mmdet3d.sh"
+    ) from error
 
 if not mmdet3d.__version__.startswith("1.4."):
     raise LibraryError(f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh")
@@ -71,11 +81,12 @@ class SynthBackend(BaseStorageBackend):  # type: ignore[misc]
 
 
 class SynthBoxes:
-    """What a ``Det3DDataset`` for a mixed list adds: a synthetic entry has the boxes of its scan in this epoch.
+    """What a ``Det3DDataset`` for a mixed list adds: a synthetic entry has the boxes of its scan in
+    this epoch.
 
     Args:
-        options: as for the dataset. ``filter_empty_gt`` must be False: replacing scans without boxes by others would
-            change the ratio.
+        options: as for the dataset. ``filter_empty_gt`` must be False: replacing scans without
+            boxes by others would change the ratio.
 
     Raises:
         ConfigError: on other boxes than LiDAR's, or ``filter_empty_gt``.
@@ -85,7 +96,8 @@ class SynthBoxes:
         name = type(self).__name__
         if options.get("filter_empty_gt", True) and not options.get("test_mode", False):
             raise ConfigError(
-                f"{name} with filter_empty_gt=True, which replaces every scan without a box by a random one",
+                f"{name} with filter_empty_gt=True, which replaces every scan without a box by a "
+                "random one",
                 "filter_empty_gt=False",
                 "Give synthetic scans boxes by labels='mix'; ObjectSample adds more.",
             )
@@ -94,7 +106,8 @@ class SynthBoxes:
         super().__init__(**options)
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
-        """The trainer's entry; a synthetic one gets the boxes of its scan, and a ground plane if real ones have one."""
+        """The trainer's entry; a synthetic one gets the boxes of its scan, and a ground plane if
+        real ones have one."""
         info: dict[str, Any] = super().get_data_info(idx)  # type: ignore[misc]
         path = info["lidar_points"]["lidar_path"]
         if path.startswith(PREFIX):
@@ -108,11 +121,15 @@ class SynthBoxes:
         given, known = require_boxes(scan), self.METAINFO["classes"]  # type: ignore[attr-defined]
         check_names(scan, known)
         mapping = self.label_mapping  # type: ignore[attr-defined]
-        labels = np.array([mapping[known.index(n)] if n in known else -1 for n in given.names], np.int64).reshape(-1)
+        labels = np.array(
+            [mapping[known.index(n)] if n in known else -1 for n in given.names], np.int64
+        ).reshape(-1)
         values = given.values
         if getattr(self, "with_velocity", False):  # nothing moves in the sweeps of a synthetic scan
             values = np.column_stack([values, np.zeros((len(values), 2), np.float32)])
-        boxes = LiDARInstance3DBoxes(values[labels >= 0], box_dim=values.shape[1], origin=(0.5, 0.5, 0.5))
+        boxes = LiDARInstance3DBoxes(
+            values[labels >= 0], box_dim=values.shape[1], origin=(0.5, 0.5, 0.5)
+        )
         return {"gt_bboxes_3d": boxes, "gt_labels_3d": labels[labels >= 0], "instances": []}
 
 
@@ -126,7 +143,8 @@ class SynthNuScenesDataset(SynthBoxes, NuScenesDataset):  # type: ignore[misc]
     """``NuScenesDataset`` for a mixed list."""
 
     def parse_data_info(self, info: dict[str, Any]) -> Any:
-        """The trainer's entry; its sweeps keep their paths, of which the trainer keeps the names only."""
+        """The trainer's entry; its sweeps keep their paths, of which the trainer keeps the names
+        only."""
         sweeps = info.get("lidar_sweeps", ())
         paths = [sweep["lidar_points"]["lidar_path"] for sweep in sweeps]
         parsed = super().parse_data_info(info)
@@ -139,21 +157,23 @@ class SynthNuScenesDataset(SynthBoxes, NuScenesDataset):  # type: ignore[misc]
 class SynthSampler(DefaultSampler):  # type: ignore[misc]
     """The sampler of a mixed list, for loops by epochs and by iterations.
 
-    Its order is a function of the mixture's seed and the epoch, so a resumed run sees the samples of an uninterrupted
-    one. Each index carries its epoch to the worker process that reads the sample.
+    Its order is a function of the mixture's seed and the epoch, so a resumed run sees the samples
+    of an uninterrupted one. Each index carries its epoch to the worker process that reads the
+    sample.
 
     Args:
         dataset: holds a mixed list.
         seed: not used: the runner draws another one if a run is resumed.
-        options: ``shuffle`` and ``round_up`` of ``DefaultSampler``. Where an epoch has other entries than all of the
-            list (a schedule, ``epoch_size``), they come in the plan's order.
+        options: ``shuffle`` and ``round_up`` of ``DefaultSampler``. Where an epoch has other
+            entries than all of the list (a schedule, ``epoch_size``), they come in the plan's
+            order.
 
     Attributes:
         start: number of samples that the next pass leaves out.
 
     Raises:
-        ConfigError: on a dataset without a mixed list, other classes than SemanticKITTI's, a detector's dataset
-            without synthetic boxes, or one that repeats scans by class.
+        ConfigError: on a dataset without a mixed list, other classes than SemanticKITTI's, a
+            detector's dataset without synthetic boxes, or one that repeats scans by class.
     """
 
     def __init__(self, dataset: Any, seed: int | None = None, **options: Any) -> None:
@@ -167,18 +187,26 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         listed = self.planned.real + self.planned.slots
         if len(folders) > 1 or len(dataset) != listed:
             raise ConfigError(
-                f"a dataset of {len(dataset)} samples around a mixed list of {listed} with a schedule or epoch_size",
+                f"a dataset of {len(dataset)} samples around a mixed list of {listed} with a "
+                "schedule or epoch_size",
                 "the list's own dataset, not repeated or joined with others",
             )
         length = len(self.planned.mixed)
-        self.num_samples = math.ceil((length - (0 if self.round_up else self.rank)) / self.world_size)
+        self.num_samples = math.ceil(
+            (length - (0 if self.round_up else self.rank)) / self.world_size
+        )
         self.total_size = self.num_samples * self.world_size if self.round_up else length
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         """The (epoch, index) of each sample."""
-        start, self.start = self.start, 0
+        start = self.start
+        self.start = 0
         epoch = self.epoch
-        order = super().__iter__() if self.planned is None else self._planned(self.planned.entries(epoch).tolist())
+        order = (
+            super().__iter__()
+            if self.planned is None
+            else self._planned(self.planned.entries(epoch).tolist())
+        )
         return ((epoch, index) for index in islice(order, start, None))
 
     def _planned(self, entries: list[int]) -> Iterator[int]:
@@ -195,7 +223,8 @@ class Fetch:
     """
 
     def __init__(self, dataset: Any, paths: list[Path]) -> None:
-        self.dataset, self.paths = dataset, paths
+        self.dataset = dataset
+        self.paths = paths
 
     def __call__(self, indices: list[tuple[int, int]]) -> list[Any]:
         """The samples of (epoch, index) pairs."""
@@ -211,8 +240,8 @@ class Fetch:
 class SynthEpochHook(Hook):  # type: ignore[misc]
     """Checks that training uses ``SynthSampler``, and resumes in the middle of an epoch.
 
-    The trainer's loop by epochs starts the epoch of a checkpoint again; the hook leaves out the samples that it has
-    seen. Its loop by iterations reads and drops them itself.
+    The trainer's loop by epochs starts the epoch of a checkpoint again; the hook leaves out the
+    samples that it has seen. Its loop by iterations reads and drops them itself.
     """
 
     def before_train(self, runner: Any) -> None:
@@ -250,7 +279,8 @@ def _checked(dataset: Any) -> list[Folder]:
     mixed = [each for each in held if is_mixed(Path(each.ann_file).resolve().parent)]
     if not mixed:
         raise ConfigError(
-            f"SynthSampler with {[each.ann_file for each in held]}", "a mixed list, an ann_file that write_infos wrote"
+            f"SynthSampler with {[each.ann_file for each in held]}",
+            "a mixed list, an ann_file that write_infos wrote",
         )
     for each in mixed:
         _check_dataset(each)

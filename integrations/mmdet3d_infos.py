@@ -2,12 +2,12 @@
 
 ``write_infos`` writes into one folder::
 
-    infos.json      the trainer's list: its own entries with absolute paths, then a slot for each synthetic sample of an
-                    epoch, see ``mmdet3d_slots``
+    infos.json      the trainer's list: its own entries with absolute paths, then a slot for each
+                    synthetic sample of an epoch, see ``mmdet3d_slots``
     mixture.json    the settings of the mixture
 
-Real and synthetic scans must be in one list, because LaserMix, PolarMix and FrustumMix sample partners from the
-dataset itself.
+Real and synthetic scans must be in one list, because LaserMix, PolarMix and FrustumMix sample
+partners from the dataset itself.
 """
 
 import json
@@ -52,26 +52,28 @@ def write_infos(
     Args:
         out: output folder.
         real: the trainer's own list (``.pkl`` or ``.json``), as written by its ``create_data.py``.
-        settings: settings of the mixture, see ``mixture.OPTIONS``. With a schedule, or another ``epoch_size`` than
-            ``"add"``, the list has as many slots as the epoch with most synthetic samples, and ``SynthSampler`` takes
-            an epoch's entries from it.
+        settings: settings of the mixture, see ``mixture.OPTIONS``. With a schedule, or another
+            ``epoch_size`` than ``"add"``, the list has as many slots as the epoch with most
+            synthetic samples, and ``SynthSampler`` takes an epoch's entries from it.
         data_root: the folder to which the paths in ``real`` are relative.
-        points: the folder of the points under ``data_root`` (the configuration's ``data_prefix['pts']``).
+        points: the folder of the points under ``data_root`` (the configuration's
+            ``data_prefix['pts']``).
         sweeps: the folder of the sweeps between nuScenes' key frames (``data_prefix['sweeps']``).
-        view: for detection, whether to crop synthetic scans to the view of the first real entry's CAM2, as in KITTI's
-            ``velodyne_reduced``; by default if the entry has this camera.
-        layout: ``"kitti"`` or ``"nuscenes"``, the form of points and boxes; by default nuScenes' if the list says that
-            it is nuScenes'.
-        balance: repeat real entries so that each class is in about as many, as ``CBGSDataset`` does, which would
-            change the ratio of a mixture.
+        view: for detection, whether to crop synthetic scans to the view of the first real entry's
+            CAM2, as in KITTI's ``velodyne_reduced``; by default if the entry has this camera.
+        layout: ``"kitti"`` or ``"nuscenes"``, the form of points and boxes; by default nuScenes' if
+            the list says that it is nuScenes'.
+        balance: repeat real entries so that each class is in about as many, as ``CBGSDataset``
+            does, which would change the ratio of a mixture.
 
     Returns:
         The mixed list, for ``ann_file``.
 
     Raises:
-        ConfigError: on labels that make a loss NaN, or a ratio that is no number, list or {epoch: ratio}; on
-            ``view=True`` without a camera.
-        DataError: on a list without entries, or of another format; for detection, on synthetic scans without boxes.
+        ConfigError: on labels that make a loss NaN, or a ratio that is no number, list or {epoch:
+            ratio}; on ``view=True`` without a camera.
+        DataError: on a list without entries, or of another format; for detection, on synthetic
+            scans without boxes.
         FileError: if the scan of the first entry does not exist.
     """
     out = Path(out).resolve()
@@ -88,15 +90,24 @@ def write_infos(
     _check_files(entries[0])
     if balance:
         entries = _balanced(entries, int(settings.get("seed", 0)))
-    facts: dict[str, Any] = {"format": FORMATS[-1], "real": len(entries), "settings": _complete(settings)}
+    facts: dict[str, Any] = {
+        "format": FORMATS[-1],
+        "real": len(entries),
+        "settings": _complete(settings),
+    }
     facts["layout"] = _layout(given, entries[0], layout, real)
     facts["view"] = None if view is False else camera
     folder = Folder(out, facts)
     if detects and folder.slots:
         require_boxes(folder.scan(0))
         check_names(folder.scan(0), folder.layout.classes)
-    slots = [_slot(out, i, folder.layout.features, entries[i % len(entries)], detects) for i in range(folder.slots)]
-    write_file(out / MIXTURE, json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode())
+    slots = [
+        _slot(out, i, folder.layout.features, entries[i % len(entries)], detects)
+        for i in range(folder.slots)
+    ]
+    write_file(
+        out / MIXTURE, json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode()
+    )
     listed = {"metainfo": given.get("metainfo", {}), "data_list": entries + slots}
     write_file(out / INFOS, json.dumps(listed, default=_plain).encode())
     open_folder.cache_clear()  # this process may have opened an earlier list in this folder
@@ -113,9 +124,16 @@ def _read(real: str | Path) -> Any:
 
 def _complete(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings with defaults, and with absolute paths to the synthetic scans and a sensor."""
-    settings = {"synthetic": settings.get("synthetic"), "ratio": 0.25, "labels": "generated", "seed": 0} | settings
+    settings = {
+        "synthetic": settings.get("synthetic"),
+        "ratio": 0.25,
+        "labels": "generated",
+        "seed": 0,
+    } | settings
     if not isinstance(settings["ratio"], int | float | list | dict):
-        raise ConfigError(f"ratio={settings['ratio']!r} for a list", "a number, a list or {epoch: ratio}")
+        raise ConfigError(
+            f"ratio={settings['ratio']!r} for a list", "a number, a list or {epoch: ratio}"
+        )
     for name in ("synthetic", "as_sensor"):
         if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
             settings[name] = str(Path(where).resolve())
@@ -131,7 +149,9 @@ def _layout(given: dict[str, Any], entry: Entry, layout: str | None, real: str |
     found = entry["lidar_points"].get("num_pts_feats", LAYOUTS[name].features)
     if found != LAYOUTS[name].features:
         fits = ", ".join(f"{each!r} ({known.features})" for each, known in LAYOUTS.items())
-        raise ConfigError(f"{real}: points of {found} values for layout={name!r}", f"another layout: {fits}")
+        raise ConfigError(
+            f"{real}: points of {found} values for layout={name!r}", f"another layout: {fits}"
+        )
     return name
 
 
@@ -144,7 +164,9 @@ def _slot(out: Path, number: int, features: int, real: Entry, detects: bool) -> 
     if not detects:
         return slot | {"pts_semantic_mask_path": f"{base}.label"}
     if "CAM2" in real.get("images", {}):  # KittiDataset needs it to convert boxes
-        slot["images"] = {"CAM2": {k: v for k, v in real["images"]["CAM2"].items() if k != "img_path"}}
+        slot["images"] = {
+            "CAM2": {k: v for k, v in real["images"]["CAM2"].items() if k != "img_path"}
+        }
     if "timestamp" in real:
         slot["timestamp"] = real["timestamp"]
     if "lidar_sweeps" in real:
@@ -153,8 +175,9 @@ def _slot(out: Path, number: int, features: int, real: Entry, detects: bool) -> 
 
 
 def _sweep(path: str, real: Entry) -> Entry:
-    """A sweep of a synthetic scan: the scan itself at the time of a real sweep, as a standing sensor sees a street in
-    which nothing moves. Number and times of sweeps are thus those of the real scans."""
+    """A sweep of a synthetic scan: the scan itself at the time of a real sweep, as a standing
+    sensor sees a street in which nothing moves. Number and times of sweeps are thus those of the
+    real scans."""
     return {
         "timestamp": real["timestamp"],
         "lidar_points": {"lidar_path": path, "lidar2sensor": np.eye(4).tolist()},
@@ -185,7 +208,9 @@ def _make_absolute(entry: Entry, root: Path, points: str, sweeps: str) -> None:
         entry["pts_semantic_mask_path"] = str(root / entry["pts_semantic_mask_path"])
     for sweep in entry.get("lidar_sweeps", ()):  # the trainer takes the name only, too
         given = Path(sweep["lidar_points"]["lidar_path"])
-        sweep["lidar_points"]["lidar_path"] = str(root / (points if "samples" in str(given) else sweeps) / given.name)
+        sweep["lidar_points"]["lidar_path"] = str(
+            root / (points if "samples" in str(given) else sweeps) / given.name
+        )
 
 
 def _check_files(entry: Entry) -> None:
@@ -196,12 +221,14 @@ def _check_files(entry: Entry) -> None:
             raise FileError(
                 f"{path}, of the first entry, does not exist",
                 "data_root, points and sweeps of write_infos that lead to the scans",
-                "They are the configuration's data_root, data_prefix['pts'] and data_prefix['sweeps'].",
+                "They are the configuration's data_root, data_prefix['pts'] and "
+                "data_prefix['sweeps'].",
             )
 
 
 def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
-    """Entries drawn so that each class is in about the same number of them (Zhu et al. 2019, arXiv:1908.09492).
+    """Entries drawn so that each class is in about the same number of them (Zhu et al. 2019,
+    arXiv:1908.09492).
 
     A class that few entries have is drawn more often; classes that no entry has do not count.
     """
@@ -215,7 +242,9 @@ def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
     share = sum(map(len, by_class.values())) // len(by_class)
     rng = np.random.default_rng(seed)
     drawn = [rng.choice(by_class[label], max(share, 1)) for label in sorted(by_class)]
-    return [json.loads(json.dumps(entries[i], default=_plain)) for i in np.concatenate(drawn).tolist()]
+    return [
+        json.loads(json.dumps(entries[i], default=_plain)) for i in np.concatenate(drawn).tolist()
+    ]
 
 
 def _plain(value: Any) -> Any:

@@ -1,8 +1,9 @@
 """Info lists of real scans for MMDetection3D 1.1 and later, made from the datasets' own folders.
 
-They are the lists of its ``create_data.py``, reduced to the entries that training and validation read, and made without
-its compiled operators. A list's file is JSON or, if its name ends with ``.pkl``, a pickle, as the stock configurations
-name it. ``split`` chooses the training or the validation list.
+They are the lists of its ``create_data.py``, reduced to the entries that training and validation
+read, and made without its compiled operators. A list's file is JSON or, if its name ends with
+``.pkl``, a pickle, as the stock configurations name it. ``split`` chooses the training or the
+validation list.
 """
 
 import json
@@ -26,7 +27,11 @@ ORDERS = ("uniform", "sequential")
 
 
 def semantic_kitti_list(
-    root: str | Path, out: str | Path, split: str = "train", share: float = 1.0, order: str = "uniform"
+    root: str | Path,
+    out: str | Path,
+    split: str = "train",
+    share: float = 1.0,
+    order: str = "uniform",
 ) -> Path:
     """Write the list of a SemanticKITTI folder; its paths are relative to ``root``.
 
@@ -35,8 +40,8 @@ def semantic_kitti_list(
         out: the list's file, ``.json`` or ``.pkl``.
         split: ``train`` or ``val``.
         share: of the scans of each sequence, above 0 and up to 1; at least one scan.
-        order: which scans these are: ``uniform``, evenly spread, as in LaserMix (Kong et al., CVPR 2023), or
-            ``sequential``, the first ones, so that most places are never seen.
+        order: which scans these are: ``uniform``, evenly spread, as in LaserMix (Kong et al., CVPR
+            2023), or ``sequential``, the first ones, so that most places are never seen.
 
     Raises:
         ConfigError: on another name of ``out``, share or order.
@@ -50,19 +55,27 @@ def semantic_kitti_list(
     entries: list[dict[str, Any]] = []
     for sequence in dict.fromkeys(sequence for sequence, _ in names):
         frames = [frame for other, frame in names if other == sequence]
-        count, base = max(1, round(share * len(frames))), f"sequences/{sequence}"
+        count = max(1, round(share * len(frames)))
+        base = f"sequences/{sequence}"
         chosen = range(count) if order == "sequential" else np.arange(count) * len(frames) // count
         for frame in (frames[i] for i in chosen):
             entry: dict[str, Any] = {"sample_idx": len(entries), "sample_id": f"{sequence}{frame}"}
-            entry["lidar_points"] = {"lidar_path": f"{base}/velodyne/{frame}.bin", "num_pts_feats": 4}
+            entry["lidar_points"] = {
+                "lidar_path": f"{base}/velodyne/{frame}.bin",
+                "num_pts_feats": 4,
+            }
             entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
     return write_list(out, "SemanticKITTI", entries, {})
 
 
-def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced") -> Path:
-    """Write the list of a KITTI object folder; its paths are relative to ``<root>/training/<points>``.
+def kitti_list(
+    root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced"
+) -> Path:
+    """Write the list of a KITTI object folder; its paths are relative to
+    ``<root>/training/<points>``.
 
-    ``velodyne_reduced`` is written if it is missing. The ground plane is that of ``planes``, or fitted to the scan.
+    ``velodyne_reduced`` is written if it is missing. The ground plane is that of ``planes``, or
+    fitted to the scan.
 
     Args:
         root: the folder that holds ``training`` and ``ImageSets``.
@@ -72,26 +85,37 @@ def kitti_list(root: str | Path, out: str | Path, split: str = "train", points: 
 
     Raises:
         ConfigError: on another name of ``out``.
-        DataError, FileError: if a scan, its boxes or its calibration cannot be read, or the list not be written.
+        DataError, FileError: if a scan, its boxes or its calibration cannot be read, or the list
+            not be written.
     """
-    scans, entries = KITTIObject(root, split), []
+    scans = KITTIObject(root, split)
+    entries = []
     for number in range(len(scans)):
-        scan, camera = scans[number], scans.calibration(number)
+        scan = scans[number]
+        camera = scans.calibration(number)
         if camera is None or camera.image_size is None or scan.boxes is None:
-            raise DataError(f"{scan.id} of {root} has no calibration, image or boxes", "calib, image_2 and label_2")
+            raise DataError(
+                f"{scan.id} of {root} has no calibration, image or boxes",
+                "calib, image_2 and label_2",
+            )
         part, frame = scan.id.split("/")
         seen = in_view(scan, camera)
         file = Path(root) / part / points / f"{frame}.bin"
         if points == "velodyne_reduced" and not file.is_file():
-            write_file(file, np.column_stack([seen.points, seen.reflectance]).astype("<f4").tobytes())
+            write_file(
+                file, np.column_stack([seen.points, seen.reflectance]).astype("<f4").tobytes()
+            )
         planes = Path(root) / part / "planes" / f"{frame}.txt"
-        plane = read_plane(planes) if planes.is_file() else plane_in_camera(ground_plane(scan), camera)
+        plane = (
+            read_plane(planes) if planes.is_file() else plane_in_camera(ground_plane(scan), camera)
+        )
         entries.append(_entry(frame, scan, seen, camera) | {"plane": plane.tolist()})
     return write_list(out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)})
 
 
 def read_plane(path: Path) -> Any:
-    """Read (4,) a, b, c, d from a plane's file: the fourth line, as in the published planes of KITTI."""
+    """Read (4,) a, b, c, d from a plane's file: the fourth line, as in the published planes of
+    KITTI."""
     lines = read_text(path).splitlines()
     if len(lines) < 4:
         raise DataError(f"{path} has {len(lines)} lines", "four, the plane in the last one")
@@ -108,7 +132,11 @@ def _entry(frame: str, scan: Scan, seen: Scan, camera: Calibration) -> dict[str,
     assert camera.image_size is not None and scan.boxes is not None
     cam2img = np.vstack([camera.projection, (0, 0, 0, 1)])
     lidar2cam = camera.camera_from_sensor
-    image = {"img_path": f"{frame}.png", "height": camera.image_size[1], "width": camera.image_size[0]}
+    image = {
+        "img_path": f"{frame}.png",
+        "height": camera.image_size[1],
+        "width": camera.image_size[0],
+    }
     image |= {k: v.tolist() for k, v in (("cam2img", cam2img), ("lidar2cam", lidar2cam))}
     image["lidar2img"] = (cam2img @ lidar2cam).tolist()
     return {
@@ -121,19 +149,40 @@ def _entry(frame: str, scan: Scan, seen: Scan, camera: Calibration) -> dict[str,
 
 def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, Any]]:
     floor, size, turn = boxes_to_camera(boxes.values, camera)
-    counts, levels = boxes.contain(seen.points).sum(1), difficulty(boxes)
+    counts = boxes.contain(seen.points).sum(1)
+    levels = difficulty(boxes)
     found = []
     for i, name in enumerate(boxes.names):
         label = CLASSES.index(name) if name in CLASSES else -1
-        box = [*floor[i], size[i, 2], size[i, 0], size[i, 1], turn[i]]  # place, length, height, width, turn
-        facts = {"bbox": boxes.image_box[i], "bbox_label": label, "bbox_3d": box, "bbox_label_3d": label}
+        box = [
+            *floor[i],
+            size[i, 2],
+            size[i, 0],
+            size[i, 1],
+            turn[i],
+        ]  # place, length, height, width, turn
+        facts = {
+            "bbox": boxes.image_box[i],
+            "bbox_label": label,
+            "bbox_3d": box,
+            "bbox_label_3d": label,
+        }
         facts |= {"depth": floor[i, 2], "num_lidar_pts": counts[i], "difficulty": levels[i]}
-        facts |= {"truncated": boxes.truncation[i], "occluded": boxes.occlusion[i], "alpha": boxes.alpha[i]}
-        found.append({k: np.asarray(v).tolist() for k, v in facts.items()} | {"score": 0.0, "index": i, "group_id": i})
+        facts |= {
+            "truncated": boxes.truncation[i],
+            "occluded": boxes.occlusion[i],
+            "alpha": boxes.alpha[i],
+        }
+        found.append(
+            {k: np.asarray(v).tolist() for k, v in facts.items()}
+            | {"score": 0.0, "index": i, "group_id": i}
+        )
     return found
 
 
-def write_list(out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]) -> Path:
+def write_list(
+    out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]
+) -> Path:
     """Write entries as a list of the trainer.
 
     Args:

@@ -1,6 +1,8 @@
-"""nuScenes' info list for MMDetection3D's LiDAR detectors, from the dataset's tables by nuScenes' own devkit.
+"""nuScenes' info list for MMDetection3D's LiDAR detectors, from the dataset's tables by nuScenes'
+own devkit.
 
-It is the list of ``create_data.py nuscenes`` without cameras, so that a dataset with a LiDAR alone has one, too.
+It is the list of ``create_data.py nuscenes`` without cameras, so that a dataset with a LiDAR alone
+has one, too.
 """
 
 from pathlib import Path
@@ -14,14 +16,22 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, FileError, LibraryError
 
 SENSOR = "LIDAR_TOP"
-SPLITS = {"v1.0-trainval": {"train": "train", "val": "val"}, "v1.0-mini": {"train": "mini_train", "val": "mini_val"}}
+SPLITS = {
+    "v1.0-trainval": {"train": "train", "val": "val"},
+    "v1.0-mini": {"train": "mini_train", "val": "mini_val"},
+}
 """The devkit's name of a split, by version."""
 
 
 def nuscenes_list(
-    root: str | Path, out: str | Path, split: str = "train", version: str = "v1.0-trainval", sweeps: int = 10
+    root: str | Path,
+    out: str | Path,
+    split: str = "train",
+    version: str = "v1.0-trainval",
+    sweeps: int = 10,
 ) -> Path:
-    """Write the list of a nuScenes folder; its paths are names of files, as in the trainer's own list.
+    """Write the list of a nuScenes folder; its paths are names of files, as in the trainer's own
+    list.
 
     Args:
         root: the folder that holds ``samples``, ``sweeps`` and the tables.
@@ -43,23 +53,40 @@ def nuscenes_list(
             f"nuScenes' devkit ({error})", "nuscenes-devkit 1.2", "bash tools/install_mmdet3d.sh"
         ) from error
     if split not in SPLITS.get(version, {}):
-        raise DataError(f"split {split!r} of {version!r}", "train or val of v1.0-trainval or v1.0-mini")
+        raise DataError(
+            f"split {split!r} of {version!r}", "train or val of v1.0-trainval or v1.0-mini"
+        )
     if not (Path(root) / version).is_dir():
         raise FileError(f"{Path(root) / version} is not a folder", f"nuScenes' tables of {version}")
     tables = NuScenes(version, str(root), verbose=False)
     scenes = set(create_splits_scenes()[SPLITS[version][split]])
-    samples = [each for each in tables.sample if tables.get("scene", each["scene_token"])["name"] in scenes]
+    samples = [
+        each for each in tables.sample if tables.get("scene", each["scene_token"])["name"] in scenes
+    ]
     if not samples:
-        raise DataError(f"{root} has no scene of {split} in {version}", f"some of {', '.join(sorted(scenes)[:3])}, ...")
-    entries = [_entry(tables, sample, sweeps) | {"sample_idx": i} for i, sample in enumerate(samples)]
+        raise DataError(
+            f"{root} has no scene of {split} in {version}",
+            f"some of {', '.join(sorted(scenes)[:3])}, ...",
+        )
+    entries = [
+        _entry(tables, sample, sweeps) | {"sample_idx": i} for i, sample in enumerate(samples)
+    ]
     return write_list(out, "nuscenes", entries, {name: i for i, name in enumerate(CLASSES)})
 
 
 def _entry(tables: Any, sample: dict[str, Any], sweeps: int) -> dict[str, Any]:
     frame = tables.get("sample_data", sample["data"][SENSOR])
     in_ego, in_world = _poses(tables, frame)
-    points = {"lidar_path": Path(frame["filename"]).name, "num_pts_feats": 5, "lidar2ego": in_ego.tolist()}
-    entry = {"token": sample["token"], "timestamp": frame["timestamp"] / 1e6, "ego2global": in_world.tolist()}
+    points = {
+        "lidar_path": Path(frame["filename"]).name,
+        "num_pts_feats": 5,
+        "lidar2ego": in_ego.tolist(),
+    }
+    entry = {
+        "token": sample["token"],
+        "timestamp": frame["timestamp"] / 1e6,
+        "ego2global": in_world.tolist(),
+    }
     found: list[dict[str, Any]] = []
     earlier = frame
     while earlier["prev"] and len(found) < sweeps:
@@ -96,7 +123,11 @@ def _instances(tables: Any, frame: dict[str, Any]) -> list[dict[str, Any]]:
         instance = {key: np.asarray(values, float).tolist() for key, values in instance.items()}
         counts = {"num_lidar_pts": row["num_lidar_pts"], "num_radar_pts": row["num_radar_pts"]}
         valid = sum(counts.values()) > 0
-        found.append(instance | counts | {"bbox_3d_isvalid": valid, "bbox_label": label, "bbox_label_3d": label})
+        found.append(
+            instance
+            | counts
+            | {"bbox_3d_isvalid": valid, "bbox_label": label, "bbox_label_3d": label}
+        )
     return found
 
 
@@ -109,5 +140,7 @@ def _poses(tables: Any, frame: dict[str, Any]) -> tuple[NDArray[np.float64], NDA
         tables.get("calibrated_sensor", frame["calibrated_sensor_token"]),
         tables.get("ego_pose", frame["ego_pose_token"]),
     ]
-    sensor, vehicle = (transform_matrix(row["translation"], Quaternion(row["rotation"])) for row in rows)
+    sensor, vehicle = (
+        transform_matrix(row["translation"], Quaternion(row["rotation"])) for row in rows
+    )
     return sensor, vehicle

@@ -1,9 +1,9 @@
 """The synthetic scans behind a mixed list of MMDetection3D.
 
-A list of ``mmdet3d_infos.write_infos`` has a *slot* for each synthetic sample of an epoch. Its files are
-``lsynth://<folder>/<slot>.bin`` and ``.label``. ``plan(seed, epoch)`` assigns a scan to each slot, a new one in each
-epoch. The epoch comes to a worker process with each batch (``mmdet3d.SynthSampler``), never by a file, so that several
-runs can share a list.
+A list of ``mmdet3d_infos.write_infos`` has a *slot* for each synthetic sample of an epoch. Its
+files are ``lsynth://<folder>/<slot>.bin`` and ``.label``. ``plan(seed, epoch)`` assigns a scan to
+each slot, a new one in each epoch. The epoch comes to a worker process with each batch
+(``mmdet3d.SynthSampler``), never by a file, so that several runs can share a list.
 """
 
 import json
@@ -32,11 +32,14 @@ from lidar_synth.mixing import Synthetic, make_synthetic
 from lidar_synth.mixing.schedules import settled
 
 PREFIX = "lsynth://"
-MIXTURE, INFOS = "mixture.json", "infos.json"
+MIXTURE = "mixture.json"
+INFOS = "infos.json"
 FORMATS = ("lidar-synth-mmdet3d/1", "lidar-synth-mmdet3d/2")
 """Formats of ``mixture.json``: the second has a layout; the first is always KITTI's."""
 
-_CACHED = 4  # number of scans in the cache of a process: points, labels and boxes of a scan are read one after another
+# number of scans in the cache of a process: points, labels and boxes of a scan are read one after
+# another
+_CACHED = 4
 
 
 class Layout(NamedTuple):
@@ -76,9 +79,13 @@ class Folder:
     """
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
-        self.path, self.settings, self.real = path, facts["settings"], int(facts["real"])
+        self.path = path
+        self.settings = facts["settings"]
+        self.real = int(facts["real"])
         if isinstance(ratio := self.settings["ratio"], dict):  # JSON knows names only
-            self.settings = self.settings | {"ratio": {int(epoch): share for epoch, share in ratio.items()}}
+            self.settings = self.settings | {
+                "ratio": {int(epoch): share for epoch, share in ratio.items()}
+            }
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
         self.mixed = mix(self.real, self.settings, lambda scan, rng: scan)
         self.slots = self.mixed.mixture.laps[0]
@@ -92,17 +99,21 @@ class Folder:
         """Open a folder of ``write_infos``.
 
         Raises:
-            DataError: on another format, or if the synthetic scans, and thus the plan, have changed since.
+            DataError: on another format, or if the synthetic scans, and thus the plan, have changed
+                since.
         """
         facts = json.loads(read_text(path / MIXTURE))
         if facts.get("format") not in FORMATS:
             raise DataError(
-                f"{path / MIXTURE} has format {facts.get('format')!r}", " or ".join(FORMATS), "Write the list again."
+                f"{path / MIXTURE} has format {facts.get('format')!r}",
+                " or ".join(FORMATS),
+                "Write the list again.",
             )
         folder = cls(path, facts)
         if folder.mixed.plan(0).hash != facts["plan"]:
             raise DataError(
-                f"{path}: the synthetic scans {folder.settings['synthetic']} are not those of the list",
+                f"{path}: the synthetic scans {folder.settings['synthetic']} are not those of "
+                "the list",
                 "the bank or model for which the list was written",
                 "Write the list again.",
             )
@@ -113,7 +124,8 @@ class Folder:
         """The epoch of the samples that this process reads; 0 until it is set.
 
         Raises:
-            ConfigError: in a worker process that was never told the epoch: every epoch would have the same scans.
+            ConfigError: in a worker process that was never told the epoch: every epoch would have
+                the same scans.
         """
         if self._epoch is None and get_worker_info() is not None:
             raise ConfigError(
@@ -140,21 +152,26 @@ class Folder:
         return entries
 
     def scan(self, slot: int) -> Scan:
-        """The scan of a slot in the current epoch, in the form of the dataset, with its labels and boxes.
+        """The scan of a slot in the current epoch, in the form of the dataset, with its labels and
+        boxes.
 
         Raises:
-            DataError: on a slot that does not exist, or on boxes with names that the dataset cannot have.
+            DataError: on a slot that does not exist, or on boxes with names that the dataset cannot
+                have.
         """
         key = (self.epoch, slot)
         if key not in self._cached:
             scan = self.mixed.sample(*self._position(*key))
-            self._cached[key] = self.layout.convert(scan if self._view is None else in_view(scan, self._view))
+            self._cached[key] = self.layout.convert(
+                scan if self._view is None else in_view(scan, self._view)
+            )
             if len(self._cached) > _CACHED:
                 self._cached.popitem(last=False)
         return self._cached[key]
 
     def _position(self, epoch: int, slot: int) -> tuple[int, int]:
-        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if it has none."""
+        """Epoch and position of a slot: in this epoch, or in the latest one with synthetic scans if
+        it has none."""
         if not 0 <= slot < self.slots:
             raise DataError(f"slot {slot} of {self.path}", f"0 to {self.slots - 1}")
         while not self.mixed.plan(epoch).synthetics:
@@ -174,11 +191,12 @@ def _opened(source: str) -> Synthetic:
 
 
 def read_url(url: str) -> bytes:
-    """The bytes of ``lsynth://<source>/<number>.bin`` (float32 points) or ``.label`` (SemanticKITTI's).
+    """The bytes of ``lsynth://<source>/<number>.bin`` (float32 points) or ``.label``
+    (SemanticKITTI's).
 
     Args:
-        url: the URL; its source is the folder of a mixed list, whose layout the points have, or else a bank, a
-            checkpoint or a folder of scans, with points x, y, z, reflectance.
+        url: the URL; its source is the folder of a mixed list, whose layout the points have, or
+            else a bank, a checkpoint or a folder of scans, with points x, y, z, reflectance.
 
     Raises:
         DataError: on any other URL, or on labels of a scan without labels.
@@ -228,7 +246,8 @@ def require_boxes(scan: Scan) -> Boxes:
         raise DataError(
             f"synthetic scan {scan.id!r} has no boxes",
             "boxes, for a detector",
-            "Write the list with labels='mix' and a bank of objects, or labels='boxes' if the scans have boxes.",
+            "Write the list with labels='mix' and a bank of objects, or labels='boxes' if the "
+            "scans have boxes.",
         )
     return scan.boxes
 

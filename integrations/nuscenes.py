@@ -1,7 +1,7 @@
 """Scans and boxes in nuScenes' form, for trainers that read it.
 
-nuScenes' LiDAR frame has x right, y forward, z up. A point has five values: x, y, z, intensity 0..255 and ring, 0 = the
-lowest. Boxes have ten classes and a velocity.
+nuScenes' LiDAR frame has x right, y forward, z up. A point has five values: x, y, z, intensity
+0..255 and ring, 0 = the lowest. Boxes have ten classes and a velocity.
 """
 
 from dataclasses import replace
@@ -16,17 +16,33 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import moved
 
 CLASSES = (
-    "car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian", "traffic_cone",
+    "car",
+    "truck",
+    "trailer",
+    "bus",
+    "construction_vehicle",
+    "bicycle",
+    "motorcycle",
+    "pedestrian",
+    "traffic_cone",
     "barrier",
-)  # fmt: skip
+)
 """nuScenes' ten detection classes."""
 
 NAMES = {
-    "Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "pedestrian", "Person_sitting": "pedestrian",
-    "Cyclist": "bicycle", "Motorcyclist": "motorcycle", "Tram": None, "Misc": None, **{name: name for name in CLASSES},
-}  # fmt: skip
-"""nuScenes' class by KITTI's; None: nuScenes has no such class, and the box is dropped. A van is a car in nuScenes, and
-a cyclist a bicycle with its rider; a motorcyclist likewise."""
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Person_sitting": "pedestrian",
+    "Cyclist": "bicycle",
+    "Motorcyclist": "motorcycle",
+    "Tram": None,
+    "Misc": None,
+    **{name: name for name in CLASSES},
+}
+"""nuScenes' class by KITTI's; None: nuScenes has no such class, and the box is dropped. A van is a
+car in nuScenes, and a cyclist a bicycle with its rider; a motorcyclist likewise."""
 
 
 def as_nuscenes(scan: Scan) -> Scan:
@@ -54,7 +70,9 @@ def nuscenes_names(names: tuple[str, ...], where: str) -> list[str | None]:
         DataError: on a name that ``NAMES`` does not have.
     """
     if unknown := sorted(set(names) - set(NAMES)):
-        raise DataError(f"boxes of {unknown} in {where}", f"some of {', '.join(NAMES)}", "Rename the boxes.")
+        raise DataError(
+            f"boxes of {unknown} in {where}", f"some of {', '.join(NAMES)}", "Rename the boxes."
+        )
     return [NAMES[name] for name in names]
 
 
@@ -72,15 +90,19 @@ def turned_boxes(boxes: Boxes) -> Boxes:
 
 
 def five_values(scan: Scan) -> NDArray[np.float32]:
-    """(N, 5) float32 x, y, z, intensity 0..255 and ring of a scan that ``as_nuscenes`` converted."""
+    """(N, 5) float32 x, y, z, intensity 0..255 and ring of a scan that ``as_nuscenes``
+    converted."""
     assert scan.ring is not None
     lowest_first = (scan.sensor.shape[0] - 1 - scan.ring).astype(np.float32)
-    points = np.column_stack([scan.points, scan.reflectance * np.float32(INTENSITY_MAX), lowest_first])
+    points = np.column_stack(
+        [scan.points, scan.reflectance * np.float32(INTENSITY_MAX), lowest_first]
+    )
     return np.ascontiguousarray(points, np.float32)
 
 
 def _rings(scan: Scan) -> NDArray[np.int16]:
-    """(N,) the row of each point on the sensor's grid, 0 = the highest; -1 becomes the lowest row."""
+    """(N,) the row of each point on the sensor's grid, 0 = the highest; -1 becomes the lowest
+    row."""
     cell = locate(scan.points, scan.sensor).cell
     rows, columns = scan.sensor.shape
     return np.where(cell < 0, rows - 1, cell // columns).astype(np.int16)

@@ -2,10 +2,11 @@
 
     import open3d.ml.torch as ml3d
     from lidar_synth.integrations.open3d_ml import dataset_class
-    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
-    pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
+    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/",
+    "ratio": 0.25}) pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
-Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever: ``use_cache`` is refused.
+Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever:
+    ``use_cache`` is refused.
 """
 
 import sys
@@ -37,8 +38,8 @@ _IDS = id_table(1, 0, np.int32)
 def dataset_class() -> Any:
     """The class ``MixedSemanticKITTI``, registered with Open3D-ML under that name.
 
-    Open3D-ML's segmentation pipeline sets the epoch of its training split from then on. With ``OPEN3D_ML_ROOT`` set,
-    Open3D takes its ML part from that checkout.
+    Open3D-ML's segmentation pipeline sets the epoch of its training split from then on. With
+    ``OPEN3D_ML_ROOT`` set, Open3D takes its ML part from that checkout.
 
     Raises:
         LibraryError: if Open3D's ML part cannot be imported.
@@ -63,7 +64,9 @@ def dataset_class() -> Any:
 
         def __init__(self, dataset_path: str, mixture: Any = None, **options: Any) -> None:
             if options.get("use_cache"):
-                raise ConfigError("use_cache=True for a mixture, whose scans change from epoch to epoch", "False")
+                raise ConfigError(
+                    "use_cache=True for a mixture, whose scans change from epoch to epoch", "False"
+                )
             super().__init__(dataset_path, **options)
             self.mixture = read_settings(mixture)
             refuse_unlabelled(self.mixture, "Open3D-ML")
@@ -71,7 +74,11 @@ def dataset_class() -> Any:
 
         def get_split(self, split: str) -> Any:
             """A split; the training split is mixed."""
-            return mixed_split(self, split) if split in ("train", "training") else super().get_split(split)
+            return (
+                mixed_split(self, split)
+                if split in ("train", "training")
+                else super().get_split(split)
+            )
 
     stock.DATASET._register_module(MixedSemanticKITTI)
     return MixedSemanticKITTI
@@ -85,7 +92,9 @@ def _split_class(stock: Any) -> Any:
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
             # First, because the base class makes a sampler, which reads the length.
-            self.mixed = mix(len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan)
+            self.mixed = mix(
+                len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan
+            )
             super().__init__(dataset, split=split)
 
         def set_epoch(self, epoch: int) -> None:
@@ -106,7 +115,8 @@ def _split_class(stock: Any) -> Any:
             return {"point": points[:, :3], "feat": points[:, 3:], "label": class_ids(sample, _IDS)}
 
         def get_attr(self, idx: int) -> dict[str, Any]:
-            """Name and path; the name of a synthetic scan contains its number, and is therefore unique."""
+            """Name and path; the name of a synthetic scan contains its number, and is therefore
+            unique."""
             _, number = self.mixed.plan()[idx]
             if not self.mixed.domain(idx):
                 attr: dict[str, Any] = super().get_attr(number)
@@ -117,14 +127,18 @@ def _split_class(stock: Any) -> Any:
 
 
 class _Loader(EpochLoader):
-    """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with numpy 2."""
+    """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with
+    numpy 2."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {}))
+        super().__init__(
+            *args, **options | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {})
+        )
 
 
 def _seed(worker: int) -> None:
-    """Seed numpy's global generator, from which Open3D-ML draws, differently in each worker and epoch."""
+    """Seed numpy's global generator, from which Open3D-ML draws, differently in each worker and
+    epoch."""
     np.random.seed(torch.initial_seed() % 2**32)  # noqa: NPY002
 
 
@@ -132,14 +146,24 @@ def _library() -> Any:
     """``open3d.ml.torch``, or an error that says which of its parts is missing."""
     try:
         ml3d = import_module("open3d.ml.torch")
-        return SimpleNamespace(datasets=ml3d.datasets, pipelines=ml3d.pipelines)  # they are imported when first used
+        return SimpleNamespace(
+            datasets=ml3d.datasets, pipelines=ml3d.pipelines
+        )  # they are imported when first used
     except (ImportError, OSError, RuntimeError) as error:
         if isinstance(error, ImportError):
-            hint = "pip install 'open3d[ml]'; lidar-synth doctor lists the system libraries that it needs."
+            hint = (
+                "pip install 'open3d[ml]'; lidar-synth doctor lists the system libraries that it "
+                "needs."
+            )
         elif isinstance(error, RuntimeError):
-            hint = "Each release of Open3D has operators for one release of torch: install that one."
+            hint = (
+                "Each release of Open3D has operators for one release of torch: install that one."
+            )
         else:
-            hint = "Open3D's operators for CUDA do not load with a torch for CPUs: pip install 'open3d-cpu[ml]'."
+            hint = (
+                "Open3D's operators for CUDA do not load with a torch for CPUs: pip install "
+                "'open3d-cpu[ml]'."
+            )
         raise LibraryError(
             f"open3d.ml.torch cannot be imported with torch {torch.__version__} ({error})",
             "Open3D with its ML part, built for this torch",

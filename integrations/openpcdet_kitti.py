@@ -21,8 +21,12 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
     A synthetic scan gets the calibration of the first real scan and a fitted ground plane.
     """
 
-    def __init__(self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any) -> None:
-        super().__init__(dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options)
+    def __init__(
+        self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any
+    ) -> None:
+        super().__init__(
+            dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options
+        )
         if training:
             self._check_files()
             self._view = self._camera()
@@ -32,7 +36,8 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
         scan = in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
         assert scan.boxes is not None
         plane = plane_in_camera(ground_plane(scan), self._view[1])
-        calib, image_shape = self._view[0], self._view[2]
+        calib = self._view[0]
+        image_shape = self._view[2]
         sample = self.prepare_data(
             {
                 "frame_id": f"synthetic/{scan.id}",
@@ -47,7 +52,8 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
         return sample
 
     def _check_files(self) -> None:
-        """Check that every real scan has a calibration, and for GT sampling a plane, without which OpenPCDet fails."""
+        """Check that every real scan has a calibration, and for GT sampling a plane, without which
+        OpenPCDet fails."""
         frames = [info["point_cloud"]["lidar_idx"] for info in self.kitti_infos]
         needed = {"calib": ("KITTI's calibration of every scan", "")}
         if any(step.get("USE_ROAD_PLANE", False) for step in self._sampling()):
@@ -57,15 +63,24 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
             folder = self.root_split_path / kind
             missing = [f for f in frames if not (folder / f"{f}.txt").is_file()]
             if missing:
-                raise ConfigError(f"{folder} without {len(missing)} scans ({missing[0]}, ...)", expected, hint)
+                raise ConfigError(
+                    f"{folder} without {len(missing)} scans ({missing[0]}, ...)", expected, hint
+                )
 
     def _camera(self) -> tuple[Any, Calibration, Any]:
-        """The camera of the first real scan, to which synthetic scans are cropped: OpenPCDet's object, our calibration,
-        and the image shape."""
+        """The camera of the first real scan, to which synthetic scans are cropped: OpenPCDet's
+        object, our calibration, and the image shape."""
         items = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
         if items - {"points"}:
-            raise ConfigError(f"GET_ITEM_LIST {sorted(items)} with MixedKitti", "['points']: there is no picture")
+            raise ConfigError(
+                f"GET_ITEM_LIST {sorted(items)} with MixedKitti", "['points']: there is no picture"
+            )
         info = self.kitti_infos[0]
-        calib, shape = self.get_calib(info["point_cloud"]["lidar_idx"]), info["image"]["image_shape"]
+        calib = self.get_calib(info["point_cloud"]["lidar_idx"])
+        shape = info["image"]["image_shape"]
         camera_from_sensor = homogeneous(calib.R0) @ homogeneous(calib.V2C)
-        return calib, Calibration(calib.P2, camera_from_sensor, (int(shape[1]), int(shape[0]))), shape
+        return (
+            calib,
+            Calibration(calib.P2, camera_from_sensor, (int(shape[1]), int(shape[0]))),
+            shape,
+        )

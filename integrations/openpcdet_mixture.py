@@ -1,4 +1,5 @@
-"""What OpenPCDet's mixed datasets share: which sample is at a position, and what is refused before training."""
+"""What OpenPCDet's mixed datasets share: which sample is at a position, and what is refused before
+training."""
 
 from collections.abc import Callable, Collection
 from typing import Any
@@ -16,21 +17,26 @@ LOOKED_AT = 16
 class Mixed:
     """A dataset of OpenPCDet mixed with synthetic scans; evaluation uses only real ones.
 
-    Combine it with a dataset class of OpenPCDet, ``class MixedKitti(Mixed, KittiDataset)``, that calls ``_start`` at
-    the end of its ``__init__`` and defines ``_synthetic``.
+    Combine it with a dataset class of OpenPCDet, ``class MixedKitti(Mixed, KittiDataset)``, that
+    calls ``_start`` at the end of its ``__init__`` and defines ``_synthetic``.
 
-    OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the ratio, a real scan is
-    replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives synthetic scans boxes.
+    OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the
+    ratio, a real scan is
+    replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives
+        synthetic scans boxes.
     """
 
     _current: int | None = None  # the position whose sample is being made
-    _synthetic: Callable[[Scan], Any]  # processes a synthetic scan with the trainer's own augmentation
+    _synthetic: Callable[
+        [Scan], Any
+    ]  # processes a synthetic scan with the trainer's own augmentation
     mixed: Any = None
     dataset_cfg: Any
     class_names: Any
 
     def _start(self, known: Collection[str]) -> None:
-        """Make the mixture and check its first synthetic scans; ``known`` are the class names that a box may have."""
+        """Make the mixture and check its first synthetic scans; ``known`` are the class names that
+        a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
         self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
         self._check_boxes({*self.class_names, *known})
@@ -42,7 +48,9 @@ class Mixed:
             ConfigError: with ``merge`` for a mixture.
         """
         if merge and self.mixed is not None:
-            raise ConfigError(f"merge_all_iters_to_one_epoch with {type(self).__name__}", "epochs one by one")
+            raise ConfigError(
+                f"merge_all_iters_to_one_epoch with {type(self).__name__}", "epochs one by one"
+            )
         super().merge_all_iters_to_one_epoch(merge, epochs)  # type: ignore[misc]
 
     def set_epoch(self, epoch: int) -> None:
@@ -75,13 +83,15 @@ class Mixed:
             self._current = None
 
     def _replacement(self, index: int) -> Any:
-        """The sample with which ``prepare_data`` replaces a scan without boxes after augmentation."""
+        """The sample with which ``prepare_data`` replaces a scan without boxes after
+        augmentation."""
         assert self._current is not None
         if not self.mixed.domain(self._current):
             return super().__getitem__(index)  # type: ignore[misc]
         scan = self.mixed[self._current]
         raise DataError(
-            f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after augmentation",
+            f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after "
+            "augmentation",
             "at least one, because OpenPCDet would replace the scan by another one",
             "Use labels: mix with a bank of objects, and gt_sampling.",
         )
@@ -105,7 +115,10 @@ class Mixed:
             if used or self._sampling():
                 return
         if self.mixed.plan().synthetics and not used:
-            given = f"the first synthetic scans have no box of {list(self.class_names)}, and there is no gt_sampling"
+            given = (
+                f"the first synthetic scans have no box of {list(self.class_names)}, and there is "
+                "no gt_sampling"
+            )
             raise DataError(given, "boxes, for a detector", hint)
 
     def _trained_names(self, scan: Scan) -> set[str]:
@@ -116,4 +129,6 @@ class Mixed:
         """The steps of GT sampling that are in use."""
         steps = self.dataset_cfg.DATA_AUGMENTOR
         unused = steps.get("DISABLE_AUG_LIST", [])
-        return [s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused]
+        return [
+            s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused
+        ]

@@ -18,20 +18,30 @@ SRC = ["x", "y", "z", "intensity", "timestamp"]
 class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
     """nuScenes mixed with synthetic scans at the ratio of its settings, see ``Mixed``.
 
-    A synthetic scan becomes what OpenPCDet makes of the first key frame of a scene, which has no earlier sweeps: the
-    scan itself in place of each, at time 0. The velocity of its boxes is unknown, which nuScenes writes as NaN.
+    A synthetic scan becomes what OpenPCDet makes of the first key frame of a scene, which has no
+        earlier sweeps: the
+    scan itself in place of each, at time 0. The velocity of its boxes is unknown, which nuScenes
+    writes as NaN.
     """
 
-    def __init__(self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any) -> None:
-        super().__init__(dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options)
+    def __init__(
+        self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any
+    ) -> None:
+        super().__init__(
+            dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options
+        )
         if not training:
             return
         features = list(dataset_cfg.POINT_FEATURE_ENCODING.src_feature_list)
         if self.use_camera or features != SRC:
-            raise ConfigError(f"cameras {self.use_camera}, features {features} with MixedNuScenes", f"none, and {SRC}")
+            raise ConfigError(
+                f"cameras {self.use_camera}, features {features} with MixedNuScenes",
+                f"none, and {SRC}",
+            )
         if dataset_cfg.MAX_SWEEPS > 1:
             warnings.warn(
-                f"MAX_SWEEPS: {dataset_cfg.MAX_SWEEPS}, but a synthetic scan has one sweep, which is repeated: a "
+                f"MAX_SWEEPS: {dataset_cfg.MAX_SWEEPS}, but a synthetic scan has one sweep, which "
+                "is repeated: a "
                 "network can tell it from a real one by its times. MAX_SWEEPS: 1 makes them alike.",
                 stacklevel=2,
             )
@@ -47,14 +57,18 @@ class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
                 "points": np.tile(points, (self.dataset_cfg.MAX_SWEEPS, 1)),
                 "frame_id": f"synthetic/{scan.id}",
                 "metadata": {"token": f"synthetic/{scan.id}"},
-                "gt_boxes": np.pad(scan.boxes.values.astype(float), ((0, 0), (0, 2)), constant_values=np.nan),
+                "gt_boxes": np.pad(
+                    scan.boxes.values.astype(float), ((0, 0), (0, 2)), constant_values=np.nan
+                ),
                 "gt_names": np.array(scan.boxes.names, dtype=str),
             }
         )
         boxes = sample["gt_boxes"]
         if self.dataset_cfg.get("SET_NAN_VELOCITY_TO_ZEROS", False):
             boxes = np.nan_to_num(boxes)
-        sample["gt_boxes"] = boxes if self.dataset_cfg.PRED_VELOCITY else boxes[:, [0, 1, 2, 3, 4, 5, 6, -1]]
+        sample["gt_boxes"] = (
+            boxes if self.dataset_cfg.PRED_VELOCITY else boxes[:, [0, 1, 2, 3, 4, 5, 6, -1]]
+        )
         return sample
 
     def _trained_names(self, scan: Scan) -> set[str]:

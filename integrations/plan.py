@@ -1,10 +1,13 @@
-"""A mixture's epochs as a file, for trainers whose environment cannot hold the package; ``reader.py`` reads it::
+"""A mixture's epochs as a file, for trainers whose environment cannot hold the package;
+``reader.py`` reads it::
 
     python -m lidar_synth.integrations.plan mix.yaml plan.npz --real 19130 --epochs 50
 
-``plan.npz`` holds the order of each epoch, computed by the package: ``epoch-<n>`` (N, 2) int64 (0 = real or 1 =
-synthetic, number of the sample), and ``settings``, the bytes of a JSON text: format, order, number of real samples, the
-bank's identity, label policy and threshold, length and hash of each epoch's plan.
+``plan.npz`` holds the order of each epoch, computed by the package: ``epoch-<n>`` (N, 2) int64 (0 =
+    real or 1 =
+synthetic, number of the sample), and ``settings``, the bytes of a JSON text: format, order, number
+of real samples, the bank's identity, label policy and threshold, length and hash of each epoch's
+plan.
 """
 
 import argparse
@@ -27,11 +30,14 @@ POLICIES = ("generated", "condition", "boxes", "none")
 """Label policies that need no other scan than the bank's own."""
 
 
-def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epochs: int) -> list[str]:
+def write_plan(
+    settings: Mapping[str, Any], out: str | Path, *, real: int, epochs: int
+) -> list[str]:
     """Write the order of a mixture's first epochs.
 
     Args:
-        settings: of the mixture, see ``lidar_synth.integrations.mixture``; its synthetic source is a bank.
+        settings: of the mixture, see ``lidar_synth.integrations.mixture``; its synthetic source is
+            a bank.
         out: the file to write, ``.npz``.
         real: number of the trainer's real samples.
         epochs: number of epochs.
@@ -40,41 +46,60 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
         The hash of each epoch's plan, as ``MixedScans.plan(epoch).hash``.
 
     Raises:
-        ConfigError: on synthetic scans that are not in a bank, a label policy that needs more than the bank's own
-            labels, no epochs or real samples, or settings that ``MixedScans`` refuses.
+        ConfigError: on synthetic scans that are not in a bank, a label policy that needs more than
+            the bank's own labels, no epochs or real samples, or settings that ``MixedScans``
+            refuses.
         FileError: if the file cannot be written.
     """
-    labels, options = settings.get("labels", "generated"), dict(settings.get("label_options") or {})
+    labels = settings.get("labels", "generated")
+    options = dict(settings.get("label_options") or {})
     if labels not in POLICIES or set(options) - {"threshold"}:
         raise ConfigError(
             f"labels={labels!r} with options {sorted(options)} for a plan file",
             f"{', '.join(POLICIES)}, and no option but threshold",
-            "The reader takes a bank's own labels; other policies need the package in the trainer's environment.",
+            "The reader takes a bank's own labels; other policies need the package in the "
+            "trainer's environment.",
         )
     if settings.get("as_sensor") is not None:
         raise ConfigError(
             f"as_sensor: {settings['as_sensor']} for a plan file",
             "none",
-            "The reader takes a bank's scans as they are; other sensors need the package in the trainer's environment.",
+            "The reader takes a bank's scans as they are; other sensors need the package in the "
+            "trainer's environment.",
         )
     if epochs < 1 or real < 1 or Path(out).suffix != ".npz":
-        raise ConfigError(f"{real} real samples and {epochs} epochs in {out}", "at least one of each, in a .npz file")
+        raise ConfigError(
+            f"{real} real samples and {epochs} epochs in {out}",
+            "at least one of each, in a .npz file",
+        )
     if not is_bank(settings.get("synthetic", "")):
-        raise ConfigError(f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one.")
+        raise ConfigError(
+            f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one."
+        )
     mixed = mix(real, settings, lambda scan, rng: scan)
-    if "boxes" in mixed.synthetic[0].fields and labels != "none" and settings.get("unboxed") != "keep":
+    if (
+        "boxes" in mixed.synthetic[0].fields
+        and labels != "none"
+        and settings.get("unboxed") != "keep"
+    ):
         raise ConfigError(
             f"labels={labels!r} of a bank with boxes for a plan file",
             "unboxed: keep, too",
-            "The reader cannot remove objects without a box; MixedScans does, where the package is installed.",
+            "The reader cannot remove objects without a box; MixedScans does, where the package "
+            "is installed.",
         )
     plans = [mixed.plan(epoch) for epoch in range(epochs)]
     arrays = {f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1) for plan in plans}
     values = {
-        "format": PLAN_FORMAT, "order": VERSION, "real": real, "bank": mixed.synthetic[0].identity, "labels": labels,
-        "threshold": float(options.get("threshold", 0)), "lengths": [len(plan) for plan in plans],
+        "format": PLAN_FORMAT,
+        "order": VERSION,
+        "real": real,
+        "bank": mixed.synthetic[0].identity,
+        "labels": labels,
+        "threshold": float(options.get("threshold", 0)),
+        "lengths": [len(plan) for plan in plans],
         "hashes": [plan.hash for plan in plans],
-    }  # fmt: skip
+    }
     text = np.frombuffer(json.dumps(values).encode(), np.uint8)
     write_arrays(Path(out), {"settings": text, **arrays}, compressed=True)
     return list(values["hashes"])
@@ -82,14 +107,20 @@ def write_plan(settings: Mapping[str, Any], out: str | Path, *, real: int, epoch
 
 def main() -> None:
     """Entry point of ``python -m lidar_synth.integrations.plan``."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("mix", help="YAML file of the mixture's settings")
     parser.add_argument("out", help="the file to write, .npz")
-    parser.add_argument("--real", type=int, required=True, help="number of the trainer's real samples")
+    parser.add_argument(
+        "--real", type=int, required=True, help="number of the trainer's real samples"
+    )
     parser.add_argument("--epochs", type=int, required=True, help="number of epochs")
     options = parser.parse_args()
     try:
-        hashes = write_plan(read_settings(options.mix), options.out, real=options.real, epochs=options.epochs)
+        hashes = write_plan(
+            read_settings(options.mix), options.out, real=options.real, epochs=options.epochs
+        )
     except LidarSynthError as error:
         print(f"lidar-synth: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, ConfigError) else 1)

@@ -1,10 +1,12 @@
-"""Pointcept: SemanticKITTI mixed with synthetic scans, registered when a configuration imports this module::
+"""Pointcept: SemanticKITTI mixed with synthetic scans, registered when a configuration imports this
+module::
 
-    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
-    hooks = [dict(type="SynthEpoch"), ...]
-    data["train"] |= dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
+    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"],
+    allow_failed_imports=False) hooks = [dict(type="SynthEpoch"), ...] data["train"] |=
+    dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
 
-For segmentation, a synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as zeros, which mean
+For segmentation, a synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as
+    zeros, which mean
 "car". Self-supervised pretraining reads no labels, so that its mixture may have ``labels: none``.
 """
 
@@ -35,7 +37,9 @@ try:
     from pointcept.engines.hooks.default import HookBase
 except ImportError as error:
     raise LibraryError(
-        f"pointcept cannot be imported ({error})", "a checkout of Pointcept", "PYTHONPATH=/path/to/Pointcept"
+        f"pointcept cannot be imported ({error})",
+        "a checkout of Pointcept",
+        "PYTHONPATH=/path/to/Pointcept",
     ) from error
 
 
@@ -44,9 +48,10 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
     """``SemanticKITTIDataset`` with synthetic samples, for training.
 
     Args:
-        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them. ``labels: none`` is
-            refused if the transforms collect ``segment``.
-        options: as for ``SemanticKITTIDataset``. ``cache`` is refused, because it identifies samples by name only.
+        mixture: settings (``lidar_synth.integrations.mixture.OPTIONS``) or a YAML file of them.
+            ``labels: none`` is refused if the transforms collect ``segment``.
+        options: as for ``SemanticKITTIDataset``. ``cache`` is refused, because it identifies
+            samples by name only.
 
     Raises:
         ConfigError: on settings that cannot be served, ``test_mode`` or ``cache``.
@@ -54,14 +59,18 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
 
     def __init__(self, mixture: Any = None, **options: Any) -> None:
         if options.get("test_mode") or options.get("cache"):
-            raise ConfigError("MixedSemanticKITTI with test_mode or cache", "training without a cache")
+            raise ConfigError(
+                "MixedSemanticKITTI with test_mode or cache", "training without a cache"
+            )
         super().__init__(**options)
         settings = read_settings(mixture)
         self._labelled = settings.get("labels", "generated") not in ("none", "ignore")
         if collects_labels(options.get("transform")):
             refuse_unlabelled(settings, "Pointcept")
         taxonomy = take_classes(settings)
-        self._ids = trainer_ids(self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32))
+        self._ids = trainer_ids(
+            self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32)
+        )
         self.mixed = mix(len(self.data_list), settings, lambda scan, rng: scan)
 
     def set_epoch(self, epoch: int) -> None:
@@ -76,7 +85,8 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         return int(len(self.mixed) * self.loop)
 
     def get_data(self, idx: int) -> dict[str, Any]:
-        """Coordinates (N, 3), strength (N, 1) float32, segment (N,) int32 and a name, as Pointcept reads them."""
+        """Coordinates (N, 3), strength (N, 1) float32, segment (N,) int32 and a name, as Pointcept
+        reads them."""
         sample = self.mixed[idx % len(self.mixed)]
         if not isinstance(sample, Scan):
             data: dict[str, Any] = super().get_data(sample)
@@ -85,22 +95,28 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         return {
             "coord": points[:, :3],
             "strength": points[:, 3:],
-            "segment": class_ids(sample, self._ids) if self._labelled else np.full(len(points), self._ids[IGNORE]),
+            "segment": class_ids(sample, self._ids)
+            if self._labelled
+            else np.full(len(points), self._ids[IGNORE]),
             "name": f"synthetic_{sample.id}",
         }
 
 
 def collects_labels(transform: Any) -> bool:
-    """Whether a pipeline gives ``segment`` to the network; without a ``Collect`` step it gives everything."""
+    """Whether a pipeline gives ``segment`` to the network; without a ``Collect`` step it gives
+    everything."""
     keys = [step["keys"] for step in transform or [] if step["type"] == "Collect"]
-    return not keys or any("segment" in ([each] if isinstance(each, str) else each) for each in keys)
+    return not keys or any(
+        "segment" in ([each] if isinstance(each, str) else each) for each in keys
+    )
 
 
 class EpochOf:
     """A trainer's loader that sets the epoch of its mixtures each time it begins to iterate.
 
-    Pointcept requests scans before it calls a hook of an epoch, and any hook of ``before_train`` may change the epoch
-    in which training begins, as ``CheckpointLoader`` does. So the epoch is read when it is needed.
+    Pointcept requests scans before it calls a hook of an epoch, and any hook of ``before_train``
+    may change the epoch in which training begins, as ``CheckpointLoader`` does. So the epoch is
+    read when it is needed.
 
     Args:
         loader: any loader of Pointcept; whatever else is asked of it is passed on.
@@ -108,7 +124,8 @@ class EpochOf:
     """
 
     def __init__(self, loader: Any, trainer: Any) -> None:
-        self._loader, self._trainer = loader, trainer
+        self._loader = loader
+        self._trainer = trainer
 
     def __iter__(self) -> Iterator[Any]:
         for each in mixtures(self._loader):
@@ -123,9 +140,15 @@ class EpochOf:
 
 
 def mixtures(loader: Any) -> list[MixedSemanticKITTI]:
-    """The mixtures that a loader reads, also within ``ConcatDataset`` and ``MultiDatasetDataloader``."""
+    """The mixtures that a loader reads, also within ``ConcatDataset`` and
+    ``MultiDatasetDataloader``."""
     datasets = loader.datasets if hasattr(loader, "datasets") else [loader.dataset]
-    return [each for dataset in datasets for each in inner(dataset) if isinstance(each, MixedSemanticKITTI)]
+    return [
+        each
+        for dataset in datasets
+        for each in inner(dataset)
+        if isinstance(each, MixedSemanticKITTI)
+    ]
 
 
 @HOOKS.register_module()
@@ -140,5 +163,7 @@ class SynthEpoch(HookBase):  # type: ignore[misc]
         """Set the epoch whenever the training loader begins to iterate."""
         loader = self.trainer.train_loader
         if not mixtures(loader):
-            raise ConfigError("the hook SynthEpoch without a mixture", "MixedSemanticKITTI in data.train")
+            raise ConfigError(
+                "the hook SynthEpoch without a mixture", "MixedSemanticKITTI in data.train"
+            )
         self.trainer.train_loader = EpochOf(loader, self.trainer)

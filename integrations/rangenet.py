@@ -1,10 +1,13 @@
-"""RangeNet++ (lidar-bonnetal), SalsaNext and CENet: a launcher that runs their own training script on a mixture::
+"""RangeNet++ (lidar-bonnetal), SalsaNext and CENet: a launcher that runs their own training script
+on a mixture::
 
     cd train/tasks/semantic    # CENet: its root
-    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET -ac ARCH.yaml ...
+    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET
+    -ac ARCH.yaml ...
 
-The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in memory (``/dev/shm`` on
-Linux). Validation, and scripts other than ``train.py``, see only real scans.
+The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in
+memory (``/dev/shm`` on Linux). Validation, and scripts other than ``train.py``, see only real
+scans.
 """
 
 import sys
@@ -35,14 +38,17 @@ from lidar_synth.formats.point_labels import encode_labels
 from lidar_synth.geometry.scan import Scan
 
 USAGE = (
-    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in train/tasks/semantic "
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in "
+    "train/tasks/semantic "
     "or CENet"
 )
 FAMILY = "lidar-bonnetal, SalsaNext or CENet"
 TRAINERS = {"tasks.semantic.modules.trainer": None, "modules.trainer": "dataset.kitti.parser"}
-"""{module of the trainer: module from which it imports its parser, or None where it loads the parser by its path}."""
+"""{module of the trainer: module from which it imports its parser, or None where it loads the
+parser by its path}."""
 STRIPES = 0.25
-"""Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of one density."""
+"""Largest difference of ``gaps`` between real and synthetic images; below, the eye sees images of
+one density."""
 
 _TRAIN_IDS = id_table(0, 255, np.uint8)
 _MEMORY = next((str(folder) for folder in (Path("/dev/shm"),) if folder.is_dir()), None)
@@ -54,7 +60,8 @@ def filled(mask: NDArray[Any]) -> float:
 
 
 def gaps(mask: NDArray[Any]) -> float:
-    """Share of the filled cells whose right neighbour is empty: near 1 for vertical stripes; ``mask`` (H, W) bool."""
+    """Share of the filled cells whose right neighbour is empty: near 1 for vertical stripes;
+    ``mask`` (H, W) bool."""
     return float((mask & ~np.roll(mask, -1, 1)).sum() / max(mask.sum(), 1))
 
 
@@ -103,15 +110,20 @@ def dataset_class(stock: Any) -> Any:
                 )
             with tempfile.TemporaryDirectory(dir=_MEMORY) as folder:
                 files = self.scan_files, self.label_files
-                self.scan_files, self.label_files = ([path] for path in _write(Path(folder), sample, self.taxonomy))
+                self.scan_files, self.label_files = (
+                    [path] for path in _write(Path(folder), sample, self.taxonomy)
+                )
                 try:
                     return super().__getitem__(0)
                 finally:
                     self.scan_files, self.label_files = files
 
         def image(self, source: Scan | str, width: int) -> NDArray[Any]:
-            """(H, width) bool, the filled cells of the trainer's own projection of a scan or file."""
-            scan = stock.LaserScan(True, self.sensor_img_H, width, self.sensor_fov_up, self.sensor_fov_down)
+            """(H, width) bool, the filled cells of the trainer's own projection of a scan or
+            file."""
+            scan = stock.LaserScan(
+                True, self.sensor_img_H, width, self.sensor_fov_up, self.sensor_fov_down
+            )
             if isinstance(source, Scan):
                 scan.set_points(source.points, source.reflectance)
             else:
@@ -137,20 +149,28 @@ def check_stripes(dataset: Any) -> None:
         return
 
     def measure(width: int) -> list[tuple[float, float]]:
-        kinds = [[dataset.image(source, width) for source in sources] for sources in (real, synthetic)]
+        kinds = [
+            [dataset.image(source, width) for source in sources] for sources in (real, synthetic)
+        ]
         return [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
 
     (real_fill, real_gaps), (fill, holes) = measure(width := dataset.sensor_img_W)
     if holes - real_gaps <= STRIPES:
         return
-    narrower = [w for w in (width // 2, width // 4, width // 8) if (m := measure(w))[1][1] - m[0][1] <= STRIPES]
+    narrower = [
+        w
+        for w in (width // 2, width // 4, width // 8)
+        if (m := measure(w))[1][1] - m[0][1] <= STRIPES
+    ]
     fitting = narrower[0] if narrower else "the columns of the synthetic scans"
     raise ConfigError(
-        f"synthetic scans in images of {dataset.sensor_img_H} x {width}: {fill:.0%} of the cells are filled, and "
+        f"synthetic scans in images of {dataset.sensor_img_H} x {width}: {fill:.0%} of the cells "
+        "are filled, and "
         f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
         f"{real_gaps:.0%}",
         "images of one density: a network tells these apart by the stripes",
-        f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and synthetic scans "
+        f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and "
+        "synthetic scans "
         "are then projected to that width, in training, validation and inference.",
     )
 
@@ -160,12 +180,15 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
 
     Args:
         stock: the module of the trainer's own parser.
-        settings: settings of the mixture, or a YAML file of them; by default the file in ``LIDAR_SYNTH_MIX``.
+        settings: settings of the mixture, or a YAML file of them; by default the file in
+            ``LIDAR_SYNTH_MIX``.
 
     Raises:
         LibraryError: if the module is not a parser of these trainers.
     """
-    missing = [name for name in ("Parser", "SemanticKitti", "LaserScan") if not hasattr(stock, name)]
+    missing = [
+        name for name in ("Parser", "SemanticKitti", "LaserScan") if not hasattr(stock, name)
+    ]
     if missing:
         raise LibraryError(f"a parser.py without {missing}", f"the parser of {FAMILY}")
     settings = read_settings(settings)
@@ -179,25 +202,43 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
         def __init__(self, *args: Any, **options: Any) -> None:
             super().__init__(*args, **options)
             self.trainiter = None  # its workers would read the stock training set
-            own, loader = self.train_dataset, self.trainloader
+            own = self.train_dataset
+            loader = self.trainloader
             arguments = {
                 name: getattr(own, name)
-                for name in ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
+                for name in (
+                    "labels",
+                    "color_map",
+                    "learning_map",
+                    "learning_map_inv",
+                    "sensor",
+                    "max_points",
+                    "gt",
+                )
             }
             if hasattr(own, "transform"):  # SalsaNext's
                 arguments["transform"] = own.transform
-            self.train_dataset = dataset_class(stock)(settings, self.root, self.train_sequences, **arguments)
+            self.train_dataset = dataset_class(stock)(
+                settings, self.root, self.train_sequences, **arguments
+            )
             self.trainloader = DataLoader(
-                self.train_dataset, batch_size=self.batch_size, shuffle=self.shuffle_train, num_workers=self.workers,
-                pin_memory=loader.pin_memory, drop_last=True, collate_fn=loader.collate_fn,
-                worker_init_fn=loader.worker_init_fn, generator=loader.generator,
-            )  # fmt: skip
+                self.train_dataset,
+                batch_size=self.batch_size,
+                shuffle=self.shuffle_train,
+                num_workers=self.workers,
+                pin_memory=loader.pin_memory,
+                drop_last=True,
+                collate_fn=loader.collate_fn,
+                worker_init_fn=loader.worker_init_fn,
+                generator=loader.generator,
+            )
 
     return Parser
 
 
 def register() -> None:
-    """Make the trainer use a mixed parser and set the epoch of its training set, also when it resumes.
+    """Make the trainer use a mixed parser and set the epoch of its training set, also when it
+    resumes.
 
     Raises:
         LibraryError: if the trainer's code cannot be imported, or is not of this family.
@@ -229,7 +270,9 @@ def _trainer() -> tuple[Any, Any]:
         except ImportError as error:
             if error.name != "tasks":  # it is this trainer, without something that it imports
                 raise LibraryError(
-                    f"{name} cannot be imported ({error})", f"{FAMILY} with all that it imports", f"Start: {USAGE}"
+                    f"{name} cannot be imported ({error})",
+                    f"{FAMILY} with all that it imports",
+                    f"Start: {USAGE}",
                 ) from error
     raise AssertionError("the last trainer is not in a package of this name")
 
@@ -245,8 +288,10 @@ def _loader(load: Any) -> SimpleNamespace:
 
 
 def _plain_state(scheduler: Any) -> None:
-    """Checkpoints hold numbers of the inner scheduler, not the object, which ``torch.load`` refuses since 2.6."""
-    state_dict, load_state_dict = scheduler.state_dict, scheduler.load_state_dict
+    """Checkpoints hold numbers of the inner scheduler, not the object, which ``torch.load`` refuses
+    since 2.6."""
+    state_dict = scheduler.state_dict
+    load_state_dict = scheduler.load_state_dict
 
     def plain(self: Any) -> dict[str, Any]:
         state: dict[str, Any] = state_dict(self)
@@ -256,38 +301,51 @@ def _plain_state(scheduler: Any) -> None:
         self.initial_scheduler.load_state_dict(state["initial_scheduler"])
         load_state_dict(self, state | {"initial_scheduler": self.initial_scheduler})
 
-    scheduler.state_dict, scheduler.load_state_dict = plain, load
+    scheduler.state_dict = plain
+    scheduler.load_state_dict = load
 
 
 def main() -> None:
     """Run one of the trainer's scripts; ``train.py`` trains on the mixture."""
-    script = prepare_script(USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load")
+    script = prepare_script(
+        USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load"
+    )
     if Path(script).with_name("__init__.py").is_file():
-        import_module("__init__")  # the trainer's own, which its scripts import first: it puts ../.. on the path
+        import_module(
+            "__init__"
+        )  # the trainer's own, which its scripts import first: it puts ../.. on the path
     register()
     run(script)
 
 
 def _write(folder: Path, scan: Scan, taxonomy: Taxonomy) -> tuple[str, str]:
-    """Write the scan as the two files of sequence ``synthetic``; the trainer reads names from the path."""
+    """Write the scan as the two files of sequence ``synthetic``; the trainer reads names from the
+    path."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scan.id)
     class_ids(scan, _TRAIN_IDS)  # refuses a scan without a valid label
-    paths = [folder / "synthetic" / kind / f"{name}.{ext}" for kind, ext in (("velodyne", "bin"), ("labels", "label"))]
+    paths = [
+        folder / "synthetic" / kind / f"{name}.{ext}"
+        for kind, ext in (("velodyne", "bin"), ("labels", "label"))
+    ]
     for path, values in zip(paths, (points_of(scan), encode_labels(scan, taxonomy)), strict=True):
         path.parent.mkdir(parents=True)
         path.write_bytes(values.astype(values.dtype.newbyteorder("<")).tobytes())
     return str(paths[0]), str(paths[1])
 
 
-def _check_classes(learning_map: dict[int, int], inverse: dict[int, int], taxonomy: Taxonomy) -> None:
-    """Check that the trainer's classes distinguish ours: mapping each class and back must not change it."""
+def _check_classes(
+    learning_map: dict[int, int], inverse: dict[int, int], taxonomy: Taxonomy
+) -> None:
+    """Check that the trainer's classes distinguish ours: mapping each class and back must not
+    change it."""
     raw = sorted(set(taxonomy.from_train or ()) - {0})
     lost = [c for c in raw if inverse.get(learning_map.get(c, -1)) != c]
     if lost or learning_map.get(0) != 0:
         raise ConfigError(
             f"a learning_map in which {taxonomy.name}'s classes {lost or [0]} do not come back",
             "its classes, and 0 = unlabelled",
-            "Use the stock config/labels/semantic-kitti.yaml, or set classes in the mixture's YAML.",
+            "Use the stock config/labels/semantic-kitti.yaml, or set classes in the mixture's "
+            "YAML.",
         )
 
 

@@ -1,14 +1,17 @@
-"""Banks and planned epochs for environments that cannot hold the package: Python 3.8, numpy 1.23 and h5py are enough.
+"""Banks and planned epochs for environments that cannot hold the package: Python 3.8, numpy 1.23
+and h5py are enough.
 
-Copy this one file into a trainer's tree; inside the package it is ``lidar_synth.integrations.reader``. Its scans are
-the package's own, bit for bit. The package plans the epochs, the trainer reads them with this file as ``reader``::
+Copy this one file into a trainer's tree; inside the package it is
+``lidar_synth.integrations.reader``. Its scans are the package's own, bit for bit. The package plans
+the epochs, the trainer reads them with this file as ``reader``::
 
     python -m lidar_synth.integrations.plan mix.yaml plan.npz --real 19130 --epochs 50
 
     train = MixedEpochs("plan.npz", trainer_dataset, Bank("/data/bank"), to_sample=lambda scan: ...)
     train.set_epoch(3)  # before each epoch
 
-It reads banks of the formats "lidar-synth-bank/1" and /2 (with boxes); those compressed with Blosc2 are refused.
+It reads banks of the formats "lidar-synth-bank/1" and /2 (with boxes); those compressed with Blosc2
+are refused.
 """
 
 from __future__ import annotations
@@ -34,19 +37,52 @@ from numpy.typing import NDArray
 FORMATS = "lidar-synth-bank/1", "lidar-synth-bank/2"  # the second has boxes
 PLAN_FORMAT = "lidar-synth-epochs/1"
 IGNORE = 255  # label of points without a known class
-TYPES = {"range": "<u2", "reflectance": "|u1", "label": "|u1", "confidence": "|u1", "instance": "<u2", "boxes": "<i4"}
-BOXES = (256, 9)  # of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused
-CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "Motorcyclist")
+TYPES = {
+    "range": "<u2",
+    "reflectance": "|u1",
+    "label": "|u1",
+    "confidence": "|u1",
+    "instance": "<u2",
+    "boxes": "<i4",
+}
+BOXES = (
+    256,
+    9,
+)  # of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused
+CLASSES = (
+    "Car",
+    "Van",
+    "Truck",
+    "Pedestrian",
+    "Person_sitting",
+    "Cyclist",
+    "Tram",
+    "Misc",
+    "Motorcyclist",
+)
 NUMBERS = {"seed": "<u8", "index": "<u8", "crc": "<u4"}  # one for each scan
 LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1
 FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
-REPAIR, PLAN = "copy it again, or run lidar-synth repair", "python -m lidar_synth.integrations.plan makes a plan"
-DAMAGE = (AttributeError, ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
-          ValueError, zipfile.BadZipFile, zlib.error)  # fmt: skip  # raised by h5py, numpy and json on damaged files
+REPAIR = "copy it again, or run lidar-synth repair"
+PLAN = "python -m lidar_synth.integrations.plan makes a plan"
+DAMAGE = (
+    AttributeError,
+    ArithmeticError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)  # raised by h5py, numpy and json on damaged files
 
 
 class ReaderError(ValueError):
-    """A bank or plan that is missing, damaged, of another version, or does not fit; the text says what to do."""
+    """A bank or plan that is missing, damaged, of another version, or does not fit; the text says
+    what to do."""
 
 
 @contextmanager
@@ -66,14 +102,16 @@ def _require(condition: object, otherwise: str) -> None:
 
 
 class Scan(NamedTuple):
-    """A synthetic scan, ``<model>/<seed>/<index>``, of N points in the sensor's frame: x forward, y left, z up.
+    """A synthetic scan, ``<model>/<seed>/<index>``, of N points in the sensor's frame: x forward, y
+    left, z up.
 
     Attributes:
         points: (N, 3) float32 metres.
         reflectance: (N,) float32 in [0, 1]; 0 if the bank has none.
         label: (N,) uint8, SemanticKITTI's train ids 0..18, 255 = ignore; None if the bank has none.
         confidence: (N,) float32 in [0, 1], the confidence of ``label``, or None.
-        boxes: (M, 7) float32 x, y, z of the centre, length, width, height, yaw (radians), or None; names: M classes.
+        boxes: (M, 7) float32 x, y, z of the centre, length, width, height, yaw (radians), or None;
+            names: M classes.
         instance: (N,) int32, the number of each point's box, from 1 on; 0 = none; or None.
     """
 
@@ -88,33 +126,47 @@ class Scan(NamedTuple):
 
 
 class Bank:
-    """The scans of a bank in the folder ``root``, read on access; every scan is checked against its CRC.
+    """The scans of a bank in the folder ``root``, read on access; every scan is checked against its
+    CRC.
 
-    A folder without a bank, or a damaged one, raises ``ReaderError``; the latter also when a scan is read.
+    A folder without a bank, or a damaged one, raises ``ReaderError``; the latter also when a scan
+    is read.
 
     Attributes:
-        fields: what a scan has besides its points: "reflectance", "label", "confidence", "instance", "boxes".
-        sensor, shape: the sensor, with the keys of ``sensors.yaml``; (rows, columns) of the range images.
+        fields: what a scan has besides its points: "reflectance", "label", "confidence",
+            "instance", "boxes".
+        sensor, shape: the sensor, with the keys of ``sensors.yaml``; (rows, columns) of the range
+            images.
         identity: the checksum of the index, different for every bank.
     """
 
     def __init__(self, root: Any) -> None:
         self.root = Path(root)
         values = _read_index(self.root / "index.json")
-        self.identity = _checksum({name: value for name, value in values.items() if name != "files"})
+        self.identity = _checksum(
+            {name: value for name, value in values.items() if name != "files"}
+        )
         with _reading(self.root / "index.json", REPAIR):
-            self._sources, self._shards = values["sources"], values["shards"]
+            self._sources = values["sources"]
+            self._shards = values["shards"]
             self.sensor, self.fields = self._sources[0]["sensor"], tuple(self._sources[0]["fields"])
             self.shape = _shape(self.sensor)
             self._directions = _directions(self.sensor, self.shape)
-            lasers = {"elevations", "heights"} <= set(self.sensor) and "beams" not in self.sensor  # rays start there
-            self._starts = np.asarray(self.sensor["heights"] if lasers else [0.0] * self.shape[0], np.float32)
+            lasers = {"elevations", "heights"} <= set(
+                self.sensor
+            ) and "beams" not in self.sensor  # rays start there
+            self._starts = np.asarray(
+                self.sensor["heights"] if lasers else [0.0] * self.shape[0], np.float32
+            )
             self._names = [name for name in TYPES if name in {"range", *self.fields}]
             self._scale = self.sensor["range_max"] / 65535
             for facts in self._sources:
                 self._check_facts(facts)
             self._ends = np.cumsum([self._check_entry(entry) for entry in self._shards]).tolist()
-            _require(values["scans"] == self._ends[-1], f"{values['scans']} scans, in shards {self._ends[-1]}")
+            _require(
+                values["scans"] == self._ends[-1],
+                f"{values['scans']} scans, in shards {self._ends[-1]}",
+            )
         self._open: OrderedDict[int, _Shard] = OrderedDict()
         self._process = os.getpid()
 
@@ -129,20 +181,28 @@ class Bank:
         points = metres[seen][:, None] * self._directions[seen]
         points[:, 2] += self._starts[seen.nonzero()[0]]
         rows = images.pop("boxes", None)
-        fields: Any = {"reflectance": np.zeros(len(points), np.float32), **{n: v[seen] for n, v in images.items()}}
-        fields["id"] = f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
+        fields: Any = {
+            "reflectance": np.zeros(len(points), np.float32),
+            **{n: v[seen] for n, v in images.items()},
+        }
+        fields["id"] = (
+            f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
+        )
         if rows is not None:
             fields["boxes"] = (rows[:, 2:] * np.array([*6 * [1e-4], 1e-5])).astype(np.float32)
             fields["names"] = tuple(CLASSES[code - 1] for code in rows[:, 0])
         return Scan(points, **{"label": None, "confidence": None, **fields})
 
     def image(self, number: int) -> dict[str, NDArray[Any]]:
-        """The range image, {name: (rows, columns)}: ``range`` float32 metres, 0 = no return, and the fields."""
+        """The range image, {name: (rows, columns)}: ``range`` float32 metres, 0 = no return, and
+        the fields."""
         shard, entry, position = self._place(number)
         with _reading(f"{self.root / entry['file']}: scan {position}", REPAIR):
             arrays = self._shard(shard).read(position)
-        # A millionth away from the sensor's limits, as in the package, so that a projection keeps every return.
-        near, far = self.sensor["range_min"] * (1 + 1e-6), self.sensor["range_max"] * (1 - 1e-6)
+        # A millionth away from the sensor's limits, as in the package, so that a projection keeps
+        # every return.
+        near = self.sensor["range_min"] * (1 + 1e-6)
+        far = self.sensor["range_max"] * (1 - 1e-6)
         metres = arrays["range"].astype(np.float32) * np.float32(self._scale)
         inside = np.minimum(np.maximum(metres, np.float32(near)), np.float32(far))
         decoded = {**arrays, "range": np.where(arrays["range"] > 0, inside, np.float32(0))}
@@ -153,16 +213,23 @@ class Bank:
         return decoded
 
     def verify(self) -> None:
-        """Compare every shard with its SHA-256 in the index; raises ``ReaderError`` on the first that differs."""
+        """Compare every shard with its SHA-256 in the index; raises ``ReaderError`` on the first
+        that differs."""
         for entry in self._shards:
-            if hashlib.sha256((self.root / entry["file"]).read_bytes()).hexdigest() != entry["sha256"]:
-                raise ReaderError(f"{self.root / entry['file']} does not match its SHA-256; copy it again")
+            if (
+                hashlib.sha256((self.root / entry["file"]).read_bytes()).hexdigest()
+                != entry["sha256"]
+            ):
+                raise ReaderError(
+                    f"{self.root / entry['file']} does not match its SHA-256; copy it again"
+                )
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_open": OrderedDict()}
 
     def _place(self, number: int) -> tuple[int, dict[str, Any], int]:
-        """The number of a scan's shard, that shard's entry in the index, and the position in its file."""
+        """The number of a scan's shard, that shard's entry in the index, and the position in its
+        file."""
         if not -len(self) <= number < len(self):
             raise IndexError(f"scan {number} of {len(self)}")
         shard = bisect_right(self._ends, number % len(self))
@@ -172,11 +239,16 @@ class Bank:
         return shard, self._shards[shard], rank + int(earlier)
 
     def _shard(self, number: int) -> _Shard:
-        if self._process != os.getpid():  # after a fork the parent's open files are left to the parent
-            self._open, self._process = OrderedDict(), os.getpid()
+        if (
+            self._process != os.getpid()
+        ):  # after a fork the parent's open files are left to the parent
+            self._open = OrderedDict()
+            self._process = os.getpid()
         if number not in self._open:
             entry = self._shards[number]
-            self._open[number] = _Shard(self.root, entry, self._sources[entry["source"]], self._names, self.shape)
+            self._open[number] = _Shard(
+                self.root, entry, self._sources[entry["source"]], self._names, self.shape
+            )
             if len(self._open) > 16:
                 self._open.popitem(last=False)[1].file.close()
         return self._open[number]
@@ -185,8 +257,15 @@ class Bank:
         form = FORMATS[bool({"boxes", "instance"} & set(facts["fields"]))]
         _require(facts["format"] == form, f"scans of format {facts['format']!r}, not {form!r}")
         if facts["compression"] != "gzip":
-            raise ReaderError(f"{self.root} is compressed by {facts['compression']!r}; bake it with --compression gzip")
-        same = (facts["sensor"], tuple(facts["fields"]), facts["scale"]) == (self.sensor, self.fields, self._scale)
+            raise ReaderError(
+                f"{self.root} is compressed by {facts['compression']!r}; bake it with "
+                "--compression gzip"
+            )
+        same = (facts["sensor"], tuple(facts["fields"]), facts["scale"]) == (
+            self.sensor,
+            self.fields,
+            self._scale,
+        )
         _require(same, "several sensors or fields, or a scale that does not fit the sensor")
         _require(set(self.fields) <= set(TYPES), f"fields {self.fields}")
 
@@ -194,11 +273,17 @@ class Bank:
         """The number of scans that a shard contributes."""
         dropped = entry.get("dropped", [])
         numbers = [entry[key] for key in ("seed", "first", "scans", "source", "bytes")] + dropped
-        _require(all(type(n) is int and 0 <= n < 1 << 64 for n in numbers), f"numbers of {entry['file']!r}")
+        _require(
+            all(type(n) is int and 0 <= n < 1 << 64 for n in numbers),
+            f"numbers of {entry['file']!r}",
+        )
         _require(entry["source"] < len(self._sources), f"the source of {entry['file']!r}")
         _require(re.fullmatch(r"\w[\w.-]*\.h5", entry["file"]), f"the shard {entry['file']!r}")
         # A scan takes 20 bytes for its seed, index and CRC alone.
-        _require(20 * entry["scans"] <= entry["bytes"], f"{entry['bytes']} bytes cannot hold {entry['scans']} scans")
+        _require(
+            20 * entry["scans"] <= entry["bytes"],
+            f"{entry['bytes']} bytes cannot hold {entry['scans']} scans",
+        )
         ascending = np.all(np.diff([-1.0, *dropped, entry["scans"]]) > 0)
         _require(ascending and len(dropped) < entry["scans"], f"dropped scans of {entry['file']!r}")
         path = self.root / entry["file"]
@@ -210,16 +295,25 @@ class Bank:
 class _Shard:
     """An open shard. Everything that it declares is checked before memory is allocated for it."""
 
-    def __init__(self, root: Path, entry: dict[str, Any], facts: dict[str, Any], names: list[str], shape: Any) -> None:
-        self.entry, self.shapes = entry, {name: BOXES if name == "boxes" else shape for name in names}
+    def __init__(
+        self, root: Path, entry: dict[str, Any], facts: dict[str, Any], names: list[str], shape: Any
+    ) -> None:
+        self.entry = entry
+        self.shapes = {name: BOXES if name == "boxes" else shape for name in names}
         with _reading(root / entry["file"], REPAIR):
             self.file = h5py.File(str(root / entry["file"]), "r")
             self._check_attributes(facts)
             extra = ["condition"] if "condition" in self.file else []
-            _require(set(self.file) == {*NUMBERS, *names, *extra}, f"it holds {sorted(self.file)[:9]}")
-            self.numbers = {name: np.asarray(self._dataset(name, kind)[:]) for name, kind in NUMBERS.items()}
+            _require(
+                set(self.file) == {*NUMBERS, *names, *extra}, f"it holds {sorted(self.file)[:9]}"
+            )
+            self.numbers = {
+                name: np.asarray(self._dataset(name, kind)[:]) for name, kind in NUMBERS.items()
+            }
             self.conditions = self._dataset("condition", None)[:] if extra else None
-            self.datasets = {name: self._dataset(name, TYPES[name], of) for name, of in self.shapes.items()}
+            self.datasets = {
+                name: self._dataset(name, TYPES[name], of) for name, of in self.shapes.items()
+            }
 
     def read(self, position: int) -> dict[str, NDArray[Any]]:
         """The arrays of one scan, checked against its CRC."""
@@ -232,22 +326,33 @@ class _Shard:
         _require(found == crc, "its CRC does not match")
         own = (seed, index) == (self.entry["seed"], self.entry["first"] + position)
         _require(own, f"it is scan {index} of seed {seed}")
-        label, confidence, boxes = (arrays.get(n, np.zeros((1, 1))) for n in ("label", "confidence", "boxes"))
+        label, confidence, boxes = (
+            arrays.get(n, np.zeros((1, 1))) for n in ("label", "confidence", "boxes")
+        )
         _require(((label <= 18) | (label == IGNORE)).all(), "it has labels above 18")
         _require((confidence <= LEVELS["confidence"]).all(), "it has confidences above 1")
-        _require(((boxes[:, 0] >= 0) & (boxes[:, 0] <= len(CLASSES))).all(), "it has boxes of unknown classes")
-        return {n: values[values[:, 0] > 0] if n == "boxes" else values for n, values in arrays.items()}
+        _require(
+            ((boxes[:, 0] >= 0) & (boxes[:, 0] <= len(CLASSES))).all(),
+            "it has boxes of unknown classes",
+        )
+        return {
+            n: values[values[:, 0] > 0] if n == "boxes" else values for n, values in arrays.items()
+        }
 
     def _inflate(self, name: str, position: int) -> NDArray[Any]:
         """One chunk, through the inverse of HDF5's filters fletcher32, deflate and shuffle."""
-        place, stored = (position, 0, 0), self.datasets[name].id
+        place = (position, 0, 0)
+        stored = self.datasets[name].id
         info = stored.get_chunk_info_by_coord(place)
         found = info.byte_offset is not None and info.byte_offset + info.size <= self.entry["bytes"]
         _require(found and not info.filter_mask, f"its {name} is missing")
-        chunk, dtype = stored.read_direct_chunk(place)[1], np.dtype(TYPES[name])
+        chunk = stored.read_direct_chunk(place)[1]
+        dtype = np.dtype(TYPES[name])
         rows, columns = self.shapes[name]
         size = rows * columns * dtype.itemsize
-        plain = zlib.decompressobj().decompress(chunk[:-4], size + 1)  # the scan's CRC covers HDF5's own Fletcher-32
+        plain = zlib.decompressobj().decompress(
+            chunk[:-4], size + 1
+        )  # the scan's CRC covers HDF5's own Fletcher-32
         _require(len(plain) == size, f"its {name} does not hold {size} bytes")
         planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
         return np.ascontiguousarray(planes.T).view(dtype).reshape(rows, columns)
@@ -255,13 +360,19 @@ class _Shard:
     def _check_attributes(self, facts: dict[str, Any]) -> None:
         """The attributes repeat the index: text and numbers as such, everything else as JSON."""
         expected = {**facts, **{key: self.entry[key] for key in ("seed", "first", "scans")}}
-        _require(set(self.file.attrs) == set(expected), "its attributes are not those of the bank's index")
+        _require(
+            set(self.file.attrs) == set(expected),
+            "its attributes are not those of the bank's index",
+        )
         for name, value in expected.items():
             attribute = self.file.attrs.get_id(name)
             kind = attribute.get_type()
             text = kind.get_class() == h5py.h5t.STRING and not kind.is_variable_str()
             number = kind.get_class() in (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
-            _require(attribute.shape == () and (text or number) and kind.get_size() <= 1 << 20, f"its attribute {name}")
+            _require(
+                attribute.shape == () and (text or number) and kind.get_size() <= 1 << 20,
+                f"its attribute {name}",
+            )
             found = self.file.attrs[name]
             if text:
                 found = found.decode() if isinstance(found, bytes) else str(found)
@@ -269,54 +380,84 @@ class _Shard:
             _require(found == value, f"{name} differs from the bank's index")
 
     def _dataset(self, name: str, kind: str | None, shape: tuple[int, ...] = ()) -> Any:
-        """A dataset of this file: one value (text if ``kind`` is None) for each scan, or chunks of one scan."""
+        """A dataset of this file: one value (text if ``kind`` is None) for each scan, or chunks of
+        one scan."""
         link = self.file.id.links.get_info(name.encode()).type
         _require(link == h5py.h5l.TYPE_HARD, f"{name} is a link to another object")
-        dataset, scans = self.file[name], self.entry["scans"]
-        # This check comes first: reading the shape of a virtual dataset already opens the files behind it.
-        properties, given = dataset.id.get_create_plist(), dataset.id.get_type()
-        layout, outside = properties.get_layout(), properties.get_external_count()
+        dataset = self.file[name]
+        scans = self.entry["scans"]
+        # This check comes first: reading the shape of a virtual dataset already opens the files
+        # behind it.
+        properties = dataset.id.get_create_plist()
+        given = dataset.id.get_type()
+        layout = properties.get_layout()
+        outside = properties.get_external_count()
         _require(layout != h5py.h5d.VIRTUAL and not outside, f"{name} is stored in another file")
         text = given.get_class() == h5py.h5t.STRING and not given.is_variable_str()
         fits = text if kind is None else given.equal(h5py.h5t.py_create(np.dtype(kind)))
         _require(fits and dataset.shape == (scans, *shape), f"{name} has another type or shape")
         filters = tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
-        contiguous = layout == h5py.h5d.CONTIGUOUS and dataset.id.get_storage_size() == scans * given.get_size()
-        chunked = layout == h5py.h5d.CHUNKED and properties.get_chunk() == (1, *shape) and filters == FILTERS
-        _require(shape or scans * given.get_size() <= self.entry["bytes"], f"{name} is larger than the file")
-        _require(chunked if shape else contiguous, f"{name} is stored in another way, with filters {filters}")
+        contiguous = (
+            layout == h5py.h5d.CONTIGUOUS
+            and dataset.id.get_storage_size() == scans * given.get_size()
+        )
+        chunked = (
+            layout == h5py.h5d.CHUNKED
+            and properties.get_chunk() == (1, *shape)
+            and filters == FILTERS
+        )
+        _require(
+            shape or scans * given.get_size() <= self.entry["bytes"],
+            f"{name} is larger than the file",
+        )
+        _require(
+            chunked if shape else contiguous,
+            f"{name} is stored in another way, with filters {filters}",
+        )
         return dataset
 
 
 class MixedEpochs:
     """A map-style dataset of a trainer's real samples and a bank's scans, in the order of a plan.
 
-    The order is already shuffled; a sampler that shuffles again does no harm. ``set_epoch`` reaches the workers of a
-    ``DataLoader``, persistent ones included. The length may differ by one between epochs. A damaged plan, or one of
-    another bank or number of real samples, raises ``ReaderError``.
+    The order is already shuffled; a sampler that shuffles again does no harm. ``set_epoch`` reaches
+    the workers of a ``DataLoader``, persistent ones included. The length may differ by one between
+    epochs. A damaged plan, or one of another bank or number of real samples, raises
+    ``ReaderError``.
 
     Args:
-        plan: file of ``python -m lidar_synth.integrations.plan``; bank: the bank with which it was made.
+        plan: file of ``python -m lidar_synth.integrations.plan``; bank: the bank with which it was
+            made.
         real: the trainer's own dataset, or a function: number of a real sample -> sample.
         to_sample: Scan -> sample in the trainer's form; by default the ``Scan``.
     """
 
     def __init__(self, plan: Any, real: Any, bank: Bank, to_sample: Any = None) -> None:
-        self.plan, self.real, self.bank, self.to_sample = str(plan), real, bank, to_sample
+        self.plan = str(plan)
+        self.real = real
+        self.bank = bank
+        self.to_sample = to_sample
         with _reading(plan, PLAN), np.load(self.plan, allow_pickle=False) as file:
             self.settings = json.loads(file["settings"].tobytes().decode())
-            form, planned = self.settings["format"], self.settings["real"]
+            form = self.settings["format"]
+            planned = self.settings["real"]
             _require(form == PLAN_FORMAT, f"format {form!r}, expected {PLAN_FORMAT!r}")
-            _require(self.settings["bank"] == bank.identity, f"it was made with another bank than {bank.root}")
+            _require(
+                self.settings["bank"] == bank.identity,
+                f"it was made with another bank than {bank.root}",
+            )
             given = len(real) if hasattr(real, "__len__") else planned
             _require(given == planned, f"it is for {planned} real samples, but there are {given}")
         self._epoch = multiprocessing.Value("q", 0)
         self._loaded = (-1, np.zeros((0, 2), np.int64))
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, before a ``DataLoader`` begins to iterate; raises ``ReaderError`` after the plan's last."""
+        """Set the epoch, before a ``DataLoader`` begins to iterate; raises ``ReaderError`` after
+        the plan's last."""
         if not 0 <= epoch < (planned := len(self.settings["lengths"])):
-            raise ReaderError(f"epoch {epoch} of a plan of {planned} epochs; make it again with more --epochs")
+            raise ReaderError(
+                f"epoch {epoch} of a plan of {planned} epochs; make it again with more --epochs"
+            )
         self._epoch.value = epoch
 
     def __len__(self) -> int:
@@ -336,9 +477,12 @@ class MixedEpochs:
         return int(self._order()[index, 0])
 
     def _labelled(self, scan: Scan) -> Scan:
-        """The scan with labels by the plan's label policy: ``generated``, ``condition``, ``boxes`` or ``none``."""
-        label, confidence = scan.label, scan.confidence
-        how, threshold = self.settings["labels"], self.settings["threshold"]
+        """The scan with labels by the plan's label policy: ``generated``, ``condition``, ``boxes``
+        or ``none``."""
+        label = scan.label
+        confidence = scan.confidence
+        how = self.settings["labels"]
+        threshold = self.settings["threshold"]
         if how == "none":
             return scan._replace(label=None, confidence=None, boxes=None, names=None, instance=None)
         if how == "boxes" or label is None:
@@ -356,9 +500,15 @@ class MixedEpochs:
             what = f"{self.plan}: epoch {epoch}"
             with _reading(what, PLAN), np.load(self.plan, allow_pickle=False) as file:
                 order = np.asarray(file[f"epoch-{epoch}"])
-                _require(order.shape == (len(self), 2) and order.dtype == np.int64, f"{order.shape}, {order.dtype}")
+                _require(
+                    order.shape == (len(self), 2) and order.dtype == np.int64,
+                    f"{order.shape}, {order.dtype}",
+                )
                 lengths = np.array([self.settings["real"], len(self.bank)])[order[:, 0]]
-                _require(((order >= 0).all(1) & (order[:, 1] < lengths)).all(), "samples that do not exist")
+                _require(
+                    ((order >= 0).all(1) & (order[:, 1] < lengths)).all(),
+                    "samples that do not exist",
+                )
             self._loaded = (epoch, order)
         return self._loaded[1]
 
@@ -367,22 +517,33 @@ def _read_index(path: Path) -> dict[str, Any]:
     """The values of ``index.json`` without their checksum, which has to match."""
     with _reading(path, f"expected the folder of a finished bank. {REPAIR}"):
         values: dict[str, Any] = json.loads(path.read_bytes().decode())
-        given, form = values.pop("checksum", None), values.get("format")
+        given = values.pop("checksum", None)
+        form = values.get("format")
         _require(form in FORMATS, f"format {form!r}, expected one of {FORMATS}")
-        _require(given == _checksum(values), "it does not match its checksum: it was damaged or edited")
+        _require(
+            given == _checksum(values), "it does not match its checksum: it was damaged or edited"
+        )
     return values
 
 
 def _checksum(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 def _shape(sensor: dict[str, Any]) -> tuple[int, int]:
     """(rows, columns) of a sensor."""
-    rows, columns = len(sensor["elevations"]) if "elevations" in sensor else sensor["rows"], sensor["columns"]
+    rows = len(sensor["elevations"]) if "elevations" in sensor else sensor["rows"]
+    columns = sensor["columns"]
     whole = type(rows) is int and type(columns) is int and min(rows, columns) >= 2
-    _require(whole and rows * columns <= 1 << 22, f"a sensor of {rows!r} rows and {columns!r} columns")
-    _require(0 <= sensor["range_min"] < sensor["range_max"] < 1e300, "a sensor without limits of its range")
+    _require(
+        whole and rows * columns <= 1 << 22, f"a sensor of {rows!r} rows and {columns!r} columns"
+    )
+    _require(
+        0 <= sensor["range_min"] < sensor["range_max"] < 1e300,
+        "a sensor without limits of its range",
+    )
     return rows, columns
 
 
@@ -391,10 +552,19 @@ def _directions(sensor: dict[str, Any], shape: tuple[int, int]) -> NDArray[Any]:
     rows, columns = shape
     degrees = np.asarray(sensor.get("elevations", ()), np.float64)
     if not len(degrees):
-        up, down = float(sensor["fov_up"]), float(sensor["fov_down"])
+        up = float(sensor["fov_up"])
+        down = float(sensor["fov_down"])
         degrees = up - (np.arange(rows) + 0.5) / rows * (up - down)
-    _require(degrees.shape == (rows,) and (np.abs(degrees) <= 90).all(), "a sensor with elevations beyond 90 degrees")
+    _require(
+        degrees.shape == (rows,) and (np.abs(degrees) <= 90).all(),
+        "a sensor with elevations beyond 90 degrees",
+    )
     elevation = np.radians(degrees).astype(np.float32).astype(np.float64)[:, None]
-    azimuth = ((2 * ((np.arange(columns) + 0.5) / columns) - 1) * np.pi).astype(np.float32).astype(np.float64)[None]
-    x, y = np.cos(azimuth) * np.cos(elevation), -np.sin(azimuth) * np.cos(elevation)
+    azimuth = (
+        ((2 * ((np.arange(columns) + 0.5) / columns) - 1) * np.pi)
+        .astype(np.float32)
+        .astype(np.float64)[None]
+    )
+    x = np.cos(azimuth) * np.cos(elevation)
+    y = -np.sin(azimuth) * np.cos(elevation)
     return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], -1).astype(np.float32)

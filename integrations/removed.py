@@ -1,7 +1,8 @@
-"""Names that libraries have removed and that trainers of 2019 to 2022 still use: what our launchers set, and why.
+"""Names that libraries have removed and that trainers of 2019 to 2022 still use: what our launchers
+set, and why.
 
-A launcher calls ``provide("numpy.float", "imp")`` before it runs the trainer's script. Whatever is missing is set, and
-one line of output says what was. ``NAMES`` is the only place for such names.
+A launcher calls ``provide("numpy.float", "imp")`` before it runs the trainer's script. Whatever is
+missing is set, and one line of output says what was. ``NAMES`` is the only place for such names.
 """
 
 import sys
@@ -32,7 +33,10 @@ def provide(*names: str) -> list[str]:
     """
     made = [name for name in names if NAMES[name][1]()]
     if made:
-        print(f"lidar_synth: provides {', '.join(f'{name} ({NAMES[name][0]})' for name in made)}", flush=True)
+        print(
+            f"lidar_synth: provides {', '.join(f'{name} ({NAMES[name][0]})' for name in made)}",
+            flush=True,
+        )
     return made
 
 
@@ -68,23 +72,31 @@ def _imp() -> bool:
 
 
 def _tensorflow() -> bool:
-    """TensorFlow 1's summaries, written by TensorBoard: the same messages in the same kind of file."""
+    """TensorFlow 1's summaries, written by TensorBoard: the same messages in the same kind of
+    file."""
     there = "tensorflow" in sys.modules or find_spec("tensorflow")
     if there and hasattr(import_module("tensorflow").summary, "FileWriter"):
         return False
     try:
-        tensorboard, messages = (
-            import_module("tensorboard.compat"),
-            import_module("tensorboard.compat.proto.summary_pb2"),
-        )
+        tensorboard = import_module("tensorboard.compat")
+        messages = import_module("tensorboard.compat.proto.summary_pb2")
         writer = import_module("torch.utils.tensorboard.writer")
     except ImportError as error:
         raise LibraryError(
-            f"tensorboard cannot be imported ({error})", "tensorboard, for logs", "pip install tensorboard"
+            f"tensorboard cannot be imported ({error})",
+            "tensorboard, for logs",
+            "pip install tensorboard",
         ) from error
-    assert tensorboard.tf.io  # TensorBoard looks for TensorFlow once, when this is first used: before there is ours
+    assert (
+        tensorboard.tf.io
+    )  # TensorBoard looks for TensorFlow once, when this is first used: before there is ours
     summary = _module("tensorflow.summary", FileWriter=writer.FileWriter)
-    _module("tensorflow", summary=summary, Summary=messages.Summary, HistogramProto=messages.HistogramProto)
+    _module(
+        "tensorflow",
+        summary=summary,
+        Summary=messages.Summary,
+        HistogramProto=messages.HistogramProto,
+    )
     return True
 
 
@@ -103,24 +115,38 @@ def _torchvision() -> bool:
 def _spconv() -> bool:
     """``import spconv`` of spconv 1, served by spconv 2.
 
-    Submanifold convolutions with one ``indice_key`` and different kernels share their neighbours in spconv 1; spconv 2
-    refuses that, so the kernel becomes part of the key. Features may be assigned again.
+    Submanifold convolutions with one ``indice_key`` and different kernels share their neighbours in
+    spconv 1; spconv 2 refuses that, so the kernel becomes part of the key. Features may be assigned
+    again.
     """
     if not find_spec("spconv"):
-        raise LibraryError("spconv is not installed", "spconv 2, for this trainer's network", "pip install spconv")
+        raise LibraryError(
+            "spconv is not installed", "spconv 2, for this trainer's network", "pip install spconv"
+        )
     if not find_spec("spconv.pytorch"):
         return False  # spconv 1
-    old, new = import_module("spconv"), import_module("spconv.pytorch")
+    old = import_module("spconv")
+    new = import_module("spconv.pytorch")
 
     class SubMConv3d(new.SubMConv3d):  # type: ignore[misc, name-defined]
-        def __init__(self, ins: int, outs: int, kernel_size: Any, *args: Any, **options: Any) -> None:
+        def __init__(
+            self, ins: int, outs: int, kernel_size: Any, *args: Any, **options: Any
+        ) -> None:
             if options.get("indice_key"):
                 options["indice_key"] = f"{options['indice_key']} {kernel_size}"
             super().__init__(ins, outs, kernel_size, *args, **options)
 
     tensor = new.SparseConvTensor
-    tensor.features = property(tensor.features.fget, lambda self, value: setattr(self, "_features", value))
-    for name in ("SparseConvTensor", "SparseConv3d", "SparseInverseConv3d", "SparseSequential", "SparseModule"):
+    tensor.features = property(
+        tensor.features.fget, lambda self, value: setattr(self, "_features", value)
+    )
+    for name in (
+        "SparseConvTensor",
+        "SparseConv3d",
+        "SparseInverseConv3d",
+        "SparseSequential",
+        "SparseModule",
+    ):
         setattr(old, name, getattr(new, name))
     old.SubMConv3d = SubMConv3d  # type: ignore[attr-defined]
     return True

@@ -1,10 +1,12 @@
-"""WaffleIron: SemanticKITTI mixed with synthetic scans, and a launcher that runs its own training script::
+"""WaffleIron: SemanticKITTI mixed with synthetic scans, and a launcher that runs its own training
+script::
 
     cd WaffleIron
     LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.waffleiron launch_train.py \\
         --dataset semantic_kitti_mixed --path_dataset KITTI --log_path LOG --config CONFIG.yaml
 
-Its instances for CutMix are extracted from the real scans only; PolarMix then takes partners of both kinds.
+Its instances for CutMix are extracted from the real scans only; PolarMix then takes partners of
+both kinds.
 """
 
 import os
@@ -31,13 +33,17 @@ from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
 
 NAME = "semantic_kitti_mixed"
-USAGE = "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.waffleiron launch_train.py ARGUMENTS"
+USAGE = (
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.waffleiron launch_train.py "
+    "ARGUMENTS"
+)
 _FILE_IDS = id_table(1, 0, np.int32)
 _IDS = id_table(0, 255, np.int32)
 
 
 def dataset_class(stock: Any) -> Any:
-    """Make a subclass of WaffleIron's ``SemanticKITTI`` (``stock``) that mixes real and synthetic scans."""
+    """Make a subclass of WaffleIron's ``SemanticKITTI`` (``stock``) that mixes real and synthetic
+    scans."""
 
     class Mixed(stock):  # type: ignore[misc]
         """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set."""
@@ -64,7 +70,8 @@ def dataset_class(stock: Any) -> Any:
             return super().__len__() if self.mixed is None else len(self.mixed)
 
         def __load_pc_internal__(self, index: int) -> Any:
-            """Points (N, 4) float32, labels (N,) int32 0..18 or 255, and instances (N,) uint32, 0 = none."""
+            """Points (N, 4) float32, labels (N,) int32 0..18 or 255, and instances (N,) uint32, 0 =
+            none."""
             if self.mixed is None:
                 return super().__load_pc_internal__(index)
             sample = self.mixed[int(index)]
@@ -85,7 +92,8 @@ def dataset_class(stock: Any) -> Any:
 
 @cache
 def register() -> Any:
-    """Register the dataset ``semantic_kitti_mixed`` with WaffleIron, and set its epoch, also when training resumes.
+    """Register the dataset ``semantic_kitti_mixed`` with WaffleIron, and set its epoch, also when
+    training resumes.
 
     Returns:
         The class.
@@ -99,11 +107,15 @@ def register() -> Any:
         stock = datasets.LIST_DATASETS["semantic_kitti"]
     except (ImportError, AttributeError, KeyError) as error:
         raise LibraryError(
-            f"WaffleIron's datasets cannot be imported ({error!r})", "a clone of WaffleIron 0.3", "cd WaffleIron"
+            f"WaffleIron's datasets cannot be imported ({error!r})",
+            "a clone of WaffleIron 0.3",
+            "cd WaffleIron",
         ) from error
     missing = [n for n in ("load_pc", "__load_pc_internal__") if not hasattr(stock, n)]
     if missing or not hasattr(manager, "one_epoch"):
-        raise LibraryError(f"WaffleIron without {missing or 'TrainingManager.one_epoch'}", "WaffleIron 0.3")
+        raise LibraryError(
+            f"WaffleIron without {missing or 'TrainingManager.one_epoch'}", "WaffleIron 0.3"
+        )
 
     mixed = dataset_class(stock)
     train = manager.one_epoch
@@ -121,19 +133,23 @@ def register() -> Any:
     def load_state(self: Any, *args: Any, **options: Any) -> None:
         try:
             load(self, *args, **options)
-        except RuntimeError as error:  # its last line, when all is loaded, names a GPU; a CPU has none
+        except (
+            RuntimeError
+        ) as error:  # its last line, when all is loaded, names a GPU; a CPU has none
             if os.environ.get(CPU) != "1" or "accelerator device" not in str(error):
                 raise
 
     datasets.LIST_DATASETS[NAME] = mixed
-    manager.one_epoch, manager.load_state = one_epoch, load_state
+    manager.one_epoch = one_epoch
+    manager.load_state = load_state
     return mixed
 
 
 def main() -> None:
     """Run WaffleIron's training script with the dataset registered.
 
-    The script is imported, not run as a file: so the processes of ``--multiprocessing-distributed`` import this module,
+    The script is imported, not run as a file: so the processes of ``--multiprocessing-distributed``
+        import this module,
     and register the dataset as well.
     """
     script = prepare_script(USAGE, "torch.load")

@@ -1,6 +1,7 @@
 """lidar_synth: synthetic LiDAR scans for perception training.
 
-Each name is imported when it is first used, so that ``import lidar_synth`` and the command line start at once.
+Each name is imported when it is first used, so that ``import lidar_synth`` and the command line
+start at once.
 
 Example:
     >>> import lidar_synth

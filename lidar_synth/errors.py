@@ -33,7 +33,9 @@ class LidarSynthError(Exception):
 
     def __init__(self, given: str, expected: str = "", hint: str = "") -> None:
         # A single string in args, so that the exception can be pickled between worker processes.
-        super().__init__(given + (f"; expected {expected}" if expected else "") + (f". {hint}" if hint else ""))
+        super().__init__(
+            given + (f"; expected {expected}" if expected else "") + (f". {hint}" if hint else "")
+        )
 
 
 def shorten(text: str, most: int) -> str:

@@ -1,14 +1,16 @@
 """Random numbers that are a function of (seed, index) alone.
 
-The noise of scan ``index`` under ``seed`` is the same on every device, in every batch and in every order. So a teacher
-and its student, or two checkpoints, can be compared from the same noise, and a bake can be resumed or distributed over
-machines. The generator is counter-based: Philox4x32 with ten rounds (Salmon et al., "Parallel random numbers: as easy
-as 1, 2, 3", SC 2011), whose output depends only on its 64-bit key (the seed) and its 128-bit counter::
+The noise of scan ``index`` under ``seed`` is the same on every device, in every batch and in every
+order. So a teacher and its student, or two checkpoints, can be compared from the same noise, and a
+bake can be resumed or distributed over machines. The generator is counter-based: Philox4x32 with
+ten rounds (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), whose output
+depends only on its 64-bit key (the seed) and its 128-bit counter::
 
     counter = (block, index mod 2^32, index div 2^32, stream)
 
-A block is four 32-bit words. Element ``e`` of a scan (row-major) comes from word ``e mod 4`` of block ``e div 4``, so
-that a smaller shape is a prefix of a larger one. Each kind of random number has its own stream.
+A block is four 32-bit words. Element ``e`` of a scan (row-major) comes from word ``e mod 4`` of
+block ``e div 4``, so that a smaller shape is a prefix of a larger one. Each kind of random number
+has its own stream.
 """
 
 import math
@@ -37,8 +39,8 @@ def gaussian(
 ) -> Tensor:
     """Standard normal noise, one sample per index.
 
-    The noise is computed in float64 by the Box-Muller transform and rounded once, so that devices agree up to float
-    rounding.
+    The noise is computed in float64 by the Box-Muller transform and rounded once, so that devices
+    agree up to float rounding.
 
     Args:
         seed: 0 <= seed < 2^64.
@@ -77,8 +79,8 @@ def uniform(
 ) -> Tensor:
     """Uniform float32 numbers in the open interval (0, 1), one sample per index.
 
-    The values are odd multiples of 2^-24, exact in float32, so that every device gives the same bits. They are
-    independent of ``gaussian`` with the same seed and index.
+    The values are odd multiples of 2^-24, exact in float32, so that every device gives the same
+    bits. They are independent of ``gaussian`` with the same seed and index.
 
     Args:
         seed: 0 <= seed < 2^64.
@@ -101,14 +103,16 @@ def keyed_rng(*key: int) -> np.random.Generator:
     """A numpy generator whose numbers depend only on its key, such as (seed, epoch, position).
 
     Args:
-        key: integers, 0 <= k < 2^64. Different keys, also of different length, give independent numbers.
+        key: integers, 0 <= k < 2^64. Different keys, also of different length, give independent
+            numbers.
 
     Raises:
         ConfigError: on an integer out of range.
     """
     if any(not 0 <= k < 2**64 for k in key):
         raise ConfigError(f"the key {key} of a random generator", "integers, 0 <= k < 2^64")
-    # Two words per integer, and the number of integers first: numpy's SeedSequence treats (1,) and (1, 0) as equal.
+    # Two words per integer, and the number of integers first: numpy's SeedSequence treats (1,) and
+    # (1, 0) as equal.
     return np.random.default_rng([len(key), *(word for k in key for word in (k & _WORD, k >> 32))])
 
 
@@ -143,14 +147,20 @@ def philox(counter: Tensor, seed: int) -> Tensor:
         (4, ...) int64, random words 0 .. 2^32 - 1.
     """
     c0, c1, c2, c3 = counter.unbind()
-    key0, key1 = seed & _WORD, seed >> 32
+    key0 = seed & _WORD
+    key1 = seed >> 32
     for _ in range(_ROUNDS):
-        # The product of two 32-bit words needs 64 bits. Signed overflow wraps around and the shift extends the sign,
-        # so the upper half is masked to 32 bits. The lower half is masked one round later: only xor is applied before.
-        product0, product1 = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]
-        c0, c1 = (product1 >> 32).bitwise_xor_(c1).bitwise_xor_(key0).bitwise_and_(_WORD), product1
-        c2, c3 = (product0 >> 32).bitwise_xor_(c3).bitwise_xor_(key1).bitwise_and_(_WORD), product0
-        key0, key1 = (key0 + _KEY_STEPS[0]) & _WORD, (key1 + _KEY_STEPS[1]) & _WORD
+        # The product of two 32-bit words needs 64 bits. Signed overflow wraps around and the shift
+        # extends the sign, so the upper half is masked to 32 bits. The lower half is masked one
+        # round later: only xor is applied before.
+        product0 = c0 * _MULTIPLIERS[0]
+        product1 = c2 * _MULTIPLIERS[1]
+        c0 = (product1 >> 32).bitwise_xor_(c1).bitwise_xor_(key0).bitwise_and_(_WORD)
+        c1 = product1
+        c2 = (product0 >> 32).bitwise_xor_(c3).bitwise_xor_(key1).bitwise_and_(_WORD)
+        c3 = product0
+        key0 = (key0 + _KEY_STEPS[0]) & _WORD
+        key1 = (key1 + _KEY_STEPS[1]) & _WORD
     return torch.stack([c0, c1 & _WORD, c2, c3 & _WORD])
 
 
@@ -162,15 +172,21 @@ def _words(
     if not 0 <= seed < 2**64:
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
     if any(not 0 <= i < 2**63 for i in indices):
-        raise ConfigError(f"index {next(i for i in indices if not 0 <= i < 2**63)}", "0 <= index < 2^63")
+        raise ConfigError(
+            f"index {next(i for i in indices if not 0 <= i < 2**63)}", "0 <= index < 2^63"
+        )
     if min(shape, default=1) < 1 or count >= 2**34:
-        raise ConfigError(f"noise of shape {tuple(shape)}", "positive sizes, less than 2^34 elements in all")
+        raise ConfigError(
+            f"noise of shape {tuple(shape)}", "positive sizes, less than 2^34 elements in all"
+        )
     # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
     place = torch.device(device) if torch.device(device).type == "cuda" else torch.device("cpu")
     blocks = torch.arange(-(-count // 4), device=place)
     index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
     counter = (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
-    return philox(torch.stack([word.expand(len(index), len(blocks)) for word in counter]), seed), count
+    return philox(
+        torch.stack([word.expand(len(index), len(blocks)) for word in counter]), seed
+    ), count
 
 
 def _samples(lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str) -> Tensor:

@@ -5,13 +5,17 @@ from typing import Any
 
 from lidar_synth.bake import BakeJob, BakePlan, make_plan
 
-COUNT, SIZE = 10, 3
+COUNT = 10
+SIZE = 3
 """Number of scans of a bank, and of a shard; the shards have 3, 3, 3 and 1 scans."""
 
 
 def plan_in(out: Path, model: Path, **settings: Any) -> BakePlan:
     """A plan with the tests' default settings, updated by ``settings``."""
-    return make_plan(out, BakeJob(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings))
+    return make_plan(
+        out,
+        BakeJob(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings),
+    )
 
 
 def files(root: Path) -> dict[str, bytes]:

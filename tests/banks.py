@@ -24,9 +24,15 @@ SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 def some_facts(sensor: Sensor = SENSOR, **others: Any) -> Facts:
     """Facts of a bank without a model."""
     known = {
-        "sensor": sensor, "fields": ("reflectance", "label"), "model": "small", "checkpoint": "c" * 64,
-        "settings": {"seed": 5}, "label_policy": "generated", "licence": "MIT", "data_licence": "none",
-    }  # fmt: skip
+        "sensor": sensor,
+        "fields": ("reflectance", "label"),
+        "model": "small",
+        "checkpoint": "c" * 64,
+        "settings": {"seed": 5},
+        "label_policy": "generated",
+        "licence": "MIT",
+        "data_licence": "none",
+    }
     return Facts(**known | others)  # type: ignore[arg-type]
 
 
@@ -40,14 +46,18 @@ def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
         "label": np.where(seen, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8),
         "confidence": (rng.random(sensor.shape) * seen).astype(np.float32),
     }
-    values = rng.uniform((-40, -40, -2, 0.5, 0.5, 0.5, -3), (40, 40, 1, 9, 3, 3, 3), (seed % 4, 7)).astype(np.float32)
+    values = rng.uniform(
+        (-40, -40, -2, 0.5, 0.5, 0.5, -3), (40, 40, 1, 9, 3, 3, 3), (seed % 4, 7)
+    ).astype(np.float32)
     names = tuple(rng.choice(["Car", "Pedestrian", "Misc", "Motorcyclist"], len(values)).tolist())
     boxes = Boxes(values, names, instance=np.arange(1, len(values) + 1, dtype=np.int32))
     channels["instance"] = (rng.integers(0, len(values) + 1, sensor.shape) * seen).astype(np.int32)
     return RangeImage((metres * seen).astype(np.float32), sensor, channels, boxes)
 
 
-def write_bank(root: Path, images: Sequence[RangeImage], shard_size: int = 2, **others: Any) -> list[Path]:
+def write_bank(
+    root: Path, images: Sequence[RangeImage], shard_size: int = 2, **others: Any
+) -> list[Path]:
     """Write a bank with these images; returns the files of its shards."""
     facts = some_facts(images[0].sensor, **others)
     root.mkdir(parents=True, exist_ok=True)
@@ -73,17 +83,22 @@ def add_stray(path: Path) -> None:
 
 
 def write_golden_bank(root: Path) -> None:
-    """Write the bank in tests/golden, and numbers.json with the expected statistics of its scans."""
+    """Write the bank in tests/golden, and numbers.json with the expected statistics of its
+    scans."""
     from lidar_synth.lab.town import Town
 
     sensor = load_sensor(Path(__file__).parents[1] / "configs" / "tiny_sensor.yaml")
     images = [project(scan) for scan in Town(0, sensor, 3)]
     for image in images:
-        image.channels["confidence"] = (image.channels["reflectance"] * image.mask).astype(np.float32)
+        image.channels["confidence"] = (image.channels["reflectance"] * image.mask).astype(
+            np.float32
+        )
     write_bank(root, images, fields=("reflectance", "label", "confidence"))
     bank = Bank(root)
     scans = [numbers(bank, i) for i in range(len(bank))]
-    (root / "numbers.json").write_text(json.dumps({"identity": bank.identity, "scans": scans}, indent=1) + "\n")
+    (root / "numbers.json").write_text(
+        json.dumps({"identity": bank.identity, "scans": scans}, indent=1) + "\n"
+    )
 
 
 def numbers(bank: Bank, number: int) -> dict[str, Any]:
@@ -96,7 +111,9 @@ def numbers(bank: Bank, number: int) -> dict[str, Any]:
         "range": round(float(image.range.sum(dtype=np.float64)), 3),
         "reflectance": round(float(image.reflectance.sum(dtype=np.float64)), 3),
         "confidence": round(float(image.channels["confidence"].sum(dtype=np.float64)), 3),
-        "labels": np.bincount(image.label.reshape(-1), minlength=256)[[*range(19), IGNORE]].tolist(),
+        "labels": np.bincount(image.label.reshape(-1), minlength=256)[
+            [*range(19), IGNORE]
+        ].tolist(),
     }
 
 

@@ -1,4 +1,5 @@
-"""A scene of a road, a wall and a car whose returns are known exactly, for any sensor at any place."""
+"""A scene of a road, a wall and a car whose returns are known exactly, for any sensor at any
+place."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ WALL = (25.0, -20.0, -2.0, 1.0, 60.0, 12.0, 0.0)
 REFLECTANCE = {ROAD: 0.25, BUILDING: 0.5, CAR: 0.75}
 
 
-def record(sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = CAR_BOX, at: float = 0.0) -> Scan:
+def record(
+    sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = CAR_BOX, at: float = 0.0
+) -> Scan:
     """What a sensor records of the scene, without noise; in its own frame.
 
     Args:
@@ -25,12 +28,18 @@ def record(sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = 
         car: the box of the car.
         at: metres that the sensor has driven forward.
     """
-    rays, matrix = rays_of(sensor), (mount or Mount()).matrix.copy()
+    rays = rays_of(sensor)
+    matrix = (mount or Mount()).matrix.copy()
     matrix[0, 3] += at
     azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
     slope, height = (np.broadcast_to(v[:, None], azimuth.shape) for v in (rays.slope, rays.height))
-    ways = np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1).reshape(-1, 3) @ matrix[:3, :3].T
-    starts = np.stack([0 * slope, 0 * slope, height], -1).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+    ways = (
+        np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1).reshape(-1, 3) @ matrix[:3, :3].T
+    )
+    starts = (
+        np.stack([0 * slope, 0 * slope, height], -1).reshape(-1, 3) @ matrix[:3, :3].T
+        + matrix[:3, 3]
+    )
     hits = [_road(starts, ways), _box(starts, ways, WALL), _box(starts, ways, car)]
     which = np.argmin(hits, 0)
     along = np.min(hits, 0)
@@ -71,12 +80,17 @@ def _road(starts: NDArray[np.float64], ways: NDArray[np.float64]) -> NDArray[np.
     return np.where(ways[:, 2] < -1e-9, along, np.inf)
 
 
-def _box(starts: NDArray[np.float64], ways: NDArray[np.float64], box: tuple[float, ...]) -> NDArray[np.float64]:
+def _box(
+    starts: NDArray[np.float64], ways: NDArray[np.float64], box: tuple[float, ...]
+) -> NDArray[np.float64]:
     """Distances along rays to a box (7,), by slabs; inf = none."""
-    c, s = np.cos(box[6]), np.sin(box[6])
+    c = np.cos(box[6])
+    s = np.sin(box[6])
     turn = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
-    start, way = (starts - box[:3]) @ turn.T, ways @ turn.T
+    start = (starts - box[:3]) @ turn.T
+    way = ways @ turn.T
     with np.errstate(divide="ignore", invalid="ignore"):
         sides = np.stack([(sign * np.array(box[3:6]) / 2 - start) / way for sign in (-1, 1)])
-    near, far = sides.min(0).max(1), sides.max(0).min(1)
+    near = sides.min(0).max(1)
+    far = sides.max(0).min(1)
     return np.where((near <= far) & (near > 0), near, np.inf)

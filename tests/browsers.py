@@ -26,9 +26,15 @@ def start(*arguments: str) -> Any:
     options.binary_location = binary
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     for argument in (
-        "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader", "--hide-scrollbars", "--host-resolver-rules=MAP * ~NOTFOUND", *arguments,
-    ):  # fmt: skip
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--hide-scrollbars",
+        "--host-resolver-rules=MAP * ~NOTFOUND",
+        *arguments,
+    ):
         options.add_argument(argument)
     return Chrome(options=options, service=ChromeService(driver))
 
@@ -47,7 +53,10 @@ class Page:
         driver.set_window_size(*size)
         driver.get(path.as_uri())
         self.until(
-            lambda: self.run("return state.views.length > 0 && state.views.every((v) => !v.draw || scanOf(v).columns)")
+            lambda: self.run(
+                "return state.views.length > 0 && state.views.every((v) => !v.draw || "
+                "scanOf(v).columns)"
+            )
         )
         self.settle()
 
@@ -64,7 +73,9 @@ class Page:
 
     def settle(self) -> None:
         """Wait until the page has drawn twice more."""
-        self.driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(() => arguments[0]()))")
+        self.driver.execute_async_script(
+            "requestAnimationFrame(() => requestAnimationFrame(() => arguments[0]()))"
+        )
 
     def all(self, selector: str) -> list[Any]:
         """The elements that a CSS selector finds."""
@@ -81,20 +92,25 @@ class Page:
         actions = ActionChains(self.driver, duration=20)
         if shift:
             actions.key_down(Keys.SHIFT)
-        actions.move_to_element(self.all(".view canvas")[view]).click_and_hold().move_by_offset(dx, dy).release()
+        actions.move_to_element(self.all(".view canvas")[view]).click_and_hold().move_by_offset(
+            dx, dy
+        ).release()
         if shift:
             actions.key_up(Keys.SHIFT)
         actions.perform()
         self.settle()
 
     def click(self, view: int, x: int, y: int) -> dict[str, str]:
-        """Click at a pixel of a view; returns what the page says about the point, {} without one."""
+        """Click at a pixel of a view; returns what the page says about the point, {} without
+        one."""
         from selenium.webdriver import ActionChains
 
         canvas = self.all(".view canvas")[view]
         width, height = self.size(view)
         actions = ActionChains(self.driver, duration=0)
-        actions.move_to_element_with_offset(canvas, x - width // 2, y - height // 2).click().perform()
+        actions.move_to_element_with_offset(
+            canvas, x - width // 2, y - height // 2
+        ).click().perform()
         self.settle()
         panel = self.all(".view")[view].find_elements("css selector", ".picked dl > *")
         words = [part.text for part in panel if part.is_displayed()]
@@ -103,7 +119,8 @@ class Page:
     def size(self, view: int) -> tuple[int, int]:
         """Width and height of a view in pixels."""
         width, height = self.run(
-            "const c = state.views[arguments[0]].canvas; return [c.clientWidth, c.clientHeight]", view
+            "const c = state.views[arguments[0]].canvas; return [c.clientWidth, c.clientHeight]",
+            view,
         )
         return width, height
 

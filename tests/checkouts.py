@@ -1,4 +1,5 @@
-"""Checkouts of trainers' public code, given by environment variables, and runs of their own scripts."""
+"""Checkouts of trainers' public code, given by environment variables, and runs of their own
+scripts."""
 
 import importlib.util
 import os
@@ -32,7 +33,9 @@ SCRIPTS = Path(__file__).parent.parent / "tools" / "trainers" / "scripts"
 """Scripts that run trainers' own scripts on a machine without a GPU."""
 
 
-def run_script(script: Path, *arguments: str, cwd: Path, mixture: Path | None = None, **variables: str) -> str:
+def run_script(
+    script: Path, *arguments: str, cwd: Path, mixture: Path | None = None, **variables: str
+) -> str:
     """What a Python script says.
 
     Raises:
@@ -40,9 +43,14 @@ def run_script(script: Path, *arguments: str, cwd: Path, mixture: Path | None = 
     """
     environment = os.environ | variables | ({} if mixture is None else {VARIABLE: str(mixture)})
     done = subprocess.run(
-        [sys.executable, str(script), *arguments], cwd=cwd, env=environment, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
+        [sys.executable, str(script), *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     print(done.stdout)
     if done.returncode:
         raise RuntimeError(done.stdout[-8000:])

@@ -20,7 +20,9 @@ from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.sensor import Sensor
 
-SENSOR = Sensor("small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+SENSOR = Sensor(
+    "small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0
+)
 
 
 ARGUMENTS: dict[str, Any] = {
@@ -60,18 +62,26 @@ def checksummed(values: dict[str, Any]) -> str:
 
 
 def rewrite(path: Path, **changes: Any) -> None:
-    """Change keys of the header (None = remove) and update its checksum; the weights stay unchanged."""
+    """Change keys of the header (None = remove) and update its checksum; the weights stay
+    unchanged."""
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
     outer = json.loads(content[8 : 8 + size])
     header = json.loads(outer["__metadata__"]["lidar_synth"]) | changes
-    outer["__metadata__"]["lidar_synth"] = checksummed({k: v for k, v in header.items() if v is not None})
+    outer["__metadata__"]["lidar_synth"] = checksummed(
+        {k: v for k, v in header.items() if v is not None}
+    )
     text = json.dumps(outer).encode()
     path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + size :])
 
 
 def replace_weights(path: Path, change: Any) -> None:
-    """Replace the weights and their checksum, but not the rest of the header, as a careless tool would."""
+    """Replace the weights and their checksum, but not the rest of the header, as a careless tool
+    would."""
     tensors = load_file(path)
     change(tensors)
-    save_file(tensors, path, {"lidar_synth": checksummed({**HEADER.to_dict(), "weights": weights_hash(tensors)})})
+    save_file(
+        tensors,
+        path,
+        {"lidar_synth": checksummed({**HEADER.to_dict(), "weights": weights_hash(tensors)})},
+    )

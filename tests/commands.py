@@ -1,4 +1,5 @@
-"""The commands that documents print, checked without running them: options, recipes, modules, extras, targets.
+"""The commands that documents print, checked without running them: options, recipes, modules,
+extras, targets.
 
 ``check`` parses a command by the program's own parser wherever there is one.
 """
@@ -27,9 +28,23 @@ from lidar_synth.lab.train import DistillConfig, TrainConfig, load_config, plan_
 from lidar_synth.lab.train.config import published_models, read_values, validated
 
 PLAIN = (
-    ".", "apt-get", "cat", "cd", "cp", "docker", "export", "git", "ln", "ls", "mkdir", "printf", "source", "sudo",
-    "unzip", "wget",
-)  # fmt: skip
+    ".",
+    "apt-get",
+    "cat",
+    "cd",
+    "cp",
+    "docker",
+    "export",
+    "git",
+    "ln",
+    "ls",
+    "mkdir",
+    "printf",
+    "source",
+    "sudo",
+    "unzip",
+    "wget",
+)
 """Commands of the shell and of the system, whose arguments are not checked."""
 
 
@@ -42,10 +57,12 @@ class _Parsed(BaseException):
 
 
 def parts_of(command: str) -> list[list[str]]:
-    """The words of each program that a line starts, without assignments before it and redirections behind it."""
+    """The words of each program that a line starts, without assignments before it and redirections
+    behind it."""
     parts: list[list[str]] = [[]]
     lexer = shlex.shlex(command, posix=True, punctuation_chars=True)
-    lexer.whitespace_split, lexer.commenters = True, ""
+    lexer.whitespace_split = True
+    lexer.commenters = ""
     words = iter(lexer)
     for word in words:
         if set(word) <= set("&|;") and word:
@@ -62,7 +79,8 @@ def check(command: str, folder: Path | None = None) -> None:
 
     Args:
         command: one line, as a document prints it.
-        folder: where it would run, with the files that the reader has saved; without it, files are not looked for.
+        folder: where it would run, with the files that the reader has saved; without it, files are
+            not looked for.
 
     Raises:
         WrongCommand: on an unknown program, option, target, extra, recipe, module or script.
@@ -71,7 +89,9 @@ def check(command: str, folder: Path | None = None) -> None:
         if program in CHECKS:
             CHECKS[program](words, folder)
         elif program not in PLAIN:
-            raise WrongCommand(f"{program!r} in {command!r} is none of {', '.join([*CHECKS, *PLAIN])}")
+            raise WrongCommand(
+                f"{program!r} in {command!r} is none of {', '.join([*CHECKS, *PLAIN])}"
+            )
 
 
 def lidar_synth(words: list[str], folder: Path | None) -> None:
@@ -117,8 +137,16 @@ def _train(values: dict[str, Any], folder: Path | None) -> None:
 
 def _bake(values: dict[str, Any], folder: Path | None) -> None:
     file = values["config"]
-    settings = {} if file is None else read_values(folder / file if folder and file.suffix else file, BakeJob)
-    settings |= {key: value for key, value in values.items() if key in BakeJob.model_fields and value is not None}
+    settings = (
+        {}
+        if file is None
+        else read_values(folder / file if folder and file.suffix else file, BakeJob)
+    )
+    settings |= {
+        key: value
+        for key, value in values.items()
+        if key in BakeJob.model_fields and value is not None
+    }
     validated(BakeJob, settings, "bake")
     _one_of("engine", (*ENGINES,))(values, folder)
 
@@ -155,7 +183,9 @@ def python(words: list[str], folder: Path | None) -> None:
     elif (ROOT / words[0]).is_file():
         _script(ROOT / words[0], words[1:], folder)
     elif folder is not None and not (folder / words[0]).is_file():
-        raise WrongCommand(f"python {words[0]}: neither a file of the repository nor one that the page shows")
+        raise WrongCommand(
+            f"python {words[0]}: neither a file of the repository nor one that the page shows"
+        )
 
 
 def _script(path: Path, words: list[str], folder: Path | None) -> None:
@@ -204,14 +234,21 @@ def make(words: list[str], folder: Path | None) -> None:
     for word in words:
         name, equals, _ = word.partition("=")
         if name not in (variables if equals else targets):
-            raise WrongCommand(f"make {word}: the Makefile has {', '.join(sorted(variables if equals else targets))}")
+            raise WrongCommand(
+                f"make {word}: the Makefile has "
+                f"{', '.join(sorted(variables if equals else targets))}"
+            )
 
 
 def pip(words: list[str], folder: Path | None) -> None:
     """``pip install ...``, the extras of this package against pyproject.toml."""
     if words[0] != "install":
         raise WrongCommand(f"pip {words[0]}: not known to the test")
-    own = [found for word in words if (found := re.fullmatch(r"(?:\./)?(?:\.|lidar[-_]synth)(?:\[(.*)\])?", word))]
+    own = [
+        found
+        for word in words
+        if (found := re.fullmatch(r"(?:\./)?(?:\.|lidar[-_]synth)(?:\[(.*)\])?", word))
+    ]
     extras = {extra.strip() for found in own for extra in (found[1] or "").split(",")} - {""}
     if unknown := extras - set(PYPROJECT["project"]["optional-dependencies"]):
         raise WrongCommand(f"pip install: extras {sorted(unknown)} are not in pyproject.toml")
@@ -219,15 +256,22 @@ def pip(words: list[str], folder: Path | None) -> None:
 
 def bash(words: list[str], folder: Path | None) -> None:
     """``bash SCRIPT``: a script of the repository that bash can read."""
-    run = subprocess.run(["bash", "-n", words[0]], cwd=ROOT, capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        ["bash", "-n", words[0]], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     if run.returncode:
         raise WrongCommand(f"bash {words[0]}: {run.stderr}")
 
 
 CHECKS: dict[str, Callable[[list[str], Path | None], None]] = {
-    "lidar-synth": lidar_synth, "python": python, "python3": python, "torchrun": torchrun, "make": make, "pip": pip,
+    "lidar-synth": lidar_synth,
+    "python": python,
+    "python3": python,
+    "torchrun": torchrun,
+    "make": make,
+    "pip": pip,
     "bash": bash,
-}  # fmt: skip
+}
 """How the arguments of each program are checked."""
 
 NEVER_RUN = ("make", "pip", "git", "apt-get", "sudo", "docker", "source", ".", "wget", "unzip")

@@ -14,7 +14,8 @@ from hypothesis import settings
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, presets
 
-# A shell leaves SIGINT ignored in what it starts in the background, and so in every process that tests start.
+# A shell leaves SIGINT ignored in what it starts in the background, and so in every process that
+# tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
@@ -42,7 +43,8 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def accelerate_unset() -> Iterator[None]:
-    """Accelerate keeps the precision of its first use in a process; it is cleared after every file of tests."""
+    """Accelerate keeps the precision of its first use in a process; it is cleared after every file
+    of tests."""
     yield
     if "accelerate.state" in sys.modules:
         sys.modules["accelerate.state"].AcceleratorState._reset_state(True)
@@ -50,7 +52,8 @@ def accelerate_unset() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def real_scans() -> Path:
-    """Folder with real scans of KITTI-360, SemanticKITTI, KITTI and nuScenes; skips where there is none."""
+    """Folder with real scans of KITTI-360, SemanticKITTI, KITTI and nuScenes; skips where there is
+    none."""
     return _folder("LIDAR_SYNTH_REAL_SCANS")
 
 
@@ -61,7 +64,8 @@ def labelled_scans() -> Path:
 
 
 class Golden:
-    """Numbers from running the peers' code: small files in tests/golden, larger ones where LIDAR_SYNTH_GOLDEN says."""
+    """Numbers from running the peers' code: small files in tests/golden, larger ones where
+    LIDAR_SYNTH_GOLDEN says."""
 
     def __truediv__(self, name: str) -> Path:
         here = Path(__file__).parent / "golden" / name
@@ -81,13 +85,21 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 
 
 def random_scan(sensor: Sensor, count: int = 3000, seed: int = 0) -> Scan:
-    """Points all around the sensor with reflectance, labels and instances; a few out of its view or range."""
+    """Points all around the sensor with reflectance, labels and instances; a few out of its view or
+    range."""
     rng = np.random.default_rng(seed)
     azimuth = rng.uniform(-np.pi, np.pi, count)
     elevation = np.radians(rng.uniform(sensor.down - 1, sensor.up + 1, count))
-    distance = np.exp(rng.uniform(np.log(max(sensor.range_min, 0.5) * 0.9), np.log(sensor.range_max * 1.1), count))
+    distance = np.exp(
+        rng.uniform(np.log(max(sensor.range_min, 0.5) * 0.9), np.log(sensor.range_max * 1.1), count)
+    )
     points = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            -np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        -1,
     )
     raw = rng.choice([0, 10, 40, 50, 70, 80, 252], count).astype(np.uint32) | (
         rng.integers(0, 50, count).astype(np.uint32) << 16

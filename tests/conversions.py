@@ -1,4 +1,5 @@
-"""Shared parts of the conversion tests: the command as an application, and a KITTI odometry sequence."""
+"""Shared parts of the conversion tests: the command as an application, and a KITTI odometry
+sequence."""
 
 from pathlib import Path
 
@@ -13,7 +14,8 @@ app.command()(convert)
 
 
 def a_sequence(root: Path, *, tr: bool = True, calib: bool = True, times: bool = True) -> Path:
-    """Three scans in KITTI's own odometry layout, with side files as they are there: F lines, exact text."""
+    """Three scans in KITTI's own odometry layout, with side files as they are there: F lines, exact
+    text."""
     source = root / "sequences" / "07"
     write_all("semantic_kitti", root, [some_scan(i) for i in range(3)], sequence="07")
     [path.unlink() for path in source.glob("*.txt")]
@@ -24,5 +26,7 @@ def a_sequence(root: Path, *, tr: bool = True, calib: bool = True, times: bool =
         (source / "calib.txt").write_text("\n".join(lines) + "\n")
     if times:
         (source / "times.txt").write_text("0.000000e+00\n1.037359e-01\n2.073381e-01\n")
-    (source / "poses.txt").write_text("".join(f"1 0 0 {i} 0 1 0 0 0 0 1 {i / 3!r}\n" for i in range(3)))
+    (source / "poses.txt").write_text(
+        "".join(f"1 0 0 {i} 0 1 0 0 0 0 1 {i / 3!r}\n" for i in range(3))
+    )
     return source

@@ -6,7 +6,8 @@ from torch import Tensor
 
 from lidar_synth.generate.flow.path import per_sample
 
-MEAN, STD = 0.5, 0.1
+MEAN = 0.5
+STD = 0.1
 """Of the data of the Gaussian flow."""
 
 

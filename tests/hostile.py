@@ -1,4 +1,5 @@
-"""Hostile inputs that several tests share: arrays in the .npy format, bodies of point clouds, a sensor."""
+"""Hostile inputs that several tests share: arrays in the .npy format, bodies of point clouds, a
+sensor."""
 
 import io
 import struct
@@ -25,7 +26,9 @@ BODIES = {
 def npy(header: str, body: bytes = b"", version: int = 1) -> bytes:
     content = header.encode("latin-1") + b"\n"
     width = {1: 2, 2: 4, 3: 4}[version]
-    return b"\x93NUMPY" + bytes([version, 0]) + len(content).to_bytes(width, "little") + content + body
+    return (
+        b"\x93NUMPY" + bytes([version, 0]) + len(content).to_bytes(width, "little") + content + body
+    )
 
 
 def described(descr: str = "'<f4'", shape: str = "(20, 4)", order: str = "False") -> str:
@@ -64,4 +67,11 @@ HOSTILE_NPY = {
 }
 
 
-LINEAR = {"columns": 64, "rows": 8, "fov_up": 3.0, "fov_down": -25.0, "range_min": 1.0, "range_max": 80.0}
+LINEAR = {
+    "columns": 64,
+    "rows": 8,
+    "fov_up": 3.0,
+    "fov_down": -25.0,
+    "range_min": 1.0,
+    "range_max": 80.0,
+}

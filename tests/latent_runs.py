@@ -24,18 +24,31 @@ RECIPE = {"iterations": 8, "batch": 4, "warmup": 2, "rate": 1e-3, "ema_every": 1
 CODEC_NETWORK = {
     "architecture": "vqvae",
     "arguments": {
-        "latent_channels": 4, "codes": 16, "codebook": "ema", "width": 8, "multipliers": [1, 2], "strides": [[1, 2]],
-        "blocks": 1, "attention": False, "patch": [2, 2], "groups": 4,
+        "latent_channels": 4,
+        "codes": 16,
+        "codebook": "ema",
+        "width": 8,
+        "multipliers": [1, 2],
+        "strides": [[1, 2]],
+        "blocks": 1,
+        "attention": False,
+        "patch": [2, 2],
+        "groups": 4,
     },
-}  # fmt: skip
+}
 
 
 UNET = {
     "architecture": "unet",
     "arguments": {
-        "width": 16, "multipliers": [1, 2], "blocks": 1, "attention": [1], "head_channels": 8, "groups": 4,
+        "width": 16,
+        "multipliers": [1, 2],
+        "blocks": 1,
+        "attention": [1],
+        "head_channels": 8,
+        "groups": 4,
     },
-}  # fmt: skip
+}
 
 
 SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
@@ -45,13 +58,17 @@ def write_config(scans: Path, folder: Path, name: str, **values: Any) -> Path:
     config = {
         "output": str(folder / name),
         "licence": "MIT",
-        "data": {"licence": "none", "path": str(scans / "scans"), "flip": True} | values.pop("data", {}),
+        "data": {"licence": "none", "path": str(scans / "scans"), "flip": True}
+        | values.pop("data", {}),
         "recipe": RECIPE | values.pop("recipe", {}),
         "save_every": 4,
         "samples": {"every": 0},
     }
     if "teacher" not in values and "codec" not in values:
-        config |= {"sensor": str(scans / "sensor.yaml"), "channels": ["range", "reflectance", "label"]}
+        config |= {
+            "sensor": str(scans / "sensor.yaml"),
+            "channels": ["range", "reflectance", "label"],
+        }
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(config | values))
     return path
@@ -108,7 +125,12 @@ def codec(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def teacher(scans: Path, codec: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("teacher")
-    values = {"network": UNET, "condition": SEMANTIC, "steps": 5, "samples": {"every": 8, "count": 2}}
+    values = {
+        "network": UNET,
+        "condition": SEMANTIC,
+        "steps": 5,
+        "samples": {"every": 8, "count": 2},
+    }
     call("train", write_config(scans, folder, "teacher", codec=str(codec), **values))
     assert (folder / "teacher" / "samples" / "0000008.png").exists()
     return folder / "teacher" / "teacher.safetensors"

@@ -1,4 +1,5 @@
-"""Small datasets in every layout that can be written, for tests of readers, conversion and bad input."""
+"""Small datasets in every layout that can be written, for tests of readers, conversion and bad
+input."""
 
 import json
 from collections.abc import Callable
@@ -33,8 +34,12 @@ WRITTEN_AS = {
 def turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """(3, 3) rotation about z, then y, then x."""
     about_z = np.array([(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)])
-    about_y = np.array([(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))])
-    about_x = np.array([(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))])
+    about_y = np.array(
+        [(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))]
+    )
+    about_x = np.array(
+        [(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))]
+    )
     return about_z @ about_y @ about_x
 
 
@@ -62,15 +67,19 @@ def some_camera() -> Calibration:
     moved = AXES_CAMERA_FROM_SENSOR.copy()
     moved[:3, :3] = moved[:3, :3] @ turn(0.01, -0.015, 0.008)
     moved[:3, 3] = 0.05, -0.08, -0.27
-    return Calibration(np.array([(600.0, 0, 350, 45), (0, 600, 130, 0), (0, 0, 1, 0.005)]), moved, (700, 260))
+    return Calibration(
+        np.array([(600.0, 0, 350, 45), (0, 600, 130, 0), (0, 0, 1, 0.005)]), moved, (700, 260)
+    )
 
 
 def some_scan(seed: int = 0, sensor: str = "hdl64e_kitti", count: int = 600) -> Scan:
-    """A scan with everything that a scan can have, but an image; nothing nearer or farther than the sensor sees."""
+    """A scan with everything that a scan can have, but an image; nothing nearer or farther than the
+    sensor sees."""
     scan = random_scan(load_sensor(sensor), count, seed)
     distance = np.linalg.norm(scan.points, axis=1)
     scan = scan[(distance > scan.sensor.range_min) & (distance < scan.sensor.range_max)]
-    scan.boxes, scan.pose = some_boxes(seed), a_pose(seed)
+    scan.boxes = some_boxes(seed)
+    scan.pose = a_pose(seed)
     return scan
 
 
@@ -93,16 +102,22 @@ def nuscenes_arrays(count: int = 320, seed: int = 0) -> tuple[np.ndarray, np.nda
     """(N, 5) a sweep as nuScenes stores it, and (N,) lidarseg classes."""
     rng = np.random.default_rng(seed)
     ring = np.tile(np.arange(32), count // 32)
-    elevation, azimuth = np.radians(-30 + 1.3 * ring), rng.uniform(-np.pi, np.pi, count)
+    elevation = np.radians(-30 + 1.3 * ring)
+    azimuth = rng.uniform(-np.pi, np.pi, count)
     distance = np.where(rng.random(count) < 0.1, 0.3, rng.uniform(2, 90, count))
-    x, y = np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth)
+    x = np.cos(elevation) * np.sin(azimuth)
+    y = np.cos(elevation) * np.cos(azimuth)
     points = np.stack([x, y, np.sin(elevation)], -1) * distance[:, None]
-    return np.column_stack([points, rng.integers(0, 256, count), ring]).astype("<f4"), rng.integers(0, 32, count)
+    return np.column_stack([points, rng.integers(0, 256, count), ring]).astype("<f4"), rng.integers(
+        0, 32, count
+    )
 
 
 def write_nuscenes(root: Path, count: int = 3, labels: bool = True) -> list[Path]:
     """A nuScenes folder with lidarseg; the sweeps' files."""
-    paths, samples, segments = [], [], []
+    paths = []
+    samples = []
+    segments = []
     for i in range(count):
         points, classes = nuscenes_arrays(seed=i)
         paths.append(root / "samples" / "LIDAR_TOP" / f"n015__LIDAR_TOP__{i}.pcd.bin")
@@ -112,8 +127,12 @@ def write_nuscenes(root: Path, count: int = 3, labels: bool = True) -> list[Path
             file = root / "lidarseg" / "v1.0-mini" / f"token{i}_lidarseg.bin"
             file.parent.mkdir(parents=True, exist_ok=True)
             classes.astype("u1").tofile(file)
-            samples.append({"token": f"token{i}", "filename": f"samples/LIDAR_TOP/{paths[-1].name}"})
-            segments.append({"sample_data_token": f"token{i}", "filename": file.relative_to(root).as_posix()})
+            samples.append(
+                {"token": f"token{i}", "filename": f"samples/LIDAR_TOP/{paths[-1].name}"}
+            )
+            segments.append(
+                {"sample_data_token": f"token{i}", "filename": file.relative_to(root).as_posix()}
+            )
     if labels:
         (root / "v1.0-mini").mkdir()
         (root / "v1.0-mini" / "sample_data.json").write_text(json.dumps(samples))
@@ -129,12 +148,11 @@ def write_kitti_raw(root: Path, count: int = 3) -> list[Path]:
     for i, path in enumerate(paths):
         scan = some_scan(i)
         np.column_stack([scan.points, scan.reflectance]).astype("<f4").tofile(path)
-    pose = (
-        "<item><tx>10</tx><ty>{}</ty><tz>-1.5</tz><rz>{}</rz><occlusion>1</occlusion><truncation>0</truncation></item>"
-    )
+    pose = "<item><tx>10</tx><ty>{}</ty><tz>-1.5</tz><rz>{}</rz><occlusion>1</occlusion><truncation>0</truncation></item>"
     poses = "".join(pose.format(k, 4 + k) for k in range(count - 1))
     (drive / "tracklet_labels.xml").write_text(
-        "<boost_serialization><tracklets><count>1</count><item><objectType>Person (sitting)</objectType>"
+        "<boost_serialization><tracklets><count>1</count><item><objectType>Person "
+        "(sitting)</objectType>"
         f"<h>1.2</h><w>0.8</w><l>0.9</l><first_frame>1</first_frame><poses>{poses}</poses></item>"
         "</tracklets></boost_serialization>"
     )
@@ -144,7 +162,9 @@ def write_kitti_raw(root: Path, count: int = 3) -> list[Path]:
 MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "bank": lambda root: write_bank(root, [project(some_scan(i)) for i in range(3)], shard_size=1),
     "kitti360": lambda root: write_all("kitti360", root, [some_scan(i) for i in range(3)]),
-    "semantic_kitti": lambda root: write_all("semantic_kitti", root, [some_scan(i) for i in range(3)]),
+    "semantic_kitti": lambda root: write_all(
+        "semantic_kitti", root, [some_scan(i) for i in range(3)]
+    ),
     "kitti_object": lambda root: write_all("kitti_object", root, [some_scan(i) for i in range(3)]),
     "folder": lambda root: write_all("kitti", root, [some_scan(i) for i in range(3)]),
     "range": lambda root: write_all("range", root, [some_scan(i) for i in range(3)]),

@@ -1,4 +1,5 @@
-"""Run a call in a process of its own, within limits of memory and time, as input that could end a process needs."""
+"""Run a call in a process of its own, within limits of memory and time, as input that could end a
+process needs."""
 
 import re
 from collections.abc import Callable
@@ -11,10 +12,14 @@ from fuzzing.server import forkserver
 
 _STATUS = Path("/proc/self/status")
 
-needs_limits = pytest.mark.skipif(not _STATUS.exists(), reason="limits of a process are set as Linux has them")
+needs_limits = pytest.mark.skipif(
+    not _STATUS.exists(), reason="limits of a process are set as Linux has them"
+)
 
 
-def in_limits(call: Callable[..., object], *arguments: Any, megabytes: int = 500, seconds: float = 60) -> str:
+def in_limits(
+    call: Callable[..., object], *arguments: Any, megabytes: int = 500, seconds: float = 60
+) -> str:
     """What becomes of ``call(*arguments)``.
 
     Args:
@@ -24,11 +29,14 @@ def in_limits(call: Callable[..., object], *arguments: Any, megabytes: int = 500
         seconds: how long it may last.
 
     Returns:
-        ``""`` where it returned, ``"DataError: its message"`` where it raised, or how its process ended.
+        ``""`` where it returned, ``"DataError: its message"`` where it raised, or how its process
+        ended.
     """
     context = forkserver()
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_limited, args=(sender, megabytes, call, arguments), daemon=True)
+    process = context.Process(
+        target=_limited, args=(sender, megabytes, call, arguments), daemon=True
+    )
     process.start()
     sender.close()
     try:
@@ -43,7 +51,9 @@ def in_limits(call: Callable[..., object], *arguments: Any, megabytes: int = 500
         process.join()
 
 
-def _limited(sender: Connection, megabytes: int, call: Callable[..., object], arguments: tuple[Any, ...]) -> None:
+def _limited(
+    sender: Connection, megabytes: int, call: Callable[..., object], arguments: tuple[Any, ...]
+) -> None:
     import resource
 
     [taken] = re.findall(r"VmData:\s*(\d+) kB", _STATUS.read_text())

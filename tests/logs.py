@@ -47,14 +47,24 @@ def velodyne(scan: Scan) -> dict[str, np.ndarray]:
     """Rings count from below."""
     ring = (scan.sensor.shape[0] - 1 - scan.ring).astype(np.uint16)
     intensity = np.round(255 * scan.reflectance).astype(np.float32)
-    return {**axes(scan), "intensity": intensity, "ring": ring, "time": turn_time(scan).astype(np.float32)}
+    return {
+        **axes(scan),
+        "intensity": intensity,
+        "ring": ring,
+        "time": turn_time(scan).astype(np.float32),
+    }
 
 
 def hesai(scan: Scan) -> dict[str, np.ndarray]:
     """Times are those of the day, in float64."""
     intensity = np.round(255 * scan.reflectance).astype(np.float32)
     time = 1.7e9 + turn_time(scan)
-    return {**axes(scan), "intensity": intensity, "timestamp": time, "ring": scan.ring.astype(np.uint16)}
+    return {
+        **axes(scan),
+        "intensity": intensity,
+        "timestamp": time,
+        "ring": scan.ring.astype(np.uint16),
+    }
 
 
 def ouster(scan: Scan) -> dict[str, np.ndarray]:
@@ -81,4 +91,8 @@ class Log(NamedTuple):
     columns: Callable[[Scan], dict[str, np.ndarray]]
 
 
-LOGS = {"velodyne": Log("vlp16", velodyne), "hesai": Log("pandar64", hesai), "ouster": Log("os1_64", ouster)}
+LOGS = {
+    "velodyne": Log("vlp16", velodyne),
+    "hesai": Log("pandar64", hesai),
+    "ouster": Log("os1_64", ouster),
+}

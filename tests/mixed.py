@@ -12,8 +12,15 @@ from lidar_synth.mixing import MixedScans
 
 def shift(scan: Scan, rng: np.random.Generator) -> Scan:
     """An augmentation that draws."""
-    return Scan(scan.points + rng.standard_normal(3).astype(np.float32), scan.reflectance, scan.sensor, scan.label,
-                confidence=scan.confidence, id=scan.id, domain=scan.domain)  # fmt: skip
+    return Scan(
+        scan.points + rng.standard_normal(3).astype(np.float32),
+        scan.reflectance,
+        scan.sensor,
+        scan.label,
+        confidence=scan.confidence,
+        id=scan.id,
+        domain=scan.domain,
+    )
 
 
 def mixed(real: int = 9, ratio: Any = 0.4, **options: Any) -> MixedScans:

@@ -17,9 +17,13 @@ SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 class Scans(list[Scan]):
     """Scans in memory; ``<name><i>`` with 20 to 29 points each."""
 
-    def __init__(self, name: str, count: int, sensor: Sensor = SENSOR, domain: int = REAL, seed: int = 0) -> None:
+    def __init__(
+        self, name: str, count: int, sensor: Sensor = SENSOR, domain: int = REAL, seed: int = 0
+    ) -> None:
         scans = (random_scan(sensor, 20 + i % 10, seed=1000 * seed + i) for i in range(count))
-        super().__init__(replace(scan, id=f"{name}{i}", domain=domain) for i, scan in enumerate(scans))
+        super().__init__(
+            replace(scan, id=f"{name}{i}", domain=domain) for i, scan in enumerate(scans)
+        )
         self.sensor = sensor
 
 
@@ -29,7 +33,9 @@ class Endless:
     sensor = SENSOR
     length = None
 
-    def __init__(self, fields: Sequence[str] = ("reflectance", "label", "confidence"), name: str = "s") -> None:
+    def __init__(
+        self, fields: Sequence[str] = ("reflectance", "label", "confidence"), name: str = "s"
+    ) -> None:
         self.fields = frozenset(fields)
         self.identity = name
 
@@ -38,7 +44,12 @@ class Endless:
         confidence = np.full(len(scan), 0.5, np.float32) if "confidence" in self.fields else None
         label = scan.label if "label" in self.fields else None
         return replace(
-            scan, label=label, raw_label=None, confidence=confidence, id=f"{self.identity}{number}", domain=SYNTHETIC
+            scan,
+            label=label,
+            raw_label=None,
+            confidence=confidence,
+            id=f"{self.identity}{number}",
+            domain=SYNTHETIC,
         )
 
 

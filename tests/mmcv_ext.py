@@ -1,4 +1,5 @@
-"""Stands in for mmcv's compiled operators, which datasets and transforms never call: they only have to import."""
+"""Stands in for mmcv's compiled operators, which datasets and transforms never call: they only have
+to import."""
 
 import sys
 from types import ModuleType

@@ -4,7 +4,16 @@ from pathlib import Path
 from typing import Any
 
 CONFIGS = Path(__file__).parent.parent / "configs" / "mmdet3d"
-DATA_KEYS = ("type", "data_root", "ann_file", "data_prefix", "pts", "sweeps", "img", "filter_empty_gt")
+DATA_KEYS = (
+    "type",
+    "data_root",
+    "ann_file",
+    "data_prefix",
+    "pts",
+    "sweeps",
+    "img",
+    "filter_empty_gt",
+)
 """Keys of a stock configuration that ours may change."""
 
 
@@ -12,7 +21,11 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     """{dotted key: value} of a configuration."""
     if not isinstance(config, dict):
         return {prefix: config}
-    return {key: value for name in config for key, value in flat(config[name], f"{prefix}.{name}").items()}
+    return {
+        key: value
+        for name in config
+        for key, value in flat(config[name], f"{prefix}.{name}").items()
+    }
 
 
 def bare(value: Any) -> Any:

@@ -1,4 +1,5 @@
-"""Pickled tables as pandas 0.25 writes them, without pandas, and small datasets in PandaSet's layout."""
+"""Pickled tables as pandas 0.25 writes them, without pandas, and small datasets in PandaSet's
+layout."""
 
 import gzip
 import io
@@ -51,31 +52,60 @@ INDEXES = "pandas.core.indexes"
 
 
 def array(values: Any, *, dtype: str | None = None, shape: tuple[int, ...] | None = None) -> Call:
-    """An array as numpy pickles it; ``dtype`` and ``shape`` may say something else than it holds."""
+    """An array as numpy pickles it; ``dtype`` and ``shape`` may say something else than it
+    holds."""
     values = np.asarray(values)
     kind = dtype or ("O8" if values.dtype == object else values.dtype.str[1:])
-    state = (3, "|" if kind[0] in "Ob" else "<", None, None, None, -1, -1, 63 if kind[0] == "O" else 0)
+    state = (
+        3,
+        "|" if kind[0] in "Ob" else "<",
+        None,
+        None,
+        None,
+        -1,
+        -1,
+        63 if kind[0] == "O" else 0,
+    )
     data = values.ravel().tolist() if values.dtype == object else values.tobytes()
-    made = (1, values.shape if shape is None else shape, Call("numpy.dtype", (kind, 0, 1), state), False, data)
+    made = (
+        1,
+        values.shape if shape is None else shape,
+        Call("numpy.dtype", (kind, 0, 1), state),
+        False,
+        data,
+    )
     return Call("numpy.core.multiarray._reconstruct", (Name("numpy.ndarray"), (0,), b"b"), made)
 
 
 def table(columns: dict[str, Any]) -> Call:
     """A table as pandas 0.25 pickles it: columns of one type in one block."""
-    names, arrays = list(columns), [np.asarray(values) for values in columns.values()]
+    names = list(columns)
+    arrays = [np.asarray(values) for values in columns.values()]
     arrays = [values.astype(object) if values.dtype.kind == "U" else values for values in arrays]
     blocks = []
     for kind in sorted({values.dtype.str for values in arrays}):
         places = [i for i, values in enumerate(arrays) if values.dtype.str == kind]
-        blocks.append({"values": array(np.stack([arrays[i] for i in places])), "mgr_locs": array(np.array(places))})
+        blocks.append(
+            {
+                "values": array(np.stack([arrays[i] for i in places])),
+                "mgr_locs": array(np.array(places)),
+            }
+        )
     labels = {"data": array(np.array(names, object)), "name": None}
     index = Call(f"{INDEXES}.base._new_Index", (Name(f"{INDEXES}.base.Index"), labels))
     length = {"start": 0, "stop": len(arrays[0]), "step": 1}
     rows = Call(f"{INDEXES}.base._new_Index", (Name(f"{INDEXES}.range.RangeIndex"), length))
     axes = [index, rows]
-    state = (axes, [block["values"] for block in blocks], axes, {"0.14.1": {"axes": axes, "blocks": blocks}})
+    state = (
+        axes,
+        [block["values"] for block in blocks],
+        axes,
+        {"0.14.1": {"axes": axes, "blocks": blocks}},
+    )
     manager = Call("pandas.core.internals.managers.BlockManager", (), state)
-    return Call("pandas.core.frame.DataFrame", (), {"_data": manager, "_typ": "dataframe", "_metadata": []})
+    return Call(
+        "pandas.core.frame.DataFrame", (), {"_data": manager, "_typ": "dataframe", "_metadata": []}
+    )
 
 
 def write_table(path: Path, columns: dict[str, Any]) -> None:
@@ -86,7 +116,8 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 def drive(count: int) -> tuple[np.ndarray, np.ndarray]:
     """(P,) times and (P, 4, 4) poses of a vehicle that turns, ten a second."""
-    times, poses = 1.5e9 + 0.1 * np.arange(count), np.tile(np.eye(4), (count, 1, 1))
+    times = 1.5e9 + 0.1 * np.arange(count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
     for i, pose in enumerate(poses):
         yaw = 0.4 + 0.05 * i
         pose[:2, :2] = [(np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))]
@@ -102,14 +133,20 @@ def quaternion(pose: np.ndarray) -> dict[str, float]:
 
 def write_track(folder: Path, times: np.ndarray, poses: np.ndarray) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    headings = [{"position": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), "heading": quaternion(pose)}
-                for pose in poses]  # fmt: skip
+    headings = [
+        {
+            "position": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+            "heading": quaternion(pose),
+        }
+        for pose in poses
+    ]
     (folder / "poses.json").write_text(json.dumps(headings))
     (folder / "timestamps.json").write_text(json.dumps(times.tolist()))
 
 
 def measured(seed: int, sensor: str = "pandar64", count: int = 400) -> tuple[Scan, np.ndarray]:
-    """A scan as the sensor measures it, with points on its beams, and the time of each point relative to the scan."""
+    """A scan as the sensor measures it, with points on its beams, and the time of each point
+    relative to the scan."""
     rng = np.random.default_rng(seed)
     scan = random_scan(load_sensor(sensor), count, seed)
     distance = np.linalg.norm(scan.points, axis=1)
@@ -135,7 +172,8 @@ CUBOIDS = {
 
 
 def write_pandaset(root: Path, count: int = 3) -> list[Path]:
-    """A sequence with both sensors, labels, cuboids and a camera without images; the tables of the points."""
+    """A sequence with both sensors, labels, cuboids and a camera without images; the tables of the
+    points."""
     folder = root / "007"
     times, poses = drive(max(count, 2))
     write_track(folder / "lidar", times, poses)
@@ -149,11 +187,18 @@ def write_pandaset(root: Path, count: int = 3) -> list[Path]:
         for device, name in enumerate(("pandar64", "pandar_gt")):
             scan, time = measured(i, name)
             moving = interpolate_poses(times, poses, times[i] + time) @ MOUNTS[name]
-            world = np.einsum("nij,nj->ni", moving[:, :3, :3], scan.points.astype(np.float64)) + moving[:, :3, 3]
+            world = (
+                np.einsum("nij,nj->ni", moving[:, :3, :3], scan.points.astype(np.float64))
+                + moving[:, :3, 3]
+            )
             intensity = np.round(scan.reflectance.astype(np.float64) * 255)
-            parts.append(np.column_stack([world, intensity, times[i] + time, np.full(len(scan), device)]))
+            parts.append(
+                np.column_stack([world, intensity, times[i] + time, np.full(len(scan), device)])
+            )
         rows = np.concatenate(parts)
-        write_table(path, dict(zip("xyzit", rows.T, strict=False)) | {"d": rows[:, 5].astype(np.int64)})
+        write_table(
+            path, dict(zip("xyzit", rows.T, strict=False)) | {"d": rows[:, 5].astype(np.int64)}
+        )
         classes = np.random.default_rng(i).integers(1, 43, len(rows))
         write_table(folder / "annotations" / "semseg" / path.name, {"class": classes})
         write_table(folder / "annotations" / "cuboids" / path.name, CUBOIDS)

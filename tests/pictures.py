@@ -12,10 +12,13 @@ from PIL import Image
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.geometry.sensor import Sensor
 
-SMALL = Sensor("small", columns=64, rows=16, fov_up=10.0, fov_down=-30.0, range_min=1.0, range_max=80.0)
+SMALL = Sensor(
+    "small", columns=64, rows=16, fov_up=10.0, fov_down=-30.0, range_min=1.0, range_max=80.0
+)
 
 
-CAR, ROAD = TRAIN_ID["car"], TRAIN_ID["road"]
+CAR = TRAIN_ID["car"]
+ROAD = TRAIN_ID["road"]
 
 
 def page_data(page: str) -> dict[str, Any]:

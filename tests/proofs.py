@@ -17,7 +17,9 @@ from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.objects import LABELS
 
-TOWN_SENSOR = Sensor("small town", columns=512, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0)
+TOWN_SENSOR = Sensor(
+    "small town", columns=512, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0
+)
 
 
 class Scans(list[Scan]):
@@ -38,24 +40,42 @@ def drives(count: int = 3, scans: int = 4) -> Scans:
 
 
 def job(name: str, folder: Path, iterations: int = 20, ratio: float | None = None) -> Job:
-    """A training on four scans, with pools of other scans and a bank of their cars as pedestrians."""
-    real, other = [street(i, boxes=False) for i in range(4)], [street(100 + i) for i in range(3)]
+    """A training on four scans, with pools of other scans and a bank of their cars as
+    pedestrians."""
+    real = [street(i, boxes=False) for i in range(4)]
+    other = [street(100 + i) for i in range(3)]
     write_scans(other, folder / "pool")
     bank = ObjectBank.from_scans(other)
-    named = replace(bank, boxes=replace(bank.boxes, names=("Pedestrian",) * len(bank)),
-                    label=np.full_like(bank.label, LABELS["Pedestrian"]))  # fmt: skip
+    named = replace(
+        bank,
+        boxes=replace(bank.boxes, names=("Pedestrian",) * len(bank)),
+        label=np.full_like(bank.label, LABELS["Pedestrian"]),
+    )
     named.save(folder / "pool" / "objects.npz")
     pool = read_pool(folder / "pool")
     pools = dict.fromkeys(("town", "skin", "generator"), pool)
     return Job(
-        Row(name, ratio), "left out", 3, real, [street(9, boxes=False)], pools, named, iterations, 2, (4, 8), False,
-        folder / "job", dict.fromkeys(pools, folder / "pool"),
-    )  # fmt: skip
+        Row(name, ratio),
+        "left out",
+        3,
+        real,
+        [street(9, boxes=False)],
+        pools,
+        named,
+        iterations,
+        2,
+        (4, 8),
+        False,
+        folder / "job",
+        dict.fromkeys(pools, folder / "pool"),
+    )
 
 
 def write_town(root: Path, streets: int, frames: Sequence[int]) -> Path:
-    """Write scans of some streets of the town in SemanticKITTI's layout, as one sequence with poses."""
-    town, writer = Town(0, TOWN_SENSOR, streets * STRETCH_FRAMES), SemanticKITTIWriter(root)
+    """Write scans of some streets of the town in SemanticKITTI's layout, as one sequence with
+    poses."""
+    town = Town(0, TOWN_SENSOR, streets * STRETCH_FRAMES)
+    writer = SemanticKITTIWriter(root)
     for index, (number, frame) in enumerate((s, f) for s in range(streets) for f in frames):
         writer.write(town[number * STRETCH_FRAMES + frame], index, name=f"00/{index:06d}")
     writer.finish()

@@ -1,4 +1,5 @@
-"""Read banks and planned epochs with a copy of ``reader.py`` alone, and compare them with expected arrays, bit for bit.
+"""Read banks and planned epochs with a copy of ``reader.py`` alone, and compare them with expected
+arrays, bit for bit.
 
     python read_alone.py FOLDER_OF_READER CASES
 
@@ -29,9 +30,12 @@ def scan_arrays(scan):
 
 def main():
     """Compares all cases."""
-    cases, scans, samples = Path(sys.argv[2]), 0, 0
+    cases = Path(sys.argv[2])
+    scans = 0
+    samples = 0
     for folder in sorted((cases / "banks").iterdir()):
-        bank, found = reader.Bank(folder / "bank"), {}
+        bank = reader.Bank(folder / "bank")
+        found = {}
         bank.verify()
         for number in range(len(bank)):
             found.update({f"{number} image {name}": v for name, v in bank.image(number).items()})
@@ -41,19 +45,24 @@ def main():
     for folder in sorted((cases / "plans").iterdir()):
         name, real = (folder / "bank.txt").read_text().splitlines()
         bank = reader.Bank(cases / "banks" / name / "bank")
-        train, found = reader.MixedEpochs(folder / "plan.npz", range(int(real)), bank), {}
+        train = reader.MixedEpochs(folder / "plan.npz", range(int(real)), bank)
+        found = {}
         for epoch in range(len(train.settings["lengths"])):
             train.set_epoch(epoch)
             for position in range(len(train)):
                 sample = train[position]
-                values = {"real": np.array(sample)} if isinstance(sample, int) else scan_arrays(sample)
+                values = (
+                    {"real": np.array(sample)} if isinstance(sample, int) else scan_arrays(sample)
+                )
                 found.update({f"{epoch} {position} {key}": value for key, value in values.items()})
                 assert train.domain(position) == (not isinstance(sample, int))
                 samples += 1
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
     heavy = {"torch", "numba", "deflate", "lidar_synth"} & set(sys.modules)
     assert not heavy, heavy
-    versions = f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
+    versions = (
+        f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
+    )
     print(f"{versions}: {scans} scans and {samples} samples are equal, bit for bit")
 
 

@@ -1,4 +1,5 @@
-"""Banks and plans of every option, and the package's own reading of them, for tests of ``integrations/reader.py``."""
+"""Banks and plans of every option, and the package's own reading of them, for tests of
+``integrations/reader.py``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,9 @@ from lidar_synth.mixing import MixedScans
 
 ALL = ("reflectance", "label", "confidence")
 BOXED = (*ALL, "instance", "boxes")
-LASERS = Sensor("lasers", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5), heights=(0.1,) * 6)
+LASERS = Sensor(
+    "lasers", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5), heights=(0.1,) * 6
+)
 
 
 def images(count: int = 5, sensor: Sensor | None = None) -> list[Any]:
@@ -32,24 +35,33 @@ def images(count: int = 5, sensor: Sensor | None = None) -> list[Any]:
 def at_limits() -> list[Any]:
     """A range image with returns at both limits of the sensor."""
     [image] = images(1)
-    image.range[image.mask] = np.resize([image.sensor.range_min, image.sensor.range_max], image.mask.sum())
+    image.range[image.mask] = np.resize(
+        [image.sensor.range_min, image.sensor.range_max], image.mask.sum()
+    )
     return [image]
 
 
 def conditional(root: Path) -> None:
     """A bank of a conditional model."""
-    facts = some_facts(condition={"kind": "semantic", "source": "kitti360", "split": "r2flow/train"})
+    facts = some_facts(
+        condition={"kind": "semantic", "source": "kitti360", "split": "r2flow/train"}
+    )
     entry = Entry("shard-00000.h5", 5, 7, 2)
     root.mkdir()
-    with ShardWriter(root / entry.file, facts, entry, conditions=["drive/0000000007", "drive/8"]) as writer:
+    with ShardWriter(
+        root / entry.file, facts, entry, conditions=["drive/0000000007", "drive/8"]
+    ) as writer:
         for image in images(2):
             writer.append(image)
     path = root / entry.file
-    write_bank_files(root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),)))
+    write_bank_files(
+        root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),))
+    )
 
 
 def curated(root: Path) -> None:
-    """A bank of which scans are dropped at the beginning, in the middle and at the end of shards."""
+    """A bank of which scans are dropped at the beginning, in the middle and at the end of
+    shards."""
     write_bank(root.with_name("original"), images(8), shard_size=3)
     drop(Bank(root.with_name("original")), [0, 4, 7], "by hand", root, progress=False)
 
@@ -96,11 +108,18 @@ EPOCHS = 3
 
 def expected_scans(root: Path) -> dict[str, Any]:
     """Arrays of every scan of a bank, as the package reads them."""
-    bank, found = Bank(root), dict[str, Any]()
+    bank = Bank(root)
+    found = dict[str, Any]()
     for number in range(len(bank)):
-        image, scan = bank.image(number), bank[number]
-        found |= {f"{number} image {name}": v for name, v in {"range": image.range, **image.channels}.items()}
-        found |= {f"{number} {name}": v for name, v in {"points": scan.points, **scan.fields()}.items()}
+        image = bank.image(number)
+        scan = bank[number]
+        found |= {
+            f"{number} image {name}": v
+            for name, v in {"range": image.range, **image.channels}.items()
+        }
+        found |= {
+            f"{number} {name}": v for name, v in {"points": scan.points, **scan.fields()}.items()
+        }
         found[f"{number} id"] = np.array(scan.id)
         if image.boxes is not None:
             found[f"{number} image boxes"] = encode_boxes(image.boxes)[: len(image.boxes)]
@@ -110,14 +129,22 @@ def expected_scans(root: Path) -> dict[str, Any]:
 
 def boxes_of(scan: Scan) -> dict[str, Any]:
     """The arrays of a scan's boxes."""
-    return {} if scan.boxes is None else {"boxes": scan.boxes.values, "names": np.array(scan.boxes.names)}
+    return (
+        {}
+        if scan.boxes is None
+        else {"boxes": scan.boxes.values, "names": np.array(scan.boxes.names)}
+    )
 
 
 def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[str, Any]:
     """Arrays of every sample of the first epochs, as ``MixedScans`` gives them."""
-    options = {key: value for key, value in settings.items() if key not in ("labels", "label_options")}
+    options = {
+        key: value for key, value in settings.items() if key not in ("labels", "label_options")
+    }
     bank = Bank(root)
-    policy = make_policy(settings.get("labels", "generated"), fields=bank.fields, **settings.get("label_options", {}))
+    policy = make_policy(
+        settings.get("labels", "generated"), fields=bank.fields, **settings.get("label_options", {})
+    )
     mixed = MixedScans.wrap(
         range(real), bank, to_sample=lambda scan, rng: scan, compare=False, labels=policy, **options
     )
@@ -128,22 +155,31 @@ def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[st
             if isinstance(sample, int):
                 found[f"{epoch} {position} real"] = np.array(sample)
                 continue
-            values = {"points": sample.points, **sample.fields(), **boxes_of(sample), "id": np.array(sample.id)}
+            values = {
+                "points": sample.points,
+                **sample.fields(),
+                **boxes_of(sample),
+                "id": np.array(sample.id),
+            }
             found |= {f"{epoch} {position} {name}": value for name, value in values.items()}
     return found
 
 
 def write_cases(folder: Path) -> None:
-    """Write every bank to ``banks/<name>`` and every plan to ``plans/<name>.npz``, each with its expected arrays."""
+    """Write every bank to ``banks/<name>`` and every plan to ``plans/<name>.npz``, each with its
+    expected arrays."""
     for name, write in BANKS.items():
         root = folder / "banks" / name / "bank"
         root.parent.mkdir(parents=True)
         write(root)
         np.savez(root.with_name("expected.npz"), **expected_scans(root))
     for name, (bank, real, settings) in MIXTURES.items():
-        root, plan = folder / "banks" / bank / "bank", folder / "plans" / name
+        root = folder / "banks" / bank / "bank"
+        plan = folder / "plans" / name
         plan.mkdir(parents=True)
         (plan / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root), **settings}))
-        write_plan({"synthetic": str(root), **settings}, plan / "plan.npz", real=real, epochs=EPOCHS)
+        write_plan(
+            {"synthetic": str(root), **settings}, plan / "plan.npz", real=real, epochs=EPOCHS
+        )
         (plan / "bank.txt").write_text(f"{bank}\n{real}\n")
         np.savez(plan / "expected.npz", **expected_samples(root, real, settings))

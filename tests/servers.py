@@ -65,16 +65,22 @@ def serve(root: Path) -> Iterator[Served]:
             if name in served.broken or not path.is_file():
                 self._answer(500 if name in served.broken else 404, b"", {})
                 return
-            content, wanted = path.read_bytes(), re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+            content = path.read_bytes()
+            wanted = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
             if wanted is None or not served.ranges:
                 self._answer(200, content, {})
                 return
-            first, last = int(wanted[1]), int(wanted[2] or len(content) - 1)
+            first = int(wanted[1])
+            last = int(wanted[2] or len(content) - 1)
             if first >= len(content):
                 self._answer(416, b"", {"Content-Range": f"bytes */{len(content)}"})
                 return
             part = content[first : last + 1]
-            self._answer(206, part, {"Content-Range": f"bytes {first}-{first + len(part) - 1}/{len(content)}"})
+            self._answer(
+                206,
+                part,
+                {"Content-Range": f"bytes {first}-{first + len(part) - 1}/{len(content)}"},
+            )
 
         def _stream(self) -> None:
             self.send_response(200)

@@ -1,4 +1,5 @@
-"""Python and YAML of documents, checked without running them: imports, names, and settings as what they are."""
+"""Python and YAML of documents, checked without running them: imports, names, and settings as what
+they are."""
 
 import ast
 import re
@@ -28,7 +29,9 @@ def check_python(code: str) -> None:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lidar_synth"):
             known = names_of(str(node.module))
-            assert all(alias.name in known for alias in node.names), f"{node.module} has not all of {ast.unparse(node)}"
+            assert all(alias.name in known for alias in node.names), (
+                f"{node.module} has not all of {ast.unparse(node)}"
+            )
     for module in re.findall(r"[\"'](lidar_synth\.[\w.]+)[\"']", code):
         assert find_spec(module), f"there is no module {module}"
     adapters = "\n".join(path.read_text() for path in (ROOT / "integrations").glob("*.py"))
@@ -37,7 +40,8 @@ def check_python(code: str) -> None:
 
 
 def names_of(module: str) -> set[str]:
-    """What can be imported from a module; from its source where the trainer that it imports is not installed."""
+    """What can be imported from a module; from its source where the trainer that it imports is not
+    installed."""
     try:
         found = import_module(module)
         return set(dir(found)) | set(getattr(found, "__all__", ()))
@@ -49,7 +53,8 @@ def names_of(module: str) -> set[str]:
 
 
 def check_yaml(code: str, path: Path) -> None:
-    """Read settings as what they are: those of a mixture, a sensor, a layout, a recipe, or some keys of these.
+    """Read settings as what they are: those of a mixture, a sensor, a layout, a recipe, or some
+    keys of these.
 
     Args:
         code: the settings.
@@ -65,5 +70,10 @@ def check_yaml(code: str, path: Path) -> None:
     elif set(values) & {"base", "network"}:
         load_config(DistillConfig if "teacher" in values else TrainConfig, path)
     else:
-        keys = {*OPTIONS, *TrainConfig.model_fields, *DistillConfig.model_fields, *BakeJob.model_fields}
+        keys = {
+            *OPTIONS,
+            *TrainConfig.model_fields,
+            *DistillConfig.model_fields,
+            *BakeJob.model_fields,
+        }
         assert set(values) <= keys, f"keys {sorted(set(values) - keys)} are known nowhere"

@@ -1,4 +1,5 @@
-"""Small "real" and synthetic datasets on disk for the tests of trainers, in every layout that the trainers read."""
+"""Small "real" and synthetic datasets on disk for the tests of trainers, in every layout that the
+trainers read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,9 @@ from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor("small", 256, 2.0, 80.0, rows=32, fov_up=3.0, fov_down=-25.0)
 CAMERA = Calibration(
-    np.array([(700.0, 0, 600, 0), (0, 700, 250, 0), (0, 0, 1, 0)]), AXES_CAMERA_FROM_SENSOR, (1200, 700)
+    np.array([(700.0, 0, 600, 0), (0, 700, 250, 0), (0, 0, 1, 0)]),
+    AXES_CAMERA_FROM_SENSOR,
+    (1200, 700),
 )
 
 
@@ -22,7 +25,9 @@ def street(seed: int, boxes: bool = True) -> Scan:
     """A street with two cars ahead of the sensor, 7 to 18 m away, and one behind it."""
     rng = np.random.default_rng(seed)
     cars = [car(rng.uniform(7, 18), y, rng.uniform(-3, 3)) for y in (-2.5, 2.5)] + [car(-9, 2, 0.3)]
-    scan = cast(cars, [wall(20, -9), wall(20, 9), wall(30, 0, 1.5)], sensor=SENSOR, id=f"street-{seed}")
+    scan = cast(
+        cars, [wall(20, -9), wall(20, 9), wall(30, 0, 1.5)], sensor=SENSOR, id=f"street-{seed}"
+    )
     scan.reflectance = rng.random(len(scan)).astype(np.float32)
     assert scan.boxes is not None
     seen = replace(scan.boxes, occlusion=np.zeros(3, np.int8), truncation=np.zeros(3, np.float32))
@@ -51,7 +56,7 @@ def synthetic(root: Path, count: int, boxes: bool = True, labels: bool = True) -
 
 
 def held(boxes: Boxes, points: np.ndarray) -> np.ndarray:
-    """(M,) number of points in each box, enlarged by 2 cm on each side to contain all returns of a car; without the
-    road."""
+    """(M,) number of points in each box, enlarged by 2 cm on each side to contain all returns of a
+    car; without the road."""
     wide = boxes.values + np.array([0, 0, 0, 0.04, 0.04, 0.04, 0], np.float32)
     return Boxes(wide, boxes.names).contain(points, 0.1).sum(1)

@@ -1,4 +1,5 @@
-"""tools/ablation.py: students learn from recorded parts of trajectories what they would learn from the teacher."""
+"""tools/ablation.py: students learn from recorded parts of trajectories what they would learn from
+the teacher."""
 
 import pytest
 import torch
@@ -20,7 +21,9 @@ def test_a_student_learns_the_recorded_slope_within_the_recorded_part(
     interval = torch.arange(6) % (len(student.parts) - 1)
     start, end = (torch.tensor(student.parts)[interval + k].view(-1, 1, 1, 1) for k in (0, 1))
     begin = torch.lerp(y0, y1, start)
-    y, t, v = supervision(student, {"y0": y0, "y1": y1, "interval": interval, "slope": slope}, draws)
+    y, t, v = supervision(
+        student, {"y0": y0, "y1": y1, "interval": interval, "slope": slope}, draws
+    )
     for state, time, velocity in zip(y, t, v, strict=True):
         part = int((slope - velocity).flatten(1).abs().sum(1).argmin())
         assert torch.allclose(velocity, slope[part], atol=1e-5)

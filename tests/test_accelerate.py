@@ -1,4 +1,5 @@
-"""Mixtures in Accelerate's loaders with two processes: the epoch that was set or resumed, each sample once."""
+"""Mixtures in Accelerate's loaders with two processes: the epoch that was set or resumed, each
+sample once."""
 
 import os
 import socket
@@ -32,7 +33,9 @@ def number(scan: Scan, rng: Any) -> torch.Tensor:
 
 def mixed() -> MixedScans:
     """47 samples an epoch."""
-    return MixedScans(Scans("r", 37), Endless(), FALLING, epoch_size=47, to_sample=number, collate=torch.stack)
+    return MixedScans(
+        Scans("r", 37), Endless(), FALLING, epoch_size=47, to_sample=number, collate=torch.stack
+    )
 
 
 def planned(epoch: int, start: int = 0) -> list[int]:
@@ -109,7 +112,8 @@ def check_refusals(accelerator: Any) -> None:
 
 
 def check_unprepared(accelerator: Any) -> None:
-    """Accelerate's own sharing from epoch 0 on, which repeats samples; and a loader that it does not know."""
+    """Accelerate's own sharing from epoch 0 on, which repeats samples; and a loader that it does
+    not know."""
     ours = accelerator.prepare(batched(mixed(), 0, rank=0, world_size=1))
     theirs = accelerator.prepare(DataLoader(mixed(), 4, collate_fn=torch.stack))
     for epoch in (0, 1):

@@ -1,4 +1,5 @@
-"""Adaptation of a model to the sensor and the scans of a user, end to end on a tiny sensor, kill and resumption too."""
+"""Adaptation of a model to the sensor and the scans of a user, end to end on a tiny sensor, kill
+and resumption too."""
 
 import json
 import os
@@ -46,9 +47,15 @@ from lidar_synth.lab.train.adaptation.stages import TOWN_SEED
 from lidar_synth.lab.train.held_out import read_history
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
-OWN = Sensor("own", 120, 1.0, 100.0, elevations=tuple(np.linspace(2, -24, 16) - np.linspace(-1, 1, 16) ** 2))
+OWN = Sensor(
+    "own", 120, 1.0, 100.0, elevations=tuple(np.linspace(2, -24, 16) - np.linspace(-1, 1, 16) ** 2)
+)
 """The user's sensor: rows of uneven elevation, another number of columns."""
-SHORT = {"save_every": 2, "held_out": {"samples": 4, "patience": 2}, "recipe": {"warmup": 1, "batch": 2}}
+SHORT = {
+    "save_every": 2,
+    "held_out": {"samples": 4, "patience": 2},
+    "recipe": {"warmup": 1, "batch": 2},
+}
 STAGES = ("labels", "codec", "flow_town", "flow", "student")
 QUICK = dict.fromkeys(STAGES, SHORT)
 
@@ -56,7 +63,8 @@ QUICK = dict.fromkeys(STAGES, SHORT)
 @pytest.fixture(autouse=True, scope="module")
 def short() -> Iterator[None]:
     """One thread, and few scans to look for copies."""
-    threads, count = torch.get_num_threads(), card.GENERATED
+    threads = torch.get_num_threads()
+    count = card.GENERATED
     torch.set_num_threads(1)
     card.GENERATED = 3
     yield
@@ -65,27 +73,53 @@ def short() -> Iterator[None]:
 
 
 def tiny_model(path: Path, semantic: bool = False) -> Path:
-    """A latent model of the tiny sensor with random weights: the architectures of ``town-dense``, ``town-semantic``."""
+    """A latent model of the tiny sensor with random weights: the architectures of ``town-dense``,
+    ``town-semantic``."""
     torch.manual_seed(0)
     size = sum(CHANNELS.values())
-    codec = {"resolution": list(TINY.shape), "channels": size, "encoder_widths": [8, 16], "widths": [8, 16],
-             "reaches": [1], "depth": 1}  # fmt: skip
-    flow = {"resolution": [4, 8], "channels": 8, "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2],
-            "patch": [1, 1], "window": [3, 3]}  # fmt: skip
+    codec = {
+        "resolution": list(TINY.shape),
+        "channels": size,
+        "encoder_widths": [8, 16],
+        "widths": [8, 16],
+        "reaches": [1],
+        "depth": 1,
+    }
+    flow = {
+        "resolution": [4, 8],
+        "channels": 8,
+        "width": 16,
+        "time_width": 16,
+        "depths": [1, 1],
+        "heads": [2, 2],
+        "patch": [1, 1],
+        "window": [3, 3],
+    }
     parts = {CODEC: NetworkSpec("surfaces", codec), VELOCITY: NetworkSpec("hdit", flow)}
     if semantic:
-        maps = {"resolution": list(TINY.shape), "target": [4, 8], "channels": 6, "method": "patches"}
+        maps = {
+            "resolution": list(TINY.shape),
+            "target": [4, 8],
+            "channels": 6,
+            "method": "patches",
+        }
         parts |= {ENCODER: NetworkSpec("semantic_map", maps)}
         flow["condition_channels"] = 6
     angles = torch.nn.functional.avg_pool2d(torch.from_numpy(TINY.ray_angles())[None], (4, 16))[0]
     needed = {VELOCITY: {"angles": angles}}
-    networks = {name: build_network(part.architecture, part.arguments | needed.get(name, {}))
-                for name, part in parts.items()}  # fmt: skip
+    networks = {
+        name: build_network(part.architecture, part.arguments | needed.get(name, {}))
+        for name, part in parts.items()
+    }
     header = Header(
-        parts, TINY, NORMALISATIONS["r2flow"], tuple(CHANNELS), (1.0, 0.6, 0.0),
+        parts,
+        TINY,
+        NORMALISATIONS["r2flow"],
+        tuple(CHANNELS),
+        (1.0, 0.6, 0.0),
         {"data": "none", "data_licence": "none", "licence": "MIT"},
         conditioning={"semantic": {"dropout": 0.1}} if semantic else {},
-    )  # fmt: skip
+    )
     save_checkpoint(path, header, networks)
     return path
 
@@ -122,7 +156,9 @@ def scans(own_scans: list[Scan], tmp_path_factory: pytest.TempPathFactory) -> Pa
 @pytest.fixture(scope="module")
 def adapted(model: Path, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("adapted") / "mine.safetensors"
-    return adapt(model, scans, out, minutes=0.02, town=4, licence="CC0", overrides=QUICK, progress=False)
+    return adapt(
+        model, scans, out, minutes=0.02, town=4, licence="CC0", overrides=QUICK, progress=False
+    )
 
 
 def test_an_adapted_model_generates_scans_of_the_users_sensor_with_labels(adapted: Path) -> None:
@@ -152,7 +188,9 @@ def test_the_autoencoder_rehearses_the_town(adapted: Path) -> None:
     assert overlap(seen_by(facts), town(TOWN_SEED))
 
 
-def test_the_provenance_has_the_scans_and_a_test_on_them_is_refused(adapted: Path, scans: Path, tmp_path: Path) -> None:
+def test_the_provenance_has_the_scans_and_a_test_on_them_is_refused(
+    adapted: Path, scans: Path, tmp_path: Path
+) -> None:
     header = read_header(adapted)[0]
     facts = header.provenance
     assert (facts["licence"], facts["adapted_from"]) == ("CC0", "tiny")
@@ -160,7 +198,11 @@ def test_the_provenance_has_the_scans_and_a_test_on_them_is_refused(adapted: Pat
     seen = seen_by(facts)
     assert overlap(seen, measured(open_scans(scans), layout_of(scans), scans, None))
     source = open_scans(scans)
-    for places, known in (((0, 3), True), ((11, 13), True), ((10,), False)):  # 10 was left out between both
+    for places, known in (
+        ((0, 3), True),
+        ((11, 13), True),
+        ((10,), False),
+    ):  # 10 was left out between both
         copy = write(tmp_path / f"copy{places[0]}", [source[i] for i in places])
         reference = measured(open_scans(copy), layout_of(copy), copy, None, seen)
         assert bool(overlap(seen, reference)) == known, places
@@ -191,9 +233,19 @@ def test_the_card_says_what_was_learnt_and_whether_it_repeats(adapted: Path) -> 
         assert part in text, part
 
 
-def test_a_model_of_label_maps_is_adapted_with_its_encoder(scans: Path, own_scans: list[Scan], tmp_path: Path) -> None:
+def test_a_model_of_label_maps_is_adapted_with_its_encoder(
+    scans: Path, own_scans: list[Scan], tmp_path: Path
+) -> None:
     model = tiny_model(tmp_path / "maps.safetensors", semantic=True)
-    out = adapt(model, scans, tmp_path / "mine.safetensors", minutes=0.02, town=2, overrides=QUICK, progress=False)
+    out = adapt(
+        model,
+        scans,
+        tmp_path / "mine.safetensors",
+        minutes=0.02,
+        town=2,
+        overrides=QUICK,
+        progress=False,
+    )
     generator = load_generator(out)
     assert (generator.condition, generator.sensor.shape) == ("semantic", (16, 128))
     wanted = project(own_scans[0], generator.sensor, ["label"]).channels["label"]
@@ -208,8 +260,18 @@ def test_a_model_of_label_maps_is_adapted_with_its_encoder(scans: Path, own_scan
 def test_scans_without_labels_get_those_that_the_autoencoder_learnt_on_the_town(
     model: Path, own_scans: list[Scan], tmp_path: Path
 ) -> None:
-    bare = write(tmp_path / "bare", [replace(scan, label=None, raw_label=None) for scan in own_scans])
-    out = adapt(model, bare, tmp_path / "mine.safetensors", minutes=0.02, town=2, overrides=QUICK, progress=False)
+    bare = write(
+        tmp_path / "bare", [replace(scan, label=None, raw_label=None) for scan in own_scans]
+    )
+    out = adapt(
+        model,
+        bare,
+        tmp_path / "mine.safetensors",
+        minutes=0.02,
+        town=2,
+        overrides=QUICK,
+        progress=False,
+    )
     card = out.with_suffix(".md").read_text()
     assert "guesses" in card and "labels that are right" not in card  # nobody knows which are
     work = out.with_suffix(".adapt")
@@ -220,18 +282,27 @@ def test_scans_without_labels_get_those_that_the_autoencoder_learnt_on_the_town(
 
 
 @pytest.mark.slow
-def test_a_killed_adaptation_is_resumed(model: Path, scans: Path, adapted: Path, tmp_path: Path) -> None:
-    """Killed in its first training, it goes on from the saved step, and ends as one that was never stopped."""
-    out, code = tmp_path / "mine.safetensors", tmp_path / "run.py"
+def test_a_killed_adaptation_is_resumed(
+    model: Path, scans: Path, adapted: Path, tmp_path: Path
+) -> None:
+    """Killed in its first training, it goes on from the saved step, and ends as one that was never
+    stopped."""
+    out = tmp_path / "mine.safetensors"
+    code = tmp_path / "run.py"
     code.write_text(
         "import torch; torch.set_num_threads(1)\nfrom lidar_synth import adapt\n"
         f"adapt({str(model)!r}, {str(scans)!r}, {str(out)!r}, minutes=5, town=0, licence='CC0',\n"
-        f"      overrides={ {name: SHORT | {'held_out': {'samples': 4, 'patience': 99}} for name in STAGES}!r})\n"
+        "      "
+        f"overrides={ {name: SHORT | {'held_out': {'samples': 4, 'patience': 99}} for name in STAGES}!r})\n"
     )
-    process = subprocess.Popen([sys.executable, str(code)], env=os.environ | {"OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(
+        [sys.executable, str(code)], env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
     history = tmp_path / "mine.adapt" / "codec" / "held_out.json"
     limit = time.monotonic() + 300
-    while time.monotonic() < limit and not (history.is_file() and len(json.loads(history.read_text())) > 2):
+    while time.monotonic() < limit and not (
+        history.is_file() and len(json.loads(history.read_text())) > 2
+    ):
         assert process.poll() is None, "it ended by itself"
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
@@ -239,22 +310,41 @@ def test_a_killed_adaptation_is_resumed(model: Path, scans: Path, adapted: Path,
     before = json.loads(history.read_text())
     prepared = (tmp_path / "mine.adapt" / "scans" / "train" / "000000.npz").stat().st_mtime_ns
     longer = {name: SHORT | {"held_out": {"samples": 4, "patience": 99}} for name in STAGES}
-    adapt(model, scans, out, minutes=before[-1][2] / 60 + 0.05, town=0, licence="CC0", overrides=longer, progress=False)
+    adapt(
+        model,
+        scans,
+        out,
+        minutes=before[-1][2] / 60 + 0.05,
+        town=0,
+        licence="CC0",
+        overrides=longer,
+        progress=False,
+    )
     after = json.loads(history.read_text())
     shared = len(before) - 1  # the last one may be after the last saved state
     assert after[:shared] == before[:shared] and after[-1][0] > before[-1][0]
-    assert (tmp_path / "mine.adapt" / "scans" / "train" / "000000.npz").stat().st_mtime_ns == prepared
+    assert (
+        tmp_path / "mine.adapt" / "scans" / "train" / "000000.npz"
+    ).stat().st_mtime_ns == prepared
     assert load_generator(out).sensor == load_generator(adapted).sensor
     with pytest.raises(ConfigError, match="which exists"):
         adapt(model, scans, out)
 
 
-def test_a_dry_run_prints_the_plan_and_writes_nothing(model: Path, scans: Path, tmp_path: Path) -> None:
+def test_a_dry_run_prints_the_plan_and_writes_nothing(
+    model: Path, scans: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "mine.safetensors"
     text = call("adapt", model, "--scans", scans, "--out", out, "--minutes", "60", "--dry-run")
-    for part in ("own: 16 x 120, as 16 x 128 cells", "10 scans to train on, 1 left out, 3 held out", "flow_town"):
+    for part in (
+        "own: 16 x 120, as 16 x 128 cells",
+        "10 scans to train on, 1 left out, 3 held out",
+        "flow_town",
+    ):
         assert part in text, part
-    assert sum(float(line.split()[1]) for line in text.splitlines() if line.startswith("  ")) == pytest.approx(60, 0.01)
+    assert sum(
+        float(line.split()[1]) for line in text.splitlines() if line.startswith("  ")
+    ) == pytest.approx(60, 0.01)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -263,7 +353,15 @@ def test_a_pixel_model_is_adapted_too(own_scans: list[Scan], tmp_path: Path) -> 
     path = write_pixel_model(tmp_path / "pixel.safetensors")
     own = replace(OWN, elevations=OWN.elevations[::2] if OWN.elevations else None, columns=40)
     folder = write(tmp_path / "scans", of_town(own, 12))
-    out = adapt(path, folder, tmp_path / "mine.safetensors", minutes=0.02, town=0, overrides=QUICK, progress=False)
+    out = adapt(
+        path,
+        folder,
+        tmp_path / "mine.safetensors",
+        minutes=0.02,
+        town=0,
+        overrides=QUICK,
+        progress=False,
+    )
     assert load_generator(out).sensor.shape == (8, 40)
     assert not (tmp_path / "mine.adapt" / "codec").exists()
 
@@ -280,7 +378,9 @@ def broken(own: list[Scan], kind: str) -> list[Scan]:
         return [*own[:5], replace(own[5], points=up), *own[6:]]
     if kind == "some labels":
         return [*own[:5], replace(own[5], label=None, raw_label=None), *own[6:]]
-    return [replace(scan, label=np.full(len(scan), IGNORE, np.uint8), raw_label=None) for scan in own]
+    return [
+        replace(scan, label=np.full(len(scan), IGNORE, np.uint8), raw_label=None) for scan in own
+    ]
 
 
 @pytest.mark.parametrize(
@@ -317,12 +417,16 @@ def test_a_folder_without_scans_is_refused(model: Path, tmp_path: Path) -> None:
         "nothing": "model 'nothing'; expected a shipped one",
     }.items(),
 )
-def test_models_that_cannot_be_adapted_are_refused(name: str, message: str, scans: Path, tmp_path: Path) -> None:
+def test_models_that_cannot_be_adapted_are_refused(
+    name: str, message: str, scans: Path, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match=message):
         adapt(name, scans, tmp_path / "mine.safetensors")
 
 
-def test_a_resumed_adaptation_has_the_same_scans_and_model(model: Path, scans: Path, tmp_path: Path) -> None:
+def test_a_resumed_adaptation_has_the_same_scans_and_model(
+    model: Path, scans: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "mine.safetensors"
     (tmp_path / "mine.adapt").mkdir()
     (tmp_path / "mine.adapt" / "adapt.json").write_text(json.dumps({"model": "another"}))
@@ -333,11 +437,16 @@ def test_a_resumed_adaptation_has_the_same_scans_and_model(model: Path, scans: P
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"elevations": OWN.elevations[:12] if OWN.elevations else None}, "12 rows; expected a multiple of 8"),
+        (
+            {"elevations": OWN.elevations[:12] if OWN.elevations else None},
+            "12 rows; expected a multiple of 8",
+        ),
         ({"range_min": 90.0}, "expected some of 1.45 to 80.0 m"),
     ],
 )
-def test_sensors_that_the_networks_cannot_have_are_refused(changed: Any, message: str, model: Path) -> None:
+def test_sensors_that_the_networks_cannot_have_are_refused(
+    changed: Any, message: str, model: Path
+) -> None:
     with pytest.raises(ConfigError, match=message):
         fitting(replace(OWN, **changed), read_header(model)[0])
 
@@ -353,7 +462,8 @@ def test_a_model_that_is_moved_to_its_own_sensor_stays_the_same(model: Path) -> 
 
 def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(model: Path) -> None:
     held = load_checkpoint(model)
-    codec, flow = held.networks[CODEC], held.networks[VELOCITY]
+    codec = held.networks[CODEC]
+    flow = held.networks[VELOCITY]
     rows = torch.from_numpy(TINY.row_elevations().reshape(8, 2).mean(1))
     with torch.no_grad():
         codec.place_stem[:] = rows.view(1, 1, -1, 1)
@@ -364,7 +474,9 @@ def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(model: Pa
     np.testing.assert_allclose(moved[CODEC].place_stem[0, 0, :, 0].detach(), wanted, atol=1e-5)
     table = moved[VELOCITY].position.table[0, :, 0].detach()
     assert table.shape == (16,)
-    torch.testing.assert_close(table[0], 0.75 * flow.position.table[0, 0, 0] + 0.25 * flow.position.table[0, -1, 0])
+    torch.testing.assert_close(
+        table[0], 0.75 * flow.position.table[0, 0, 0] + 0.25 * flow.position.table[0, -1, 0]
+    )
 
 
 def test_the_shipped_dense_model_can_be_moved() -> None:
@@ -377,5 +489,15 @@ def test_a_sensor_file_is_taken(model: Path, scans: Path, tmp_path: Path) -> Non
     path = tmp_path / "named.yaml"
     path.write_text(sensor_yaml(replace(OWN, name="named")))
     assert yaml.safe_load(path.read_text())["named"]["columns"] == 120
-    text = call("adapt", model, "--scans", scans, "--out", tmp_path / "x.safetensors", "--sensor", path, "--dry-run")
+    text = call(
+        "adapt",
+        model,
+        "--scans",
+        scans,
+        "--out",
+        tmp_path / "x.safetensors",
+        "--sensor",
+        path,
+        "--dry-run",
+    )
     assert "sensor named: 16 x 120" in text

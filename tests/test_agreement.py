@@ -13,7 +13,15 @@ from layouts import write_all, write_kitti_raw
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, NuScenes, SemanticKITTI, open_scans
+from lidar_synth.formats import (
+    KITTI360,
+    WRITERS,
+    KITTIObject,
+    KITTIRaw,
+    NuScenes,
+    SemanticKITTI,
+    open_scans,
+)
 from lidar_synth.formats.convert import convert
 from lidar_synth.formats.description import NAME
 from lidar_synth.formats.source import ScanFiles
@@ -29,26 +37,31 @@ VLP16 = Sensor("vlp16", 1800, 0.5, 100.0, elevations=tuple(float(e) for e in ran
 
 
 def street(sensor: Sensor, seed: int = 0, tilt: float = 0.0) -> Points:
-    """Points on the beams of a sensor that stands 1.7 m above a flat road between walls, in degrees tilted forward."""
+    """Points on the beams of a sensor that stands 1.7 m above a flat road between walls, in degrees
+    tilted forward."""
     azimuth = sensor.column_azimuths().astype(np.float64)[None, :]
     elevation = sensor.laser_elevations.astype(np.float64)[:, None]
     height = np.asarray(sensor.heights or np.zeros(sensor.shape[0]))[:, None]
     rng = np.random.default_rng(seed)
     wall = 12 + 40 * np.abs(np.sin(3 * azimuth + rng.uniform(0, 6))) + 0 * elevation
-    road = np.where(elevation < -0.01, (1.7 + height) / np.sin(np.minimum(-elevation, np.pi / 2) + 1e-9), np.inf)
+    road = np.where(
+        elevation < -0.01, (1.7 + height) / np.sin(np.minimum(-elevation, np.pi / 2) + 1e-9), np.inf
+    )
     distance = np.minimum(wall / np.cos(elevation), road)
     distance = distance + rng.normal(0, 0.02, distance.shape)
     flat = distance * np.cos(elevation)
     up = distance * np.sin(elevation) + height
     points = np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], -1).reshape(-1, 3)
-    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    c = np.cos(np.radians(tilt))
+    s = np.sin(np.radians(tilt))
     points = points @ np.array([(c, 0, s), (0, 1, 0), (-s, 0, c)])
     within = np.linalg.norm(points, axis=1)
     return points[(within > sensor.range_min) & (within < sensor.range_max)].astype(np.float32)
 
 
 def quantised(points: Points) -> Points:
-    """The points as they are after a projection to the grid of an HDL-64E, one in the centre of each cell."""
+    """The points as they are after a projection to the grid of an HDL-64E, one in the centre of
+    each cell."""
     return unproject(project(Scan(points, np.zeros(len(points), np.float32), HDL64))).points
 
 
@@ -76,7 +89,10 @@ OWN: dict[str, tuple[Points, Sensor]] = {
     "HDL-32E": (street(HDL32), HDL32),
     "OS1-128": (street(OS1), OS1),
     "VLP-16": (street(VLP16), VLP16),
-    "firings without a return": (np.concatenate([street(HDL64), np.zeros((90_000, 3), np.float32)]), HDL64),
+    "firings without a return": (
+        np.concatenate([street(HDL64), np.zeros((90_000, 3), np.float32)]),
+        HDL64,
+    ),
     "few points": (street(OS1)[:900], HDL64),
     "no points": (np.zeros((0, 3), np.float32), HDL64),
     "NaN": (np.full((5000, 3), np.nan, np.float32), HDL64),
@@ -88,11 +104,27 @@ WRONG: dict[str, tuple[Points, Sensor, str]] = {
     "VLP-16 as HDL-64E": (street(VLP16), HDL64, "above 3.0 degrees.*beams have no points"),
     "HDL-64E as VLP-16": (street(HDL64), VLP16, "below -16.0 degrees"),
     "HDL-64E as HDL-32E": (street(HDL64), HDL32, "lie between the beams"),
-    "16 beams, one of four, as HDL-64E": (every_fourth(street(HDL64)), HDL64, "though beams around them have"),
-    "16 neighbouring beams as HDL-64E": (sixteen(street(HDL64)), HDL64, "7. % of the 64 beams have no points"),
-    "far points": (street(replace(HDL64, range_max=200.0)) * np.float32(3), HDL64, "farther than 80 m"),
+    "16 beams, one of four, as HDL-64E": (
+        every_fourth(street(HDL64)),
+        HDL64,
+        "though beams around them have",
+    ),
+    "16 neighbouring beams as HDL-64E": (
+        sixteen(street(HDL64)),
+        HDL64,
+        "7. % of the 64 beams have no points",
+    ),
+    "far points": (
+        street(replace(HDL64, range_max=200.0)) * np.float32(3),
+        HDL64,
+        "farther than 80 m",
+    ),
     "near points": (street(HDL64), replace(HDL64, range_min=20.0), "nearer than 20 m"),
-    "flattened": (street(HDL64) * np.array([1, 1, 0.3], np.float32), HDL64, "between the beams|no points"),
+    "flattened": (
+        street(HDL64) * np.array([1, 1, 0.3], np.float32),
+        HDL64,
+        "between the beams|no points",
+    ),
 }
 
 
@@ -110,8 +142,13 @@ def test_points_of_another_sensor(name: str) -> None:
 
 
 def test_a_tilt_puts_no_point_outside_of_the_field_of_view() -> None:
-    """A beam of a scan that leans forward looks up behind the sensor, as all beams of real scans do a little."""
-    assert agreement(street(HDL64, tilt=0.9), HDL64).outside == 0 < agreement(street(HDL64, tilt=2.5), HDL64).outside
+    """A beam of a scan that leans forward looks up behind the sensor, as all beams of real scans do
+    a little."""
+    assert (
+        agreement(street(HDL64, tilt=0.9), HDL64).outside
+        == 0
+        < agreement(street(HDL64, tilt=2.5), HDL64).outside
+    )
 
 
 def test_shares_do_not_depend_on_the_order_of_points() -> None:
@@ -123,26 +160,35 @@ def test_shares_do_not_depend_on_the_order_of_points() -> None:
 
 SENSORLESS: dict[str, Callable[[Path, Scan], object]] = {
     "kitti_raw": lambda root, scan: [
-        np.column_stack([scan.points, scan.reflectance]).tofile(path) for path in write_kitti_raw(root)
+        np.column_stack([scan.points, scan.reflectance]).tofile(path)
+        for path in write_kitti_raw(root)
     ],
     **{
         to: lambda root, scan, to=to: (write_all(to, root, [scan]), (root / NAME).unlink())  # type: ignore[misc]
         for to in ("kitti", "semantic_kitti", "kitti360")
     },
-    "npy": lambda root, scan: np.save(root / "scan.npy", np.column_stack([scan.points, scan.reflectance])),
+    "npy": lambda root, scan: np.save(
+        root / "scan.npy", np.column_stack([scan.points, scan.reflectance])
+    ),
 }
 """Writers of a scan in a layout that names no sensor."""
 
 
 def a_scan(points: Points, sensor: Sensor = OS1) -> Scan:
-    return Scan(points, np.full(len(points), 0.5, np.float32), sensor, label=np.zeros(len(points), np.uint8))
+    return Scan(
+        points, np.full(len(points), 0.5, np.float32), sensor, label=np.zeros(len(points), np.uint8)
+    )
 
 
 @pytest.mark.parametrize("layout", SENSORLESS)
-def test_readers_refuse_points_of_another_sensor_than_their_layout_has(tmp_path: Path, layout: str) -> None:
+def test_readers_refuse_points_of_another_sensor_than_their_layout_has(
+    tmp_path: Path, layout: str
+) -> None:
     SENSORLESS[layout](tmp_path, a_scan(street(OS1)))
     for on_bad in ("error", "skip", "drop-points"):
-        with pytest.raises(ConfigError, match=r"read as one of sensor 'hdl64e.*lie above 3\.0 degrees.*--sensor"):
+        with pytest.raises(
+            ConfigError, match=r"read as one of sensor 'hdl64e.*lie above 3\.0 degrees.*--sensor"
+        ):
             open_scans(tmp_path, on_bad=on_bad)[0]  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="read as one of sensor"):
         next(iter(open_scans(tmp_path)))
@@ -175,7 +221,9 @@ def test_a_conversion_that_is_refused_leaves_nothing_behind(tmp_path: Path) -> N
     with pytest.raises(ConfigError, match="hdl64e_kitti360"):
         convert(open_scans(tmp_path / "in"), WRITERS["range"](tmp_path / "out"), progress=False)
     assert not (tmp_path / "out").exists()
-    convert(open_scans(tmp_path / "in", sensor=OS1), WRITERS["range"](tmp_path / "out"), progress=False)
+    convert(
+        open_scans(tmp_path / "in", sensor=OS1), WRITERS["range"](tmp_path / "out"), progress=False
+    )
     assert open_scans(tmp_path / "out").sensor == OS1
 
 
@@ -202,8 +250,15 @@ def pandar64(folder: Path) -> Sensor:
 
 def recorded(real: Path) -> Iterator[ScanFiles]:
     """Every recorded dataset, read with its own preset."""
-    yield from (KITTI360(real / "kitti360"), SemanticKITTI(real / "semantic_kitti"), KITTIRaw(real / "kitti_raw"))
-    yield from (KITTIObject(real / "kitti_object"), KITTIObject(real / "kitti_object", reduced=True))
+    yield from (
+        KITTI360(real / "kitti360"),
+        SemanticKITTI(real / "semantic_kitti"),
+        KITTIRaw(real / "kitti_raw"),
+    )
+    yield from (
+        KITTIObject(real / "kitti_object"),
+        KITTIObject(real / "kitti_object", reduced=True),
+    )
     yield NuScenes(real / "nuscenes")
 
 
@@ -218,9 +273,17 @@ def agrees(points: Points, sensor: Sensor) -> bool:
 
 @pytest.mark.slow
 def test_every_recorded_scan_agrees_with_its_own_sensor(real_scans: Path, labelled: Path) -> None:
-    scans = [scan for source in (*recorded(real_scans), SemanticKITTI(labelled / "semantic_kitti")) for scan in source]
+    scans = [
+        scan
+        for source in (*recorded(real_scans), SemanticKITTI(labelled / "semantic_kitti"))
+        for scan in source
+    ]
     assert len(scans) > 50
-    wrong = {scan.id: agreement(scan.points, scan.sensor) for scan in scans if not agrees(scan.points, scan.sensor)}
+    wrong = {
+        scan.id: agreement(scan.points, scan.sensor)
+        for scan in scans
+        if not agrees(scan.points, scan.sensor)
+    }
     assert wrong == {}
 
 
@@ -233,7 +296,13 @@ def test_recorded_scans_contradict_other_sensors(real_scans: Path, labelled: Pat
         assert agreement(points, HDL64).outside > MOST_OUTSIDE  # refused if HDL-64E is only assumed
         assert not agrees(points, HDL32) and not agrees(points, VLP16)
     sweep = NuScenes(real_scans / "nuscenes")[0].points
-    assert agreement(sweep, HDL64).outside > MOST_OUTSIDE and not agrees(sweep, own) and not agrees(sweep, OS1)
+    assert (
+        agreement(sweep, HDL64).outside > MOST_OUTSIDE
+        and not agrees(sweep, own)
+        and not agrees(sweep, OS1)
+    )
     for scan in list(KITTI360(real_scans / "kitti360"))[::4]:
-        assert not agrees(every_fourth(scan.points), HDL64) and not agrees(sixteen(scan.points), HDL64)
+        assert not agrees(every_fourth(scan.points), HDL64) and not agrees(
+            sixteen(scan.points), HDL64
+        )
         assert not agrees(scan.points, HDL32) and not agrees(scan.points, VLP16)

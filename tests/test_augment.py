@@ -39,19 +39,32 @@ def scan_with_boxes(seed: int, count: int = 3000) -> Scan:
     scan = random_scan(SENSOR, count, seed)
     scan.ring = (locate(scan.points, SENSOR).cell // 1024).clip(0).astype(np.int16)
     scan.confidence = rng.random(count).astype(np.float32)
-    scan.pose, scan.image_path = np.eye(4), Path("image.png")
+    scan.pose = np.eye(4)
+    scan.image_path = Path("image.png")
     values = np.c_[
-        rng.uniform(-15, 15, (6, 2)), rng.uniform(-3, 1, 6), rng.uniform(2, 9, (6, 3)), rng.uniform(-4, 4, 6)
+        rng.uniform(-15, 15, (6, 2)),
+        rng.uniform(-3, 1, 6),
+        rng.uniform(2, 9, (6, 3)),
+        rng.uniform(-4, 4, 6),
     ]
-    scan.boxes = Boxes(values.astype(np.float32), ("Car", "Van", "Truck", "Tram", "Misc", "Cyclist"),
-                       truncation=rng.random(6), occlusion=rng.integers(0, 3, 6), instance=np.arange(1, 7))  # fmt: skip
+    scan.boxes = Boxes(
+        values.astype(np.float32),
+        ("Car", "Van", "Truck", "Tram", "Misc", "Cyclist"),
+        truncation=rng.random(6),
+        occlusion=rng.integers(0, 3, 6),
+        instance=np.arange(1, 7),
+    )
     margin = np.array([0, 0, 0, 2e-3, 2e-3, 2e-3, 0], np.float32)
     wide, tight = (Boxes(scan.boxes.values + m, scan.boxes.names) for m in (margin, -margin))
     return scan[(wide.contain(scan.points) == tight.contain(scan.points)).all(0)]
 
 
 def freeze(scan: Scan) -> Scan:
-    for array in (scan.points, *scan.fields().values(), *([] if scan.boxes is None else [scan.boxes.values])):
+    for array in (
+        scan.points,
+        *scan.fields().values(),
+        *([] if scan.boxes is None else [scan.boxes.values]),
+    ):
         array.setflags(write=False)
     return scan
 
@@ -61,11 +74,15 @@ def freeze(scan: Scan) -> Scan:
 @given(seed=seeds)
 def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, seed: int) -> None:
     scan = freeze(scan_with_boxes(seed % 50))
-    first, again, *others = (STEPS[name](scan, keyed_rng(s)) for s in (seed, *range(seed, seed + 6)))
+    first, again, *others = (
+        STEPS[name](scan, keyed_rng(s)) for s in (seed, *range(seed, seed + 6))
+    )
     assert first.points.dtype == np.float32 and first.fields().keys() == scan.fields().keys()
     assert np.array_equal(first.points, again.points)
     for key, values in first.fields().items():
-        assert values.dtype == scan.fields()[key].dtype and np.array_equal(values, again.fields()[key])
+        assert values.dtype == scan.fields()[key].dtype and np.array_equal(
+            values, again.fields()[key]
+        )
     assert first.boxes is not None and np.array_equal(first.boxes.values, again.boxes.values)
     assert (first.reflectance >= 0).all() and (first.reflectance <= 1).all()
     assert (np.abs(first.boxes.values[:, 6]) <= np.float32(np.pi)).all() or name in (
@@ -89,11 +106,14 @@ def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
     changed = STEPS[name](scan, keyed_rng(seed))
     assert scan.boxes is not None and changed.boxes is not None
     left = changed.fields()["confidence"].astype(int)
-    before, after = scan.boxes.contain(scan.points), changed.boxes.contain(changed.points)
+    before = scan.boxes.contain(scan.points)
+    after = changed.boxes.contain(changed.points)
     kept = [scan.boxes.names.index(n) for n in changed.boxes.names]
     assert np.array_equal(after, before[kept][:, left])
     gone = np.setdiff1d(np.arange(6), kept)
-    assert before[gone].any(1).all() and not before[gone][:, left].any()  # they lost all that they had
+    assert (
+        before[gone].any(1).all() and not before[gone][:, left].any()
+    )  # they lost all that they had
     assert np.array_equal(changed.boxes.occlusion, scan.boxes.occlusion[kept])
     for key in ("label", "raw_label", "instance", "ring"):
         assert np.array_equal(changed.fields()[key], scan.fields()[key][left])
@@ -153,13 +173,18 @@ def test_yaw_and_scale_stay_within_their_limits() -> None:
     turns = [augment.yaw(scan, keyed_rng(s), limit=30).boxes.values[0] for s in range(60)]
     angles = np.degrees([np.arctan2(y, x) for x, y, *_ in turns])
     assert 20 < angles.max() <= 30 and -30 <= angles.min() < -20
-    sizes = [augment.scale(scan, keyed_rng(s), low=0.8, high=0.9).boxes.values[0, 3] / 4.2 for s in range(60)]
+    sizes = [
+        augment.scale(scan, keyed_rng(s), low=0.8, high=0.9).boxes.values[0, 3] / 4.2
+        for s in range(60)
+    ]
     assert 0.8 <= min(sizes) < 0.82 and 0.88 < max(sizes) <= 0.9
 
 
 def test_a_flip_happens_as_often_as_it_should() -> None:
     scan = cast([car(10, 3)])
-    flipped = [augment.flip_y(scan, keyed_rng(s), chance=0.3).boxes.values[0, 1] < 0 for s in range(200)]
+    flipped = [
+        augment.flip_y(scan, keyed_rng(s), chance=0.3).boxes.values[0, 1] < 0 for s in range(200)
+    ]
     assert 40 <= sum(flipped) <= 80
     assert augment.flip_x(scan, keyed_rng(0), chance=0) is scan
 
@@ -167,7 +192,8 @@ def test_a_flip_happens_as_often_as_it_should() -> None:
 def test_jitter_is_along_the_ray() -> None:
     scan = cast([], [wall(8, 0, 1.5)])
     noisy = augment.jitter(scan, keyed_rng(0), spread=0.05, reflectance=0)
-    before, after = np.linalg.norm(scan.points, axis=1), np.linalg.norm(noisy.points, axis=1)
+    before = np.linalg.norm(scan.points, axis=1)
+    after = np.linalg.norm(noisy.points, axis=1)
     assert np.allclose(noisy.points / after[:, None], scan.points / before[:, None], atol=1e-5)
     assert (after - before).std() == pytest.approx(0.05, rel=0.03)
     assert np.abs(after - before).max() < 0.151
@@ -193,7 +219,9 @@ def test_beams_go_as_wholes(rings: bool) -> None:
 
 def test_far_returns_are_lost_more_often() -> None:
     scan = random_scan(SENSOR, 40_000)
-    kept = augment.range_drop(replace(scan, confidence=np.arange(len(scan), dtype=np.float32)), keyed_rng(0), 0.8)
+    kept = augment.range_drop(
+        replace(scan, confidence=np.arange(len(scan), dtype=np.float32)), keyed_rng(0), 0.8
+    )
     distance = np.linalg.norm(scan.points, axis=1)
     here = np.isin(np.arange(len(scan)), kept.fields()["confidence"].astype(int))
     for low, high in ((0, 10), (30, 40), (70, 80)):

@@ -19,30 +19,107 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
 @pytest.mark.parametrize(
     ("layout", "file", "text", "message"),
     [
-        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 1", "a line with 4 fields; expected 15 fields"),
-        ("kitti_object", "training/label_2/000000.txt", "Car " + "x " * 14, "could not convert.*15 fields"),
-        ("kitti_object", "training/calib/000000.txt", "P2: 1 2 3", "has .*'P2': 3.*expected P2 with 12"),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car 0 0 1",
+            "a line with 4 fields; expected 15 fields",
+        ),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car " + "x " * 14,
+            "could not convert.*15 fields",
+        ),
+        (
+            "kitti_object",
+            "training/calib/000000.txt",
+            "P2: 1 2 3",
+            "has .*'P2': 3.*expected P2 with 12",
+        ),
         ("semantic_kitti", "sequences/00/poses.txt", "1 0 0", "does not hold rows of 12 numbers"),
-        ("kitti360", "data_poses/2013_05_28_drive_0000_sync/poses.txt", "0 one", "does not hold rows of 13 numbers"),
-        ("kitti360", "calibration/perspective.txt", "P_rect_00: 1", "KeyError.*expected P_rect_00, R_rect_00"),
-        ("kitti360", "data_3d_bboxes/train/2013_05_28_drive_0000_sync.xml", "<a><b>", "no element|mismatched|unclosed"),
-        ("kitti_raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a>", "no element|tracklet"),
-        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "nan " * 12, "line 1 has the values .*finite"),
-        ("kitti_object", "training/label_2/000000.txt", "Car 0 9 " + "1 " * 12, "occlusion of 0 to 3"),
+        (
+            "kitti360",
+            "data_poses/2013_05_28_drive_0000_sync/poses.txt",
+            "0 one",
+            "does not hold rows of 13 numbers",
+        ),
+        (
+            "kitti360",
+            "calibration/perspective.txt",
+            "P_rect_00: 1",
+            "KeyError.*expected P_rect_00, R_rect_00",
+        ),
+        (
+            "kitti360",
+            "data_3d_bboxes/train/2013_05_28_drive_0000_sync.xml",
+            "<a><b>",
+            "no element|mismatched|unclosed",
+        ),
+        (
+            "kitti_raw",
+            "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
+            "<a>",
+            "no element|tracklet",
+        ),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car 0 0 " + "nan " * 12,
+            "line 1 has the values .*finite",
+        ),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car 0 9 " + "1 " * 12,
+            "occlusion of 0 to 3",
+        ),
         ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "0 " * 12, "a size above 0"),
-        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "1e30 " * 12, "finite numbers"),
-        ("semantic_kitti", "sequences/00/poses.txt", "1 0 0 0 0 2 0 0 0 0 1 0", "1 of 1 transforms are not rigid"),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car 0 0 " + "1e30 " * 12,
+            "finite numbers",
+        ),
+        (
+            "semantic_kitti",
+            "sequences/00/poses.txt",
+            "1 0 0 0 0 2 0 0 0 0 1 0",
+            "1 of 1 transforms are not rigid",
+        ),
         ("semantic_kitti", "sequences/00/poses.txt", "inf " * 12, "not rigid"),
-        ("semantic_kitti", "sequences/00/poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0 " * 2, "rows of 12 numbers"),
-        ("semantic_kitti", "sequences/00/calib.txt", f"P2: {'1 ' * 12}\nTr: {'1 ' * 12}", "not rigid"),
+        (
+            "semantic_kitti",
+            "sequences/00/poses.txt",
+            "1 0 0 0 0 1 0 0 0 0 1 0 " * 2,
+            "rows of 12 numbers",
+        ),
+        (
+            "semantic_kitti",
+            "sequences/00/calib.txt",
+            f"P2: {'1 ' * 12}\nTr: {'1 ' * 12}",
+            "not rigid",
+        ),
         ("kitti360", DRIVE, "7 " + "nan " * 12, "not rigid"),
         ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "invalid or repeated frame numbers"),
         ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "invalid or repeated frame numbers"),
-        ("kitti360", "calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 11, "'image_00': 11"),
-        ("kitti360", "calibration/calib_cam_to_velo.txt", "1 0 0 0 0 1 0 0 0 0 0 0", "cam_to_velo: .*not rigid"),
+        (
+            "kitti360",
+            "calibration/calib_cam_to_pose.txt",
+            "image_00: " + "1 " * 11,
+            "'image_00': 11",
+        ),
+        (
+            "kitti360",
+            "calibration/calib_cam_to_velo.txt",
+            "1 0 0 0 0 1 0 0 0 0 0 0",
+            "cam_to_velo: .*not rigid",
+        ),
     ],
 )
-def test_damaged_text_files_are_named(tmp_path: Path, layout: str, file: str, text: str, message: str) -> None:
+def test_damaged_text_files_are_named(
+    tmp_path: Path, layout: str, file: str, text: str, message: str
+) -> None:
     MAKERS[layout](tmp_path)
     assert (tmp_path / file).is_file()
     (tmp_path / file).write_text(text)
@@ -54,11 +131,29 @@ def test_damaged_text_files_are_named(tmp_path: Path, layout: str, file: str, te
 @pytest.mark.parametrize(
     ("layout", "file", "old", "new", "message"),
     [
-        ("kitti_raw", "tracklet_labels.xml", "<boost", '<?xml version="1.0" encoding="x"?><boost', "unknown encoding"),
-        ("kitti_raw", "tracklet_labels.xml", "<tx>10</tx>", "<tx>1e400</tx>", "a box of frame 1 with .*inf"),
+        (
+            "kitti_raw",
+            "tracklet_labels.xml",
+            "<boost",
+            '<?xml version="1.0" encoding="x"?><boost',
+            "unknown encoding",
+        ),
+        (
+            "kitti_raw",
+            "tracklet_labels.xml",
+            "<tx>10</tx>",
+            "<tx>1e400</tx>",
+            "a box of frame 1 with .*inf",
+        ),
         ("kitti_raw", "tracklet_labels.xml", "<h>1.2</h>", "<h>0</h>", "size that is not positive"),
         ("kitti360", "*.xml", "encoding='utf-8'", "encoding='x'", "unknown encoding"),
-        ("kitti360", "*.xml", "<instanceId>1<", "<instanceId>99999999999<", "out of bounds|too large"),
+        (
+            "kitti360",
+            "*.xml",
+            "<instanceId>1<",
+            "<instanceId>99999999999<",
+            "out of bounds|too large",
+        ),
         ("kitti360", "*.xml", "<data>", "<data>nan ", "cannot reshape|no boxes"),
         ("kitti_object", "calib/000000.txt", "R0_rect: 1", "R0_rect: 2", "not rigid"),
         ("kitti_object", "calib/000000.txt", "R0_rect: 1.0", "R0_rect: nan 1.0", "'R0_rect': 10"),
@@ -77,7 +172,8 @@ def test_a_changed_value_is_refused_by_the_name_of_its_file(
 
 
 def test_an_image_of_size_zero_is_refused(tmp_path: Path) -> None:
-    """A camera's size comes from its picture's header, and a black picture of that size is written where none is."""
+    """A camera's size comes from its picture's header, and a black picture of that size is written
+    where none is."""
     write_all("kitti_object", tmp_path, [some_scan()])
     path = tmp_path / "training" / "image_2" / "000000.png"
     content = path.read_bytes()
@@ -92,7 +188,9 @@ def test_an_image_of_size_zero_is_refused(tmp_path: Path) -> None:
 def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
     MAKERS["kitti_object"](tmp_path)
     (tmp_path / "ImageSets" / "train.txt").write_text("000000\n../velodyne/000001\n")
-    with pytest.raises(DataError, match=r"train.txt lists '../velodyne/000001'; expected names of frames"):
+    with pytest.raises(
+        DataError, match=r"train.txt lists '../velodyne/000001'; expected names of frames"
+    ):
         open_scans(tmp_path, split="train")
 
 
@@ -108,7 +206,9 @@ def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
 def test_impossible_values_of_a_scan_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, name: str, value: Any, message: str
 ) -> None:
-    monkeypatch.setattr("lidar_synth.formats.writer.check_scan", lambda scan, where: None)  # another program's file
+    monkeypatch.setattr(
+        "lidar_synth.formats.writer.check_scan", lambda scan, where: None
+    )  # another program's file
     scan = some_scan()
     scan.confidence = np.ones(len(scan), np.float32)
     if name == "pose":
@@ -135,7 +235,9 @@ def test_cells_without_a_return_may_hold_anything(tmp_path: Path) -> None:
     assert found is not None and found.tolist() == [[0.5, 0, 1, 0]] * 2
     image[1, 0, 2] = 64.5
     np.save(tmp_path / "image.npy", image)
-    with pytest.raises(DataError, match=r"image.npy: reflectance from 0.0 to 64.5; expected 0 to 1"):
+    with pytest.raises(
+        DataError, match=r"image.npy: reflectance from 0.0 to 64.5; expected 0 to 1"
+    ):
         RangeImages(tmp_path, sensor=sensor).image(0)
 
 

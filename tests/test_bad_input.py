@@ -1,4 +1,5 @@
-"""Bad input: a clear error that names the file and says what to do, never a wrong scan, nothing half-written."""
+"""Bad input: a clear error that names the file and says what to do, never a wrong scan, nothing
+half-written."""
 
 import re
 import shutil
@@ -52,11 +53,26 @@ POINT_FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "cut": (cut, r"is \d+ bytes long; expected a multiple of 16: 4 float32.*on_bad='skip'"),
     "empty": (empty, r"is empty; expected 16 bytes for each point.*on_bad='skip'"),
     "missing": (remove, r"cannot be read \(No such file or directory\)"),
-    "nan": (lambda p: spoil(p, np.nan), r"1 of \d+ points are NaN or infinite, the first is point 3"),
-    "infinite": (lambda p: spoil(p, -np.inf, 3), r"1 of \d+ points are NaN or infinite, the first is point 3"),
-    "far": (lambda p: spoil(p, 1e9), r"a coordinate of 1e\+09 m; expected coordinates within 100000 m"),
-    "five floats": (five_floats, r"reflectance .* runs from .*; expected values in \[0, 1\].*fields=5"),
-    "percent": (lambda p: spoil(p, 37.0, 3), r"reflectance .* runs from .* to 37; expected values in \[0, 1\]"),
+    "nan": (
+        lambda p: spoil(p, np.nan),
+        r"1 of \d+ points are NaN or infinite, the first is point 3",
+    ),
+    "infinite": (
+        lambda p: spoil(p, -np.inf, 3),
+        r"1 of \d+ points are NaN or infinite, the first is point 3",
+    ),
+    "far": (
+        lambda p: spoil(p, 1e9),
+        r"a coordinate of 1e\+09 m; expected coordinates within 100000 m",
+    ),
+    "five floats": (
+        five_floats,
+        r"reflectance .* runs from .*; expected values in \[0, 1\].*fields=5",
+    ),
+    "percent": (
+        lambda p: spoil(p, 37.0, 3),
+        r"reflectance .* runs from .* to 37; expected values in \[0, 1\]",
+    ),
     "negative": (lambda p: spoil(p, -0.5, 3), r"reflectance .* runs from -0.5 to"),
     "big-endian": (big_endian, r"NaN or infinite|a coordinate of|reflectance"),
 }
@@ -82,7 +98,9 @@ def check_skipping(source: object, message: str) -> None:
     with pytest.warns(UserWarning, match=f"skipped scan {re.escape(source.ids[1])}"):
         found = [scan.id for scan in source]
     assert found == [source.ids[0], source.ids[2]] and len(source) == 3
-    assert list(source.skipped) == [source.ids[1]] and re.search(message, source.skipped[source.ids[1]])
+    assert list(source.skipped) == [source.ids[1]] and re.search(
+        message, source.skipped[source.ids[1]]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # each bad scan is told of once
         assert [source[i].id for i in range(3)] == [source.ids[0], source.ids[2], source.ids[2]]
@@ -92,8 +110,14 @@ def check_skipping(source: object, message: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda raw: raw[:-3], r"has {labels} labels, .*{points} has {count} points.*on_bad='skip'"),
-        (lambda raw: np.where(np.arange(len(raw)) == 5, 777, raw), r"{points}.*unknown class ids \[777\]"),
+        (
+            lambda raw: raw[:-3],
+            r"has {labels} labels, .*{points} has {count} points.*on_bad='skip'",
+        ),
+        (
+            lambda raw: np.where(np.arange(len(raw)) == 5, 777, raw),
+            r"{points}.*unknown class ids \[777\]",
+        ),
     ],
     ids=["length", "unknown id"],
 )
@@ -114,7 +138,9 @@ def test_labels_that_do_not_fit_their_scan(
 def test_a_label_file_that_is_missing(tmp_path: Path) -> None:
     path = MAKERS["semantic_kitti"](tmp_path)[1]
     (path.parents[1] / "labels" / "000001.label").unlink()
-    with pytest.raises(FileError, match=r"has labels in .* for other scans, but no 000001.label; .*--on-bad skip"):
+    with pytest.raises(
+        FileError, match=r"has labels in .* for other scans, but no 000001.label; .*--on-bad skip"
+    ):
         SemanticKITTI(tmp_path)[1]
 
 
@@ -130,7 +156,9 @@ def test_a_label_file_that_is_missing(tmp_path: Path) -> None:
     ],
     ids=["cut", "nan", "intensity", "ring", "zeros", "four floats"],
 )
-def test_bad_sweeps_of_nuscenes(tmp_path: Path, fault: Callable[[Path], None], message: str) -> None:
+def test_bad_sweeps_of_nuscenes(
+    tmp_path: Path, fault: Callable[[Path], None], message: str
+) -> None:
     paths = write_nuscenes(tmp_path, labels=False)
     fault(paths[1])
     with pytest.raises(DataError, match=re.escape(str(paths[1])) + ".*" + message):
@@ -143,7 +171,9 @@ def test_lidarseg_that_does_not_fit_its_sweep(tmp_path: Path) -> None:
     _, classes = nuscenes_arrays(seed=1)
     path = tmp_path / "lidarseg" / "v1.0-mini" / "token1_lidarseg.bin"
     classes[:-1].astype("u1").tofile(path)
-    with pytest.raises(DataError, match=rf"{path} has 319 labels, .*LIDAR_TOP__1.pcd.bin has 320 points"):
+    with pytest.raises(
+        DataError, match=rf"{path} has 319 labels, .*LIDAR_TOP__1.pcd.bin has 320 points"
+    ):
         NuScenes(tmp_path)[1]
     np.where(classes == 3, 99, classes).astype("u1").tofile(path)
     with pytest.raises(DataError, match=rf"{path} .*__1.pcd.bin.*unknown class ids \[99\]"):
@@ -165,13 +195,18 @@ def test_a_directory_without_scans(tmp_path: Path, layout: str) -> None:
 
 def test_a_path_in_no_known_layout(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(DataError, match=r"holds no scan in a layout that is known; expected one of kitti360, .*\.ply"):
+    with pytest.raises(
+        DataError,
+        match=r"holds no scan in a layout that is known; expected one of kitti360, .*\.ply",
+    ):
         open_scans(tmp_path)
     with pytest.raises(DataError, match=r"notes.txt holds no scan"):
         open_scans(tmp_path / "notes.txt")
     with pytest.raises(FileError, match="nowhere does not exist"):
         open_scans(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match=r"layout 'kitti'; expected one of 'kitti360', 'semantic_kitti'"):
+    with pytest.raises(
+        ConfigError, match=r"layout 'kitti'; expected one of 'kitti360', 'semantic_kitti'"
+    ):
         open_scans(tmp_path, layout="kitti")
 
 
@@ -179,12 +214,19 @@ def test_wrong_splits(tmp_path: Path) -> None:
     for layout in ("kitti360", "semantic_kitti", "kitti_object", "kitti_raw"):
         MAKERS[layout](tmp_path / layout)
     with pytest.raises(
-        ConfigError, match=r"KITTI-360 split 'train'; expected one of 'r2flow/train', .*full name of a split"
+        ConfigError,
+        match=r"KITTI-360 split 'train'; expected one of 'r2flow/train', .*full name of a split",
     ):
         open_scans(tmp_path / "kitti360", split="train")
-    with pytest.raises(ConfigError, match="SemanticKITTI split 'valid'; expected one of 'train', 'val', 'test', 'all'"):
+    with pytest.raises(
+        ConfigError,
+        match="SemanticKITTI split 'valid'; expected one of 'train', 'val', 'test', 'all'",
+    ):
         open_scans(tmp_path / "semantic_kitti", split="valid")
-    with pytest.raises(ConfigError, match="KITTI object split 'training'; expected one of 'train', 'val', 'trainval'"):
+    with pytest.raises(
+        ConfigError,
+        match="KITTI object split 'training'; expected one of 'train', 'val', 'trainval'",
+    ):
         open_scans(tmp_path / "kitti_object", split="training")
     with pytest.raises(ConfigError, match="split 'train' of .*layout 'kitti_raw' has none"):
         open_scans(tmp_path / "kitti_raw", split="train")
@@ -224,7 +266,9 @@ def test_a_folder_of_two_kinds(tmp_path: Path) -> None:
 def test_a_target_that_cannot_be_written(tmp_path: Path, to: str) -> None:
     """A file stands where the folder should be: refused for root too, whom no permission stops."""
     (tmp_path / "out").write_text("in the way")
-    with pytest.raises(FileError, match=r"out.* cannot be written \(.*Choose another output folder"):
+    with pytest.raises(
+        FileError, match=r"out.* cannot be written \(.*Choose another output folder"
+    ):
         WRITERS[to](tmp_path / "out").write(some_scan(), 0)
     assert (tmp_path / "out").read_text() == "in the way"
 
@@ -245,7 +289,9 @@ def test_a_disk_that_is_full_leaves_no_half_scan(tmp_path: Path, to: str) -> Non
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not writer.complete(0)
-    assert not [p for p in tmp_path.rglob("*") if p.suffix in (".part", ".bin", ".npz", ".pcd", ".ply")]
+    assert not [
+        p for p in tmp_path.rglob("*") if p.suffix in (".part", ".bin", ".npz", ".pcd", ".ply")
+    ]
     writer.write(scan, 0)
     assert writer.complete(0)
 
@@ -326,7 +372,8 @@ def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
     content[148:156] = b"%06o\x00 " % sum(content[:512])
     path.write_bytes(content)
     with pytest.raises(
-        DataError, match=rf"{path.name} is truncated, damaged or not a tar file \(a member of 9223372036854775807"
+        DataError,
+        match=rf"{path.name} is truncated, damaged or not a tar file \(a member of 9223372036854775807",
     ):
         open_scans(path)
 

@@ -59,42 +59,68 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 
 @pytest.mark.slow
-def test_a_bank_holds_the_models_scans(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
+def test_a_bank_holds_the_models_scans(
+    plan: BakePlan, model: Path, expected: dict[str, bytes]
+) -> None:
     index = bake(plan, progress=False)
-    assert index is not None and index.scans == COUNT and [e.scans for e in index.shards] == [3, 3, 3, 1]
+    assert (
+        index is not None
+        and index.scans == COUNT
+        and [e.scans for e in index.shards] == [3, 3, 3, 1]
+    )
     assert files(plan.out) == expected
-    bank, generator = Bank(plan.out), load_generator(model)
+    bank = Bank(plan.out)
+    generator = load_generator(model)
     encoding = Encoding(generator.sensor, bank.fields)
     for i, image in enumerate(generator.range_images(4, range(COUNT))):
         assert np.array_equal(bank.image(i).range, encoding.decode(encoding.encode(image)).range)
         assert bank[i].id == f"small/4/{i}"
         assert np.array_equal(bank[i].label, image.label[image.mask])
     facts = bank.facts
-    assert (facts.checkpoint, facts.label_policy, facts.licence) == (generator.hash, "generated", "MIT")
+    assert (facts.checkpoint, facts.label_policy, facts.licence) == (
+        generator.hash,
+        "generated",
+        "MIT",
+    )
     assert facts.settings["seed"] == 4 and facts.software["torch"] and facts.software["deflate"]
 
 
 def write_conditioned(path: Path) -> Path:
     """A checkpoint with random weights that generates ranges from label maps."""
     arguments = {
-        "resolution": SENSOR.shape, "channels": 1, "width": 16, "time_width": 16, "depths": (1, 1), "heads": (2, 2),
-        "patch": (2, 2), "window": (3, 3), "condition_channels": 3,
-    }  # fmt: skip
+        "resolution": SENSOR.shape,
+        "channels": 1,
+        "width": 16,
+        "time_width": 16,
+        "depths": (1, 1),
+        "heads": (2, 2),
+        "patch": (2, 2),
+        "window": (3, 3),
+        "condition_channels": 3,
+    }
     of_maps = {"resolution": SENSOR.shape, "target": SENSOR.shape, "channels": 3}
     torch.manual_seed(0)
     networks = {
-        VELOCITY: build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())}),
+        VELOCITY: build_network(
+            "hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())}
+        ),
         ENCODER: build_network("semantic_map", of_maps),
     }
     for network in networks.values():
         for parameter in network.parameters():
             torch.nn.init.normal_(parameter, std=0.2)
     header = Header(
-        networks={VELOCITY: NetworkSpec("hdit", arguments), ENCODER: NetworkSpec("semantic_map", of_maps)},
+        networks={
+            VELOCITY: NetworkSpec("hdit", arguments),
+            ENCODER: NetworkSpec("semantic_map", of_maps),
+        },
         sensor=SENSOR,
-        normalisation=NORMALISATIONS["r2flow"], channels=("range",), time_grid=(1.0, 0.5, 0.0),
-        provenance={"data": "none", "data_licence": "none", "licence": "MIT"}, conditioning={"semantic": {}},
-    )  # fmt: skip
+        normalisation=NORMALISATIONS["r2flow"],
+        channels=("range",),
+        time_grid=(1.0, 0.5, 0.0),
+        provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
+        conditioning={"semantic": {}},
+    )
     save_checkpoint(path, header, networks)
     return path
 
@@ -107,9 +133,16 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     plan = plan_in(tmp_path / "bank", model, condition=str(real), seed=2, first=4)
     index = bake(plan, progress=False)
     assert index is not None and plan.facts.label_policy == "condition"
-    bank, source = Bank(plan.out), open_scans(real)
+    bank = Bank(plan.out)
+    source = open_scans(real)
     names = hashlib.sha256("\n".join(source.ids).encode()).hexdigest()
-    known = {"kind": "semantic", "source": str(real), "layout": None, "split": None, "content": names}
+    known = {
+        "kind": "semantic",
+        "source": str(real),
+        "layout": None,
+        "split": None,
+        "content": names,
+    }
     assert bank.facts.condition == known
     [expected] = load_generator(model).range_images(2, [9], [source[0]])
     assert bank.condition(5) == source.ids[0]  # index 9 of 3 conditions
@@ -125,7 +158,9 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
-def test_processes_write_the_same_bytes(plan: BakePlan, expected: dict[str, bytes], workers: int) -> None:
+def test_processes_write_the_same_bytes(
+    plan: BakePlan, expected: dict[str, bytes], workers: int
+) -> None:
     prepare(plan)
     reported: list[int] = []
     ENGINES["processes"](plan, range(4), Resources(workers), reported.append)
@@ -145,9 +180,14 @@ def test_shares_in_any_order_write_the_same_bytes(
 
 @pytest.mark.parametrize("ranks", [(0,), (1, 0), (1, 2, 0)])
 def test_ranks_of_torchrun_one_after_another_write_the_same_bytes(
-    plan: BakePlan, expected: dict[str, bytes], ranks: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+    plan: BakePlan,
+    expected: dict[str, bytes],
+    ranks: tuple[int, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"):
+    with pytest.raises(
+        ConfigError, match="engine 'torchrun' without 'RANK'.*torchrun --nproc-per-node"
+    ):
         bake(plan, "torchrun", progress=False)
     monkeypatch.setenv("WORLD_SIZE", str(len(ranks)))
     for rank in ranks:
@@ -158,11 +198,26 @@ def test_ranks_of_torchrun_one_after_another_write_the_same_bytes(
 
 
 @pytest.mark.slow
-def test_torchrun_writes_the_same_bytes(plan: BakePlan, model: Path, expected: dict[str, bytes]) -> None:
+def test_torchrun_writes_the_same_bytes(
+    plan: BakePlan, model: Path, expected: dict[str, bytes]
+) -> None:
     """Two concurrent processes, started by torchrun itself."""
-    options = ["--model", model, "--count", COUNT, "--shard-size", SIZE, "--seed", 4, "--engine", "torchrun"]
+    options = [
+        "--model",
+        model,
+        "--count",
+        COUNT,
+        "--shard-size",
+        SIZE,
+        "--seed",
+        4,
+        "--engine",
+        "torchrun",
+    ]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2]
-    subprocess.run([str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)], check=True)
+    subprocess.run(
+        [str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)], check=True
+    )
     assert files(plan.out) == expected
 
 
@@ -171,7 +226,9 @@ def test_a_missing_library_of_an_engine_is_reported(
     plan: BakePlan, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[engine], None)
-    with pytest.raises(LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"):
+    with pytest.raises(
+        LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"
+    ):
         bake(plan, engine, progress=False)
 
 
@@ -181,7 +238,9 @@ def test_every_engine_is_named_in_the_help() -> None:
 
 
 @pytest.mark.parametrize(("name", "field"), BakeJob.model_fields.items())
-def test_every_setting_is_an_option_with_its_description_and_default(name: str, field: FieldInfo) -> None:
+def test_every_setting_is_an_option_with_its_description_and_default(
+    name: str, field: FieldInfo
+) -> None:
     text = " ".join(CliRunner().invoke(app, ["bake", "--help"]).output.split())
     description = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
     option = re.escape(f"--{name.replace('_', '-')} ")
@@ -197,7 +256,10 @@ def test_every_setting_is_an_option_with_its_description_and_default(name: str, 
         ({"seed": 5}, r"'seed': 4.*'seed': 5"),
         ({"count": 11}, r"'count': 10.*'count': 11"),
         ({"steps": 2}, r"'steps': None.*'steps': 2"),
-        ({"fields": ("label",)}, r"'fields': \['reflectance', 'label', 'confidence'\].*'fields': \['label'\]"),
+        (
+            {"fields": ("label",)},
+            r"'fields': \['reflectance', 'label', 'confidence'\].*'fields': \['label'\]",
+        ),
         ({"batch": 2}, r"'batch': 1.*'batch': 2"),
     ],
 )
@@ -250,7 +312,9 @@ def test_a_file_of_the_user_is_not_replaced(plan: BakePlan, name: str) -> None:
 
 
 @pytest.mark.parametrize(("count", "size"), [(10, 64), (1000, 125), (20_000, 1024)])
-def test_shards_of_small_banks_are_small(model: Path, tmp_path: Path, count: int, size: int) -> None:
+def test_shards_of_small_banks_are_small(
+    model: Path, tmp_path: Path, count: int, size: int
+) -> None:
     """An interrupted bake keeps whole shards."""
     plan = make_plan(tmp_path, BakeJob(model=str(model), count=count))
     assert plan.job.shard_size == size
@@ -281,7 +345,9 @@ def test_shards_of_small_banks_are_small(model: Path, tmp_path: Path, count: int
         (["--model", "city"], "model 'city'; expected a shipped one"),
     ],
 )
-def test_invalid_options_are_refused(options: list[str], message: str, model: Path, tmp_path: Path) -> None:
+def test_invalid_options_are_refused(
+    options: list[str], message: str, model: Path, tmp_path: Path
+) -> None:
     call = ["bake", str(tmp_path / "bank"), "--model", str(model), *options]
     with pytest.raises(ConfigError, match=message):
         CliRunner().invoke(app, call, catch_exceptions=False)
@@ -290,32 +356,55 @@ def test_invalid_options_are_refused(options: list[str], message: str, model: Pa
 
 def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
-    with pytest.raises(ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel"):
+    with pytest.raises(
+        ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel"
+    ):
         plan_in(tmp_path / "bank", plain, fields=("reflectance", "label"))
     assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
-    with pytest.raises(ConfigError, match="condition here for model .*takes no condition; expected none"):
+    with pytest.raises(
+        ConfigError, match="condition here for model .*takes no condition; expected none"
+    ):
         plan_in(tmp_path / "bank", plain, condition="here")
-    with pytest.raises(ConfigError, match="condition None for model .*takes semantic conditions; expected a dataset"):
+    with pytest.raises(
+        ConfigError,
+        match="condition None for model .*takes semantic conditions; expected a dataset",
+    ):
         plan_in(tmp_path / "bank", write_conditioned(tmp_path / "conditioned.safetensors"))
     with pytest.raises(FileError, match="nowhere does not exist"):
-        plan_in(tmp_path / "bank", tmp_path / "conditioned.safetensors", condition=str(tmp_path / "nowhere"))
+        plan_in(
+            tmp_path / "bank",
+            tmp_path / "conditioned.safetensors",
+            condition=str(tmp_path / "nowhere"),
+        )
     (tmp_path / "broken.safetensors").write_bytes(b"no")
     with pytest.raises(DataError, match="broken"):
         plan_in(tmp_path / "bank", tmp_path / "broken.safetensors")
     assert not (tmp_path / "bank").exists()
 
 
-def test_options_override_a_configuration_file(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+def test_options_override_a_configuration_file(
+    model: Path, tmp_path: Path, expected: dict[str, bytes]
+) -> None:
     config = tmp_path / "bake.yaml"
-    config.write_text(yaml.safe_dump({"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9}))
-    result = CliRunner().invoke(app, ["bake", str(tmp_path / "bank"), "--config", str(config), "--seed", "4"])
+    config.write_text(
+        yaml.safe_dump({"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9})
+    )
+    result = CliRunner().invoke(
+        app, ["bake", str(tmp_path / "bank"), "--config", str(config), "--seed", "4"]
+    )
     assert result.exit_code == 0 and "10 scans in 4 shards" in result.output
     assert files(tmp_path / "bank") == expected
     config.write_text("model: small\nsize: 3\n")
-    with pytest.raises(ConfigError, match=r"bake.yaml: unknown key 'size'; known there: model, count, seed"):
-        CliRunner().invoke(app, ["bake", str(tmp_path / "b"), "--config", str(config)], catch_exceptions=False)
+    with pytest.raises(
+        ConfigError, match=r"bake.yaml: unknown key 'size'; known there: model, count, seed"
+    ):
+        CliRunner().invoke(
+            app, ["bake", str(tmp_path / "b"), "--config", str(config)], catch_exceptions=False
+        )
     with pytest.raises(FileError, match="nowhere.yaml cannot be read"):
-        CliRunner().invoke(app, ["bake", str(tmp_path / "b"), "--config", "nowhere.yaml"], catch_exceptions=False)
+        CliRunner().invoke(
+            app, ["bake", str(tmp_path / "b"), "--config", "nowhere.yaml"], catch_exceptions=False
+        )
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem)
@@ -326,11 +415,27 @@ def test_published_configurations_load(path: Path) -> None:
 @pytest.mark.slow
 def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "bank"
-    call = ["bake", str(out), "--model", str(model), "--count", "50", "--shard-size", "20", "--dry-run"]
+    call = [
+        "bake",
+        str(out),
+        "--model",
+        str(model),
+        "--count",
+        "50",
+        "--shard-size",
+        "20",
+        "--dry-run",
+    ]
     output = CliRunner().invoke(app, call).output
-    assert "50 scans in 3 shards of up to 20" in output and "scans/s" in output and "label policy" in output
+    assert (
+        "50 scans in 3 shards of up to 20" in output
+        and "scans/s" in output
+        and "label policy" in output
+    )
     assert not out.exists()
-    actual = CliRunner().invoke(app, [*call[:-1]]).output  # the estimate is close to the actual size
+    actual = (
+        CliRunner().invoke(app, [*call[:-1]]).output
+    )  # the estimate is close to the actual size
     estimated, written = (float(text.split(" MB")[0].split()[-1]) for text in (output, actual))
     assert estimated == pytest.approx(written, rel=0.4)
 
@@ -339,7 +444,9 @@ def test_the_index_needs_a_record_of_every_shard(plan: BakePlan) -> None:
     bake(plan, share=Share(0, 2), progress=False)
     bake(plan, share=Share(1, 2), progress=False)
     (plan.out / INDEX).unlink()
-    assert finish(plan) is None  # a finished bake has removed the records, so a rerun checks the shards
+    assert (
+        finish(plan) is None
+    )  # a finished bake has removed the records, so a rerun checks the shards
 
 
 SHARD = b"shard".ljust(64)
@@ -349,17 +456,24 @@ SHARD = b"shard".ljust(64)
 def test_a_rerun_over_many_shards_parses_the_index_once(
     plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """10,000 shards, of which 20 are missing. A few bytes stand in for each shard, because its content is not read."""
+    """10,000 shards, of which 20 are missing. A few bytes stand in for each shard, because its
+    content is not read."""
     many = plan_in(plan.out, model, count=10_000, shard_size=1)
     prepare(many)
     for entry in many.shards:
         (plan.out / entry.file).write_bytes(SHARD)
     content = {"bytes": len(SHARD), "sha256": sha256(plan.out / many.shards[0].file)}
-    write_bank_files(plan.out, Index((many.facts,), tuple(replace(e, **content) for e in many.shards)), baked=True)
+    write_bank_files(
+        plan.out,
+        Index((many.facts,), tuple(replace(e, **content) for e in many.shards)),
+        baked=True,
+    )
     for entry in many.shards[::500]:
         (plan.out / entry.file).unlink()
-    parsed, made = [0], [0]
-    parse, begin = Index.from_json, Entry.__post_init__
+    parsed = [0]
+    made = [0]
+    parse = Index.from_json
+    begin = Entry.__post_init__
 
     def count_parsed(text: bytes, where: str) -> Index:
         parsed[0] += 1

@@ -1,4 +1,5 @@
-"""Interrupted bakes: signals, kills, full disks, lost folders. Finished shards are kept, a rerun completes the bank."""
+"""Interrupted bakes: signals, kills, full disks, lost folders. Finished shards are kept, a rerun
+completes the bank."""
 
 import multiprocessing
 import os
@@ -87,15 +88,31 @@ def test_a_signal_keeps_finished_shards(
         stop_after(plan, scans, lambda: os.kill(os.getpid(), stop))
     assert signal.getsignal(signal.SIGTERM) == before
     kept = sorted(path.name for path in plan.out.glob("*.h5"))
-    assert len(kept) == (scans - 1) // SIZE and not list(plan.out.glob(".*.part")) and not (plan.out / INDEX).exists()
+    assert (
+        len(kept) == (scans - 1) // SIZE
+        and not list(plan.out.glob(".*.part"))
+        and not (plan.out / INDEX).exists()
+    )
     times = {name: (plan.out / name).stat().st_mtime_ns for name in kept}
     bake(plan, progress=False)
     assert files(plan.out) == expected
-    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in kept}  # not written twice
+    assert times == {
+        name: (plan.out / name).stat().st_mtime_ns for name in kept
+    }  # not written twice
 
 
 def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "lidar_synth", "bake", str(out), "--model", str(model), "--count", "60"]
+    command = [
+        sys.executable,
+        "-m",
+        "lidar_synth",
+        "bake",
+        str(out),
+        "--model",
+        str(model),
+        "--count",
+        "60",
+    ]
     command += ["--shard-size", "5", "--seed", "4", *options]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **others)
 
@@ -107,7 +124,9 @@ def wait_for_shards(process: subprocess.Popen[str], out: Path, count: int) -> No
 
 
 @pytest.mark.slow
-def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path, sixty: dict[str, bytes]) -> None:
+def test_killed_and_terminated_runs_resume(
+    model: Path, tmp_path: Path, sixty: dict[str, bytes]
+) -> None:
     out = tmp_path / "bank"
     process = start(out, model)
     wait_for_shards(process, out, 2)
@@ -128,9 +147,13 @@ def test_killed_and_terminated_runs_resume(model: Path, tmp_path: Path, sixty: d
 @pytest.mark.slow
 def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
     """A terminal sends the signal to every process of the group; only the parent reports it."""
-    process = start(tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0)
+    process = start(
+        tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0
+    )
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while len(children.read_text().split()) < 3:  # the workers, and Python's own for what they share
+    while (
+        len(children.read_text().split()) < 3
+    ):  # the workers, and Python's own for what they share
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
@@ -140,7 +163,9 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_reported(model: Path, tmp_path: Path, expected: dict[str, bytes]) -> None:
+def test_a_killed_worker_is_reported(
+    model: Path, tmp_path: Path, expected: dict[str, bytes]
+) -> None:
     plan = plan_in(tmp_path / "bank", model, count=300, shard_size=100)
 
     def kill(scans: int) -> None:
@@ -149,7 +174,9 @@ def test_a_killed_worker_is_reported(model: Path, tmp_path: Path, expected: dict
                 os.kill(worker.pid, signal.SIGKILL)
 
     prepare(plan)
-    with pytest.raises(FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"):
+    with pytest.raises(
+        FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"
+    ):
         ENGINES["processes"](plan, range(3), Resources(1), kill)
     assert multiprocessing.active_children() == []
 
@@ -162,7 +189,9 @@ def test_an_error_of_a_worker_is_raised(plan: BakePlan, model: Path) -> None:
         ENGINES["processes"](plan, range(4), Resources(1), lambda scans: None)
 
 
-def test_a_damaged_finished_shard_is_regenerated(plan: BakePlan, expected: dict[str, bytes]) -> None:
+def test_a_damaged_finished_shard_is_regenerated(
+    plan: BakePlan, expected: dict[str, bytes]
+) -> None:
     bake(plan, progress=False)
     path = plan.out / "shard-00001.h5"
     content = bytearray(path.read_bytes())
@@ -173,7 +202,9 @@ def test_a_damaged_finished_shard_is_regenerated(plan: BakePlan, expected: dict[
     assert files(plan.out) == expected
 
 
-def test_temporary_files_of_killed_processes_are_removed(plan: BakePlan, expected: dict[str, bytes]) -> None:
+def test_temporary_files_of_killed_processes_are_removed(
+    plan: BakePlan, expected: dict[str, bytes]
+) -> None:
     """Only after the last process in the folder has ended, whichever process wrote them."""
     prepare(plan)
     halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
@@ -191,7 +222,10 @@ def test_temporary_files_of_killed_processes_are_removed(plan: BakePlan, expecte
     assert files(plan.out) == expected
 
 
-SHARES = {"all": [()] * 3, "shares": [("--shard-index", str(k), "--num-shards", "3") for k in range(3)]}
+SHARES = {
+    "all": [()] * 3,
+    "shares": [("--shard-index", str(k), "--num-shards", "3") for k in range(3)],
+}
 
 
 @pytest.mark.slow
@@ -208,13 +242,23 @@ def test_three_concurrent_bakes_write_the_same_bytes(
 
 
 @pytest.mark.slow
-def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(plan: BakePlan, expected: dict[str, bytes]) -> None:
+def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(
+    plan: BakePlan, expected: dict[str, bytes]
+) -> None:
     """A complete bake starts and ends while another one is in the middle of a shard."""
     ended: list[subprocess.CompletedProcess[str]] = []
 
     def another() -> None:
         assert list(plan.out.glob(".*.part"))
-        command = [sys.executable, "-m", "lidar_synth", "bake", str(plan.out), "--model", plan.job.model]
+        command = [
+            sys.executable,
+            "-m",
+            "lidar_synth",
+            "bake",
+            str(plan.out),
+            "--model",
+            plan.job.model,
+        ]
         command += ["--count", str(plan.job.count), "--shard-size", str(SIZE), "--seed", "4"]
         ended.append(subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False))
         assert list(plan.out.glob(".*.part"))
@@ -224,7 +268,9 @@ def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(plan: BakePlan, e
     assert files(plan.out) == expected
 
 
-def test_two_concurrent_claims_of_a_folder(plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_concurrent_claims_of_a_folder(
+    plan: BakePlan, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both see an empty folder; the later one detects the conflict."""
     late = plan_in(plan.out, model, seed=5)
     looked = Path.is_file
@@ -265,13 +311,16 @@ def test_two_bakes_may_end_at_the_same_time(
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.98])
 def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes], share: float) -> None:
-    """A file cannot grow to the end of a shard; at a low limit HDF5 cannot even write its metadata."""
+    """A file cannot grow to the end of a shard; at a low limit HDF5 cannot even write its
+    metadata."""
     bake(plan, share=Share(0, 4), progress=False)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     shortest = min(len(content) for name, content in expected.items() if name.endswith(".h5"))
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * shortest), limits[1]))
     try:
-        with pytest.raises(FileError, match=r"cannot be written \(File too large\).*finished shards are kept"):
+        with pytest.raises(
+            FileError, match=r"cannot be written \(File too large\).*finished shards are kept"
+        ):
             bake(plan, progress=False)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -287,7 +336,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=44k", "tmpfs", folder],
+        capture_output=True,
+        check=False,
     )
     if not mounted or mounted.returncode:
         pytest.skip("mounting a file system is not permitted")
@@ -298,7 +349,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(
     small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shard_module, "_PACKED", 0)  # disables the check of free space before a shard
+    monkeypatch.setattr(
+        shard_module, "_PACKED", 0
+    )  # disables the check of free space before a shard
     plan = plan_in(small_disk / "bank", model)
     with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
         bake(plan, progress=False)
@@ -310,11 +363,16 @@ def test_a_full_disk(
     assert files(plan.out) == expected
 
 
-def test_free_space_is_checked_before_a_shard(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_space_is_checked_before_a_shard(
+    plan: BakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     usage = namedtuple("usage", "total used free")
     need = 3 * 8 * 32 * 5 * 0.6
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need - 1))
-    with pytest.raises(FileError, match=r"bank has 0.0 MB free; expected 0.1 MB for the next shard. Free some space"):
+    with pytest.raises(
+        FileError,
+        match=r"bank has 0.0 MB free; expected 0.1 MB for the next shard. Free some space",
+    ):
         bake(plan, progress=False)
     assert not list(plan.out.glob("*.h5"))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(0, 0, need + 1))
@@ -341,14 +399,19 @@ def no_privileges() -> Iterator[None]:
 
 
 def test_a_folder_that_becomes_read_only(model: Path, expected: dict[str, bytes]) -> None:
-    with tempfile.TemporaryDirectory() as folder:  # pytest's own folders are not accessible to other users
+    with (
+        tempfile.TemporaryDirectory() as folder
+    ):  # pytest's own folders are not accessible to other users
         plan = plan_in(Path(folder) / "bank", model)
         bake(plan, share=Share(0, 4), progress=False)
         Path(folder).chmod(0o755)
         plan.out.chmod(0o555)
         with (
             no_privileges(),
-            pytest.raises(FileError, match=r"cannot be written \(Permission denied\).*finished shards are kept"),
+            pytest.raises(
+                FileError,
+                match=r"cannot be written \(Permission denied\).*finished shards are kept",
+            ),
         ):
             bake(plan, progress=False)
         assert [path.name for path in plan.out.glob("*.h5")] == ["shard-00000.h5"]
@@ -360,7 +423,9 @@ def test_a_folder_that_becomes_read_only(model: Path, expected: dict[str, bytes]
 @pytest.mark.slow
 def test_a_folder_that_vanishes(plan: BakePlan, expected: dict[str, bytes]) -> None:
     for scans in (3, 4):  # at the end of a shard, and within one
-        with pytest.raises(FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"):
+        with pytest.raises(
+            FileError, match=r"bank.*(has vanished or lost its .bake.json|No such file)"
+        ):
             stop_after(plan, scans, lambda: shutil.rmtree(plan.out))
         assert not plan.out.exists()
     bake(plan, progress=False)

@@ -1,4 +1,5 @@
-"""Engine ``ray`` on real local clusters: actors are killed, nodes join and leave, the bytes stay the same."""
+"""Engine ``ray`` on real local clusters: actors are killed, nodes join and leave, the bytes stay
+the same."""
 
 import os
 import signal
@@ -76,11 +77,16 @@ def becomes_true(condition: Callable[[], bool], seconds: float = 200) -> bool:
 
 def writing(plan: BakePlan) -> set[int]:
     """Ids of the processes that are writing a shard, from the temporary files in the folder."""
-    return {int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")}
+    return {
+        int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")
+    }
 
 
-def test_the_engine_starts_and_stops_its_own_cluster(plan: BakePlan, model: Path, tmp_path: Path) -> None:
-    """Without an address the engine starts Ray and stops it; without a running cluster 'auto' is refused."""
+def test_the_engine_starts_and_stops_its_own_cluster(
+    plan: BakePlan, model: Path, tmp_path: Path
+) -> None:
+    """Without an address the engine starts Ray and stops it; without a running cluster 'auto' is
+    refused."""
     with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a running cluster"):
         bake(plan, "ray", Resources(1, "auto"), progress=False)
     assert bake(plan, "ray", Resources(2), progress=False) is not None
@@ -92,8 +98,12 @@ def test_the_engine_starts_and_stops_its_own_cluster(plan: BakePlan, model: Path
 
 @pytest.mark.timeout(900)
 def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_path: Path) -> None:
-    """A second node joins; an actor of the first node and later the second node are killed while they write a shard."""
-    single, plan = (plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40) for name in ("single", "upset"))
+    """A second node joins; an actor of the first node and later the second node are killed while
+    they write a shard."""
+    single, plan = (
+        plan_in(tmp_path / name / "bank", model, count=1200, shard_size=40)
+        for name in ("single", "upset")
+    )
     bake(single, progress=False)
     prepare(plan)
     reported: list[int] = []
@@ -113,8 +123,12 @@ def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_pa
         elif upsets == ["a node joined"] and (busy := writing(plan) & first):
             os.kill(busy.pop(), signal.SIGKILL)
             upsets.append("an actor was killed")
-        elif upsets[-1] == "an actor was killed" and becomes_true(lambda: len(actors() - first) == 2, 10):
-            upsets.append("another started")  # not before this returns and the engine hears of the loss
+        elif upsets[-1] == "an actor was killed" and becomes_true(
+            lambda: len(actors() - first) == 2, 10
+        ):
+            upsets.append(
+                "another started"
+            )  # not before this returns and the engine hears of the loss
         elif upsets[-1] == "another started" and writing(plan) & second:
             cluster.remove_node(nodes.pop(), allow_graceful=False)
             assert becomes_true(lambda: not actors() & second)
@@ -148,6 +162,8 @@ def test_actors_that_never_finish_a_shard_stop_the_bake(
     monkeypatch.setattr(module, "Baker", Dying)
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     prepare(plan)
-    with pytest.raises(FileError, match=r"(?s)2 Ray actors were lost without a finished.*finished shards are kept"):
+    with pytest.raises(
+        FileError, match=r"(?s)2 Ray actors were lost without a finished.*finished shards are kept"
+    ):
         ENGINES["ray"](plan, range(4), Resources(1), lambda scans: None)
     assert not list(plan.out.glob("*.h5"))

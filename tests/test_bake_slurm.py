@@ -1,4 +1,5 @@
-"""Engine ``slurm`` with submitit's executor for one machine: real jobs, their logs, and failures."""
+"""Engine ``slurm`` with submitit's executor for one machine: real jobs, their logs, and
+failures."""
 
 import os
 import signal
@@ -17,7 +18,9 @@ from lidar_synth.bake.slurm import LOGS, SlurmTask
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import write_file
 
-submitit = pytest.importorskip("submitit", reason="submitit is not installed: pip install 'lidar_synth[slurm]'")
+submitit = pytest.importorskip(
+    "submitit", reason="submitit is not installed: pip install 'lidar_synth[slurm]'"
+)
 cloudpickle = pytest.importorskip("cloudpickle")  # comes with it
 
 LOCAL = {"cluster": "local"}
@@ -66,22 +69,30 @@ def test_a_job_that_runs_out_of_time_resumes(plan: BakePlan) -> None:
     first = (plan.out / "shard-00000.h5").stat()
     os.kill(int((plan.out / "waited").read_text()), signal.SIGUSR2)
     assert job.result() == COUNT, job.stderr()
-    assert (plan.out / "shard-00000.h5").stat().st_mtime_ns == first.st_mtime_ns  # not written twice
+    assert (
+        plan.out / "shard-00000.h5"
+    ).stat().st_mtime_ns == first.st_mtime_ns  # not written twice
 
 
 def test_a_failed_job_is_reported(plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
-    with pytest.raises(FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"):
+    with pytest.raises(
+        FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"
+    ):
         ENGINES["slurm"](plan, range(4), Resources(2, slurm=LOCAL), lambda scans: None)
     assert len(list((plan.out / LOGS).glob("*.out"))) == 2  # kept for diagnosis
     bake(plan, progress=False)
     assert not (plan.out / LOGS).exists()
 
 
-def test_a_missing_slurm_and_unknown_options_are_refused(plan: BakePlan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_slurm_and_unknown_options_are_refused(
+    plan: BakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PATH", os.devnull)
-    with pytest.raises(ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'):
+    with pytest.raises(
+        ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'
+    ):
         bake(plan, "slurm", progress=False)
     with pytest.raises(ConfigError, match=r"(?s)'speed'.*options of submitit"):
         bake(plan, "slurm", Resources(1, slurm=LOCAL | {"speed": 9}), progress=False)

@@ -1,4 +1,5 @@
-"""Banks: scans are read as they were written, by every process, and the same scans give the same bytes."""
+"""Banks: scans are read as they were written, by every process, and the same scans give the same
+bytes."""
 
 import json
 import multiprocessing
@@ -58,8 +59,11 @@ def test_plain_hdf5_reads_a_shard(tmp_path: Path) -> None:
         for name in ("range", *ALL):
             dataset = file[name]
             assert (dataset.chunks, dataset.compression, dataset.shuffle, dataset.fletcher32) == (
-                (1, 8, 32), "gzip", True, True,
-            )  # fmt: skip
+                (1, 8, 32),
+                "gzip",
+                True,
+                True,
+            )
             expected = np.stack([Encoding(SENSOR, ALL).encode(image)[name] for image in images])
             assert np.array_equal(dataset[:], expected)
 
@@ -74,7 +78,8 @@ def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_the_number_of_threads_changes_no_byte(tmp_path: Path, threads: int) -> None:
-    facts, entry = some_facts(), Entry("shard-00000.h5", 5, 0, 40)
+    facts = some_facts()
+    entry = Entry("shard-00000.h5", 5, 0, 40)
     with ShardWriter(tmp_path / entry.file, facts, entry, threads=threads) as writer:
         for i in range(40):
             writer.append(some_image(i))
@@ -83,11 +88,18 @@ def test_the_number_of_threads_changes_no_byte(tmp_path: Path, threads: int) -> 
 
 
 def test_a_shard_with_too_few_scans_or_a_bad_one_is_not_left_behind(tmp_path: Path) -> None:
-    path, entry = tmp_path / "shard-00000.h5", Entry("shard-00000.h5", 5, 0, 2)
-    with pytest.raises(DataError, match="1 scans for .*; expected 2"), ShardWriter(path, some_facts(), entry) as writer:
+    path = tmp_path / "shard-00000.h5"
+    entry = Entry("shard-00000.h5", 5, 0, 2)
+    with (
+        pytest.raises(DataError, match="1 scans for .*; expected 2"),
+        ShardWriter(path, some_facts(), entry) as writer,
+    ):
         writer.append(some_image())
     assert not path.exists()
-    with pytest.raises(DataError, match="reflectance from"), ShardWriter(path, some_facts(), entry) as writer:
+    with (
+        pytest.raises(DataError, match="reflectance from"),
+        ShardWriter(path, some_facts(), entry) as writer,
+    ):
         writer.append(spoiled("reflectance", 2))
         writer.append(some_image())
     assert not path.exists()
@@ -99,17 +111,28 @@ def test_a_shard_with_too_few_scans_or_a_bad_one_is_not_left_behind(tmp_path: Pa
 def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
     bank = Bank(root)
     assert isinstance(bank, Source)
-    assert (len(bank), bank.length, bank.sensor, bank.fields) == (5, 5, SENSOR, {"reflectance", "label"})
+    assert (len(bank), bank.length, bank.sensor, bank.fields) == (
+        5,
+        5,
+        SENSOR,
+        {"reflectance", "label"},
+    )
     encoding = Encoding(SENSOR, bank.fields)
     for i in (3, 0, 4, 1, 2):
         expected = encoding.decode(encoding.encode(some_image(i)))
-        image, scan = bank.image(i), bank[i]
-        assert np.array_equal(image.range, expected.range) and np.array_equal(image.label, expected.label)
+        image = bank.image(i)
+        scan = bank[i]
+        assert np.array_equal(image.range, expected.range) and np.array_equal(
+            image.label, expected.label
+        )
         assert (scan.id, scan.domain, scan.sensor) == (f"small/5/{i}", SYNTHETIC, SENSOR)
         assert np.array_equal(scan.points, unproject(expected).points)
         assert np.array_equal(scan.label, expected.label[expected.mask]) and scan.confidence is None
     assert bank[-1].id == "small/5/4" and len(list(iter(bank))) == 5
-    assert list(bank.ids) == [f"small/5/{i}" for i in range(5)] and bank.ids[1:3] == ["small/5/1", "small/5/2"]
+    assert list(bank.ids) == [f"small/5/{i}" for i in range(5)] and bank.ids[1:3] == [
+        "small/5/1",
+        "small/5/2",
+    ]
     for wrong in (5, -6):
         with pytest.raises(IndexError):
             bank[wrong]
@@ -118,7 +141,9 @@ def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
     assert np.array_equal(bank.image(-1).range, bank.image(4).range) and bank.ids[-1] == bank.ids[4]
 
 
-def test_few_files_are_open_and_each_shard_is_parsed_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_files_are_open_and_each_shard_is_parsed_once(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(reader, "_OPEN", 1)
     bank = Bank(root)
     first = bank.shard(0)
@@ -130,7 +155,9 @@ def test_few_files_are_open_and_each_shard_is_parsed_once(root: Path, monkeypatc
     assert bank[2].id == "small/5/2"
 
 
-def test_memory_for_the_places_of_scans_is_bounded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_for_the_places_of_scans_is_bounded(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(reader, "_OPEN", 1)
     monkeypatch.setattr(reader, "_KNOWN", 2 * reader._LEAST)
     bank = Bank(root)
@@ -141,12 +168,15 @@ def test_memory_for_the_places_of_scans_is_bounded(root: Path, monkeypatch: pyte
 @pytest.mark.parametrize("change", ["other scans", "damage", "shorter", "gone"])
 def test_a_shard_that_changed_while_it_was_closed_is_checked_again(root: Path, change: str) -> None:
     bank = Bank(root)
-    content, path = bank[0].points, root / bank.index.shards[0].file
+    content = bank[0].points
+    path = root / bank.index.shards[0].file
     bank.close()
     if change == "other scans":  # in other places of the file
         path.unlink()
         write_bank(root, [some_image(i) for i in (1, 0)])
-        assert not np.array_equal(bank[0].points, content) and np.array_equal(bank[1].points, content)
+        assert not np.array_equal(bank[0].points, content) and np.array_equal(
+            bank[1].points, content
+        )
         return
     if change == "damage":
         path.write_bytes(path.read_bytes().replace(b"generated", b"Generated", 1))
@@ -180,9 +210,13 @@ def test_workers_read_a_bank(root: Path, method: str) -> None:
 
 
 def test_conditions_are_stored_by_name(tmp_path: Path) -> None:
-    facts = some_facts(condition={"kind": "semantic", "source": "kitti360", "split": "r2flow/train"})
+    facts = some_facts(
+        condition={"kind": "semantic", "source": "kitti360", "split": "r2flow/train"}
+    )
     entry = Entry("shard-00000.h5", 5, 7, 2)
-    with ShardWriter(tmp_path / entry.file, facts, entry, conditions=["drive/0000000007", "drive/8"]) as writer:
+    with ShardWriter(
+        tmp_path / entry.file, facts, entry, conditions=["drive/0000000007", "drive/8"]
+    ) as writer:
         writer.append(some_image(0))
         writer.append(some_image(1))
     path = tmp_path / entry.file
@@ -228,10 +262,14 @@ def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
 def test_missing_libraries_are_reported(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(LibraryError, match=r"s3://bucket/bank/index.json cannot be opened .*fsspec.*pip install"):
+    with pytest.raises(
+        LibraryError, match=r"s3://bucket/bank/index.json cannot be opened .*fsspec.*pip install"
+    ):
         Bank("s3://bucket/bank")
     facts = some_facts(compression="blosc2")
-    with pytest.raises(LibraryError, match=r"hdf5plugin cannot be imported .*pip install 'lidar_synth\[blosc2\]'"):
+    with pytest.raises(
+        LibraryError, match=r"hdf5plugin cannot be imported .*pip install 'lidar_synth\[blosc2\]'"
+    ):
         ShardWriter(root / "new.h5", facts, Entry("new.h5", 0, 0, 1))
 
 
@@ -240,7 +278,9 @@ def test_blosc2_banks_are_read(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i) for i in range(3)], compression="blosc2")
     encoding = Encoding(SENSOR, ("reflectance", "label"))
     for i in range(3):
-        assert np.array_equal(Bank(tmp_path).image(i).range, encoding.decode(encoding.encode(some_image(i))).range)
+        assert np.array_equal(
+            Bank(tmp_path).image(i).range, encoding.decode(encoding.encode(some_image(i))).range
+        )
 
 
 # Identity, card and golden bank
@@ -256,7 +296,13 @@ def test_the_identity_depends_on_the_content_of_the_index(root: Path) -> None:
 
 def test_card_and_croissant(root: Path) -> None:
     card = (root / "README.md").read_text()
-    for text in ('license: "mit"', "| scans | 5 |", "| data licence | none |", "checkpoint cccc", "none was measured"):
+    for text in (
+        'license: "mit"',
+        "| scans | 5 |",
+        "| data licence | none |",
+        "checkpoint cccc",
+        "none was measured",
+    ):
         assert text in card
     described = json.loads((root / "croissant.json").read_text())
     assert described["conformsTo"] == "http://mlcommons.org/croissant/1.0"

@@ -1,4 +1,5 @@
-"""``lidar-synth bank as-sensor``: a bank of the scans of another sensor, made once; settings that name the sensor."""
+"""``lidar-synth bank as-sensor``: a bank of the scans of another sensor, made once; settings that
+name the sensor."""
 
 import logging
 from dataclasses import replace
@@ -51,20 +52,29 @@ class Stops(Transfer):
 def test_a_bank_holds_what_its_transfer_gives(bank: Bank, tmp_path: Path) -> None:
     index = turn_bank(bank, tmp_path, TRANSFER, progress=False)
     turned = Bank(tmp_path)
-    assert (index.scans, turned.sensor, turned.fields, list(turned.ids)) == (3, THEIRS, bank.fields, list(bank.ids))
+    assert (index.scans, turned.sensor, turned.fields, list(turned.ids)) == (
+        3,
+        THEIRS,
+        bank.fields,
+        list(bank.ids),
+    )
     for i in range(3):
         expected = project(TRANSFER(bank[i], keyed_rng(5, i)))
         assert expected.mask.sum() > 1000
         encoding = turned.facts.encoding
-        image, expected = turned.image(i), encoding.decode(encoding.encode(expected))
-        assert np.array_equal(image.range, expected.range) and np.array_equal(image.label, expected.label)
+        image = turned.image(i)
+        expected = encoding.decode(encoding.encode(expected))
+        assert np.array_equal(image.range, expected.range) and np.array_equal(
+            image.label, expected.label
+        )
     assert verify(tmp_path, progress=False) == []
     with pytest.raises(DataError, match="turned into scans of 'theirs'.*bank as-sensor again"):
         job_of(turned.facts)
 
 
 def test_an_interrupted_run_resumes_and_damage_is_made_again(bank: Bank, tmp_path: Path) -> None:
-    whole, out = tmp_path / "whole", tmp_path / "out"
+    whole = tmp_path / "whole"
+    out = tmp_path / "out"
     turn_bank(bank, whole, TRANSFER, progress=False)
     stops = Stops(TRANSFER.target, TRANSFER.mount, TRANSFER.measurement)
     with pytest.raises(KeyboardInterrupt):
@@ -94,19 +104,31 @@ def test_settings_name_sensor_mount_and_scans_to_match(tmp_path: Path, bank: Ban
     writer.finish()
     values = THEIRS.to_dict()
     (tmp_path / "theirs.yaml").write_text(yaml.safe_dump({values.pop("name"): values}))
-    given = {"sensor": str(tmp_path / "theirs.yaml"), "mount": [0.1, 0], "like": str(tmp_path / "real")}
+    given = {
+        "sensor": str(tmp_path / "theirs.yaml"),
+        "mount": [0.1, 0],
+        "like": str(tmp_path / "real"),
+    }
     matched = read_transfer(given, bank)
     assert matched.mount == Mount(0.1) and matched.target == THEIRS
     assert abs(np.median(matched(bank[0]).reflectance) - np.median(bright.reflectance * 2)) < 0.05
     for wrong in ({"mount": [0, 0]}, given | {"mount": "high"}, given | {"noise": 1}):
         with pytest.raises(ConfigError, match="as_sensor: .*expected sensor: a preset's name"):
             read_transfer(wrong, bank)
-    plain = mix(3, {"synthetic": bank, "as_sensor": {"sensor": "os1_128", "mount": [0.1, 0]}}, lambda scan, rng: scan)
-    made = [sample for sample in map(plain.__getitem__, range(len(plain))) if isinstance(sample, Scan)]
+    plain = mix(
+        3,
+        {"synthetic": bank, "as_sensor": {"sensor": "os1_128", "mount": [0.1, 0]}},
+        lambda scan, rng: scan,
+    )
+    made = [
+        sample for sample in map(plain.__getitem__, range(len(plain))) if isinstance(sample, Scan)
+    ]
     assert made and all(scan.sensor.name == "os1_128" for scan in made)
 
 
-def test_what_scans_of_a_sensor_will_lack_is_said_once(bank: Bank, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_scans_of_a_sensor_will_lack_is_said_once(
+    bank: Bank, caplog: pytest.LogCaptureFixture
+) -> None:
     transfer = Transfer(replace(THEIRS, name="wide", fov_up=12.0, fov_down=-31.0))
     with caplog.at_level(logging.WARNING):
         transfer(bank[0])

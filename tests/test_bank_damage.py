@@ -24,14 +24,19 @@ def root(tmp_path: Path) -> Path:
 
 
 def read_all(root: Path) -> list[bytes]:
-    return [scan.points.tobytes() + scan.label.tobytes() + scan.reflectance.tobytes() for scan in Bank(root)]
+    return [
+        scan.points.tobytes() + scan.label.tobytes() + scan.reflectance.tobytes()
+        for scan in Bank(root)
+    ]
 
 
 @pytest.mark.slow
 def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
     expected = read_all(root)
     path = root / "shard-00001.h5"
-    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
     for bit in rng.choice(8 * len(content), 300, replace=False):
         damaged = bytearray(content)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -41,17 +46,22 @@ def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
         except DataError as error:
             assert "shard-00001.h5" in str(error), error
             refused += 1
-        assert sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256  # as verify does
+        assert (
+            sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256
+        )  # as verify does
     assert refused > 90  # half of such a small shard is unused space for metadata
 
 
 def test_a_truncated_shard_is_found(root: Path) -> None:
     path = root / "shard-00001.h5"
-    content, rng = path.read_bytes(), np.random.default_rng(0)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
     index = Index.from_json((root / INDEX).read_bytes(), INDEX)
     for length in rng.integers(0, len(content), 60).tolist():
         path.write_bytes(content[:length])
-        with pytest.raises(DataError, match=rf"shard-00001.h5 is {length} bytes long; expected {len(content)}"):
+        with pytest.raises(
+            DataError, match=rf"shard-00001.h5 is {length} bytes long; expected {len(content)}"
+        ):
             Bank(root)
         with pytest.raises(DataError, match="shard-00001.h5"):  # and without knowing the size
             shard = ShardReader(path, str(path), index.sources[0], index.shards[1])
@@ -63,7 +73,9 @@ def test_a_missing_shard_and_a_missing_index_are_reported(root: Path) -> None:
     with pytest.raises(FileError, match=r"shard shard-00002.h5 is missing .*lidar-synth repair"):
         Bank(root)
     (root / INDEX).unlink()
-    with pytest.raises(FileError, match=r"holds no bank: index.json cannot be read .*Run an interrupted bake again"):
+    with pytest.raises(
+        FileError, match=r"holds no bank: index.json cannot be read .*Run an interrupted bake again"
+    ):
         open_scans(root)
 
 
@@ -86,7 +98,10 @@ def test_files_that_do_not_belong_to_the_bank_are_refused(root: Path, tmp_path: 
     foreign.write_text("no HDF5 at all, but as long as two scans")
     with pytest.raises(DataError, match="shard-00000.h5 is truncated, damaged or not an HDF5 file"):
         with_shard(root, foreign)[0]
-    with pytest.raises(DataError, match="shard-00000.h5 holds scans 2 to 3 of seed 5; expected scans 0 to 1 of seed 5"):
+    with pytest.raises(
+        DataError,
+        match="shard-00000.h5 holds scans 2 to 3 of seed 5; expected scans 0 to 1 of seed 5",
+    ):
         with_shard(root, root / "shard-00001.h5")[0]
     for name, change in {
         "licence": {"licence": "none"},
@@ -94,11 +109,16 @@ def test_files_that_do_not_belong_to_the_bank_are_refused(root: Path, tmp_path: 
         "sensor": {"sensor": replace(SENSOR, name="x", range_max=60.0)},
     }.items():
         facts = replace(some_facts(), **change)
-        images = [RangeImage(i.range.clip(max=60), facts.sensor, i.channels) for i in (some_image(0), some_image(1))]
+        images = [
+            RangeImage(i.range.clip(max=60), facts.sensor, i.channels)
+            for i in (some_image(0), some_image(1))
+        ]
         with ShardWriter(foreign, facts, Entry("shard-00000.h5", 5, 0, 2)) as writer:
             for image in images:
                 writer.append(image)
-        with pytest.raises(DataError, match=f"shard-00000.h5: .*{name} differ from the bank's index"):
+        with pytest.raises(
+            DataError, match=f"shard-00000.h5: .*{name} differ from the bank's index"
+        ):
             with_shard(root, foreign)[0]
 
 
@@ -150,15 +170,23 @@ def test_an_index_with_invalid_shards_is_refused(root: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "code"), [("label", 127), ("label", 19), ("confidence", 16)])
-def test_invalid_codes_are_refused_despite_a_matching_checksum(tmp_path: Path, name: str, code: int) -> None:
+def test_invalid_codes_are_refused_despite_a_matching_checksum(
+    tmp_path: Path, name: str, code: int
+) -> None:
     [path] = write_bank(tmp_path, [some_image()], fields=("reflectance", "label", "confidence"))
     with h5py.File(path, "r+") as file:
         values = file[name][0]
         values[2, 3] = code
         file[name][0] = values
-        arrays = {n: np.ascontiguousarray(file[n][0]) for n in ("range", "reflectance", "label", "confidence")}
+        arrays = {
+            n: np.ascontiguousarray(file[n][0])
+            for n in ("range", "reflectance", "label", "confidence")
+        }
         file["crc"][0] = checksum(int(file["seed"][0]), int(file["index"][0]), arrays)
-    with ShardReader(path, "the shard") as shard, pytest.raises(DataError, match=f"the shard: scan 0: .*{code}"):
+    with (
+        ShardReader(path, "the shard") as shard,
+        pytest.raises(DataError, match=f"the shard: scan 0: .*{code}"),
+    ):
         shard.read(0)
 
 

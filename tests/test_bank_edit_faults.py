@@ -46,7 +46,8 @@ def test_a_killed_call_is_completed_by_the_same_call(
     CALLS[call](bank, tmp_path / "whole")
     expected = contents(tmp_path / "whole")
     files = len([name for name in expected if name.endswith(".h5")])
-    out, replace = tmp_path / "out", Path.replace
+    out = tmp_path / "out"
+    replace = Path.replace
     for survivors in range(files + 2):
         shutil.rmtree(out, ignore_errors=True)
         left = iter(range(survivors))
@@ -102,7 +103,10 @@ def test_commands_that_are_killed_resume_to_the_same_bytes() -> None:
     some = ["convert", "convert, webdataset", "bank split", "curate"]
     options = [word for name in some for word in ("--command", name)]
     done = subprocess.run(
-        [sys.executable, script, "--kills", "2", *options], capture_output=True, text=True, check=False
+        [sys.executable, script, "--kills", "2", *options],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (done.stdout + done.stderr).count("| no |") == len(some)

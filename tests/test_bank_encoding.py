@@ -1,4 +1,5 @@
-"""The bytes of a bank: encoded range images and HDF5 chunks decode to what was written, or are refused."""
+"""The bytes of a bank: encoded range images and HDF5 chunks decode to what was written, or are
+refused."""
 
 import zlib
 from typing import Any
@@ -27,12 +28,19 @@ ALL = ("reflectance", "label", "confidence")
 
 def test_decoded_images_differ_by_at_most_half_a_step(sensor: Sensor) -> None:
     image = some_image(1, sensor)
-    image.range[0, :4] = sensor.range_min, sensor.range_max, max(sensor.range_min, 1e-6), sensor.range_max * (1 - 1e-7)
+    image.range[0, :4] = (
+        sensor.range_min,
+        sensor.range_max,
+        max(sensor.range_min, 1e-6),
+        sensor.range_max * (1 - 1e-7),
+    )
     encoding = Encoding(sensor, ALL)
     decoded = encoding.decode(encoding.encode(image))
     assert np.abs(decoded.range - image.range).max() <= encoding.scale / 2 * 1.02
     assert np.array_equal(decoded.mask, image.mask)
-    assert np.array_equal(project(unproject(decoded)).mask, image.mask)  # nothing leaves the sensor's limits
+    assert np.array_equal(
+        project(unproject(decoded)).mask, image.mask
+    )  # nothing leaves the sensor's limits
     assert np.array_equal(decoded.label, image.label)
     for name, levels in LEVELS.items():
         assert np.abs(decoded.channels[name] - image.channels[name]).max() <= 0.5001 / levels
@@ -42,10 +50,12 @@ def test_decoded_images_differ_by_at_most_half_a_step(sensor: Sensor) -> None:
 @given(seed=st.integers(0, 2**32 - 1), near=st.floats(0, 3), far=st.floats(20, 300))
 def test_encode_is_the_inverse_of_decode(seed: int, near: float, far: float) -> None:
     sensor = Sensor("any", 16, near, far, rows=4, fov_up=3.0, fov_down=-25.0)
-    encoding, rng = Encoding(sensor, ALL), np.random.default_rng(seed)
+    encoding = Encoding(sensor, ALL)
+    rng = np.random.default_rng(seed)
     lowest = max(1, int(np.ceil(near * 1.000002 / encoding.scale)))
     arrays = {
-        "range": rng.integers(lowest, 65536, sensor.shape).astype(np.uint16) * (rng.random(sensor.shape) < 0.8),
+        "range": rng.integers(lowest, 65536, sensor.shape).astype(np.uint16)
+        * (rng.random(sensor.shape) < 0.8),
         "reflectance": rng.integers(0, 256, sensor.shape).astype(np.uint8),
         "label": rng.choice([*range(19), IGNORE], sensor.shape).astype(np.uint8),
         "confidence": rng.integers(0, 16, sensor.shape).astype(np.uint8),
@@ -60,10 +70,14 @@ def test_codes_and_checksums_match_the_format() -> None:
     """Exact: a bank of today is read by every later version."""
     sensor = Sensor("x", 2, 0.0, 65.535, rows=2, fov_up=3.0, fov_down=-25.0)
     image = RangeImage(
-        np.array([(0, 1e-9), (0.0015001, 65.535)], np.float32), sensor,
-        {"reflectance": np.array([(0, 1), (0.5, 0.25)], np.float32), "label": np.array([(255, 0), (18, 7)], np.uint8),
-         "confidence": np.array([(0, 1), (0.5, 0.1)], np.float32)},
-    )  # fmt: skip
+        np.array([(0, 1e-9), (0.0015001, 65.535)], np.float32),
+        sensor,
+        {
+            "reflectance": np.array([(0, 1), (0.5, 0.25)], np.float32),
+            "label": np.array([(255, 0), (18, 7)], np.uint8),
+            "confidence": np.array([(0, 1), (0.5, 0.1)], np.float32),
+        },
+    )
     arrays = Encoding(sensor, ALL).encode(image)
     assert {name: values.tolist() for name, values in arrays.items()} == {
         "range": [[0, 1], [2, 65535]],
@@ -71,7 +85,9 @@ def test_codes_and_checksums_match_the_format() -> None:
         "label": [[255, 0], [18, 7]],
         "confidence": [[0, 15], [8, 2]],
     }
-    assert Encoding(sensor).metres(np.array([0, 1, 1000], np.uint16)).tolist() == pytest.approx([0, 0.001, 1.0])
+    assert Encoding(sensor).metres(np.array([0, 1, 1000], np.uint16)).tolist() == pytest.approx(
+        [0, 0.001, 1.0]
+    )
     content = "07000000000000000000000000010000", "000001000200ffff00ff8040ff001207000f0802"
     expected = zlib.crc32(bytes.fromhex(content[0]) + b"seq/0001" + bytes.fromhex(content[1]))
     assert checksum(7, 2**40, arrays, b"seq/0001") == expected
@@ -79,7 +95,9 @@ def test_codes_and_checksums_match_the_format() -> None:
 
 def test_encoding_into_existing_arrays() -> None:
     encoding = Encoding(SENSOR, ("label",))
-    slots = {name: np.zeros((3, *shape), dtype) for name, (shape, dtype) in encoding.arrays().items()}
+    slots = {
+        name: np.zeros((3, *shape), dtype) for name, (shape, dtype) in encoding.arrays().items()
+    }
     encoding.encode(some_image(), {name: values[1] for name, values in slots.items()})
     for name, values in encoding.encode(some_image()).items():
         assert np.array_equal(slots[name][1], values)
@@ -89,7 +107,10 @@ def test_encoding_into_existing_arrays() -> None:
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (spoiled("range", 80.1), r"ranges from .* to 80\.1 m; expected 1\.45 to 80 m, the limits of 'small'"),
+        (
+            spoiled("range", 80.1),
+            r"ranges from .* to 80\.1 m; expected 1\.45 to 80 m, the limits of 'small'",
+        ),
         (spoiled("range", 1.4), r"ranges from 1\.4"),
         (spoiled("range", -1), "ranges from -1"),
         (spoiled("range", np.nan), "ranges from"),
@@ -98,8 +119,14 @@ def test_encoding_into_existing_arrays() -> None:
         (spoiled("reflectance", np.nan), "reflectance from"),
         (spoiled("confidence", -0.1), "confidence from -0.1"),
         (spoiled("label", 19), r"train ids \[19\]; expected 0..18, or 255"),
-        (RangeImage(some_image().range, SENSOR, {}), r"without \['reflectance', 'label', 'confidence'\]"),
-        (some_image(0, Sensor("other", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)), r"of \(8, 64\); expected"),
+        (
+            RangeImage(some_image().range, SENSOR, {}),
+            r"without \['reflectance', 'label', 'confidence'\]",
+        ),
+        (
+            some_image(0, Sensor("other", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)),
+            r"of \(8, 64\); expected",
+        ),
     ],
 )
 def test_values_without_a_code_are_refused(image: RangeImage, message: str) -> None:
@@ -108,7 +135,9 @@ def test_values_without_a_code_are_refused(image: RangeImage, message: str) -> N
 
 
 def test_unknown_fields_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"fields \['ring'\] of a bank; expected some of range, reflectance"):
+    with pytest.raises(
+        ConfigError, match=r"fields \['ring'\] of a bank; expected some of range, reflectance"
+    ):
         Encoding(SENSOR, ("label", "ring"))
 
 
@@ -118,9 +147,13 @@ def test_unknown_fields_are_refused() -> None:
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 719, 720, 721, 50_001])
 @pytest.mark.parametrize("fill", [None, 0, 255])
 def test_fletcher32_matches_hdf5(size: int, fill: int | None) -> None:
-    data = np.random.default_rng(size).integers(0, 256, size) if fill is None else np.full(size, fill)
+    data = (
+        np.random.default_rng(size).integers(0, 256, size) if fill is None else np.full(size, fill)
+    )
     with h5py.File("any", "w", driver="core", backing_store=False) as file:
-        dataset = file.create_dataset("x", data=data.astype(np.uint8), chunks=(size,), fletcher32=True)
+        dataset = file.create_dataset(
+            "x", data=data.astype(np.uint8), chunks=(size,), fletcher32=True
+        )
         file.flush()
         chunk = bytes(dataset.id.read_direct_chunk((0,))[1])
     assert fletcher32(chunk[:-4]) == int.from_bytes(chunk[-4:], "little")
@@ -134,7 +167,10 @@ def test_fletcher32_matches_hdf5(size: int, fill: int | None) -> None:
 )
 @settings(max_examples=60)
 def test_inflate_is_the_inverse_of_deflate(
-    values: np.random.Generator, shape: tuple[int, int], dtype: type[np.unsignedinteger[Any]], most: int
+    values: np.random.Generator,
+    shape: tuple[int, int],
+    dtype: type[np.unsignedinteger[Any]],
+    most: int,
 ) -> None:
     array = values.integers(0, min(most, np.iinfo(dtype).max), shape).astype(dtype)
     again = inflate(deflate(array), shape, np.dtype(dtype))
@@ -143,7 +179,8 @@ def test_inflate_is_the_inverse_of_deflate(
 
 def test_invalid_chunks_are_refused() -> None:
     array = np.random.default_rng(0).integers(0, 9, (8, 32)).astype(np.uint16)
-    chunk, dtype = deflate(array), array.dtype
+    chunk = deflate(array)
+    dtype = array.dtype
     for bit in range(8 * len(chunk)):
         damaged = bytearray(chunk)
         damaged[bit // 8] ^= 1 << bit % 8

@@ -88,7 +88,9 @@ def linked(file: h5py.File, beside: Path) -> None:
 def stored_outside(file: h5py.File, beside: Path) -> None:
     values = outside(file, beside, "crc")
     del file["crc"]
-    file.create_dataset("crc", values.shape, "<u4", external=[(str(beside / "other.raw"), 0, values.nbytes)])
+    file.create_dataset(
+        "crc", values.shape, "<u4", external=[(str(beside / "other.raw"), 0, values.nbytes)]
+    )
 
 
 def virtual(file: h5py.File, beside: Path) -> None:
@@ -121,7 +123,12 @@ def huge_grid(file: h5py.File, _: Path) -> None:
     for name, dtype in (("range", "<u2"), ("reflectance", "u1"), ("label", "u1")):
         del file[name]
         shape = (1, 1 << 15, 1 << 15)
-        options = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
+        options = {
+            "shuffle": True,
+            "compression": "gzip",
+            "compression_opts": 1,
+            "fletcher32": True,
+        }
         dataset = file.create_dataset(name, (2, *shape[1:]), dtype, chunks=shape, **options)
         for position in range(2):
             dataset.id.write_direct_chunk((position, 0, 0), b"a chunk")
@@ -145,11 +152,16 @@ HARMFUL: dict[str, Change] = {
     "crc declared": declared("crc", "<u4"),
     "crc in chunks": declared("crc", "<u4", chunks=(1 << 20,), compression="gzip"),
     "condition declared": declared("condition", "S4"),
-    "condition of huge texts": replaced("condition", lambda f, _: f.create_dataset("condition", (2,), "S2000000000")),
-    "condition of any length": replaced(
-        "condition", lambda f, _: f.create_dataset("condition", data=["a", "b"], dtype=h5py.string_dtype())
+    "condition of huge texts": replaced(
+        "condition", lambda f, _: f.create_dataset("condition", (2,), "S2000000000")
     ),
-    "crc as references": replaced("crc", lambda f, _: f.create_dataset("crc", (2,), h5py.ref_dtype)),
+    "condition of any length": replaced(
+        "condition",
+        lambda f, _: f.create_dataset("condition", data=["a", "b"], dtype=h5py.string_dtype()),
+    ),
+    "crc as references": replaced(
+        "crc", lambda f, _: f.create_dataset("crc", (2,), h5py.ref_dtype)
+    ),
     "crc as a compound": replaced("crc", lambda f, _: f.create_dataset("crc", (2,), "u4,u4")),
     "crc as a group": replaced("crc", lambda f, _: f.create_group("crc")),
     "another dataset": lambda f, _: f.create_dataset("other", (2,), "u4") and None,
@@ -173,13 +185,19 @@ HARMFUL: dict[str, Change] = {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux to measure the memory")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="needs Linux to measure the memory"
+)
 def test_malicious_shards_allocate_no_memory(tmp_path: Path) -> None:
     made = [harmful(tmp_path / str(number), what) for number, what in enumerate(HARMFUL)]
     assert all(path.stat().st_size < 100_000 for _, path in made)
     given = [made[0][0], str(LIMIT), *(path for _, path in made)]
     done = subprocess.run(
-        [sys.executable, "-c", CHILD, *given], capture_output=True, text=True, timeout=200, check=False
+        [sys.executable, "-c", CHILD, *given],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
 
@@ -195,7 +213,9 @@ def test_a_malicious_shard_is_refused(tmp_path: Path, what: str) -> None:
 
 def harmful(folder: Path, what: str) -> tuple[Path, Path]:
     """A valid shard and a malicious one."""
-    good, path = (write_bank(folder / name, [some_image(i) for i in range(2)])[0] for name in ("good", "bad"))
+    good, path = (
+        write_bank(folder / name, [some_image(i) for i in range(2)])[0] for name in ("good", "bad")
+    )
     path = path.rename(path.with_name("bad.h5"))
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         HARMFUL[what](file, folder)
@@ -204,8 +224,28 @@ def harmful(folder: Path, what: str) -> tuple[Path, Path]:
 
 # The index
 
-WRONG: list[Any] = [1e30, -1, 0, 0.5, 1e400, float("nan"), 10**30, 1 << 63, True, None, "", "x", "\ud800", [], {}, [[]],
-                    [None], {"x": 1}, "\0" * 300, json.loads("[" * 40 + "]" * 40)]  # fmt: skip
+WRONG: list[Any] = [
+    1e30,
+    -1,
+    0,
+    0.5,
+    1e400,
+    float("nan"),
+    10**30,
+    1 << 63,
+    True,
+    None,
+    "",
+    "x",
+    "\ud800",
+    [],
+    {},
+    [[]],
+    [None],
+    {"x": 1},
+    "\0" * 300,
+    json.loads("[" * 40 + "]" * 40),
+]
 
 
 def places(values: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -253,7 +293,9 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     assert refused > 0.8 * len(places(values)) * len(WRONG)
 
 
-@pytest.mark.parametrize("text", ["[" * 10**6, '{"a":' * 10**5, "1" * 5000, "null", "[]", "1e400", "\ufeff{}", ""])
+@pytest.mark.parametrize(
+    "text", ["[" * 10**6, '{"a":' * 10**5, "1" * 5000, "null", "[]", "1e400", "\ufeff{}", ""]
+)
 def test_invalid_index_texts_are_refused(text: str) -> None:
     with pytest.raises(LidarSynthError, match="index"):
         Index.from_json(text.encode("utf-8", "surrogatepass"), "index.json")
@@ -282,5 +324,9 @@ def test_cards_show_markup_as_text(tmp_path: Path) -> None:
     card = dataset_card(evil, Bank(tmp_path / "bank").index)
     body = card.split("---\n", 2)[2]
     assert "<img" not in body and "[x](" not in body.replace("\\[", "")
-    assert all(line.count("|") - line.count("\\|") == 3 for line in body.splitlines() if line.startswith("| "))
+    assert all(
+        line.count("|") - line.count("\\|") == 3
+        for line in body.splitlines()
+        if line.startswith("| ")
+    )
     assert body.count("\n# ") == 1

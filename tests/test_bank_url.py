@@ -40,15 +40,21 @@ def served(tmp_path: Path) -> Iterator[Served]:
 def test_random_access_transfers_little_more_than_the_scans(
     tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Index, shard metadata and scans: at most 1.3 times the scans' bytes, and at most 4 requests per scan."""
+    """Index, shard metadata and scans: at most 1.3 times the scans' bytes, and at most 4 requests
+    per scan."""
     if layout == "before":  # files of older versions, whose metadata is scattered
         monkeypatch.setattr(writer, "metadata_size", lambda *_: 2048)
     images = [some_image(i, LARGE) for i in range(6)]
-    facts = {"layout": "plain" if layout == "before" else layout, "provenance": {"recipe": "x" * 20_000}}
+    facts = {
+        "layout": "plain" if layout == "before" else layout,
+        "provenance": {"recipe": "x" * 20_000},
+    }
     write_bank(tmp_path / "bank", [images[i % 6] for i in range(60)], shard_size=20, **facts)
-    here, chosen = Bank(tmp_path / "bank"), np.random.default_rng(0).permutation(60)[:30].tolist()
+    here = Bank(tmp_path / "bank")
+    chosen = np.random.default_rng(0).permutation(60)[:30].tolist()
     with serve(tmp_path) as served:
-        bank, scans = Bank(f"{served.url}/bank/"), 0
+        bank = Bank(f"{served.url}/bank/")
+        scans = 0
         for number in chosen:
             before = len(served.requests)
             assert np.array_equal(bank.image(number).range, here.image(number).range)
@@ -57,7 +63,10 @@ def test_random_access_transfers_little_more_than_the_scans(
             assert opened <= (7 if layout == "before" else 4)
         assert served.bytes <= 1.3 * scans
         assert len(served.requests) <= 4 * len(chosen)
-        assert {name for name, _ in served.requests} == {"index.json", *(entry.file for entry in bank.index.shards)}
+        assert {name for name, _ in served.requests} == {
+            "index.json",
+            *(entry.file for entry in bank.index.shards),
+        }
 
 
 def test_a_new_shard_takes_two_requests(tmp_path: Path) -> None:
@@ -72,9 +81,12 @@ def test_a_new_shard_takes_two_requests(tmp_path: Path) -> None:
 
 
 def test_a_url_gives_the_same_scans_as_the_folder(served: Served, tmp_path: Path) -> None:
-    near, far = open_scans(tmp_path / "bank"), open_scans(f"{served.url}/bank")
+    near = open_scans(tmp_path / "bank")
+    far = open_scans(f"{served.url}/bank")
     for a, b in zip(near, far, strict=True):
-        assert a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
+        assert (
+            a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
+        )
 
 
 @pytest.mark.slow
@@ -87,7 +99,9 @@ def test_forked_workers_read_from_a_url(served: Served) -> None:
 
 def test_a_server_without_ranges_is_refused(served: Served) -> None:
     served.ranges = False
-    with pytest.raises(FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+; .*a server that serves"):
+    with pytest.raises(
+        FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+; .*a server that serves"
+    ):
         Bank(f"{served.url}/bank").image(0)
 
 
@@ -100,7 +114,9 @@ def test_a_busy_server_costs_no_scan(served: Served, tmp_path: Path) -> None:
     assert len(served.requests) > 60
 
 
-def test_a_silent_server_is_left_after_the_time_limit(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_server_is_left_after_the_time_limit(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(storage, "PATIENCE", 0.5)
     served.silent.add("index.json")
     start = time.monotonic()
@@ -120,7 +136,10 @@ def test_redirects_end(served: Served) -> None:
     with pytest.raises(FileError, match=r"index.json cannot be read"):
         Bank(f"{served.url}/bank")
     served.moved = {"moved": f"{served.url}/bank/index.json"}
-    assert RemoteFile(f"{served.url}/bank/moved").read_all() == RemoteFile(f"{served.url}/bank/index.json").read_all()
+    assert (
+        RemoteFile(f"{served.url}/bank/moved").read_all()
+        == RemoteFile(f"{served.url}/bank/index.json").read_all()
+    )
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,9 @@ def test_loading_restores_everything_that_was_saved(saved: Path) -> None:
     header, networks, digest = load_checkpoint(saved)
     assert header == HEADER
     original = network()
-    assert all(torch.equal(v, original.state_dict()[k]) for k, v in networks[VELOCITY].state_dict().items())
+    assert all(
+        torch.equal(v, original.state_dict()[k]) for k, v in networks[VELOCITY].state_dict().items()
+    )
     y = torch.randn(1, 7, 8, 32)
     with torch.no_grad():
         assert torch.equal(networks[VELOCITY](y, 0.5), original.eval()(y, 0.5))
@@ -66,7 +68,9 @@ def test_the_same_content_gives_the_same_bytes_and_hash(saved: Path, tmp_path: P
     assert again.read_bytes() == saved.read_bytes()
     assert digest == load_checkpoint(saved).hash
     other_weights = save_checkpoint(again, HEADER, {VELOCITY: network(1)})
-    other_grid = save_checkpoint(again, replace(HEADER, time_grid=(1.0, 0.0)), {VELOCITY: network()})
+    other_grid = save_checkpoint(
+        again, replace(HEADER, time_grid=(1.0, 0.0)), {VELOCITY: network()}
+    )
     assert len({digest, other_weights, other_grid}) == 3
 
 
@@ -77,11 +81,14 @@ def test_a_loaded_checkpoint_saves_to_the_same_bytes(saved: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_used_only_for_parameters(saved: Path, tmp_path: Path, dtype: torch.dtype) -> None:
+def test_half_precision_is_used_only_for_parameters(
+    saved: Path, tmp_path: Path, dtype: torch.dtype
+) -> None:
     path = tmp_path / "half.safetensors"
     save_checkpoint(path, HEADER, {VELOCITY: network()}, dtype)
     assert path.stat().st_size < 0.7 * saved.stat().st_size
-    half, whole = load_checkpoint(path).networks[VELOCITY], load_checkpoint(saved).networks[VELOCITY]
+    half = load_checkpoint(path).networks[VELOCITY]
+    whole = load_checkpoint(saved).networks[VELOCITY]
     assert {t.dtype for t in half.state_dict().values()} == {torch.float32}
     for (name, a), b in zip(half.named_parameters(), whole.parameters(), strict=True):
         assert torch.equal(a, b.to(dtype).float()), name
@@ -93,7 +100,9 @@ def test_a_truncated_file_is_refused(saved: Path, share: float) -> None:
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match=r"model.safetensors is truncated, damaged or no .safetensors file"):
+        with pytest.raises(
+            DataError, match=r"model.safetensors is truncated, damaged or no .safetensors file"
+        ):
             read(saved)
 
 
@@ -108,7 +117,10 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "lidar-synth-checkpoint/3"}, f"format 'lidar-synth-checkpoint/3'; expected '{FORMAT}'"),
+        (
+            {"format": "lidar-synth-checkpoint/3"},
+            f"format 'lidar-synth-checkpoint/3'; expected '{FORMAT}'",
+        ),
         ({"format": None}, "format None"),
         ({"format": WITHOUT_CHECKSUM}, r"header keys \['checksum'\]"),
         ({"convention": "t=0 noise"}, "convention 't=0 noise'"),
@@ -116,7 +128,10 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
         ({"colour": "red"}, r"header keys \['colour'\]"),
         ({"sensor": None}, "a header without 'sensor'"),
         ({"sensor": {"name": "x"}}, "sensor"),
-        ({"sensor": SENSOR.to_dict() | {"columns": 64}}, "a network for .7, 8, 32. channels, rows and columns"),
+        (
+            {"sensor": SENSOR.to_dict() | {"columns": 64}},
+            "a network for .7, 8, 32. channels, rows and columns",
+        ),
         ({"normalisation": {"kind": "cubic"}}, "normalisation|header with invalid values"),
         ({"channels": ["range"]}, "a network for"),
         ({"channels": ["range", "colour"]}, "colour"),
@@ -125,9 +140,26 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
         ({"provenance": {"data": "town"}}, "without data_licence, licence"),
         ({"networks": {}}, "networks"),
         ({"networks": {VELOCITY: {"architecture": "vgg", "arguments": {}}}}, "architecture 'vgg'"),
-        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"a": 1}}}}, "'a'"),
-        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}}}, "other shapes"),
-        ({"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}}}, "missing"),
+        (
+            {"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"a": 1}}}},
+            "'a'",
+        ),
+        (
+            {
+                "networks": {
+                    VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}
+                }
+            },
+            "other shapes",
+        ),
+        (
+            {
+                "networks": {
+                    VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}
+                }
+            },
+            "missing",
+        ),
         ({"networks": [1]}, "header with invalid values"),
         ({"weights": None}, "do not match their checksum"),
     ],
@@ -144,20 +176,25 @@ def same(a: Checkpoint, b: Checkpoint) -> bool:
     """Whether two checkpoints have equal headers and weights."""
     states = [{p: n.state_dict() for p, n in c.networks.items()} for c in (a, b)]
     return (a.header, a.hash) == (b.header, b.hash) and all(
-        torch.equal(value, states[1][part][key]) for part, state in states[0].items() for key, value in state.items()
+        torch.equal(value, states[1][part][key])
+        for part, state in states[0].items()
+        for key, value in state.items()
     )
 
 
 @pytest.mark.slow
 def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
     """Changes every byte of the header in turn, and some bytes of the weights."""
-    content, whole = saved.read_bytes(), load_checkpoint(saved)
+    content = saved.read_bytes()
+    whole = load_checkpoint(saved)
     header = 8 + struct.unpack("<Q", content[:8])[0]
     random = Random(0)
     refused = 0
     for place in [*range(header), *(random.randrange(header, len(content)) for _ in range(50))]:
         changed = bytearray(content)
-        changed[place] = random.choice([changed[place] ^ (1 << random.randrange(8)), random.randrange(256)])
+        changed[place] = random.choice(
+            [changed[place] ^ (1 << random.randrange(8)), random.randrange(256)]
+        )
         saved.write_bytes(changed)
         try:
             assert same(load_checkpoint(saved), whole), place
@@ -166,8 +203,12 @@ def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
     assert refused > 0.9 * header
 
 
-@pytest.mark.parametrize(("old", "new"), [(b"0.86", b"0.76"), (b'range_max\\": 80.0', b'range_max\\": 90.0')])
-def test_a_changed_time_or_range_limit_is_refused(saved: Path, tmp_path: Path, old: bytes, new: bytes) -> None:
+@pytest.mark.parametrize(
+    ("old", "new"), [(b"0.86", b"0.76"), (b'range_max\\": 80.0', b'range_max\\": 90.0')]
+)
+def test_a_changed_time_or_range_limit_is_refused(
+    saved: Path, tmp_path: Path, old: bytes, new: bytes
+) -> None:
     content = saved.read_bytes()
     assert old in content
     saved.write_bytes(content.replace(old, new))
@@ -177,8 +218,10 @@ def test_a_changed_time_or_range_limit_is_refused(saved: Path, tmp_path: Path, o
 
 
 def test_version_1_can_be_read(tmp_path: Path) -> None:
-    """Its hash stays the same, since students, banks and resumed runs identify checkpoints by it."""
-    path, copy = tmp_path / "old.safetensors", tmp_path / "new.safetensors"
+    """Its hash stays the same, since students, banks and resumed runs identify checkpoints by
+    it."""
+    path = tmp_path / "old.safetensors"
+    copy = tmp_path / "new.safetensors"
     digest = save_version_1(path)
     header, networks, found = load_checkpoint(path)
     assert (header, found, has_checksum(path)) == (HEADER, digest, False)
@@ -208,11 +251,14 @@ def test_weights_without_a_header_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
-    path, trace = tmp_path / "model.pth", tmp_path / "ran"
+    path = tmp_path / "model.pth"
+    trace = tmp_path / "ran"
     for new_format in (True, False):
         torch.save(Evil(trace), path, _use_new_zipfile_serialization=new_format)
         for read in (load_checkpoint, read_header):
-            with pytest.raises(DataError, match=r"is a PyTorch pickle.*lidar-synth import .*model\.pth OUT"):
+            with pytest.raises(
+                DataError, match=r"is a PyTorch pickle.*lidar-synth import .*model\.pth OUT"
+            ):
                 read(path)
     assert not trace.exists()
 
@@ -269,8 +315,16 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         (HEADER, {}, "networks"),
         (HEADER, {VELOCITY: network(), "codec": network()}, "networks"),
         (HEADER, {VELOCITY: nn.Linear(2, 2)}, "missing keys"),
-        (replace(HEADER, provenance=HEADER.provenance | {"jsd": float("nan")}), {VELOCITY: network()}, "JSON"),
-        (replace(HEADER, provenance=HEADER.provenance | {"path": Path("x")}), {VELOCITY: network()}, "JSON"),
+        (
+            replace(HEADER, provenance=HEADER.provenance | {"jsd": float("nan")}),
+            {VELOCITY: network()},
+            "JSON",
+        ),
+        (
+            replace(HEADER, provenance=HEADER.provenance | {"path": Path("x")}),
+            {VELOCITY: network()},
+            "JSON",
+        ),
     ],
     ids=["none", "too many", "another", "nan", "path"],
 )
@@ -283,7 +337,8 @@ def test_networks_that_do_not_match_the_header_are_not_written(
 
 
 def test_weights_that_are_not_finite_do_not_overwrite_a_checkpoint(saved: Path) -> None:
-    before, broken = saved.read_bytes(), network()
+    before = saved.read_bytes()
+    broken = network()
     next(broken.parameters()).data[0] = torch.inf
     with pytest.raises(DataError, match="NaN or infinity"):
         save_checkpoint(saved, HEADER, {VELOCITY: broken})
@@ -292,7 +347,9 @@ def test_weights_that_are_not_finite_do_not_overwrite_a_checkpoint(saved: Path) 
 
 def test_missing_ray_angles_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"NaN or infinity in \['velocity.angles.cells'\]"):
-        save_checkpoint(tmp_path / "model.safetensors", HEADER, {VELOCITY: build_network("hdit", ARGUMENTS)})
+        save_checkpoint(
+            tmp_path / "model.safetensors", HEADER, {VELOCITY: build_network("hdit", ARGUMENTS)}
+        )
 
 
 def test_a_path_that_cannot_be_written_is_reported(tmp_path: Path, saved: Path) -> None:

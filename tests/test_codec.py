@@ -41,10 +41,22 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def network(**arguments: Any) -> VQVAE:
     torch.manual_seed(0)
-    net = build_network("vqvae", {
-        "resolution": (8, 32), "channels": 7, "latent_channels": 6, "codes": 64, "codebook": "ema", "width": 16,
-        "multipliers": (1, 2), "strides": ((1, 2),), "blocks": 1, "groups": 4, **arguments,
-    })  # fmt: skip
+    net = build_network(
+        "vqvae",
+        {
+            "resolution": (8, 32),
+            "channels": 7,
+            "latent_channels": 6,
+            "codes": 64,
+            "codebook": "ema",
+            "width": 16,
+            "multipliers": (1, 2),
+            "strides": ((1, 2),),
+            "blocks": 1,
+            "groups": 4,
+            **arguments,
+        },
+    )
     assert isinstance(net, VQVAE)
     return net
 
@@ -53,8 +65,12 @@ def tensors() -> Tensor:
     return TENSORS.from_images([project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS])
 
 
-def autoencoding(metric: str = "l1", weights: dict[str, float] | None = None, **losses: float) -> Autoencoding:
-    return Autoencoding(network(), TENSORS, SENSOR, Losses(**losses), METRICS[metric], weights or {})  # type: ignore[arg-type]
+def autoencoding(
+    metric: str = "l1", weights: dict[str, float] | None = None, **losses: float
+) -> Autoencoding:
+    return Autoencoding(
+        network(), TENSORS, SENSOR, Losses(**losses), METRICS[metric], weights or {}
+    )  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -67,7 +83,9 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
     returned = x[:, :1] > -1
 
     def right() -> float:
-        return float(((net._decode(net.codebook(net._encode(x))[0])[:, 7:] > 0) == returned).float().mean())
+        return float(
+            ((net._decode(net.codebook(net._encode(x))[0])[:, 7:] > 0) == returned).float().mean()
+        )
 
     before = right()
     for _ in range(40):
@@ -84,16 +102,20 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
 
 
 def test_the_adversarial_weight_balances_two_gradients() -> None:
-    """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient equals that of the reconstruction."""
+    """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient equals that of the
+    reconstruction."""
     x = tensors()
     plain, balanced = (autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True))
     balanced.load_state_dict(plain.state_dict())
     last = balanced.network.decoder.head.weight
     output = balanced.network(x).output
-    rec, judge = balanced.reconstruction(output, x), balanced.discriminator
+    rec = balanced.reconstruction(output, x)
+    judge = balanced.discriminator
     assert judge is not None
     fooled = -judge(expected(output, TENSORS)).mean()
-    one, other = (torch.autograd.grad(part, last, retain_graph=True)[0].norm() for part in (rec, fooled))
+    one, other = (
+        torch.autograd.grad(part, last, retain_graph=True)[0].norm() for part in (rec, fooled)
+    )
     difference = 0.6 * (one / (other + 1e-4) - 1) * fooled
     torch.testing.assert_close(balanced(x) - plain(x), difference, rtol=1e-4, atol=1e-5)
     balanced(x).backward()
@@ -103,7 +125,8 @@ def test_the_adversarial_weight_balances_two_gradients() -> None:
 
 
 def test_the_codec_of_a_pixel_model_is_the_identity() -> None:
-    codec, x = make_codec(None, TENSORS, SENSOR.shape), tensors()
+    codec = make_codec(None, TENSORS, SENSOR.shape)
+    x = tensors()
     assert isinstance(codec, Identity)
     assert codec.shape == (7, 8, 32) == x.shape[1:]
     assert codec.decode(codec.encode(x)) is x
@@ -111,7 +134,8 @@ def test_the_codec_of_a_pixel_model_is_the_identity() -> None:
 
 def test_the_codec_of_a_latent_model_is_its_autoencoder() -> None:
     net = network().eval()
-    codec, x = make_codec(net, TENSORS, SENSOR.shape), tensors()
+    codec = make_codec(net, TENSORS, SENSOR.shape)
+    x = tensors()
     assert isinstance(codec, Latent)
     y = codec.encode(x)
     assert y.shape[1:] == codec.shape == net.latent_shape
@@ -127,7 +151,11 @@ def test_the_codec_of_a_latent_model_is_its_autoencoder() -> None:
 
 def test_an_autoencoder_for_other_images_is_refused() -> None:
     with pytest.raises(DataError, match=r"images of shape \(7, 8, 32\); expected \(2, 8, 32\)"):
-        make_codec(network(), TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"]), SENSOR.shape)
+        make_codec(
+            network(),
+            TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"]),
+            SENSOR.shape,
+        )
 
 
 def test_label_bits_are_the_expected_values_of_their_logits() -> None:
@@ -161,7 +189,8 @@ def logits_of(x: Tensor) -> Tensor:
 
 
 def test_geometry_is_in_metres_along_the_rays() -> None:
-    trained, x = autoencoding(), tensors()
+    trained = autoencoding()
+    x = tensors()
     image = project(SCANS[0], SENSOR)
     points = image.range[..., None] * SENSOR.ray_directions()
     means = points.reshape(8, 8, 4, 3).mean(2) / SENSOR.range_max
@@ -169,11 +198,14 @@ def test_geometry_is_in_metres_along_the_rays() -> None:
 
 
 def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
-    trained, x = autoencoding(adversarial=1.0), tensors()
+    trained = autoencoding(adversarial=1.0)
+    x = tensors()
     assert trained.discriminator is not None
     output = torch.zeros_like(x).requires_grad_()
     trained._adversarial(trained.discriminator, output, x).backward()
-    by_both = {n: p.grad.clone() for n, p in trained.discriminator.named_parameters() if p.grad is not None}
+    by_both = {
+        n: p.grad.clone() for n, p in trained.discriminator.named_parameters() if p.grad is not None
+    }
     assert output.grad is not None and output.grad.any()
     trained.zero_grad()
     judge = trained.discriminator
@@ -187,17 +219,23 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("losses", [{}, {"geometric": 1.0, "adversarial": 0.05}], ids=["plain", "all terms"])
+@pytest.mark.parametrize(
+    "losses", [{}, {"geometric": 1.0, "adversarial": 0.05}], ids=["plain", "all terms"]
+)
 def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str, float]) -> None:
     batches = Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=1)
     trained = autoencoding(**losses)
     recipe = Recipe(iterations=50, batch=4, rate=3e-3, warmup=5, metric="l1", ema_every=1)
     training = Training(trained, recipe)
     before = reconstruction_figures(Latent(trained.network.eval(), TENSORS), tensors(), SENSOR)
-    records = list(steps(training, reconstruction_task, batches, Accelerator(cpu=True), autoencoder_loss))
+    records = list(
+        steps(training, reconstruction_task, batches, Accelerator(cpu=True), autoencoder_loss)
+    )
     assert sum(r.loss for r in records[-5:]) < 0.75 * sum(r.loss for r in records[:5])
     average: Any = training.average
-    assert torch.equal(average.network.scale, trained.network.scale)  # buffers are copied, not averaged
+    assert torch.equal(
+        average.network.scale, trained.network.scale
+    )  # buffers are copied, not averaged
     after = reconstruction_figures(Latent(average.network, TENSORS), tensors(), SENSOR)
     assert set(after) == {"mae", "within_5cm", "drop_accuracy", "chamfer", "label_accuracy"}
     assert after["mae"] < before["mae"]
@@ -206,11 +244,15 @@ def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str
 
 
 class Offset(VQVAE):
-    """An autoencoder that returns images with a known error of the range, and drops rows of returns."""
+    """An autoencoder that returns images with a known error of the range, and drops rows of
+    returns."""
 
     def __init__(self, metres: float, drop: int) -> None:
-        super().__init__((8, 32), 7, 7, 0, width=8, multipliers=(1,), strides=(), blocks=1, groups=1)
-        self.metres, self.drop = metres, drop
+        super().__init__(
+            (8, 32), 7, 7, 0, width=8, multipliers=(1,), strides=(), blocks=1, groups=1
+        )
+        self.metres = metres
+        self.drop = drop
 
     def encode(self, x: Tensor) -> Tensor:
         return x

@@ -1,4 +1,5 @@
-"""Wrapping a trainer's dataset: a synthetic sample without the form of the real ones is refused at construction."""
+"""Wrapping a trainer's dataset: a synthetic sample without the form of the real ones is refused at
+construction."""
 
 import logging
 import random
@@ -22,12 +23,18 @@ from lidar_synth.mixing.compare import made_up
 
 
 class Theirs:
-    """A trainer's dataset: each sample is made of the same arrays, points and labels cut to a length of its own."""
+    """A trainer's dataset: each sample is made of the same arrays, points and labels cut to a
+    length of its own."""
 
     def __init__(
-        self, form: Callable[[np.ndarray, np.ndarray], Any], ignored: int = -1, first_ignored: int = 0
+        self,
+        form: Callable[[np.ndarray, np.ndarray], Any],
+        ignored: int = -1,
+        first_ignored: int = 0,
     ) -> None:
-        self.form, self.ignored, self.first_ignored = form, ignored, first_ignored
+        self.form = form
+        self.ignored = ignored
+        self.first_ignored = first_ignored
         self.asked: list[int] = []
 
     def __len__(self) -> int:
@@ -52,12 +59,26 @@ class Sample:
 
 
 FORMS: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
-    "dict": lambda points, label: {"coord": points[:, :3], "feat": points, "segment": label, "name": "x"},
-    "tensors": lambda points, label: {"points": torch.from_numpy(points), "label": torch.from_numpy(label)},
+    "dict": lambda points, label: {
+        "coord": points[:, :3],
+        "feat": points,
+        "segment": label,
+        "name": "x",
+    },
+    "tensors": lambda points, label: {
+        "points": torch.from_numpy(points),
+        "label": torch.from_numpy(label),
+    },
     "tuple": lambda points, label: (points, label, "x"),
     "list": lambda points, label: [points, label],
-    "nested": lambda points, label: {"inputs": {"points": points}, "data_samples": Sample(label, {"path": "x"})},
-    "image": lambda points, label: {"image": np.zeros((3, 4, 6), np.uint8), "sem": label.reshape(3, -1)},
+    "nested": lambda points, label: {
+        "inputs": {"points": points},
+        "data_samples": Sample(label, {"path": "x"}),
+    },
+    "image": lambda points, label: {
+        "image": np.zeros((3, 4, 6), np.uint8),
+        "sem": label.reshape(3, -1),
+    },
 }
 
 
@@ -82,7 +103,8 @@ def test_samples_of_the_same_form_are_accepted(name: str) -> None:
 
 def test_a_missing_label_would_cost_the_real_samples_theirs() -> None:
     """What torch makes of such a batch, and that it does not come to it."""
-    form, without = FORMS["dict"], lambda p, s: {"coord": p[:, :3], "feat": p, "name": "x"}
+    form = FORMS["dict"]
+    without = lambda p, s: {"coord": p[:, :3], "feat": p, "name": "x"}
     options = {"to_sample": as_sample(without), "seed": 2}
     mixed = MixedScans.wrap(Theirs(form), Endless(), 0.5, compare=False, **options)
     samples = sorted((mixed[i] for i in range(len(mixed))), key=lambda s: "segment" in s)
@@ -92,17 +114,45 @@ def test_a_missing_label_would_cost_the_real_samples_theirs() -> None:
 
 
 WRONG: dict[str, tuple[str, Callable[..., Any], str]] = {
-    "another key": ("dict", lambda p, s: FORMS["dict"](p, s) | {"extra": 1}, "an additional 'extra'"),
-    "dtype": ("dict", lambda p, s: FORMS["dict"](p.astype(np.float64), s), r"\['coord'\] is an array of float64"),
-    "rank": ("dict", lambda p, s: FORMS["dict"](p, s[:, None]), r"\['segment'\] is an array of int64, rank 2 instead"),
-    "library": ("dict", lambda p, s: FORMS["dict"](p, torch.from_numpy(s)), "a tensor of int64, rank 1 instead"),
-    "tuple's dtype": ("tuple", lambda p, s: (p, s.astype(np.int32), "x"), r"sample\[1\] is an array of int32"),
+    "another key": (
+        "dict",
+        lambda p, s: FORMS["dict"](p, s) | {"extra": 1},
+        "an additional 'extra'",
+    ),
+    "dtype": (
+        "dict",
+        lambda p, s: FORMS["dict"](p.astype(np.float64), s),
+        r"\['coord'\] is an array of float64",
+    ),
+    "rank": (
+        "dict",
+        lambda p, s: FORMS["dict"](p, s[:, None]),
+        r"\['segment'\] is an array of int64, rank 2 instead",
+    ),
+    "library": (
+        "dict",
+        lambda p, s: FORMS["dict"](p, torch.from_numpy(s)),
+        "a tensor of int64, rank 1 instead",
+    ),
+    "tuple's dtype": (
+        "tuple",
+        lambda p, s: (p, s.astype(np.int32), "x"),
+        r"sample\[1\] is an array of int32",
+    ),
     "tuple's length": ("tuple", lambda p, s: (p, s), "2 parts instead of 3"),
     "kind of text": ("tuple", lambda p, s: (p, s, 7), r"sample\[2\] is an integer instead of text"),
     "another container": ("dict", lambda p, s: (p, s), "sample is a sequence instead of a mapping"),
-    "in an object": ("nested", lambda p, s: FORMS["nested"](p, s.astype(np.uint8)), r"\.gt_seg is an array"),
-    "another object": ("nested", lambda p, s: {"inputs": {"points": p}, "data_samples": s}, "instead of an object"),
-}  # fmt: skip
+    "in an object": (
+        "nested",
+        lambda p, s: FORMS["nested"](p, s.astype(np.uint8)),
+        r"\.gt_seg is an array",
+    ),
+    "another object": (
+        "nested",
+        lambda p, s: {"inputs": {"points": p}, "data_samples": s},
+        "instead of an object",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -115,8 +165,12 @@ def test_another_form_is_refused(case: str) -> None:
 @pytest.mark.parametrize("name", FORMS)
 @pytest.mark.parametrize(("theirs", "ours"), [(-1, 255), (255, -1), (255, 254), (-100, 255)])
 def test_another_value_for_ignored_labels_is_refused(name: str, theirs: int, ours: int) -> None:
-    with pytest.raises(ConfigError, match=f"holds {ours}, which no real sample does .*one value for ignored labels"):
-        MixedScans.wrap(Theirs(FORMS[name], theirs), Endless(), 0.5, to_sample=as_sample(FORMS[name], ours))
+    with pytest.raises(
+        ConfigError, match=f"holds {ours}, which no real sample does .*one value for ignored labels"
+    ):
+        MixedScans.wrap(
+            Theirs(FORMS[name], theirs), Endless(), 0.5, to_sample=as_sample(FORMS[name], ours)
+        )
 
 
 def test_real_samples_without_an_ignored_label_tell_nothing_yet() -> None:
@@ -133,7 +187,9 @@ def test_comparing_leaves_everything_as_it_was() -> None:
     train = MixedScans.wrap(theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4)
     assert (random.random(), np.random.rand(), torch.rand(1)) == expected  # noqa: NPY002
     assert theirs.asked == [0] and train.epoch == 0
-    plain = MixedScans.wrap(theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4, compare=False)
+    plain = MixedScans.wrap(
+        theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4, compare=False
+    )
     assert theirs.asked == [0]
     assert all(np.array_equal(train[i]["segment"], plain[i]["segment"]) for i in range(len(train)))
 
@@ -164,13 +220,20 @@ class Slow(Generated):
 def test_sources_on_demand_are_compared_by_a_made_up_scan(kind: type) -> None:
     MixedScans.wrap(Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"]))
     with pytest.raises(ConfigError, match="no 'segment'"):
-        MixedScans.wrap(Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(lambda p, s: {"coord": p, "feat": p}))
+        MixedScans.wrap(
+            Theirs(FORMS["dict"]),
+            kind(),
+            0.5,
+            to_sample=as_sample(lambda p, s: {"coord": p, "feat": p}),
+        )
     with pytest.raises(ConfigError, match="holds 255"):
         MixedScans.wrap(Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"], 255))
 
 
 @pytest.mark.parametrize("first", [None, ValueError("a damaged file")])
-def test_a_first_sample_that_cannot_be_had_stops_nothing(first: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_first_sample_that_cannot_be_had_stops_nothing(
+    first: Any, caplog: pytest.LogCaptureFixture
+) -> None:
     def form(points: np.ndarray, label: np.ndarray) -> Any:
         if first is None:
             return None  # as datasets do whose collate function leaves such samples out

@@ -10,7 +10,18 @@ import pytest
 import torch
 import yaml
 from conftest import random_scan
-from latent_runs import CODEC_NETWORK, SEMANTIC, SENSOR, UNET, call, codec, one_thread, scans, teacher, write_config  # noqa: F401 - fixtures
+from latent_runs import (
+    CODEC_NETWORK,
+    SEMANTIC,
+    SENSOR,
+    UNET,
+    call,
+    codec,
+    one_thread,
+    scans,
+    teacher,
+    write_config,
+)  # noqa: F401 - fixtures
 from PIL import Image
 
 from lidar_synth.bake.conditions import conditions_for
@@ -26,21 +37,42 @@ from lidar_synth.lab.town import Town
 from lidar_synth.lab.train.config import DistillConfig, load_config
 from lidar_synth.lab.train.plan import make_plan, open_data
 
-TRANSFORMER = {"architecture": "hdit", "arguments": {
-    "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [1, 1], "window": [3, 3],
-}}  # fmt: skip
+TRANSFORMER = {
+    "architecture": "hdit",
+    "arguments": {
+        "width": 16,
+        "time_width": 16,
+        "depths": [1, 1],
+        "heads": [2, 2],
+        "patch": [1, 1],
+        "window": [3, 3],
+    },
+}
 
 
 CAMERA = {
-    "kind": "camera", "dropout": 0.1, "view_dropout": 0.5, "image": [40, 80],
+    "kind": "camera",
+    "dropout": 0.1,
+    "view_dropout": 0.5,
+    "image": [40, 80],
     "arguments": {"resolution": [16, 32], "views": 2, "channels": 8, "widths": [4, 8]},
-}  # fmt: skip
+}
 
 
-SIGHT = CAMERA | {"encoder": "sight", "view_dropout": 0.0, "arguments": {
-    "resolution": [16, 32], "channels": 5, "widths": [4, 8],
-    "image_from_sensor": [[40.0, -30.0, 0.0, 0.0], [20.0, 0.0, -30.0, 0.0], [1.0, 0.0, 0.0, 0.0]],
-}}  # fmt: skip
+SIGHT = CAMERA | {
+    "encoder": "sight",
+    "view_dropout": 0.0,
+    "arguments": {
+        "resolution": [16, 32],
+        "channels": 5,
+        "widths": [4, 8],
+        "image_from_sensor": [
+            [40.0, -30.0, 0.0, 0.0],
+            [20.0, 0.0, -30.0, 0.0],
+            [1.0, 0.0, 0.0, 0.0],
+        ],
+    },
+}
 
 
 def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
@@ -48,7 +80,15 @@ def test_a_pixel_model_of_label_maps(scans: Path, tmp_path: Path) -> None:
     network = TRANSFORMER | {"arguments": TRANSFORMER["arguments"] | {"patch": [2, 2]}}
     call(
         "train",
-        write_config(scans, tmp_path, "pixel", network=network, condition=SEMANTIC, channels=["range"], steps=3),
+        write_config(
+            scans,
+            tmp_path,
+            "pixel",
+            network=network,
+            condition=SEMANTIC,
+            channels=["range"],
+            steps=3,
+        ),
     )
     generator = load_generator(tmp_path / "pixel" / "pixel.safetensors")
     [scan] = generator.scans(0, [0], random_scan(SENSOR, 400, 1))
@@ -69,10 +109,17 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("condition", [SEMANTIC, CAMERA, SIGHT], ids=["semantic", "camera", "sight"])
-def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "condition", [SEMANTIC, CAMERA, SIGHT], ids=["semantic", "camera", "sight"]
+)
+def test_a_latent_transformer(
+    condition: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path
+) -> None:
     """Any velocity network lives on latents, which look where their cells look."""
-    call("train", write_config(scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3))
+    call(
+        "train",
+        write_config(scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3),
+    )
     start = tmp_path / "latent" / "latent.safetensors"
     [image] = load_generator(start).range_images(0, [0])
     assert "label" in image.channels
@@ -80,10 +127,18 @@ def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Pat
     # The start of a conditional model: until it has learnt to look, it generates what it did.
     data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
     config = write_config(
-        kitti, tmp_path, "looking", condition=condition, init=str(start), recipe={"rate": 1e-9}, data=data
+        kitti,
+        tmp_path,
+        "looking",
+        condition=condition,
+        init=str(start),
+        recipe={"rate": 1e-9},
+        data=data,
     )
     values = yaml.safe_load(config.read_text())
-    config.write_text(yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")}))
+    config.write_text(
+        yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")})
+    )
     call("train", config)
     looking = load_generator(tmp_path / "looking" / "looking.safetensors")
     given = replace(random_scan(SENSOR, 400, 1), image_path=min(kitti.rglob("*.png")))
@@ -91,24 +146,43 @@ def test_a_latent_transformer(condition: dict[str, Any], scans: Path, kitti: Pat
     [before] = load_generator(start).range_images(0, [0], steps=50)
     assert np.allclose(same.range, before.range, rtol=1e-3)
     kind = str(condition["kind"])
-    assert looking.condition == kind and looking.header.conditioning[kind]["dropout"] == condition["dropout"]
+    assert (
+        looking.condition == kind
+        and looking.header.conditioning[kind]["dropout"] == condition["dropout"]
+    )
     assert looking.header.provenance["init"] == load_checkpoint(start).hash
     if condition is SIGHT:  # it looks where the cells look
         angles = {
-            name: load_checkpoint(tmp_path / "looking" / "looking.safetensors").networks[name].angles.cells
+            name: load_checkpoint(tmp_path / "looking" / "looking.safetensors")
+            .networks[name]
+            .angles.cells
             for name in (ENCODER, VELOCITY)
         }
         assert torch.equal(angles[ENCODER], angles[VELOCITY])
 
 
-@pytest.mark.parametrize("network", [UNET, TRANSFORMER], ids=lambda network: network["architecture"])
-def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
-    config = write_config(scans, tmp_path, "camera", network=network, condition=CAMERA, codec=str(codec), steps=3,
-                          data={"path": str(kitti), "layout": "kitti360", "split": "all"})  # fmt: skip
+@pytest.mark.parametrize(
+    "network", [UNET, TRANSFORMER], ids=lambda network: network["architecture"]
+)
+def test_a_camera_model(
+    network: dict[str, Any], scans: Path, kitti: Path, codec: Path, tmp_path: Path
+) -> None:
+    config = write_config(
+        scans,
+        tmp_path,
+        "camera",
+        network=network,
+        condition=CAMERA,
+        codec=str(codec),
+        steps=3,
+        data={"path": str(kitti), "layout": "kitti360", "split": "all"},
+    )
     call("train", config)
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
     images = sorted(kitti.rglob("*.png"))
-    given = np.asarray(Image.open(images[0]).resize((32, 16), Image.Resampling.BICUBIC)).transpose(2, 0, 1)
+    given = np.asarray(Image.open(images[0]).resize((32, 16), Image.Resampling.BICUBIC)).transpose(
+        2, 0, 1
+    )
     [scan] = generator.scans(0, [0], given.copy())
     [same] = generator.scans(0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0]))
     assert np.allclose(scan.points, same.points)
@@ -119,7 +193,13 @@ def test_a_camera_model(network: dict[str, Any], scans: Path, kitti: Path, codec
 def test_the_town_renders_the_images_of_a_camera_model(scans: Path, tmp_path: Path) -> None:
     condition = CAMERA | {"image": [376, 1408]}
     config = write_config(
-        scans, tmp_path, "camera", network=UNET, condition=condition, steps=3, data={"town": 2, "path": None}
+        scans,
+        tmp_path,
+        "camera",
+        network=UNET,
+        condition=condition,
+        steps=3,
+        data={"town": 2, "path": None},
     )
     call("train", config, "recipe.iterations=1")
     kept = np.load(tmp_path / "camera" / "cache" / "camera.npy")
@@ -127,13 +207,20 @@ def test_the_town_renders_the_images_of_a_camera_model(scans: Path, tmp_path: Pa
     for i, image in enumerate(kept):
         small = Image.fromarray(town.image(i)).resize((32, 16), Image.Resampling.BICUBIC)
         assert np.array_equal(image, np.asarray(small).transpose(2, 0, 1))
-    with pytest.raises(DataError, match=r"the town's image of \(376, 1408\) rows and columns; expected \(40, 80\)"):
+    with pytest.raises(
+        DataError, match=r"the town's image of \(376, 1408\) rows and columns; expected \(40, 80\)"
+    ):
         call("train", config, f"output={tmp_path / 'other'}", "condition.image=[40,80]")
 
 
-def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path, codec: Path, tmp_path: Path) -> None:
-    data, condition = {"path": str(kitti), "layout": "kitti360", "split": "all"}, CAMERA | {"focal": 552.55}
-    config = write_config(scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), data=data)
+def test_the_camera_of_another_focal_length_is_refused(
+    scans: Path, kitti: Path, codec: Path, tmp_path: Path
+) -> None:
+    data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
+    condition = CAMERA | {"focal": 552.55}
+    config = write_config(
+        scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), data=data
+    )
     call("train", config, "recipe.iterations=1")
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
     assert conditions_for(generator, str(kitti)) is not None
@@ -151,10 +238,16 @@ def test_the_camera_of_another_focal_length_is_refused(scans: Path, kitti: Path,
 
 
 @pytest.mark.slow
-def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_together(
+    scans: Path, codec: Path, teacher: Path, tmp_path: Path
+) -> None:
     def refuse(message: str, *overrides: str, **values: Any) -> None:
         with pytest.raises(ConfigError, match=message):
-            call("train", write_config(scans, tmp_path, "bad", **({"network": UNET} | values)), *overrides)
+            call(
+                "train",
+                write_config(scans, tmp_path, "bad", **({"network": UNET} | values)),
+                *overrides,
+            )
 
     refuse("an autoencoder with a codec or a condition", network=CODEC_NETWORK, condition=SEMANTIC)
     refuse("decoder without init", decoder=True)
@@ -165,9 +258,18 @@ def test_what_does_not_fit_together(scans: Path, codec: Path, teacher: Path, tmp
     refuse("expected the checkpoint of an autoencoder", codec=str(pixel_checkpoint(tmp_path)))
     refuse("unknown key 'condition.colour'", condition=SEMANTIC | {"colour": 1})
     refuse("one of semantic_map", condition=SEMANTIC | {"encoder": "views"})
-    refuse(r"network.arguments with \['condition_channels'\]", condition=SEMANTIC,
-           network={"architecture": "unet", "arguments": UNET["arguments"] | {"condition_channels": 3}})  # fmt: skip
-    refuse("unexpected keyword argument 'colour'", network={"architecture": "hdit", "arguments": {"colour": 1}})
+    refuse(
+        r"network.arguments with \['condition_channels'\]",
+        condition=SEMANTIC,
+        network={
+            "architecture": "unet",
+            "arguments": UNET["arguments"] | {"condition_channels": 3},
+        },
+    )
+    refuse(
+        "unexpected keyword argument 'colour'",
+        network={"architecture": "hdit", "arguments": {"colour": 1}},
+    )
     student = write_config(scans, tmp_path, "student", teacher=str(codec))
     with pytest.raises(ConfigError, match="an autoencoder; expected a model that generates"):
         call("distill", student)
@@ -185,13 +287,24 @@ def pixel_checkpoint(folder: Path) -> Path:
     return path
 
 
-def test_conditions_reach_the_batches_of_teacher_and_student(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_conditions_reach_the_batches_of_teacher_and_student(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     from accelerate import Accelerator
 
     accelerator = Accelerator(cpu=True)
-    config = load_config(DistillConfig, write_config(
-        scans, tmp_path, "student", teacher=str(teacher), grid=[1, 0.5, 0], intervals=2, steps=1,
-    ))  # fmt: skip
+    config = load_config(
+        DistillConfig,
+        write_config(
+            scans,
+            tmp_path,
+            "student",
+            teacher=str(teacher),
+            grid=[1, 0.5, 0],
+            intervals=2,
+            steps=1,
+        ),
+    )
     plan = make_plan(config, accelerator)
     data = open_data(config, plan, accelerator.device)
     batch = data(range(3))

@@ -42,7 +42,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path:
     """Write a PNG of the given rows and columns."""
-    Image.fromarray(np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)).save(path)
+    Image.fromarray(np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)).save(
+        path
+    )
     return path
 
 
@@ -55,11 +57,18 @@ def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_path: Path) -> None:
-    condition, scan = CONDITIONS[name], some_scan(tmp_path)
+    condition = CONDITIONS[name]
+    scan = some_scan(tmp_path)
     encoder = {
-        "semantic": lambda: build_network("semantic_map", {"resolution": (8, 32), "target": (4, 16)}),
-        "camera": lambda: build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}),
-        "layout": lambda: build_network("layout", {"resolution": (8, 32), "target": (4, 16), "channels": 7}),
+        "semantic": lambda: build_network(
+            "semantic_map", {"resolution": (8, 32), "target": (4, 16)}
+        ),
+        "camera": lambda: build_network(
+            "views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}
+        ),
+        "layout": lambda: build_network(
+            "layout", {"resolution": (8, 32), "target": (4, 16), "channels": 7}
+        ),
     }[name]()
     shape = condition.shape(encoder)
     values = condition.read(scan, SENSOR, shape, OPTIONS)
@@ -67,7 +76,10 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     given = batch_of(name, scan, 3, SENSOR, shape, OPTIONS)
     assert torch.equal(given, torch.from_numpy(values).expand(3, *shape))
     encoded = encoder(given)
-    assert encoded.shape == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5), "layout": (3, 7, 4, 16)}[name]
+    assert (
+        encoded.shape
+        == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5), "layout": (3, 7, 4, 16)}[name]
+    )
     assert (blank(name, given) == condition.blank).all()
     assert set(encoders_of(name)) <= set(NETWORKS)
 
@@ -81,7 +93,9 @@ def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
 def test_label_maps_are_encoded_by_class_and_place(method: str) -> None:
-    net = build_network("semantic_map", {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method})
+    net = build_network(
+        "semantic_map", {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method}
+    )
     labels = torch.full((1, 8, 32), 3, dtype=torch.uint8)
     same = net(labels)
     assert torch.allclose(same, same[:, :, :1, :1].expand_as(same), atol=1e-6)
@@ -136,46 +150,79 @@ def test_the_calibration_gives_the_pixel_of_every_cell() -> None:
 
 @torch.no_grad()
 def test_a_cell_depends_only_on_its_part_of_the_image() -> None:
-    encoder, image = sight(), torch.zeros(1, 3, 32, 64, dtype=torch.uint8)
+    encoder = sight()
+    image = torch.zeros(1, 3, 32, 64, dtype=torch.uint8)
     before = encoder(image)
     image[..., :8] = 255  # the left eighth
     changed = (encoder(image) != before).any(1)[0]
-    place, seen = encoder.pixel_coordinates()[..., 0], (encoder.pixel_coordinates().abs() <= 1).all(-1)
+    place = encoder.pixel_coordinates()[..., 0]
+    seen = (encoder.pixel_coordinates().abs() <= 1).all(-1)
     assert before.shape == (1, 5, *TOWN.shape)
     assert changed[seen & (place < -0.8)].all() and not changed[place > -0.4].any()
     assert torch.equal(before[0, -1] == 1, seen) and not before[0, :, ~seen].any()
 
 
 def test_the_position_embeddings_of_views_and_cells_are_used_and_trained() -> None:
-    net = build_network("views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)})
+    net = build_network(
+        "views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}
+    )
     image = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
     swapped = torch.cat((image[..., 32:], image[..., :32]), -1)
     net.eval()
-    a, b = net(image), net(swapped)
+    a = net(image)
+    b = net(swapped)
     assert not torch.allclose(a[:, :64], b[:, 64:], atol=1e-4)
     net.train()(image).square().mean().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None and parameter.grad.any(), name
 
 
-# --- conditions of users ---------------------------------------------------------------------------------------------
+# --- conditions of users
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "given", "error", "message"),
     [
-        ("semantic", np.full((8, 32), 40, np.uint8), DataError, r"ids \[40\]; expected train ids 0..18, or 255"),
+        (
+            "semantic",
+            np.full((8, 32), 40, np.uint8),
+            DataError,
+            r"ids \[40\]; expected train ids 0..18, or 255",
+        ),
         ("semantic", np.full((8, 32), 1000), DataError, "from 1000 to 1000"),
-        ("semantic", np.zeros((64, 1024), np.uint8), DataError, r"of shape \(64, 1024\); expected \(8, 32\)"),
+        (
+            "semantic",
+            np.zeros((64, 1024), np.uint8),
+            DataError,
+            r"of shape \(64, 1024\); expected \(8, 32\)",
+        ),
         ("semantic", np.zeros((2, 8, 32), np.uint8), DataError, r"or \(3, 8, 32\)"),
-        ("semantic", torch.zeros(8, 32), DataError, "semantic condition of torch.float32; expected whole numbers"),
+        (
+            "semantic",
+            torch.zeros(8, 32),
+            DataError,
+            "semantic condition of torch.float32; expected whole numbers",
+        ),
         ("semantic", "map.png", ConfigError, "a condition of type str"),
-        ("semantic", {"camera": 1}, ConfigError, r"conditions \['camera'\]; expected 'semantic' among them"),
+        (
+            "semantic",
+            {"camera": 1},
+            ConfigError,
+            r"conditions \['camera'\]; expected 'semantic' among them",
+        ),
         ("semantic", [], ConfigError, "a condition of type list"),
-        ("camera", np.zeros((3, 32, 60), np.uint8), DataError, r"camera condition of shape \(3, 32, 60\)"),
+        (
+            "camera",
+            np.zeros((3, 32, 60), np.uint8),
+            DataError,
+            r"camera condition of shape \(3, 32, 60\)",
+        ),
     ],
 )
-def test_invalid_conditions_are_refused(name: str, given: Any, error: type[Exception], message: str) -> None:
+def test_invalid_conditions_are_refused(
+    name: str, given: Any, error: type[Exception], message: str
+) -> None:
     shape = SENSOR.shape if name == "semantic" else CAMERA_SHAPE
     with pytest.raises(error, match=message):
         batch_of(name, given, 3, SENSOR, shape, OPTIONS)
@@ -189,14 +236,36 @@ def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:
         batch_of("camera", replace(scan, image_path=None), 1, SENSOR, CAMERA_SHAPE, {})
     picture(tmp_path / "other.png", (40, 70))
     with pytest.raises(
-        DataError, match=r"other.png of \(40, 70\) rows and columns; expected \(40, 80\), those of the camera"
+        DataError,
+        match=r"other.png of \(40, 70\) rows and columns; expected \(40, 80\), those of the camera",
     ):
-        batch_of("camera", replace(scan, image_path=tmp_path / "other.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+        batch_of(
+            "camera",
+            replace(scan, image_path=tmp_path / "other.png"),
+            1,
+            SENSOR,
+            CAMERA_SHAPE,
+            OPTIONS,
+        )
     (tmp_path / "cut.png").write_bytes((tmp_path / "0.png").read_bytes()[:200])
     with pytest.raises(DataError, match=r"cut.png cannot be read"):
-        batch_of("camera", replace(scan, image_path=tmp_path / "cut.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+        batch_of(
+            "camera",
+            replace(scan, image_path=tmp_path / "cut.png"),
+            1,
+            SENSOR,
+            CAMERA_SHAPE,
+            OPTIONS,
+        )
     with pytest.raises(DataError, match=r"nowhere.png cannot be read"):
-        batch_of("camera", replace(scan, image_path=tmp_path / "nowhere.png"), 1, SENSOR, CAMERA_SHAPE, OPTIONS)
+        batch_of(
+            "camera",
+            replace(scan, image_path=tmp_path / "nowhere.png"),
+            1,
+            SENSOR,
+            CAMERA_SHAPE,
+            OPTIONS,
+        )
 
 
 @pytest.mark.parametrize(
@@ -220,7 +289,8 @@ def test_an_invalid_calibration_is_refused() -> None:
         sight(resolution=(30, 64))
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
+# --- training
+# ---------------------------------------------------------------------------------------------------------
 
 
 def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
@@ -243,7 +313,9 @@ def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
         y0, _, _, cond = batches(range(8))
         assert cond is not None and cond.shape == (8, 8, 32)
         empty = TENSORS.decode(y0)["range"] == 0
-        assert (cond[empty] == IGNORE).all()  # cells without a return have no label, also after a rotation
+        assert (
+            cond[empty] == IGNORE
+        ).all()  # cells without a return have no label, also after a rotation
     whole = plain.conditions(range(8))
     assert whole is not None and torch.equal(whole, plain(range(8)).cond)  # type: ignore[arg-type]
     assert not torch.equal(whole, moved(range(8)).cond)  # type: ignore[arg-type]
@@ -251,7 +323,8 @@ def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
 
 def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(tmp_path: Path) -> None:
     plain, flipped = (conditioned_batches(tmp_path, "camera", flip=flip) for flip in (False, True))
-    a, b = plain(range(16)), flipped(range(16))
+    a = plain(range(16))
+    b = flipped(range(16))
     assert a.cond is not None and b.cond is not None
     mirrored = torch.tensor([not torch.equal(x, y) for x, y in zip(a.y0, b.y0, strict=True)])
     assert 0 < mirrored.sum() < 16
@@ -263,8 +336,10 @@ def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(tmp_path: Path
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Path) -> None:
-    plain, dropped = conditioned_batches(tmp_path, name), conditioned_batches(tmp_path, name, dropout=0.25)
-    a, b = plain(range(200)), dropped(range(200))
+    plain = conditioned_batches(tmp_path, name)
+    dropped = conditioned_batches(tmp_path, name, dropout=0.25)
+    a = plain(range(200))
+    b = dropped(range(200))
     assert torch.equal(a.y0, b.y0) and torch.equal(a.y1, b.y1)
     assert a.cond is not None and b.cond is not None
     is_blank = (b.cond == CONDITIONS[name].blank).flatten(1).all(1)
@@ -275,14 +350,19 @@ def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Pa
 def test_a_reduced_camera_image_keeps_one_view(tmp_path: Path) -> None:
     cond = conditioned_batches(tmp_path, "camera", reduction=0.5)(range(60)).cond
     assert cond is not None
-    left, right = (cond[..., :32] == 0).flatten(1).all(1), (cond[..., 32:] == 0).flatten(1).all(1)
+    left = (cond[..., :32] == 0).flatten(1).all(1)
+    right = (cond[..., 32:] == 0).flatten(1).all(1)
     assert 15 <= int(left.sum()) <= 45
     assert not right.any()
 
 
 def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) -> None:
     scans = [some_scan(tmp_path, seed) for seed in range(3)]
-    others = {"camera": Other(CAMERA_SHAPE, lambda i, s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS))}
+    others = {
+        "camera": Other(
+            CAMERA_SHAPE, lambda i, s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS)
+        )
+    }
     cache = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
     again = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
     assert np.array_equal(cache.fields["camera"], again.fields["camera"])
@@ -291,7 +371,8 @@ def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) ->
         cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False)
 
 
-# --- guidance ---------------------------------------------------------------------------------------------------------
+# --- guidance
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_guidance_extrapolates_from_the_blank_condition() -> None:
@@ -301,13 +382,12 @@ def test_guidance_extrapolates_from_the_blank_condition() -> None:
         calls.append(len(y))
         return y * t.view(-1, 1) + c.float() ** 2
 
-    y, t, cond, nothing = (
-        torch.randn(3, 2),
-        torch.rand(3),
-        torch.tensor([[1.0, 2], [3, 4], [5, 6]]),
-        torch.tensor([0.5, 1]),
-    )
-    with_condition, without = velocity(y, t, cond), velocity(y, t, nothing.expand(3, 2))
+    y = torch.randn(3, 2)
+    t = torch.rand(3)
+    cond = torch.tensor([[1.0, 2], [3, 4], [5, 6]])
+    nothing = torch.tensor([0.5, 1])
+    with_condition = velocity(y, t, cond)
+    without = velocity(y, t, nothing.expand(3, 2))
     calls.clear()
     for scale in (0.0, 1.5, 4.0):
         out = guided(velocity, scale, nothing)(y, t, cond)
@@ -316,7 +396,8 @@ def test_guidance_extrapolates_from_the_blank_condition() -> None:
     assert guided(velocity, 1.0, nothing) is velocity
 
 
-# --- CLIP ------------------------------------------------------------------------------------------------------------
+# --- CLIP
+# ------------------------------------------------------------------------------------------------------------
 
 
 class Tower(nn.Module):
@@ -348,7 +429,9 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         asked.append(f"open_clip {name} {Path(pretrained).name}")
         return Tower()
 
-    holder = SimpleNamespace(CLIPVisionModelWithProjection=SimpleNamespace(from_pretrained=from_pretrained))
+    holder = SimpleNamespace(
+        CLIPVisionModelWithProjection=SimpleNamespace(from_pretrained=from_pretrained)
+    )
     monkeypatch.setitem(sys.modules, "transformers", holder)
     monkeypatch.setitem(sys.modules, "open_clip", SimpleNamespace(create_model=create_model))
     frozen_clip.cache_clear()
@@ -364,7 +447,11 @@ def test_frozen_clip_encodes_each_view_and_only_other_layers_are_trained(
     place.mkdir() if form == "folder" else place.write_bytes(b"")
     monkeypatch.setenv(CLIP_VARIABLE, str(place))
     net = build_network("clip_views", {"views": 2, "channels": 6})
-    assert {name for name, _ in net.named_parameters()} == {"view_embedding", "project.weight", "project.bias"}
+    assert {name for name, _ in net.named_parameters()} == {
+        "view_embedding",
+        "project.weight",
+        "project.bias",
+    }
     image = torch.randint(0, 256, (3, 3, 224, 448), dtype=torch.uint8)
     tokens = net(image)
     assert tokens.shape == (3, 2, 6)
@@ -379,10 +466,12 @@ def test_missing_clip_weights_or_libraries_are_reported_with_a_hint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frozen_clip.cache_clear()
-    net, image = build_network("clip_views", {"views": 2}), torch.zeros(1, 3, 224, 448, dtype=torch.uint8)
+    net = build_network("clip_views", {"views": 2})
+    image = torch.zeros(1, 3, 224, 448, dtype=torch.uint8)
     monkeypatch.delenv(CLIP_VARIABLE, raising=False)
     with pytest.raises(
-        FileError, match=r"LIDAR_SYNTH_CLIP is not set.*set LIDAR_SYNTH_CLIP to it; or train with .*'views'"
+        FileError,
+        match=r"LIDAR_SYNTH_CLIP is not set.*set LIDAR_SYNTH_CLIP to it; or train with .*'views'",
     ):
         net(image)
     monkeypatch.setenv(CLIP_VARIABLE, str(tmp_path / "nowhere"))
@@ -392,9 +481,14 @@ def test_missing_clip_weights_or_libraries_are_reported_with_a_hint(
     monkeypatch.setenv(CLIP_VARIABLE, str(tmp_path / "clip.pt"))
     with pytest.raises(FileError, match=r"expected a folder, or a .safetensors file"):
         net(image)
-    for place, library in ((tmp_path, "transformers"), (tmp_path / "clip.safetensors", "open_clip")):
+    for place, library in (
+        (tmp_path, "transformers"),
+        (tmp_path / "clip.safetensors", "open_clip"),
+    ):
         (tmp_path / "clip.safetensors").write_bytes(b"")
         monkeypatch.setenv(CLIP_VARIABLE, str(place))
         monkeypatch.setitem(sys.modules, library, None)
-        with pytest.raises(LibraryError, match=rf"{library}\w* is not installed.*pip install {library}"):
+        with pytest.raises(
+            LibraryError, match=rf"{library}\w* is not installed.*pip install {library}"
+        ):
             net(image)

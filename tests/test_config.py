@@ -25,13 +25,17 @@ KINDS = {"train": TrainConfig, "distill": DistillConfig}
 def test_every_file_is_a_recipe_a_base_or_a_sensor() -> None:
     assert {p.stem for p in CONFIGS.glob("*.yaml")} == set(RECIPES) | {"tiny_sensor"}
     named = {
-        base for p in CONFIGS.rglob("*.yaml") for base in np.atleast_1d(yaml.safe_load(p.read_text()).get("base", []))
+        base
+        for p in CONFIGS.rglob("*.yaml")
+        for base in np.atleast_1d(yaml.safe_load(p.read_text()).get("base", []))
     }
     assert named == {p.stem for p in (CONFIGS / "base").iterdir()}
 
 
 @pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command in KINDS])
-def test_every_recipe_loads_by_name_from_any_folder(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_recipe_loads_by_name_from_any_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     kind: type[Run] = KINDS[RECIPES[name].command]
     config = load_config(kind, name)
@@ -43,7 +47,8 @@ def test_every_recipe_loads_by_name_from_any_folder(name: str, tmp_path: Path, m
 
 @pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command == "train"])
 def test_the_listed_size_is_that_of_the_networks(name: str) -> None:
-    """Where a recipe starts from a checkpoint that is not there yet, its size cannot be computed."""
+    """Where a recipe starts from a checkpoint that is not there yet, its size cannot be
+    computed."""
     config = load_config(TrainConfig, name)
     if config.init is not None:
         pytest.skip("starts from a checkpoint")
@@ -95,26 +100,48 @@ def test_an_unknown_name_is_refused_with_the_known_ones(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"recipe .*expected a YAML file or one of .*town_teacher"):
+    with pytest.raises(
+        ConfigError, match=r"recipe .*expected a YAML file or one of .*town_teacher"
+    ):
         load_config(TrainConfig, name)
 
 
 def test_the_published_recipes() -> None:
     teacher = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
-    assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments["resolution"] == [64, 1024]
-    assert (teacher.recipe.iterations, teacher.recipe.batch, teacher.recipe.warmup) == (320_000, 8, 10_000)
+    assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments["resolution"] == [
+        64,
+        1024,
+    ]
+    assert (teacher.recipe.iterations, teacher.recipe.batch, teacher.recipe.warmup) == (
+        320_000,
+        8,
+        10_000,
+    )
     student = load_config(DistillConfig, CONFIGS / "kitti360_student.yaml")
-    assert (student.grid, student.steps, student.recipe.metric) == ((1, 0.86, 0.58, 0.22, 0), 20, "pseudo_huber")
+    assert (student.grid, student.steps, student.recipe.metric) == (
+        (1, 0.86, 0.58, 0.22, 0),
+        20,
+        "pseudo_huber",
+    )
 
 
 def test_overrides() -> None:
-    overrides = ["recipe.batch=4", "data.flip=false", "recipe.rate=1e-3", "channels=[range]", "samples.every=0"]
+    overrides = [
+        "recipe.batch=4",
+        "data.flip=false",
+        "recipe.rate=1e-3",
+        "channels=[range]",
+        "samples.every=0",
+    ]
     config = load_config(TrainConfig, TINY, overrides)
     assert (config.recipe.batch, config.data.flip, config.recipe.rate) == (4, False, 1e-3)
     assert config.tensors().size == 1
     assert config.samples.every == 0
     student = CONFIGS / "kitti360_student.yaml"
-    assert [load_config(DistillConfig, student, o).precision for o in ([], ["precision=no"])] == ["bf16", "no"]
+    assert [load_config(DistillConfig, student, o).precision for o in ([], ["precision=no"])] == [
+        "bf16",
+        "no",
+    ]
 
 
 def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -124,7 +151,9 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
     assert (len(source), source.seed, source.sensor.shape) == (40, 3, (16, 128))
     disk = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
     monkeypatch.delenv("KITTI360_ROOT", raising=False)
-    with pytest.raises(ConfigError, match=r"data.path '\$KITTI360_ROOT'; expected variables that are set"):
+    with pytest.raises(
+        ConfigError, match=r"data.path '\$KITTI360_ROOT'; expected variables that are set"
+    ):
         disk.data.open(load_sensor(disk.sensor))
     monkeypatch.setenv("KITTI360_ROOT", str(tmp_path / "nowhere"))
     with pytest.raises(DataError, match="nowhere"):
@@ -135,7 +164,10 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
     ("override", "message"),
     [
         ("sead=1", "unknown key 'sead'; known there: output, licence, data, recipe, seed"),
-        ("recipe.batches=1", "unknown key 'recipe.batches'; known there: iterations, batch, accumulate"),
+        (
+            "recipe.batches=1",
+            "unknown key 'recipe.batches'; known there: iterations, batch, accumulate",
+        ),
         ("data.twon=1", "unknown key 'data.twon'; known there: licence, town"),
         ("recipe.batch=many", "recipe.batch = 'many'"),
         ("recipe.batch=0", "of at least 1"),
@@ -144,7 +176,10 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
         ("normalisation=cubic", "normalisation 'cubic'; expected one of r2flow"),
         ("channels=[range, colour]", "range and some of"),
         ("sensor=hdl99", "sensor 'hdl99'"),
-        ("network.arguments.patch=[3, 4]", r"resolution \(16, 128\); expected multiples of \(6, 8\)"),
+        (
+            "network.arguments.patch=[3, 4]",
+            r"resolution \(16, 128\); expected multiples of \(6, 8\)",
+        ),
         ("network.arguments.depths=[1, 1, 1, 1, 1]", "expected multiples of"),
         ("network.arguments.width=[1]", "arguments"),
         ("network.arguments.depth=3", "arguments"),
@@ -164,7 +199,9 @@ def test_what_cannot_be_is_refused(override: str, message: str) -> None:
         load_config(TrainConfig, TINY, [*start, override])
 
 
-@pytest.mark.parametrize("grid", ["[1, 0.5, 0]", "[1, 0.5, 0.6, 0.2, 0]", "[0.9, 0.6, 0.5, 0.2, 0]"])
+@pytest.mark.parametrize(
+    "grid", ["[1, 0.5, 0]", "[1, 0.5, 0.6, 0.2, 0]", "[0.9, 0.6, 0.5, 0.2, 0]"]
+)
 def test_a_grid_that_is_none_is_refused(grid: str) -> None:
     with pytest.raises(ConfigError, match="5 descending times from 1 to 0"):
         load_config(DistillConfig, CONFIGS / "kitti360_student.yaml", [f"grid={grid}"])
@@ -208,9 +245,21 @@ def test_the_papers_latent_recipes() -> None:
 
 @pytest.mark.parametrize("name", ["kitti360_codec", "semantic_kitti_codec"])
 def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(name: str) -> None:
-    """autoencoder_c2_p4.yaml: beta 0.25 of the quantiser on the codes, disc_weight 0.6, base_learning_rate 4.5e-6."""
+    """autoencoder_c2_p4.yaml: beta 0.25 of the quantiser on the codes, disc_weight 0.6,
+    base_learning_rate 4.5e-6."""
     config = load_config(TrainConfig, CONFIGS / f"{name}.yaml")
-    losses, recipe = config.losses, config.recipe
-    assert (losses.commitment, losses.codebook, losses.adversarial, losses.adaptive) == (1.0, 0.25, 0.6, True)
+    losses = config.losses
+    recipe = config.recipe
+    assert (losses.commitment, losses.codebook, losses.adversarial, losses.adaptive) == (
+        1.0,
+        0.25,
+        0.6,
+        True,
+    )
     assert recipe.rate == pytest.approx(4.5e-6 * recipe.batch)
-    assert (recipe.batch, recipe.accumulate, recipe.betas, recipe.weight_decay) == (8, 2, (0.5, 0.9), 0.0)
+    assert (recipe.batch, recipe.accumulate, recipe.betas, recipe.weight_decay) == (
+        8,
+        2,
+        (0.5, 0.9),
+        0.0,
+    )

@@ -76,7 +76,8 @@ def test_a_rerun_writes_only_missing_scans(tmp_path: Path) -> None:
 
 
 def test_a_resumed_run_writes_the_same_files(tmp_path: Path) -> None:
-    """Interrupted before the folder's own files are written; the next run has to write all frames' poses and boxes."""
+    """Interrupted before the folder's own files are written; the next run has to write all frames'
+    poses and boxes."""
     MAKERS["kitti360"](tmp_path / "in")
     source = open_scans(tmp_path / "in")
     convert(source, WRITERS["kitti360"](tmp_path / "once"), progress=False)
@@ -93,10 +94,16 @@ def test_a_resumed_run_writes_the_same_files(tmp_path: Path) -> None:
     writer = WRITERS["kitti360"](tmp_path / "twice", calibration=source.calibration(0))
     with pytest.raises(KeyboardInterrupt):
         convert(Interrupted(), writer, progress=False)
-    assert not (tmp_path / "twice" / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt").exists()
-    assert convert(source, WRITERS["kitti360"](tmp_path / "twice"), progress=False) == Report(written=1, kept=2)
+    assert not (
+        tmp_path / "twice" / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt"
+    ).exists()
+    assert convert(source, WRITERS["kitti360"](tmp_path / "twice"), progress=False) == Report(
+        written=1, kept=2
+    )
     assert files(tmp_path / "twice") == files(tmp_path / "once")
-    assert [scan.pose is not None and scan.boxes is not None for scan in open_scans(tmp_path / "twice")] == [True] * 3
+    assert [
+        scan.pose is not None and scan.boxes is not None for scan in open_scans(tmp_path / "twice")
+    ] == [True] * 3
 
 
 @pytest.mark.slow
@@ -104,7 +111,9 @@ def test_processes_write_the_same_files(tmp_path: Path) -> None:
     write_all("semantic_kitti", tmp_path / "in", [some_scan(i, count=80) for i in range(12)])
     source = open_scans(tmp_path / "in")
     convert(source, WRITERS["kitti360"](tmp_path / "one"), progress=False)
-    assert convert(source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False) == Report(written=12)
+    assert convert(source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False) == Report(
+        written=12
+    )
     assert files(tmp_path / "one") == files(tmp_path / "two") and len(files(tmp_path / "one")) > 24
 
 
@@ -112,15 +121,20 @@ def test_processes_write_the_same_files(tmp_path: Path) -> None:
 def test_a_bank_becomes_semantic_kitti_with_a_label_file_for_every_scan(
     tmp_path: Path, fields: tuple[str, ...]
 ) -> None:
-    """A trainer reads a missing ``.label`` as some class; a bank without labels gets 0, unlabelled, everywhere."""
+    """A trainer reads a missing ``.label`` as some class; a bank without labels gets 0, unlabelled,
+    everywhere."""
     write_bank(tmp_path / "bank", [some_image(i) for i in range(3)], fields=fields)
     bank = open_scans(tmp_path / "bank")
     convert(bank, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     for index, scan in enumerate(bank):
-        raw = np.fromfile(tmp_path / "out" / "sequences" / "00" / "labels" / f"{index:06d}.label", "<u4")
+        raw = np.fromfile(
+            tmp_path / "out" / "sequences" / "00" / "labels" / f"{index:06d}.label", "<u4"
+        )
         assert len(raw) == len(scan) and (scan.label is None) == ("label" not in fields)
         known = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
-        assert np.array_equal(raw, SEMANTIC_KITTI.encode(known)) and (raw[known == IGNORE] == 0).all()
+        assert (
+            np.array_equal(raw, SEMANTIC_KITTI.encode(known)) and (raw[known == IGNORE] == 0).all()
+        )
         assert raw.any() == ("label" in fields)
 
 
@@ -129,7 +143,9 @@ def test_a_bank_has_no_boxes_for_kitti_objects(tmp_path: Path) -> None:
     call = [str(tmp_path / "bank"), str(tmp_path / "out"), "--to", "kitti_object"]
     result = CliRunner().invoke(app, call)
     assert isinstance(result.exception, DataError)
-    assert re.search(r"scan 'small/5/0' has no boxes; .*Write it as semantic_kitti", str(result.exception))
+    assert re.search(
+        r"scan 'small/5/0' has no boxes; .*Write it as semantic_kitti", str(result.exception)
+    )
     result = CliRunner().invoke(app, [*call, "--on-bad", "skip"])
     assert "0 scans written, 0 were there already, 3 skipped" in result.output
     assert not list(tmp_path.rglob("*.bin"))
@@ -170,11 +186,15 @@ def test_a_full_target_stops_the_run_for_every_policy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", presets())
 def test_conversion_to_another_sensor(tmp_path: Path, name: str) -> None:
-    scan, sensor = record(load_sensor("hdl64e_kitti")), load_sensor(name)
+    scan = record(load_sensor("hdl64e_kitti"))
+    sensor = load_sensor(name)
     report = convert([scan], WRITERS["npz"](tmp_path), as_sensor=sensor, progress=False)
-    read, expected = open_scans(tmp_path)[0], Transfer(sensor)(scan, keyed_rng(0, 0))
+    read = open_scans(tmp_path)[0]
+    expected = Transfer(sensor)(scan, keyed_rng(0, 0))
     assert read.sensor == sensor and np.array_equal(read.points, expected.points)
-    assert all(np.array_equal(read.fields()[k], v) for k, v in expected.fields().items() if k != "time")
+    assert all(
+        np.array_equal(read.fields()[k], v) for k, v in expected.fields().items() if k != "time"
+    )
     assert np.array_equal(read.pose, scan.pose) and read.boxes is not None
     assert report.seen == [Transfer(sensor).cast(scan).seen]
 
@@ -189,17 +209,23 @@ def drive(tmp_path: Path) -> Path:
 
 def test_poses_and_calibration_move_with_the_mount(tmp_path: Path, drive: Path) -> None:
     """A point of the street has the same pixel and the same place in the world before and after."""
-    before, transfer = open_scans(drive), Transfer(load_sensor("hdl32e_nuscenes"), Mount(0.3, 4.0))
+    before = open_scans(drive)
+    transfer = Transfer(load_sensor("hdl32e_nuscenes"), Mount(0.3, 4.0))
     out = WRITERS["semantic_kitti"](tmp_path / "out")
     report = convert(before, out, as_sensor=AsSensor(transfer, sweeps=1), progress=False)
     assert report.written == 3 and "times.txt" in report.left_out[0]
-    after, corners = open_scans(out.root), record(before.sensor).boxes.corners()[0]
+    after = open_scans(out.root)
+    corners = record(before.sensor).boxes.corners()[0]
     moved = transfer.mount.points(corners)
-    for a, b in zip(before.calibration(0).pixels(corners), after.calibration(0).pixels(moved), strict=True):
+    for a, b in zip(
+        before.calibration(0).pixels(corners), after.calibration(0).pixels(moved), strict=True
+    ):
         np.testing.assert_allclose(a, b, atol=1e-2)
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(b.pose, a.pose @ transfer.mount.matrix, atol=1e-5)
-    alone = convert(before, WRITERS["semantic_kitti"](tmp_path / "alone"), as_sensor=transfer, progress=False)
+    alone = convert(
+        before, WRITERS["semantic_kitti"](tmp_path / "alone"), as_sensor=transfer, progress=False
+    )
     assert alone.written == 3
     assert all(len(a) < len(b) for a, b in zip(open_scans(tmp_path / "alone"), after, strict=True))
 
@@ -212,7 +238,18 @@ def dataset(tmp_path: Path) -> Iterator[Path]:
 
 def test_the_command(drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = ["--to", "range", "--as-sensor", "os1_128", "--mount", "0.1,2", "--sweeps", "1", "--like", str(drive)]
+    options = [
+        "--to",
+        "range",
+        "--as-sensor",
+        "os1_128",
+        "--mount",
+        "0.1,2",
+        "--sweeps",
+        "1",
+        "--like",
+        str(drive),
+    ]
     result = CliRunner().invoke(app, [str(drive), str(out), *options])
     assert result.exit_code == 0, result.output
     assert "3 scans written, 0 were there already, 0 skipped" in result.output
@@ -224,7 +261,10 @@ def test_the_command(drive: Path, tmp_path: Path) -> None:
 
 WRONG = {
     "--mount without a sensor": (["--mount", "0,0"], "mount without --as-sensor"),
-    "a mount of one number": (["--as-sensor", "os1_128", "--mount", "0.1"], "--mount 0.1; expected metres and degrees"),
+    "a mount of one number": (
+        ["--as-sensor", "os1_128", "--mount", "0.1"],
+        "--mount 0.1; expected metres and degrees",
+    ),
     "an impossible mount": (["--as-sensor", "os1_128", "--mount", "9,0"], "at most 5 m"),
     "fewer than no sweeps": (["--as-sensor", "os1_128", "--sweeps", "-1"], "-1 sweeps"),
     "noise of metres": (["--as-sensor", "os1_128", "--range-noise", "2"], "range_noise=2"),
@@ -235,16 +275,28 @@ WRONG = {
 def test_wrong_options_of_another_sensor(drive: Path, tmp_path: Path, case: str) -> None:
     options, message = WRONG[case]
     with pytest.raises(ConfigError, match=message):
-        CliRunner().invoke(app, [str(drive), str(tmp_path / "out"), "--to", "kitti", *options], catch_exceptions=False)
+        CliRunner().invoke(
+            app,
+            [str(drive), str(tmp_path / "out"), "--to", "kitti", *options],
+            catch_exceptions=False,
+        )
     assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_skipped_scans_with_reasons(dataset: Path, tmp_path: Path) -> None:
     [*_, path] = sorted(dataset.rglob("*.bin"))
     path.write_bytes(b"cut")
-    result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), "--to", "kitti", "--on-bad", "skip"])
-    assert result.exit_code == 0 and "2 scans written, 0 were there already, 1 skipped" in result.output
-    assert "skipped 2013_05_28_drive_0000_sync/0000000002: " in result.output and "is 3 bytes long" in result.output
+    result = CliRunner().invoke(
+        app, [str(dataset), str(tmp_path / "out"), "--to", "kitti", "--on-bad", "skip"]
+    )
+    assert (
+        result.exit_code == 0
+        and "2 scans written, 0 were there already, 1 skipped" in result.output
+    )
+    assert (
+        "skipped 2013_05_28_drive_0000_sync/0000000002: " in result.output
+        and "is 3 bytes long" in result.output
+    )
 
 
 @pytest.mark.parametrize(
@@ -266,7 +318,9 @@ def test_the_error_of_a_wrong_call_names_the_right_one(
 
 def test_the_script_in_tools_is_the_command(tmp_path: Path) -> None:
     script = Path(__file__).parents[1] / "tools" / "convert.py"
-    result = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=120)
+    result = subprocess.run(
+        [sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=120
+    )
     assert result.returncode == 0 and "--as-sensor" in result.stdout
 
 
@@ -274,10 +328,14 @@ def test_a_folder_filled_from_something_else_is_refused(tmp_path: Path) -> None:
     """Not: the old scans kept, and passed off as the new ones."""
     for name in "ab":
         MAKERS["kitti360"](tmp_path / name)
-    a, b, out = open_scans(tmp_path / "a"), open_scans(tmp_path / "b"), WRITERS["npz"](tmp_path / "out")
+    a = open_scans(tmp_path / "a")
+    b = open_scans(tmp_path / "b")
+    out = WRITERS["npz"](tmp_path / "out")
     convert(a, out, progress=False)
     before = files(out.root)
-    with pytest.raises(ConfigError, match=r"out was filled with .*/a.*expected .*/b.*another folder"):
+    with pytest.raises(
+        ConfigError, match=r"out was filled with .*/a.*expected .*/b.*another folder"
+    ):
         convert(b, out, progress=False)
     with pytest.raises(ConfigError, match="os1_128"):
         convert(a, out, as_sensor=load_sensor("os1_128"), progress=False)
@@ -292,9 +350,12 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
     values = np.full((20, 4), 5, "<f4")
     (tmp_path / "in").mkdir()
     (values * [1, 1, 0, 10]).astype("<f4").tofile(tmp_path / "in" / "a.bin")
-    out, changed = WRITERS["npz"](tmp_path / "out"), WRITERS["npz"](tmp_path / "changed")
+    out = WRITERS["npz"](tmp_path / "out")
+    changed = WRITERS["npz"](tmp_path / "changed")
     convert(open_scans(tmp_path / "in", reflectance_max=65535), out, progress=False)
-    with pytest.raises(ConfigError, match="was filled with .*reflectance_max.*65535.*choose another folder"):
+    with pytest.raises(
+        ConfigError, match="was filled with .*reflectance_max.*65535.*choose another folder"
+    ):
         convert(open_scans(tmp_path / "in", reflectance_max=255), out, progress=False)
     target = load_sensor("vlp16")
     mistaken = open_scans(tmp_path / "in", reflectance_max=255, sensor="vlp16")
@@ -302,7 +363,12 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
     changed.path(0, "a").touch()  # as if it could be written: these points are no streets
     convert(mistaken, changed, as_sensor=target, progress=False)
     with pytest.raises(ConfigError, match="was filled with"):
-        convert(open_scans(tmp_path / "in", reflectance_max=255), changed, as_sensor=target, progress=False)
+        convert(
+            open_scans(tmp_path / "in", reflectance_max=255),
+            changed,
+            as_sensor=target,
+            progress=False,
+        )
 
 
 def five_fields(folder: Path, *counts: int) -> Path:
@@ -315,7 +381,8 @@ def five_fields(folder: Path, *counts: int) -> Path:
 
 @pytest.mark.parametrize("policy", ["error", "skip"])
 def test_a_run_that_wrote_nothing_can_be_corrected(tmp_path: Path, policy: Any) -> None:
-    root, out = five_fields(tmp_path / "in", 21, 23), WRITERS["npz"](tmp_path / "out")
+    root = five_fields(tmp_path / "in", 21, 23)
+    out = WRITERS["npz"](tmp_path / "out")
     with suppress(DataError):
         convert(open_scans(root), out, on_bad=policy, progress=False)
     assert files(out.root) == {} and not (out.root / SETTINGS).exists()
@@ -323,20 +390,25 @@ def test_a_run_that_wrote_nothing_can_be_corrected(tmp_path: Path, policy: Any) 
 
 
 def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(tmp_path: Path) -> None:
-    scans, out = [some_scan(0), some_scan(1)], WRITERS["kitti_object"](tmp_path)
+    scans = [some_scan(0), some_scan(1)]
+    out = WRITERS["kitti_object"](tmp_path)
     scans[1].boxes = None
     with pytest.raises(DataError, match="has no boxes"):
         convert(scans, out, progress=False)
     with pytest.raises(ConfigError, match="was filled with .*KITTIObjectWriter"):
         convert(scans, WRITERS["semantic_kitti"](tmp_path), progress=False)
     [path.unlink() for path in tmp_path.rglob("*") if path.is_file() and path.name != SETTINGS]
-    with pytest.raises(DataError, match="has no boxes"):  # beside another run, which has not written a scan yet
+    with pytest.raises(
+        DataError, match="has no boxes"
+    ):  # beside another run, which has not written a scan yet
         convert(scans[::-1], out, progress=False)
     assert (tmp_path / SETTINGS).is_file()
 
 
 @pytest.mark.parametrize("options", [{}, {"tr": False}, {"calib": False}, {"times": False}])
-def test_side_files_of_semantic_kitti_are_carried_and_never_invented(tmp_path: Path, options: dict[str, bool]) -> None:
+def test_side_files_of_semantic_kitti_are_carried_and_never_invented(
+    tmp_path: Path, options: dict[str, bool]
+) -> None:
     given = a_sequence(tmp_path / "in", **options)
     source = open_scans(tmp_path / "in")
     report = convert(source, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
@@ -345,17 +417,26 @@ def test_side_files_of_semantic_kitti_are_carried_and_never_invented(tmp_path: P
     assert {path.name: path.read_bytes() for path in written.glob("*.txt")} == there
     lacking = {"calib.txt", "poses.txt", "times.txt"} - set(there)
     assert len(report.left_out) == len(lacking)
-    assert all(f"sequences/07/{name}" in what for name, what in zip(sorted(lacking), report.left_out, strict=True))
+    assert all(
+        f"sequences/07/{name}" in what
+        for name, what in zip(sorted(lacking), report.left_out, strict=True)
+    )
     for expected, scan in zip(source, open_scans(tmp_path / "out"), strict=True):
         assert np.array_equal(scan.points, expected.points)
-        assert (scan.pose is None) == (expected.pose is None) == (options in ({"tr": False}, {"calib": False}))
+        assert (
+            (scan.pose is None)
+            == (expected.pose is None)
+            == (options in ({"tr": False}, {"calib": False}))
+        )
         assert scan.pose is None or np.array_equal(scan.pose, expected.pose)
 
 
 def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(tmp_path: Path) -> None:
     given = a_sequence(tmp_path / "in")
     given.rename(given.with_name("seven"))
-    report = convert(open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
+    report = convert(
+        open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
+    )
     assert report.left_out == [
         "calibration, poses and times of sequence seven: its scans are renumbered",
     ]
@@ -365,5 +446,10 @@ def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(tmp_path: 
 
 def test_the_command_reports_what_was_left_out(tmp_path: Path) -> None:
     a_sequence(tmp_path / "in", times=False)
-    result = CliRunner().invoke(app, [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "semantic_kitti"])
-    assert result.exit_code == 0 and f"left out sequences/07/times.txt: {tmp_path / 'in'} has none" in result.output
+    result = CliRunner().invoke(
+        app, [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "semantic_kitti"]
+    )
+    assert (
+        result.exit_code == 0
+        and f"left out sequences/07/times.txt: {tmp_path / 'in'} has none" in result.output
+    )

@@ -1,4 +1,5 @@
-"""What conversion does to the points: unfolding, bad points, intensity scales, real or synthetic."""
+"""What conversion does to the points: unfolding, bad points, intensity scales, real or
+synthetic."""
 
 import re
 from dataclasses import replace
@@ -23,9 +24,13 @@ from lidar_synth.geometry.sensor import load_sensor
 def rings_of(seed: int) -> Scan:
     """A scan on the beams of its sensor, ring by ring from straight ahead on."""
     sensor = load_sensor("hdl64e_kitti")
-    rng, lasers = np.random.default_rng(seed), sensor.by_beams()
-    distance = np.where(rng.random(lasers.shape) < 0.8, rng.uniform(5, 70, lasers.shape), 0).astype(np.float32)
-    scan, row = unproject(RangeImage(distance, lasers)), np.nonzero(distance)[0]
+    rng = np.random.default_rng(seed)
+    lasers = sensor.by_beams()
+    distance = np.where(rng.random(lasers.shape) < 0.8, rng.uniform(5, 70, lasers.shape), 0).astype(
+        np.float32
+    )
+    scan = unproject(RangeImage(distance, lasers))
+    row = np.nonzero(distance)[0]
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]) % (2 * np.pi)
     return replace(scan[np.lexsort((azimuth, row))], sensor=sensor)
 
@@ -40,13 +45,29 @@ def test_conversion_unfolds_scans(tmp_path: Path) -> None:
     read = open_scans(tmp_path / "out")
     for scan, expected in zip(read, scans, strict=True):
         assert np.allclose(project(scan).range, unfold(expected).range, rtol=3e-7)
-        assert np.array_equal(project(scan).sensor.row_elevations(), expected.sensor.laser_elevations)
+        assert np.array_equal(
+            project(scan).sensor.row_elevations(), expected.sensor.laser_elevations
+        )
     for report in (Report(written=3), Report(kept=3)):  # points on the beams, described beside them
-        again = convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "b"), unfold=True, progress=False)
+        again = convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["kitti"](tmp_path / "b"),
+            unfold=True,
+            progress=False,
+        )
         assert again == report and open_scans(tmp_path / "b").sensor == scans[0].sensor.by_beams()
-    write_all("kitti", tmp_path / "shuffled", [scans[0][np.random.default_rng(0).permutation(len(scans[0]))]])
+    write_all(
+        "kitti",
+        tmp_path / "shuffled",
+        [scans[0][np.random.default_rng(0).permutation(len(scans[0]))]],
+    )
     with pytest.raises(DataError, match="ring by ring"):
-        convert(open_scans(tmp_path / "shuffled"), WRITERS["npz"](tmp_path / "no"), unfold=True, progress=False)
+        convert(
+            open_scans(tmp_path / "shuffled"),
+            WRITERS["npz"](tmp_path / "no"),
+            unfold=True,
+            progress=False,
+        )
     with pytest.raises(ConfigError, match="was filled with .*'unfold': True"):
         convert(open_scans(tmp_path / "in"), WRITERS["range"](tmp_path / "out"), progress=False)
 
@@ -59,7 +80,9 @@ def with_bad_points(path: Path) -> np.ndarray:
     return np.isfinite(points).all(1)
 
 
-@pytest.mark.parametrize("layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder", "nuscenes"])
+@pytest.mark.parametrize(
+    "layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder", "nuscenes"]
+)
 def test_bad_points_are_dropped_with_their_labels_and_counted(tmp_path: Path, layout: str) -> None:
     paths = MAKERS[layout](tmp_path / "in")
     before = open_scans(tmp_path / "in", layout=layout)[1]
@@ -78,10 +101,16 @@ def test_bad_points_are_dropped_with_their_labels_and_counted(tmp_path: Path, la
     result = CliRunner().invoke(app, [str(tmp_path / "in"), str(out), *options])
     name = open_scans(tmp_path / "in", layout=layout).ids[1]
     count = len(before) - len(kept)
-    assert result.exit_code == 0 and f"dropped {count} points of {name}, which are NaN or infinite" in result.output
-    scan, expected = open_scans(out)[1], before[kept]
+    assert (
+        result.exit_code == 0
+        and f"dropped {count} points of {name}, which are NaN or infinite" in result.output
+    )
+    scan = open_scans(out)[1]
+    expected = before[kept]
     assert np.array_equal(scan.points, expected.points)
-    assert all(np.array_equal(scan.fields()[name], values) for name, values in expected.fields().items())
+    assert all(
+        np.array_equal(scan.fields()[name], values) for name, values in expected.fields().items()
+    )
     source = open_scans(tmp_path / "in", layout=layout, on_bad="drop-points")
     assert len(source[1]) == len(kept) and source.dropped == {name: count}
 
@@ -113,7 +142,9 @@ def test_intensities_on_another_scale(tmp_path: Path) -> None:
 
 def test_five_floats_per_point(tmp_path: Path) -> None:
     scan = some_scan(0)[:41]  # not a multiple of four
-    np.column_stack([scan.points, scan.reflectance, np.zeros(41)]).astype("<f4").tofile(tmp_path / "a.bin")
+    np.column_stack([scan.points, scan.reflectance, np.zeros(41)]).astype("<f4").tofile(
+        tmp_path / "a.bin"
+    )
     with pytest.raises(DataError, match="--fields 5"):
         open_scans(tmp_path / "a.bin")[0]
     assert np.array_equal(open_scans(tmp_path / "a.bin", fields=5)[0].points, scan.points)
@@ -127,7 +158,9 @@ def test_suffixes_in_capitals(tmp_path: Path, to: str) -> None:
         path.rename(path.with_suffix(path.suffix.upper()))
     source = open_scans(tmp_path / "in")
     assert len(source) == 3 and np.array_equal(source[0].points, expected.points)
-    assert np.array_equal(open_scans(paths[0].with_suffix(paths[0].suffix.upper()))[0].points, expected.points)
+    assert np.array_equal(
+        open_scans(paths[0].with_suffix(paths[0].suffix.upper()))[0].points, expected.points
+    )
     assert source[0].label is not None and np.array_equal(source[0].label, expected.label)
     assert convert(source, WRITERS["kitti"](tmp_path / "out"), progress=False) == Report(written=3)
 
@@ -146,7 +179,9 @@ def test_synthetic_scans_stay_synthetic_in_every_format(tmp_path: Path, to: str)
 
 def test_real_scans_stay_real(tmp_path: Path) -> None:
     MAKERS["kitti360"](tmp_path / "in")
-    convert(open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
+    convert(
+        open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
+    )
     assert {scan.domain for scan in open_scans(tmp_path / "out")} == {REAL}
     (tmp_path / MARK).write_text("{}")  # above a dataset, not beside it
     assert open_scans(tmp_path / "out")[0].domain == REAL
@@ -154,7 +189,8 @@ def test_real_scans_stay_real(tmp_path: Path) -> None:
 
 def test_an_interrupted_run_marks_existing_scans_as_synthetic(tmp_path: Path) -> None:
     bank = write_bank(tmp_path / "bank", [some_image(i) for i in range(3)])[0].parent
-    source, writer = open_scans(bank), WRITERS["kitti"](tmp_path / "out")
+    source = open_scans(bank)
+    writer = WRITERS["kitti"](tmp_path / "out")
     read = source.read
 
     def stop(index: int) -> Scan:

@@ -29,7 +29,9 @@ def with_image(folder: Path) -> Scan:
 
 
 @pytest.mark.parametrize("to", WRITERS)
-def test_what_a_format_cannot_hold_is_counted_and_refused_on_request(to: str, tmp_path: Path) -> None:
+def test_what_a_format_cannot_hold_is_counted_and_refused_on_request(
+    to: str, tmp_path: Path
+) -> None:
     scans = [with_image(tmp_path)] * 2
     report = convert(scans, WRITERS[to](tmp_path / "out"), progress=False)  # type: ignore[call-arg]
     assert report.written == 2 and set(report.lost.values()) <= {2}
@@ -37,7 +39,9 @@ def test_what_a_format_cannot_hold_is_counted_and_refused_on_request(to: str, tm
     has = {name for name in DETAILS if getattr(found, name) is not None}
     assert has == set(DETAILS) - set(report.lost)
     strict = WRITERS[to](tmp_path / "strict")  # type: ignore[call-arg]
-    with pytest.raises(ConfigError, match=f"has .*{next(iter(report.lost))}.* cannot hold.*npz or webdataset"):
+    with pytest.raises(
+        ConfigError, match=f"has .*{next(iter(report.lost))}.* cannot hold.*npz or webdataset"
+    ):
         convert(scans, strict, on_bad="skip", strict=True, progress=False)
     assert not [path for path in (tmp_path / "strict").rglob("*") if path.is_file()]
 
@@ -48,12 +52,19 @@ def test_scans_without_labels_gain_none(to: str, tmp_path: Path) -> None:
     report = convert([scan], WRITERS[to](tmp_path), progress=False)  # type: ignore[call-arg]
     found = back(to, tmp_path)[0]
     # A trainer takes a missing label file of SemanticKITTI for a class: it is written, and named.
-    assert (found.label is not None) == (report.unlabelled == 1) == (WRITTEN_AS[to] == "semantic_kitti")
+    assert (
+        (found.label is not None)
+        == (report.unlabelled == 1)
+        == (WRITTEN_AS[to] == "semantic_kitti")
+    )
 
 
 @pytest.mark.parametrize("to", ["pcd", "ply"])
 def test_boxes_stand_beside_clouds(to: str, tmp_path: Path) -> None:
-    scan = replace(some_scan(), boxes=replace(some_boxes(), occlusion=np.arange(5) % 3, dont_care=np.ones((2, 4))))
+    scan = replace(
+        some_scan(),
+        boxes=replace(some_boxes(), occlusion=np.arange(5) % 3, dont_care=np.ones((2, 4))),
+    )
     [path] = write_all(to, tmp_path, [scan])
     found = back(to, tmp_path)[0].boxes
     assert found is not None and scan.boxes is not None
@@ -77,9 +88,12 @@ def test_the_command_prints_a_line_for_each_field(tmp_path: Path) -> None:
 
 
 def test_boxes_in_which_the_other_sensor_sees_nothing_are_left_out(tmp_path: Path) -> None:
-    near, far = car(9, 2), car(11, -60)
+    near = car(9, 2)
+    far = car(11, -60)
     scan = cast([near])
     scan.boxes = Boxes(np.array([near, far]), ("Car", "Van"))
-    convert([scan], WRITERS["npz"](tmp_path), as_sensor=presets()["hdl32e_nuscenes"], progress=False)
+    convert(
+        [scan], WRITERS["npz"](tmp_path), as_sensor=presets()["hdl32e_nuscenes"], progress=False
+    )
     found = open_scans(tmp_path)[0].boxes
     assert found is not None and found.names == ("Car",) and np.allclose(found.values[0], near)

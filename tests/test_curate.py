@@ -1,4 +1,5 @@
-"""Curation: planted outliers get the highest scores, and the command lists, plots and drops scans."""
+"""Curation: planted outliers get the highest scores, and the command lists, plots and drops
+scans."""
 
 import json
 from collections.abc import Callable
@@ -25,12 +26,15 @@ from lidar_synth.lab.curate.scores import FARTHEST
 from lidar_synth.viz import histograms
 
 ALL = ("reflectance", "label", "confidence")
-ROAD, BUILDING = TRAIN_ID["road"], TRAIN_ID["building"]
+ROAD = TRAIN_ID["road"]
+BUILDING = TRAIN_ID["building"]
 
 
 def plain_image(seed: int) -> RangeImage:
     """Four walls on a road at random distances; each seed gives another scan."""
-    metres = np.tile(np.repeat(np.random.default_rng(seed).uniform(6, 38, 4), 8), (8, 1)).astype(np.float32)
+    metres = np.tile(np.repeat(np.random.default_rng(seed).uniform(6, 38, 4), 8), (8, 1)).astype(
+        np.float32
+    )
     metres[:, seed % 32] = 0
     seen = metres > 0
     label = np.where(np.arange(8)[:, None] < 3, BUILDING, ROAD) * np.ones((1, 32))
@@ -98,25 +102,43 @@ def test_the_measures_match_their_definitions() -> None:
     scan = unproject(image)
     assert MEASURES["empty"].of(image, scan) == pytest.approx(1 / 32)
     assert MEASURES["confidence"].of(image, scan) == pytest.approx(0.9)
-    assert [MEASURES[name].of(image, scan) for name in ("unlabelled", "floating", "speckle")] == [0, 0, 0]
-    image.channels["label"][0, 1:5] = ROAD, ROAD, IGNORE, BUILDING  # the first row looks up, the others down
+    assert [MEASURES[name].of(image, scan) for name in ("unlabelled", "floating", "speckle")] == [
+        0,
+        0,
+        0,
+    ]
+    image.channels["label"][0, 1:5] = (
+        ROAD,
+        ROAD,
+        IGNORE,
+        BUILDING,
+    )  # the first row looks up, the others down
     scan = unproject(image)
     assert MEASURES["unlabelled"].of(image, scan) == pytest.approx(1 / (8 * 31))
     assert MEASURES["floating"].of(image, scan) == pytest.approx(2 / (5 * 31 + 2))
     assert MEASURES["speckle"].of(image, scan) == 0
     image.channels["label"][0, 10] = ROAD
-    pairs = 8 * 27 - 2  # four walls of 7 in every row, less what is beside the gap and beside the unknown label
+    pairs = (
+        8 * 27 - 2
+    )  # four walls of 7 in every row, less what is beside the gap and beside the unknown label
     assert MEASURES["speckle"].of(image, unproject(image)) == pytest.approx(2 / pairs)
 
 
 def test_a_scan_without_returns_has_the_largest_distance(tmp_path: Path) -> None:
     images = [plain_image(seed) for seed in range(3)]
-    images[1] = RangeImage(np.zeros_like(images[1].range), SENSOR, {"label": np.full_like(images[1].label, IGNORE)})
+    images[1] = RangeImage(
+        np.zeros_like(images[1].range), SENSOR, {"label": np.full_like(images[1].label, IGNORE)}
+    )
     write_bank(tmp_path, images, fields=("label",))
     values = score(Bank(tmp_path), progress=False).values
     assert set(values) == set(MEANINGS) - {"confidence"}
     assert values["range"][1] == values["labels"][1] == FARTHEST and values["empty"][1] == 1
-    assert [values[name][1] for name in ("unlabelled", "floating", "speckle", "duplicate")] == [0, 0, 0, 0]
+    assert [values[name][1] for name in ("unlabelled", "floating", "speckle", "duplicate")] == [
+        0,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_signatures_are_unit_vectors_of_the_near_returns() -> None:
@@ -132,21 +154,26 @@ def test_signatures_are_unit_vectors_of_the_near_returns() -> None:
 def test_the_most_similar_earlier_scan_is_found(seed: int, count: int, block: int) -> None:
     rng = np.random.default_rng(seed)
     signatures = rng.random((count, 6)) * (rng.random((count, 6)) < 0.5)
-    signatures = (signatures / np.linalg.norm(signatures, axis=1).clip(1e-9)[:, None]).astype(np.float16)
+    signatures = (signatures / np.linalg.norm(signatures, axis=1).clip(1e-9)[:, None]).astype(
+        np.float16
+    )
     products = signatures.astype(np.float32) @ signatures.astype(np.float32).T
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(duplicates, "BLOCK", block)
         similarity, twin = duplicates.most_similar(signatures, progress=False)
     assert (similarity[0], twin[0]) == (0, -1)
     for i in range(1, count):
-        assert 0 <= twin[i] < i and similarity[i] == pytest.approx(min(products[i, :i].max(), 1), abs=1e-6)
+        assert 0 <= twin[i] < i and similarity[i] == pytest.approx(
+            min(products[i, :i].max(), 1), abs=1e-6
+        )
         assert products[i, twin[i]] == pytest.approx(products[i, :i].max(), abs=1e-6)
 
 
 def test_a_reference_replaces_the_mean_histograms(tmp_path: Path) -> None:
     write_bank(tmp_path / "bank", images_with("range"), fields=ALL)
     write_bank(tmp_path / "odd", [images_with("range")[13]], fields=ALL)
-    bank, odd = Bank(tmp_path / "bank"), Bank(tmp_path / "odd")
+    bank = Bank(tmp_path / "bank")
+    odd = Bank(tmp_path / "odd")
     values = score(bank, odd, name="odd", progress=False).values
     assert values["range"].argmin() == 13 and values["range"][13] < 1e-6
     assert np.array_equal(values["empty"], score(bank, progress=False).values["empty"])
@@ -164,12 +191,20 @@ def test_scores_do_not_depend_on_processes_and_are_saved(tmp_path: Path) -> None
         assert np.array_equal(values, two.values[name])
     write_scores(tmp_path / FILE, one)
     back = read_scores(tmp_path / FILE)
-    assert (back.bank, back.reference) == (Bank(tmp_path).identity, "") and list(back.values) == list(one.values)
+    assert (back.bank, back.reference) == (Bank(tmp_path).identity, "") and list(
+        back.values
+    ) == list(one.values)
     assert all(np.array_equal(back.values[name], values) for name, values in one.values.items())
     (tmp_path / FILE).write_bytes((tmp_path / FILE).read_bytes()[:-100])
     with pytest.raises(DataError, match=r"scores.npz: "):
         read_scores(tmp_path / FILE)
-    np.savez(tmp_path / FILE, bank=np.array(""), reference=np.array(""), twin=np.zeros(3), range=np.zeros(2))
+    np.savez(
+        tmp_path / FILE,
+        bank=np.array(""),
+        reference=np.array(""),
+        twin=np.zeros(3),
+        range=np.zeros(2),
+    )
     with pytest.raises(DataError, match=r"expected the scores of a bank. Remove it"):
         read_scores(tmp_path / FILE)
 
@@ -185,7 +220,8 @@ def bank(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
-    out, picture = tmp_path / "good", tmp_path / "scores.png"
+    out = tmp_path / "good"
+    picture = tmp_path / "scores.png"
     status, output = call("curate", bank, "--sort", "duplicate", "--limit", 1, "--plot", picture)
     assert status == 0 and "0 of 20 scans match the rules" in output
     [row] = [line for line in output.splitlines() if "small/5/13" in line]
@@ -196,10 +232,16 @@ def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
     status, output = call("curate", bank, *rules, "--limit", 20)
     assert "1 of 20 scans match the rules" in output and output.count("dropped") == 1
     status, output = call("curate", bank, *rules, "--out", out)
-    assert status == 0 and f"{out}: 19 scans in 3 shards; 1 of 20 scans left out by 'duplicate > 0.99' or " in output
+    assert (
+        status == 0
+        and f"{out}: 19 scans in 3 shards; 1 of 20 scans left out by 'duplicate > 0.99' or "
+        in output
+    )
     assert (bank / FILE).stat().st_mtime_ns == made  # scored once
     assert names_and_points(out) == names_and_points(bank)[:13] + names_and_points(bank)[14:]
-    assert "left out by 'duplicate > 0.99'" in json.loads(call("info", out, "--json")[1])["curation"]
+    assert (
+        "left out by 'duplicate > 0.99'" in json.loads(call("info", out, "--json")[1])["curation"]
+    )
     call("curate", out)
     assert len(read_scores(out / FILE).twin) == 19
 
@@ -207,7 +249,8 @@ def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_plot_counts_every_scan_and_marks_some() -> None:
     rng = np.random.default_rng(0)
-    values, marked = {name: rng.random(50) for name in MEANINGS}, rng.random(50) < 0.2
+    values = {name: rng.random(50) for name in MEANINGS}
+    marked = rng.random(50) < 0.2
     figure = histograms(values, MEANINGS, marked, "title")
     assert [axes.get_title(loc="left") for axes in figure.axes] == list(MEANINGS)
     for axes in figure.axes:
@@ -216,7 +259,9 @@ def test_the_plot_counts_every_scan_and_marks_some() -> None:
 
 
 def test_the_command_prints_json_and_takes_a_reference(bank: Path, tmp_path: Path) -> None:
-    found = json.loads(call("curate", bank, "--json", "--sort", "-empty", "--limit", 3, "--drop", "empty >= 0")[1])
+    found = json.loads(
+        call("curate", bank, "--json", "--sort", "-empty", "--limit", 3, "--drop", "empty >= 0")[1]
+    )
     assert (found["scans"], found["dropped"], len(found["listed"])) == (20, 20, 3)
     assert {"number", "id", "twin", "dropped", *MEANINGS} == set(found["listed"][0])
     before = read_scores(bank / FILE).values["range"]
@@ -227,7 +272,9 @@ def test_the_command_prints_json_and_takes_a_reference(bank: Path, tmp_path: Pat
     assert not np.allclose(scores.values["range"], before)
 
 
-def test_scores_of_a_reference_with_other_scans_of_the_same_names_are_not_reused(bank: Path, tmp_path: Path) -> None:
+def test_scores_of_a_reference_with_other_scans_of_the_same_names_are_not_reused(
+    bank: Path, tmp_path: Path
+) -> None:
     found = []
     for seed in (1, 2):
         write_all("npz", tmp_path / "real", [unproject(some_image(seed))])
@@ -240,7 +287,10 @@ def test_scores_of_another_bank_are_not_reused(bank: Path) -> None:
     call("curate", bank, "--json")
     write_bank(bank, [some_image(i) for i in range(3)], fields=ALL)
     call("curate", bank, "--json")
-    assert len(read_scores(bank / FILE).twin) == 3 and read_scores(bank / FILE).bank == Bank(bank).identity
+    assert (
+        len(read_scores(bank / FILE).twin) == 3
+        and read_scores(bank / FILE).bank == Bank(bank).identity
+    )
 
 
 @pytest.mark.parametrize(

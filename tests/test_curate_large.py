@@ -1,4 +1,5 @@
-"""Curation of banks that do not fit into memory: approximate search for near duplicates, features on disk."""
+"""Curation of banks that do not fit into memory: approximate search for near duplicates, features
+on disk."""
 
 import os
 import signal
@@ -49,17 +50,26 @@ class Planted(NamedTuple):
     copies: dict[int, int]
 
 
-def some_signatures(count: int, rng: np.random.Generator, scenes: int = 30, own: float = 1.0) -> NDArray[np.float32]:
-    """Like the town's: the similarity of two is 0.76 to 0.91, that of the most similar ones 0.92 to 0.95."""
+def some_signatures(
+    count: int, rng: np.random.Generator, scenes: int = 30, own: float = 1.0
+) -> NDArray[np.float32]:
+    """Like the town's: the similarity of two is 0.76 to 0.91, that of the most similar ones 0.92 to
+    0.95."""
     side = np.arange(32) - 15.5
     profile = 1 / (1 + side**2 + side[:, None] ** 2).reshape(-1)
-    scene = np.random.default_rng(9).gamma(0.6, 1, (scenes, SIGNATURE))[rng.integers(0, scenes, count)]
-    roots = np.sqrt(profile * (scene + own * rng.standard_gamma(0.6, (count, SIGNATURE))), dtype=np.float32)
+    scene = np.random.default_rng(9).gamma(0.6, 1, (scenes, SIGNATURE))[
+        rng.integers(0, scenes, count)
+    ]
+    roots = np.sqrt(
+        profile * (scene + own * rng.standard_gamma(0.6, (count, SIGNATURE))), dtype=np.float32
+    )
     unit: NDArray[np.float32] = roots / np.linalg.norm(roots, axis=1)[:, None]
     return unit
 
 
-def like(signature: NDArray[np.float32], similarity: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def like(
+    signature: NDArray[np.float32], similarity: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
     """Another unit vector with about this similarity."""
     noise = rng.normal(size=SIGNATURE) * signature
     noise -= signature * (noise @ signature)
@@ -96,7 +106,9 @@ def test_near_duplicates_are_found(scenes: int) -> None:
     """At least 95 % of the scans with a similarity at the threshold, and every copy."""
     signatures, near, copies = planted(8_000, scenes, scenes=scenes)
     similarity, twin = find_similar(signatures, progress=False)
-    true = [float(signatures[a].astype(float) @ signatures[b].astype(float)) for a, b in near.items()]
+    true = [
+        float(signatures[a].astype(float) @ signatures[b].astype(float)) for a, b in near.items()
+    ]
     assert min(true) > 0.9895 and max(true) < 0.9915
     assert np.mean([twin[a] == b for a, b in near.items()]) >= 0.95
     assert all(twin[a] == b and similarity[a] > 0.999 for a, b in copies.items())
@@ -110,7 +122,9 @@ def test_the_approximate_similarity_never_exceeds_the_exact_one(many: Planted) -
     assert (similarity <= exact + 1e-5).all() and (similarity[0], twin[0]) == (0, -1)
     assert ((twin < np.arange(4000)) & (similarity >= 0)).all()
     found = twin >= 0
-    products = np.einsum("nd,nd->n", signatures.astype(np.float64), signatures[twin].astype(np.float64))
+    products = np.einsum(
+        "nd,nd->n", signatures.astype(np.float64), signatures[twin].astype(np.float64)
+    )
     assert np.allclose(similarity[found], products.clip(max=1)[found], atol=1e-5)
     assert np.median(exact - similarity) < 0.03
 
@@ -126,7 +140,8 @@ def test_the_block_size_changes_nothing(many: Planted, monkeypatch: pytest.Monke
 
 
 def test_nearly_identical_scans_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Like the scans of a collapsed model: one cell holds most scans, and only its first ones are compared."""
+    """Like the scans of a collapsed model: one cell holds most scans, and only its first ones are
+    compared."""
     rng = np.random.default_rng(3)
     one = some_signatures(1, rng)[0]
     same = np.stack([like(one, 0.9999, rng) for _ in range(1500)])
@@ -155,10 +170,14 @@ def test_the_search_among_few_scans(seed: int, count: int) -> None:
 
 
 @pytest.mark.slow
-def test_large_banks_use_the_approximate_search(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_banks_use_the_approximate_search(
+    many: Planted, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(duplicates, "compare_all", None)
     monkeypatch.setattr(duplicates, "ALL_PAIRS", len(many.signatures) - 1)
-    assert np.array_equal(most_similar(many.signatures, False)[1], find_similar(many.signatures, False)[1])
+    assert np.array_equal(
+        most_similar(many.signatures, False)[1], find_similar(many.signatures, False)[1]
+    )
 
 
 def peak(store: Store) -> int:
@@ -173,10 +192,13 @@ def peak(store: Store) -> int:
 
 def stored(folder: Path, count: int) -> Store:
     """A store with this many signatures."""
-    store, rng = Store(folder, count, NAMES), np.random.default_rng(0)
+    store = Store(folder, count, NAMES)
+    rng = np.random.default_rng(0)
     for block, start in enumerate(range(0, count, store_module.BLOCK)):
         rows = np.zeros(min(store_module.BLOCK, count - start), store.dtype)
-        rows["signature"] = rng.integers(0, 256, (len(rows), SIGNATURE), np.uint8) * np.float16(1 / 4096)
+        rows["signature"] = rng.integers(0, 256, (len(rows), SIGNATURE), np.uint8) * np.float16(
+            1 / 4096
+        )
         store.write(block, rows)
     return store
 
@@ -199,7 +221,9 @@ def small_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def bank(tmp_path: Path) -> Bank:
-    write_bank(tmp_path / "bank", [plain_image(seed) for seed in range(20)], shard_size=7, fields=ALL)
+    write_bank(
+        tmp_path / "bank", [plain_image(seed) for seed in range(20)], shard_size=7, fields=ALL
+    )
     return Bank(tmp_path / "bank")
 
 
@@ -209,8 +233,12 @@ def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.Fixt
     request.getfixturevalue("small_files")
     for jobs in (1, 2):
         parts = score(bank, jobs=jobs, progress=False)
-        assert list(parts.values) == list(expected.values) and np.array_equal(parts.twin, expected.twin)
-        assert all(np.array_equal(parts.values[name], values) for name, values in expected.values.items())
+        assert list(parts.values) == list(expected.values) and np.array_equal(
+            parts.twin, expected.twin
+        )
+        assert all(
+            np.array_equal(parts.values[name], values) for name, values in expected.values.items()
+        )
 
 
 @pytest.mark.usefixtures("small_files")
@@ -231,18 +259,24 @@ def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.M
     read.clear()
     scores = score(bank, progress=False, folder=tmp_path / "kept")
     assert read == [16, 17, 18, 19]  # two files of eight scans existed
-    assert all(np.array_equal(scores.values[name], values) for name, values in expected.values.items())
+    assert all(
+        np.array_equal(scores.values[name], values) for name, values in expected.values.items()
+    )
     damaged = next((tmp_path / "kept").rglob("features-000001.npy"))
     damaged.write_bytes(damaged.read_bytes()[:-50])
     read.clear()
     scores = score(bank, progress=False, folder=tmp_path / "kept")
-    assert read[0] == 8 and all(np.array_equal(scores.values[n], v) for n, v in expected.values.items())
+    assert read[0] == 8 and all(
+        np.array_equal(scores.values[n], v) for n, v in expected.values.items()
+    )
 
 
 @pytest.mark.usefixtures("small_files")
 def test_features_of_another_bank_are_not_reused(bank: Bank, tmp_path: Path) -> None:
     score(bank, progress=False, folder=tmp_path / "kept")
-    write_bank(tmp_path / "other", [some_image(seed) for seed in range(20)], shard_size=7, fields=ALL)
+    write_bank(
+        tmp_path / "other", [some_image(seed) for seed in range(20)], shard_size=7, fields=ALL
+    )
     other = Bank(tmp_path / "other")
     scores = score(other, progress=False, folder=tmp_path / "kept")
     assert np.array_equal(scores.values["empty"], score(other, progress=False).values["empty"])

@@ -1,4 +1,5 @@
-"""Curated banks and parts of banks: they hold the kept scans, and merge, split, head and repair keep the curation."""
+"""Curated banks and parts of banks: they hold the kept scans, and merge, split, head and repair
+keep the curation."""
 
 import shutil
 from pathlib import Path
@@ -34,7 +35,8 @@ def original(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def good(original: Path, tmp_path: Path) -> Path:
-    """Scans 1, 4 and 5 are dropped: one in the middle of the first shard, the last two of the second one."""
+    """Scans 1, 4 and 5 are dropped: one in the middle of the first shard, the last two of the
+    second one."""
     drop(Bank(original), [1, 4, 5], "by hand", tmp_path / "good", progress=False)
     return tmp_path / "good"
 
@@ -71,9 +73,17 @@ def test_an_index_without_curation_has_no_keys_for_it(original: Path) -> None:
 def test_a_fully_dropped_shard_is_omitted(original: Path, tmp_path: Path) -> None:
     index = drop(Bank(original), [0, 3, 4, 5], "by hand", tmp_path / "few", progress=False)
     assert [entry.dropped for entry in index.shards] == [(0,), ()]
-    assert len(list((tmp_path / "few").glob("*.h5"))) == 2 and verify(tmp_path / "few", progress=False) == []
-    assert names_and_points(tmp_path / "few") == [names_and_points(original)[i] for i in (1, 2, 6, 7)]
-    with pytest.raises(ConfigError, match=r"all 4 scans of .*few left out \(all\); expected a rule that leaves some"):
+    assert (
+        len(list((tmp_path / "few").glob("*.h5"))) == 2
+        and verify(tmp_path / "few", progress=False) == []
+    )
+    assert names_and_points(tmp_path / "few") == [
+        names_and_points(original)[i] for i in (1, 2, 6, 7)
+    ]
+    with pytest.raises(
+        ConfigError,
+        match=r"all 4 scans of .*few left out \(all\); expected a rule that leaves some",
+    ):
         drop(Bank(tmp_path / "few"), range(4), "all", tmp_path / "none", progress=False)
     with pytest.raises(ConfigError, match=r"scans \[-1, 4\] to leave out; expected 0 to 3"):
         drop(Bank(tmp_path / "few"), [1, 4, -1], "some", tmp_path / "none", progress=False)
@@ -83,20 +93,32 @@ def test_a_fully_dropped_shard_is_omitted(original: Path, tmp_path: Path) -> Non
 def test_a_curated_bank_can_be_curated_again(good: Path, original: Path, tmp_path: Path) -> None:
     index = drop(Bank(good), [0, 2], "once more", tmp_path / "better", progress=False)
     assert (index.curation, index.scans) == (("by hand", "once more"), 3)
-    assert names_and_points(tmp_path / "better") == [names_and_points(original)[i] for i in (2, 6, 7)]
+    assert names_and_points(tmp_path / "better") == [
+        names_and_points(original)[i] for i in (2, 6, 7)
+    ]
     with pytest.raises(ConfigError, match="good was filled with .*'by hand'"):
         drop(Bank(original), [0], "elsewhere", good, progress=False)
 
 
-@pytest.mark.parametrize("shares", [(float("nan"), 1.0), (float("inf"), 1.0), (0.0, 1.0), (-1.0, 2.0), (0.5, 0.4)])
-def test_shares_that_are_none_are_refused(good: Path, tmp_path: Path, shares: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    "shares", [(float("nan"), 1.0), (float("inf"), 1.0), (0.0, 1.0), (-1.0, 2.0), (0.5, 0.4)]
+)
+def test_shares_that_are_none_are_refused(
+    good: Path, tmp_path: Path, shares: tuple[float, ...]
+) -> None:
     with pytest.raises(ConfigError, match="expected positive numbers that sum to 1"):
-        split(Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False)
+        split(
+            Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False
+        )
 
 
 @pytest.mark.parametrize("shares", [(0.2, 0.2, 0.6), (0.4, 0.6), (0.8, 0.2)])
-def test_parts_of_a_curated_bank_are_curated(good: Path, tmp_path: Path, shares: tuple[float, ...]) -> None:
-    parts = split(Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False)
+def test_parts_of_a_curated_bank_are_curated(
+    good: Path, tmp_path: Path, shares: tuple[float, ...]
+) -> None:
+    parts = split(
+        Bank(good), {tmp_path / str(i): share for i, share in enumerate(shares)}, progress=False
+    )
     assert names_and_points(*parts) == names_and_points(good)
     assert all(verify(part, progress=False) == [] for part in parts)
     assert all(index.curation == ("by hand",) for index in parts.values())
@@ -111,7 +133,9 @@ def test_parts_of_a_curated_bank_are_curated(good: Path, tmp_path: Path, shares:
 def test_a_part_of_a_shard_keeps_its_dropped_scans(tmp_path: Path) -> None:
     write_bank(tmp_path / "bank", [some_image(i) for i in range(9)], shard_size=9)
     drop(Bank(tmp_path / "bank"), [2, 4, 5], "by hand", tmp_path / "good", progress=False)
-    parts = split(Bank(tmp_path / "good"), {tmp_path / "a": 2 / 6, tmp_path / "b": 4 / 6}, progress=False)
+    parts = split(
+        Bank(tmp_path / "good"), {tmp_path / "a": 2 / 6, tmp_path / "b": 4 / 6}, progress=False
+    )
     [a], [b] = (index.shards for index in parts.values())
     assert (a.first, a.scans, a.dropped, b.first, b.scans, b.dropped) == (0, 2, (), 3, 6, (1, 2))
     assert [list(Bank(part).ids) for part in parts] == [
@@ -123,14 +147,18 @@ def test_a_part_of_a_shard_keeps_its_dropped_scans(tmp_path: Path) -> None:
 
 
 def test_repair_keeps_the_curation(good: Path, original: Path, model: Path) -> None:
-    before, index = shards(good), (good / INDEX).read_bytes()
+    before = shards(good)
+    index = (good / INDEX).read_bytes()
     (good / "shard-00000.curated.h5").unlink()  # removes a hard link, not the original
     flip_copy(good / "shard-00001.curated.h5")
     assert [problem.file for problem in verify(good, progress=False)][:2] == [
         "shard-00000.curated.h5",
         "shard-00001.curated.h5",
     ]
-    assert set(repair(good, str(model), progress=False)) == {"shard-00000.curated.h5", "shard-00001.curated.h5"}
+    assert set(repair(good, str(model), progress=False)) == {
+        "shard-00000.curated.h5",
+        "shard-00001.curated.h5",
+    }
     assert (shards(good), (good / INDEX).read_bytes()) == (before, index)
     assert verify(original, progress=False) == []
 
@@ -167,11 +195,15 @@ def test_an_index_with_invalid_dropped_positions_is_refused(dropped: tuple[int, 
         Index((some_facts(),), (Entry("a.h5", 0, 0, 3, dropped=(1,)),))
 
 
-def test_a_part_without_its_index_does_not_get_the_other_parts(original: Path, model: Path, tmp_path: Path) -> None:
+def test_a_part_without_its_index_does_not_get_the_other_parts(
+    original: Path, model: Path, tmp_path: Path
+) -> None:
     """A part has the names, and may have the first shards, of the whole bake."""
     split(Bank(original), {tmp_path / "train": 3 / 8, tmp_path / "val": 5 / 8}, progress=False)
     (tmp_path / "train" / INDEX).unlink()
-    with pytest.raises(DataError, match="shard-00001.h5 is not there, nor .bake.json.*a copy of the index"):
+    with pytest.raises(
+        DataError, match="shard-00001.h5 is not there, nor .bake.json.*a copy of the index"
+    ):
         repair(tmp_path / "train", str(model), progress=False)
     assert [path.name for path in (tmp_path / "train").glob("*.h5")] == ["shard-00000.h5"]
 
@@ -179,7 +211,10 @@ def test_a_part_without_its_index_does_not_get_the_other_parts(original: Path, m
 def test_the_same_scans_by_other_settings_are_not_merged(model: Path, tmp_path: Path) -> None:
     banks = []
     for name, steps in (("own", None), ("named", 2)):
-        bake(make_plan(tmp_path / name, BakeJob(model=str(model), count=2, steps=steps)), progress=False)
+        bake(
+            make_plan(tmp_path / name, BakeJob(model=str(model), count=2, steps=steps)),
+            progress=False,
+        )
         banks.append(Bank(tmp_path / name))
     with pytest.raises(ConfigError, match="both hold scan 0 of seed 0"):
         merge(banks, tmp_path / "both", progress=False)

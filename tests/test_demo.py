@@ -1,4 +1,5 @@
-"""The demo: which scans it holds out, and that both trainings of its comparison differ in nothing but the mixture."""
+"""The demo: which scans it holds out, and that both trainings of its comparison differ in nothing
+but the mixture."""
 
 import importlib
 from dataclasses import replace
@@ -36,14 +37,21 @@ def write_sequences(root: Path, names: list[str], scans: int) -> None:
     """A dataset in SemanticKITTI's layout."""
     writer = WRITERS["semantic_kitti"](root)
     sensor = load_sensor("hdl64e_semantic_kitti")
-    for i, name in enumerate(f"{sequence}/{frame:06d}" for sequence in names for frame in range(scans)):
+    for i, name in enumerate(
+        f"{sequence}/{frame:06d}" for sequence in names for frame in range(scans)
+    ):
         writer.write(replace(random_scan(sensor, 50, i), id=name), i, name=name)
     writer.finish()
 
 
-@pytest.mark.parametrize(("sequences", "held_out"), [
-    (["00", "08", "10"], "08"), (["00", "03", "09"], "09"), (["00", "05", "14"], "05"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("sequences", "held_out"),
+    [
+        (["00", "08", "10"], "08"),
+        (["00", "03", "09"], "09"),
+        (["00", "05", "14"], "05"),
+    ],
+)
 def test_a_sequence_that_is_never_trained_on_is_held_out(
     demo: ModuleType, tmp_path: Path, sequences: list[str], held_out: str
 ) -> None:
@@ -63,7 +71,8 @@ def test_one_sequence_alone_is_refused(demo: ModuleType, tmp_path: Path) -> None
 
 def write_drives(root: Path, drives: list[int], scans: int, labelled: bool) -> None:
     """A dataset in KITTI-360's layout."""
-    writer, sensor = WRITERS["kitti360"](root), load_sensor("hdl64e_kitti360")
+    writer = WRITERS["kitti360"](root)
+    sensor = load_sensor("hdl64e_kitti360")
     for drive in drives:
         for frame in range(scans):
             scan = random_scan(sensor, 50, frame)
@@ -72,7 +81,9 @@ def write_drives(root: Path, drives: list[int], scans: int, labelled: bool) -> N
     writer.finish()
 
 
-@pytest.mark.parametrize(("drives", "held_out"), [([4, 5, 0], {5}), ([4], {4})], ids=["several drives", "one drive"])
+@pytest.mark.parametrize(
+    ("drives", "held_out"), [([4, 5, 0], {5}), ([4], {4})], ids=["several drives", "one drive"]
+)
 def test_labelled_scans_of_kitti360_are_split_by_place(
     demo: ModuleType, tmp_path: Path, drives: list[int], held_out: set[int]
 ) -> None:
@@ -86,7 +97,11 @@ def test_labelled_scans_of_kitti360_are_split_by_place(
 def test_kitti360_without_labels_is_not_trained_on(demo: ModuleType, tmp_path: Path) -> None:
     write_drives(tmp_path, [4], 4, labelled=False)
     data = demo.kitti360(str(tmp_path), 3)
-    assert not data.labelled and not data.held_out and f"lidar-synth label kitti360 {tmp_path}" in data.notes
+    assert (
+        not data.labelled
+        and not data.held_out
+        and f"lidar-synth label kitti360 {tmp_path}" in data.notes
+    )
 
 
 def test_the_town_that_is_held_out_is_another_one(
@@ -113,12 +128,16 @@ def some_scans(first: int, count: int) -> list[Scan]:
 def test_a_training_depends_on_nothing_but_its_protocol(comparison: ModuleType) -> None:
     synthetic = [replace(scan, domain=SYNTHETIC) for scan in some_scans(10, 2)]
     other = [replace(scan, domain=SYNTHETIC) for scan in some_scans(20, 2)]
-    protocol = comparison.Protocol(some_scans(0, 3), synthetic, some_scans(30, 2), ratio=0.5, steps=3)
+    protocol = comparison.Protocol(
+        some_scans(0, 3), synthetic, some_scans(30, 2), ratio=0.5, steps=3
+    )
     again = replace(protocol, synthetic=other)
     np.testing.assert_array_equal(protocol.train(0.0, 0), again.train(0.0, 0), "real scans only")
     assert (protocol.train(0.5, 0) != again.train(0.5, 0)).any(), "synthetic scans are trained on"
     assert (protocol.train(0.0, 0) != protocol.train(0.0, 1)).any(), "seeds differ"
-    assert protocol.train(0.0, 0).sum() == sum((project(s).label < 19).sum() for s in protocol.held_out)
+    assert protocol.train(0.0, 0).sum() == sum(
+        (project(s).label < 19).sum() for s in protocol.held_out
+    )
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -129,12 +148,22 @@ def test_both_trainings_have_as_many_iterations_and_the_same_augmentation(
 
     def train(network: object, batches: object, height: object, steps: int, progress: bool) -> None:
         taken = [batch for _, batch in zip(range(steps), batches, strict=False)]
-        seen.append((steps, {len(batch["domain"]) for batch in taken}, sum(int(b["domain"].sum()) for b in taken)))
+        seen.append(
+            (
+                steps,
+                {len(batch["domain"]) for batch in taken},
+                sum(int(b["domain"].sum()) for b in taken),
+            )
+        )
 
     augmented = []
     monkeypatch.setattr(comparison, "train_segmenter", train)
-    monkeypatch.setattr(comparison, "AUGMENT", lambda scan, rng: augmented.append(scan.domain) or scan)
-    protocol = comparison.Protocol(some_scans(0, 6), some_scans(10, 4), some_scans(30, 1), ratio=0.25, steps=8, batch=2)
+    monkeypatch.setattr(
+        comparison, "AUGMENT", lambda scan, rng: augmented.append(scan.domain) or scan
+    )
+    protocol = comparison.Protocol(
+        some_scans(0, 6), some_scans(10, 4), some_scans(30, 1), ratio=0.25, steps=8, batch=2
+    )
     for ratio in (0.0, 0.25):
         protocol.train(ratio, 0)
     assert seen == [(8, {2}, 0), (8, {2}, 4)], "16 samples, a quarter of them synthetic"
@@ -144,7 +173,9 @@ def test_both_trainings_have_as_many_iterations_and_the_same_augmentation(
 
 @pytest.mark.slow
 def test_a_comparison_runs_both_arms_with_every_seed(comparison: ModuleType) -> None:
-    protocol = comparison.Protocol(some_scans(0, 2), some_scans(10, 2), some_scans(30, 1), steps=2, seeds=2)
+    protocol = comparison.Protocol(
+        some_scans(0, 2), some_scans(10, 2), some_scans(30, 1), steps=2, seeds=2
+    )
     result = comparison.compare(protocol, jobs=1)
     without, with_synthetic = result.scores()
     assert len(without) == len(with_synthetic) == 2

@@ -10,9 +10,16 @@ from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor("small", 16, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 ARGUMENTS = {
-    "resolution": (8, 16), "channels": 2, "width": 16, "time_width": 16, "depths": (1, 1), "heads": (2, 2),
-    "patch": (2, 2), "window": (3, 3), "angles": torch.from_numpy(SENSOR.ray_angles()),
-}  # fmt: skip
+    "resolution": (8, 16),
+    "channels": 2,
+    "width": 16,
+    "time_width": 16,
+    "depths": (1, 1),
+    "heads": (2, 2),
+    "patch": (2, 2),
+    "window": (3, 3),
+    "angles": torch.from_numpy(SENSOR.ray_angles()),
+}
 TIMES = torch.tensor([1e-3, 0.05, 0.3, 0.8, 1.0])
 
 
@@ -30,11 +37,15 @@ def states() -> torch.Tensor:
 
 def test_the_velocity_points_from_the_state_to_the_data_estimate() -> None:
     """y - t v = (1 - t) s^2 / d y - t / sqrt(d) F, the equation in the module's docstring."""
-    detail, y = 0.2, states()
-    net, t = network(detail, std=0.3), TIMES.view(-1, 1, 1, 1)
+    detail = 0.2
+    y = states()
+    net = network(detail, std=0.3)
+    t = TIMES.view(-1, 1, 1, 1)
     spread = (1 - t) ** 2 * detail**2 + t**2
     with torch.no_grad():
-        estimate = (1 - t) * detail**2 / spread * y - t / spread.sqrt() * HDiT.forward(net, y, TIMES)
+        estimate = (1 - t) * detail**2 / spread * y - t / spread.sqrt() * HDiT.forward(
+            net, y, TIMES
+        )
         assert torch.allclose(y - t * net(y, TIMES), estimate, atol=1e-5)
 
 
@@ -43,7 +54,9 @@ def test_a_fresh_network_gives_the_best_linear_estimate() -> None:
     y = states()
     with torch.no_grad():
         v = network()(y, TIMES)
-    assert torch.allclose(y[-1] - v[-1], torch.zeros(2, 8, 16), atol=1e-6)  # t = 1: the estimate is 0
+    assert torch.allclose(
+        y[-1] - v[-1], torch.zeros(2, 8, 16), atol=1e-6
+    )  # t = 1: the estimate is 0
     assert torch.allclose(y[0] - 1e-3 * v[0], y[0], atol=5e-3)  # t near 0: the state itself
 
 
@@ -52,7 +65,8 @@ def test_the_velocity_is_finite_and_has_a_bounded_slope_at_all_times() -> None:
     t = torch.linspace(0, 1, 21)
     y = torch.randn(21, 2, 8, 16)
     with torch.no_grad():
-        v, answer = net(y, t), HDiT.forward(net, y, t)
+        v = net(y, t)
+        answer = HDiT.forward(net, y, t)
     assert v.isfinite().all()
     assert (v.abs() <= y.abs() / 0.1 + answer.abs() / 0.09).all()
     with torch.no_grad():
@@ -60,7 +74,8 @@ def test_the_velocity_is_finite_and_has_a_bounded_slope_at_all_times() -> None:
 
 
 def test_bfloat16_stays_close_to_float32() -> None:
-    net, y = network(std=0.3), states()
+    net = network(std=0.3)
+    y = states()
     with torch.no_grad():
         exact = net(y, TIMES)
         rough = net.to(torch.bfloat16)(y, TIMES)

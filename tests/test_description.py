@@ -1,4 +1,5 @@
-"""Outputs name their sensor, grid and origin: inside their files, or in ``scans.json`` beside them."""
+"""Outputs name their sensor, grid and origin: inside their files, or in ``scans.json`` beside
+them."""
 
 import json
 import warnings
@@ -15,7 +16,16 @@ from layouts import MAKERS, WRITTEN_AS, some_scan, write_all
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import READERS, WRITERS, open_scans
 from lidar_synth.formats.convert import convert
-from lidar_synth.formats.description import FORMAT, LINE, MARK, NAME, TOWN, Description, Origin, record
+from lidar_synth.formats.description import (
+    FORMAT,
+    LINE,
+    MARK,
+    NAME,
+    TOWN,
+    Description,
+    Origin,
+    record,
+)
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor, presets
@@ -25,14 +35,21 @@ SENSORS = {
     "preset": load_sensor("os1_128"),
     "beams": load_sensor("hdl64e_kitti360"),
     "own": Sensor(
-        "own one", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5), description="two  spaces ö"
+        "own one",
+        48,
+        0.9,
+        120.0,
+        elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5),
+        description="two  spaces ö",
     ),
 }
 
 ORIGINS = {
     "real": Origin(),
     "town": Origin(SYNTHETIC, {"made_by": "town", "seed": 5, "interval": 0.4}),
-    "model": Origin(SYNTHETIC, {"made_by": "model", "model": "a b", "checkpoint": "c" * 64, "seed": 2**63 - 1}),
+    "model": Origin(
+        SYNTHETIC, {"made_by": "model", "model": "a b", "checkpoint": "c" * 64, "seed": 2**63 - 1}
+    ),
 }
 
 BESIDE = ("kitti", "semantic_kitti", "kitti_object", "kitti360")
@@ -41,20 +58,28 @@ BESIDE = ("kitti", "semantic_kitti", "kitti_object", "kitti360")
 IMAGES = ("range", "png")
 
 
-def a_scan(sensor: Sensor = SENSORS["preset"], origin: Origin = ORIGINS["town"], seed: int = 0) -> Scan:
+def a_scan(
+    sensor: Sensor = SENSORS["preset"], origin: Origin = ORIGINS["town"], seed: int = 0
+) -> Scan:
     """A scan of this sensor and origin, with labels, boxes and pose."""
     scan = some_scan(seed, sensor.name if sensor.name in presets() else "hdl64e_kitti")
     return replace(scan, sensor=sensor, domain=origin.domain, provenance=origin.provenance)
 
 
 def files(root: Path) -> dict[str, bytes]:
-    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(root).as_posix(): p.read_bytes()
+        for p in sorted(root.rglob("*"))
+        if p.is_file()
+    }
 
 
 @pytest.mark.parametrize("origin", ORIGINS.values(), ids=list(ORIGINS))
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=list(SENSORS))
 @pytest.mark.parametrize("to", WRITERS)
-def test_what_is_written_is_read_without_arguments(tmp_path: Path, to: str, sensor: Sensor, origin: Origin) -> None:
+def test_what_is_written_is_read_without_arguments(
+    tmp_path: Path, to: str, sensor: Sensor, origin: Origin
+) -> None:
     paths = write_all(to, tmp_path, [a_scan(sensor, origin, seed) for seed in range(2)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -63,14 +88,19 @@ def test_what_is_written_is_read_without_arguments(tmp_path: Path, to: str, sens
         for scan in source:
             assert scan.sensor == sensor and Origin.of(scan) == origin
         if paths[0].is_file():
-            assert open_scans(paths[0])[0].sensor == sensor and Origin.of(open_scans(paths[0])[0]) == origin
+            assert (
+                open_scans(paths[0])[0].sensor == sensor
+                and Origin.of(open_scans(paths[0])[0]) == origin
+            )
     assert (tmp_path / NAME).is_file() == (to in BESIDE)
 
 
 @pytest.mark.parametrize("first", WRITERS)
 def test_conversions_keep_sensor_and_origin(tmp_path: Path, first: str) -> None:
     chain = [first, *(name for name in WRITERS if name != first)]
-    chain.sort(key=lambda name: name != first and name in IMAGES)  # images have no boxes, which kitti_object needs
+    chain.sort(
+        key=lambda name: name != first and name in IMAGES
+    )  # images have no boxes, which kitti_object needs
     scan = a_scan()
     write_all(first, tmp_path / "0", [scan])
     if first != "kitti_object":
@@ -88,7 +118,12 @@ def test_a_bank_names_its_model_and_seed(tmp_path: Path) -> None:
     assert [scan.provenance for scan in open_scans(bank)] == [made] * 2
     convert(open_scans(bank), WRITERS["kitti"](tmp_path / "out"), progress=False)
     assert open_scans(tmp_path / "out")[1].provenance == made
-    convert(open_scans(bank), WRITERS["npz"](tmp_path / "other"), as_sensor=SENSORS["own"], progress=False)
+    convert(
+        open_scans(bank),
+        WRITERS["npz"](tmp_path / "other"),
+        as_sensor=SENSORS["own"],
+        progress=False,
+    )
     read = open_scans(tmp_path / "other")
     assert read.sensor == SENSORS["own"] and read[0].provenance == made
 
@@ -96,7 +131,8 @@ def test_a_bank_names_its_model_and_seed(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_town_of_any_sensor_is_read_as_what_it_is(tmp_path: Path, layout: str) -> None:
-    """With the layout's own sensor, an image of 128 x 1024 cells lost half of them without a warning."""
+    """With the layout's own sensor, an image of 128 x 1024 cells lost half of them without a
+    warning."""
     sensor = Sensor("wide", 256, 0.5, 170.0, rows=48, fov_up=22.5, fov_down=-22.5)
     export_town(Town(3, sensor, 1), tmp_path / "town", layout, camera=False, progress=False)
     source = open_scans(tmp_path / "town")
@@ -119,7 +155,9 @@ def test_a_scan_on_another_grid_is_refused(tmp_path: Path, to: str) -> None:
         with pytest.raises(ConfigError, match=message):
             WRITERS[to](tmp_path).write(a_scan(SENSORS["beams"]), index)
     assert files(tmp_path) == before
-    WRITERS[to](tmp_path).write(a_scan(replace(SENSORS["preset"], name="the same grid", range_max=120.0)), 1)
+    WRITERS[to](tmp_path).write(
+        a_scan(replace(SENSORS["preset"], name="the same grid", range_max=120.0)), 1
+    )
 
 
 def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -127,7 +165,12 @@ def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(tmp_pa
     write_all("npz", tmp_path / "in", [a_scan(SENSORS["beams"])])
     before = files(tmp_path / "out")
     with pytest.raises(ConfigError, match="which holds scans of sensor 'os1_128'"):
-        convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "out"), on_bad="skip", progress=False)
+        convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["kitti"](tmp_path / "out"),
+            on_bad="skip",
+            progress=False,
+        )
     assert files(tmp_path / "out") == before
     others = open_scans(tmp_path / "in")
     convert(others, WRITERS["kitti"](tmp_path / "out"), as_sensor=SENSORS["preset"], progress=False)
@@ -138,7 +181,9 @@ def test_a_folder_of_several_origins_lists_all_of_them(tmp_path: Path) -> None:
     scans = [a_scan(origin=ORIGINS[name], seed=i) for i, name in enumerate(names * 2)]
     convert(scans, WRITERS["kitti"](tmp_path / "in"), progress=False)
     read = open_scans(tmp_path / "in")
-    assert read.description is not None and read.description.origins == tuple(ORIGINS[name] for name in names)
+    assert read.description is not None and read.description.origins == tuple(
+        ORIGINS[name] for name in names
+    )
     assert {scan.domain for scan in read} == {REAL} and read[0].provenance == {}
     synthetic = [scan for scan in scans if scan.domain == SYNTHETIC]
     convert(synthetic, WRITERS["kitti"](tmp_path / "other"), progress=False)
@@ -158,9 +203,14 @@ def test_writers_of_several_processes_add_their_origins(tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", [name for name in WRITERS if name not in IMAGES])
 def test_a_sensor_that_the_user_names_is_taken_with_a_warning(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [a_scan()])
-    with pytest.warns(UserWarning, match="are of sensor 'os1_128'; they are read as those of 'hdl64e_kitti360'"):
+    with pytest.warns(
+        UserWarning, match="are of sensor 'os1_128'; they are read as those of 'hdl64e_kitti360'"
+    ):
         source = open_scans(tmp_path, sensor="hdl64e_kitti360")
-    assert source.sensor == source[0].sensor == SENSORS["beams"] and source[0].provenance == ORIGINS["town"].provenance
+    assert (
+        source.sensor == source[0].sensor == SENSORS["beams"]
+        and source[0].provenance == ORIGINS["town"].provenance
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         named = replace(SENSORS["preset"], name="mine")
@@ -206,7 +256,9 @@ def test_a_damaged_description_is_refused(tmp_path: Path, values: Any) -> None:
     write_all("kitti", tmp_path / "in", [a_scan()])
     (tmp_path / "in" / NAME).write_text(json.dumps(values))
     for options in ({}, {"sensor": "os1_128"}):
-        with pytest.raises(DataError, match=f"{NAME} is damaged .*; expected a description.* remove it and name"):
+        with pytest.raises(
+            DataError, match=f"{NAME} is damaged .*; expected a description.* remove it and name"
+        ):
             open_scans(tmp_path / "in", **options)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=f"{NAME} is damaged"):
         WRITERS["kitti"](tmp_path / "in").write(a_scan(), 1)
@@ -253,8 +305,12 @@ def test_the_lines_of_a_header_are_short(tmp_path: Path, to: str) -> None:
 
 
 @pytest.mark.parametrize("to", ["npz", "range", "png", "webdataset"])
-def test_a_damaged_provenance_is_refused(tmp_path: Path, to: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidar_synth.formats.writer.check_facts", lambda scan, where: None)  # another program's file
+def test_a_damaged_provenance_is_refused(
+    tmp_path: Path, to: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "lidar_synth.formats.writer.check_facts", lambda scan, where: None
+    )  # another program's file
     origin = Origin(SYNTHETIC, {"seed": {"nested": 1}})
     write_all(to, tmp_path, [a_scan(origin=origin)])
     with pytest.raises(DataError, match="not a short text or a number"):
@@ -266,7 +322,12 @@ def _marked(root: Path) -> None:
 
 
 def _a_town(root: Path) -> None:
-    settings = {"seed": 7, "interval": 0.5, "layout": "kitti", "sensor": SENSORS["preset"].to_dict()}
+    settings = {
+        "seed": 7,
+        "interval": 0.5,
+        "layout": "kitti",
+        "sensor": SENSORS["preset"].to_dict(),
+    }
     (root / TOWN).write_text(json.dumps(settings))
 
 
@@ -298,7 +359,9 @@ def test_a_damaged_town_is_refused(tmp_path: Path, content: str) -> None:
 def test_users_describe_their_own_folders(tmp_path: Path) -> None:
     MAKERS["kitti_raw"](tmp_path)
     assert open_scans(tmp_path).sensor.name == "hdl64e_kitti"
-    (tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / NAME).write_text("not beside the root")
+    (tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / NAME).write_text(
+        "not beside the root"
+    )
     (tmp_path / NAME).write_text(json.dumps({"format": FORMAT, "sensor": "os1_128"}))
     source = open_scans(tmp_path)
     assert source.sensor.name == "os1_128" and Origin.of(source[0]) == Origin()
@@ -314,7 +377,9 @@ def test_recording_again_changes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("to", [name for name in WRITERS if name not in BESIDE])
 def test_files_that_describe_themselves_may_differ(tmp_path: Path, to: str) -> None:
-    scans = [a_scan(origin=origin, seed=seed) for seed, origin in enumerate(reversed(ORIGINS.values()))]
+    scans = [
+        a_scan(origin=origin, seed=seed) for seed, origin in enumerate(reversed(ORIGINS.values()))
+    ]
     write_all(to, tmp_path, scans)
     assert [Origin.of(scan) for scan in open_scans(tmp_path)] == list(reversed(ORIGINS.values()))
 
@@ -325,7 +390,8 @@ def test_a_folder_may_hold_files_of_several_sensors(tmp_path: Path, to: str) -> 
     assert [scan.sensor for scan in open_scans(tmp_path)] == list(SENSORS.values())
 
 
-# --- folders below a description ----------------------------------------------------------------------------------
+# --- folders below a description
+# ----------------------------------------------------------------------------------
 
 
 NESTED = ("town/1/0", "town/1/1", "002/00", "a/b/c/d/0")
@@ -339,7 +405,9 @@ def nested(root: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("part", ["town", "town/1", "town/1/0.bin", "002", "002/00.bin", "a/b/c/d/0.bin"])
+@pytest.mark.parametrize(
+    "part", ["town", "town/1", "town/1/0.bin", "002", "002/00.bin", "a/b/c/d/0.bin"]
+)
 def test_a_part_of_a_converted_folder_is_what_the_folder_is(tmp_path: Path, part: str) -> None:
     source = open_scans(nested(tmp_path / "out") / part)
     assert source.sensor == SENSORS["preset"] and Origin.of(source[0]) == ORIGINS["town"]
@@ -361,8 +429,11 @@ def test_a_description_above_a_dataset_says_nothing_about_it(tmp_path: Path, lay
 
 
 @pytest.mark.parametrize("above", ["kitti", "semantic_kitti", "kitti_object", "kitti360"])
-def test_a_description_above_a_folder_of_other_scans_says_nothing_about_them(tmp_path: Path, above: str) -> None:
-    """Of a dataset's layout, which has no other folders, or of scans that lie in the folder itself."""
+def test_a_description_above_a_folder_of_other_scans_says_nothing_about_them(
+    tmp_path: Path, above: str
+) -> None:
+    """Of a dataset's layout, which has no other folders, or of scans that lie in the folder
+    itself."""
     write_all(above, tmp_path, [a_scan()])
     write_all("kitti", tmp_path / "own", [some_scan()])
     (tmp_path / "own" / NAME).unlink()

@@ -13,7 +13,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.flow.distill import STRATEGIES, adaptive_piecewise, every_piece, interval_of
+from lidar_synth.generate.flow.distill import (
+    STRATEGIES,
+    adaptive_piecewise,
+    every_piece,
+    interval_of,
+)
 from lidar_synth.generate.flow.path import interpolate, per_sample
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.noise import gaussian, uniform
@@ -33,8 +38,13 @@ def grid_of(name: str) -> tuple[float, ...]:
 
 def bounds(t: Tensor, grid: tuple[float, ...]) -> tuple[Tensor, Tensor]:
     """Start and end of the interval that contains t, by linear search."""
-    which = [next(i for i in range(len(grid) - 1) if grid[i + 1] < x <= grid[i] + 1e-12) for x in t.tolist()]
-    return torch.tensor([grid[i] for i in which]).double(), torch.tensor([grid[i + 1] for i in which]).double()
+    which = [
+        next(i for i in range(len(grid) - 1) if grid[i + 1] < x <= grid[i] + 1e-12)
+        for x in t.tolist()
+    ]
+    return torch.tensor([grid[i] for i in which]).double(), torch.tensor(
+        [grid[i + 1] for i in which]
+    ).double()
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
@@ -48,10 +58,15 @@ def test_a_straight_teacher_is_its_own_student(name: str) -> None:
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_targets_converge_to_those_of_an_exact_gaussian_teacher(name: str) -> None:
     """The targets converge at Euler's first order in the number of steps."""
-    grid, errors = grid_of(name), []
+    grid = grid_of(name)
+    errors = []
     for steps in (50, 100, 200):
         example = STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid, steps, None)
-        start, end = bounds(example.t, grid) if name in PIECEWISE else (torch.ones(COUNT), torch.zeros(COUNT))
+        start, end = (
+            bounds(example.t, grid)
+            if name in PIECEWISE
+            else (torch.ones(COUNT), torch.zeros(COUNT))
+        )
         y = interpolate(DATA, NOISE, start)
         exact = (gaussian_flow(y, start, end) - y) / per_sample(end - start, y)
         errors.append((example.velocity - exact).norm().item() / exact.norm().item())
@@ -89,15 +104,21 @@ def test_the_times_and_the_number_of_teacher_evaluations(name: str) -> None:
     assert len(calls) == 5
     assert example.teacher_evaluations == 5 * COUNT
     assert not example.velocity.requires_grad and not example.y.requires_grad
-    first = bounds(example.t, grid_of(name))[0] if name in PIECEWISE else torch.ones(COUNT, dtype=torch.float64)
+    first = (
+        bounds(example.t, grid_of(name))[0]
+        if name in PIECEWISE
+        else torch.ones(COUNT, dtype=torch.float64)
+    )
     assert torch.allclose(calls[0], first)
     assert all((b < a).all() for a, b in pairwise(calls))
 
 
 def test_four_steps_of_the_student_reach_the_end_of_the_teacher() -> None:
-    """A student that has learned its targets exactly retraces the teacher's many steps in four: its targets at
-    each start are an affine function of y here, found by least squares from Algorithm 1's examples."""
-    count, steps = 4000, 25
+    """A student that has learned its targets exactly retraces the teacher's many steps in four: its
+    targets at each start are an affine function of y here, found by least squares from Algorithm
+    1's examples."""
+    count = 4000
+    steps = 25
     data = MEAN + STD * gaussian(5, range(count), (1,), dtype=torch.float64)
     noise = gaussian(6, range(count), (1,), dtype=torch.float64)
     u = uniform(7, range(count)).double()
@@ -118,7 +139,9 @@ def test_four_steps_of_the_student_reach_the_end_of_the_teacher() -> None:
     teacher = solve(gaussian_velocity, start, [*fine.tolist(), 0.0])
     exact = gaussian_flow(start, torch.ones(500), torch.zeros(500))
     assert torch.allclose(solve(velocity, start, ADAPTIVE), teacher, atol=1e-9)
-    assert (teacher - exact).norm() < 0.2 * (solve(gaussian_velocity, start, ADAPTIVE) - exact).norm()
+    assert (teacher - exact).norm() < 0.2 * (
+        solve(gaussian_velocity, start, ADAPTIVE) - exact
+    ).norm()
 
 
 def test_every_piece_of_several_grids_leads_where_the_teacher_does() -> None:
@@ -137,7 +160,9 @@ def test_every_piece_of_several_grids_leads_where_the_teacher_does() -> None:
     pieces = [piece for grid in grids for piece in pairwise(grid)]
     assert example.end is not None and torch.equal(example.cond, U.repeat(7))
     for (a, b), y, t, end, velocity in zip(
-        pieces, *(part.split(COUNT) for part in (example.y, example.t, example.end, example.velocity)), strict=True
+        pieces,
+        *(part.split(COUNT) for part in (example.y, example.t, example.end, example.velocity)),
+        strict=True,
     ):
         assert (t == a).all() and (end == b).all()
         assert torch.allclose(y, interpolate(DATA, NOISE, t))
@@ -150,7 +175,8 @@ def test_every_piece_of_several_grids_leads_where_the_teacher_does() -> None:
 @pytest.mark.parametrize("k", [1, 2, 4])
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
 def test_times_are_rounded_as_in_r2flow(golden: Golden, name: str, k: int) -> None:
-    """R2Flow rounds its time (0 = noise) down to floor(t k) / k, where a sampler of k steps evaluates."""
+    """R2Flow rounds its time (0 = noise) down to floor(t k) / k, where a sampler of k steps
+    evaluates."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     theirs = vectors[f"timesteps/{name}/first_64"]
     grid = uniform_grid(k)

@@ -1,7 +1,9 @@
-"""Every block of code and every command of README.md and docs/ runs, or is checked and says why it does not run.
+"""Every block of code and every command of README.md and docs/ runs, or is checked and says why it
+does not run.
 
-The blocks of one page share a folder and, for Python, one namespace, from top to bottom. ``documents.py`` has the marks
-that a page may set. Pages find a small town where theirs would lie (``DATASETS``), made once.
+The blocks of one page share a folder and, for Python, one namespace, from top to bottom.
+``documents.py`` has the marks that a page may set. Pages find a small town where theirs would lie
+(``DATASETS``), made once.
 """
 
 import os
@@ -25,7 +27,19 @@ from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.cli import COMMANDS, main
 from lidar_synth.lab.town import Town, export_town
 
-NAMES = (*COMMANDS, "bank", "merge", "split", "head", "sensor", "skin", "fit", "show", "metrics", "setup")
+NAMES = (
+    *COMMANDS,
+    "bank",
+    "merge",
+    "split",
+    "head",
+    "sensor",
+    "skin",
+    "fit",
+    "show",
+    "metrics",
+    "setup",
+)
 FULL = os.environ.get("LIDAR_SYNTH_DOCS") == "full"
 SCANS = 6
 
@@ -43,7 +57,8 @@ def _semantic_kitti(out: Path) -> None:
         _town("semantic_kitti")(out)
         return
     for sequence in ("00", "01"):
-        source, target = Path(real) / "semantic_kitti" / "sequences" / sequence, out / "sequences" / sequence
+        source = Path(real) / "semantic_kitti" / "sequences" / sequence
+        target = out / "sequences" / sequence
         for folder in ("velodyne", "labels"):
             (target / folder).mkdir(parents=True)
             for path in sorted((source / folder).iterdir())[:2]:
@@ -60,7 +75,8 @@ DATASETS: dict[str, Callable[[Path], object]] = {
     "KITTI": _town("kitti"),
     "PandaSet": write_pandaset,
 }
-"""What pages name without making it: town and bank as ``make demo`` leaves them, and a dataset in each layout."""
+"""What pages name without making it: town and bank as ``make demo`` leaves them, and a dataset in
+each layout."""
 
 
 @pytest.fixture(scope="session")
@@ -82,15 +98,22 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 def named_in(blocks: list[Block]) -> list[str]:
     """The datasets that the blocks name, without those that a command among them writes."""
     code = "\n".join(block.code for block in blocks)
-    words = {name for name in DATASETS if re.search(rf"(?<![\w./-]){re.escape(name)}(?![\w-])", code)}
-    return sorted(name for name in words if not re.search(rf"lidar-synth (?:town|bake) +{re.escape(name)}\b", code))
+    words = {
+        name for name in DATASETS if re.search(rf"(?<![\w./-]){re.escape(name)}(?![\w-])", code)
+    }
+    return sorted(
+        name
+        for name in words
+        if not re.search(rf"lidar-synth (?:town|bake) +{re.escape(name)}\b", code)
+    )
 
 
 class Reader:
     """Someone who types the blocks of one page, in one folder, from top to bottom."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.folder, self.monkeypatch = folder, monkeypatch
+        self.folder = folder
+        self.monkeypatch = monkeypatch
         self.names: dict[str, Any] = {"__name__": "__main__"}
         monkeypatch.chdir(folder)
         monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
@@ -114,8 +137,10 @@ class Reader:
                     self.run(command)
 
     def run(self, command: str) -> None:
-        """A command, in this process where it is ``lidar-synth`` and needs no shell: the same entry point."""
-        parts, words = parts_of(command), shlex.split(command)
+        """A command, in this process where it is ``lidar-synth`` and needs no shell: the same entry
+        point."""
+        parts = parts_of(command)
+        words = shlex.split(command)
         if any(part[0] in NEVER_RUN for part in parts):
             return
         if words[0] == "cd":
@@ -134,7 +159,8 @@ class Reader:
 @pytest.fixture
 def untouched() -> Any:
     """torch's global settings as they were, whatever a page does with them."""
-    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    threads = torch.get_num_threads()
+    state = torch.get_rng_state()
     yield
     torch.set_num_threads(threads)
     torch.set_rng_state(state)
@@ -150,7 +176,11 @@ NOT_RUN = [(page, block) for page in PAGES for block in marked(page)]
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if "```" in page.read_text()], ids=name_of)
 def test_the_blocks_of_a_page_run(
-    page: Path, tmp_path: Path, made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, untouched: None
+    page: Path,
+    tmp_path: Path,
+    made: Callable[[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    untouched: None,
 ) -> None:
     blocks = blocks_of(page.read_text())
     for name in named_in([block for block in blocks if not block.not_run]):
@@ -168,9 +198,12 @@ def read(page: Path, blocks: list[Block], reader: Reader) -> None:
             raise AssertionError(f"{page.name}, line {block.line}: {error!r}") from error
 
 
-@pytest.mark.parametrize(("page", "block"), NOT_RUN, ids=[f"{name_of(page)}:{block.line}" for page, block in NOT_RUN])
+@pytest.mark.parametrize(
+    ("page", "block"), NOT_RUN, ids=[f"{name_of(page)}:{block.line}" for page, block in NOT_RUN]
+)
 def test_a_block_that_is_not_run_says_why(page: Path, block: Block) -> None:
-    """The list of these blocks: ``pytest -rs`` prints it. The test of their page checks what can be checked."""
+    """The list of these blocks: ``pytest -rs`` prints it. The test of their page checks what can be
+    checked."""
     pytest.skip(f"checked, not run: {block.not_run}")
 
 

@@ -1,4 +1,5 @@
-"""What is generated when the site is built: equations, the API, the command line, recipes and their keys."""
+"""What is generated when the site is built: equations, the API, the command line, recipes and their
+keys."""
 
 import re
 import runpy
@@ -40,7 +41,9 @@ def test_dollars_in_code_stay() -> None:
 
 
 def test_the_api_has_every_public_name() -> None:
-    listed = {line.rpartition(".")[2] for line in TABLES["api"]().splitlines() if line.startswith("::: ")}
+    listed = {
+        line.rpartition(".")[2] for line in TABLES["api"]().splitlines() if line.startswith("::: ")
+    }
     assert set(lidar_synth.__all__) - {"__version__"} <= listed
 
 
@@ -65,14 +68,18 @@ def test_the_command_line_has_every_command_and_no_control_characters() -> None:
 
 def test_every_recipe_is_listed_with_its_time() -> None:
     text = TABLES["recipes"]()
-    assert all(f"{one.name}` |" in text and one.time in text for one in (*published_models(), *published()))
+    assert all(
+        f"{one.name}` |" in text and one.time in text for one in (*published_models(), *published())
+    )
 
 
 @pytest.mark.parametrize("section", TABLES["SECTIONS"], ids=lambda name: name or "top")
 def test_every_key_of_a_recipe_is_explained(section: str) -> None:
     for model in TABLES["SECTIONS"][section]:
         own = {name for name in vars(model).get("__annotations__", {}) if not name.startswith("_")}
-        explained = {name for row in TABLES["_keys"](model) for name in row.split("`")[1].split(", ")}
+        explained = {
+            name for row in TABLES["_keys"](model) for name in row.split("`")[1].split(", ")
+        }
         assert explained == own, model
 
 

@@ -1,4 +1,5 @@
-"""Documents stay short: every page has a limit of words, counted as ``wc -w`` does, and so has their sum."""
+"""Documents stay short: every page has a limit of words, counted as ``wc -w`` does, and so has
+their sum."""
 
 import re
 from pathlib import Path
@@ -59,7 +60,9 @@ LIMITS = {
 MAIN_PATH = 8_500
 """Words of all pages of docs/ on the main path."""
 
-PAGES = [p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)]
+PAGES = [
+    p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)
+]
 
 
 def words(page: Path) -> int:
@@ -82,6 +85,10 @@ def test_the_main_path_is_short() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_page_begins_with_what_the_reader_can_do(page: Path) -> None:
-    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line and not line.startswith("<!--")]
+    lines = [
+        line
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if line and not line.startswith("<!--")
+    ]
     title, first, *_ = [*lines, ""]
     assert title.startswith("# ") and re.match(r"[\w`*\[]", first), "a title, and then a sentence"

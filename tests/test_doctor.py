@@ -57,14 +57,17 @@ def test_every_dependency_is_looked_at() -> None:
     """The list is the installed package's own."""
     project = PYPROJECT["project"]
     names = {
-        re.split(r"[>=<; ]", line)[0] for line in project["dependencies"] + project["optional-dependencies"]["open3d"]
+        re.split(r"[>=<; ]", line)[0]
+        for line in project["dependencies"] + project["optional-dependencies"]["open3d"]
     }
     assert names <= {finding.name for finding in examine()}
     assert set(doctor.OPTIONAL) <= names
     assert set(doctor.MODULES) <= names
 
 
-def test_a_required_library_that_is_missing_breaks_the_package(importing: Callable[..., None]) -> None:
+def test_a_required_library_that_is_missing_breaks_the_package(
+    importing: Callable[..., None],
+) -> None:
     importing("h5py", ModuleNotFoundError("No module named 'h5py'"))
     findings = examine()
     lost = named(findings, "h5py")
@@ -83,11 +86,15 @@ def test_an_old_library_is_told_by_its_version(importing: Callable[..., None]) -
     assert re.match(r"0\.9\.1, older than 0\.\d\d", found.found), "numbers, not text, are compared"
 
 
-def test_open3d_without_its_system_libraries(importing: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_without_its_system_libraries(
+    importing: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Only the packages whose libraries are missing are named, and the package works without."""
     importing("open3d", OSError("libusb-1.0.so.0: cannot open shared object file"))
     monkeypatch.setattr(doctor.sys, "platform", "linux")  # type: ignore[attr-defined]
-    monkeypatch.setattr(doctor, "_loads", lambda library: library not in ("libusb-1.0.so.0", "libEGL.so.1"))
+    monkeypatch.setattr(
+        doctor, "_loads", lambda library: library not in ("libusb-1.0.so.0", "libEGL.so.1")
+    )
     findings = list(doctor._libraries())
     found = named(findings, "open3d")
     assert (found.state, found.found) == ("absent", "lacks system libraries")
@@ -116,7 +123,9 @@ def test_a_projection_that_goes_wrong_is_found(monkeypatch: pytest.MonkeyPatch) 
     import lidar_synth.geometry.projection
 
     def shifted(scan: Any) -> SimpleNamespace:
-        return SimpleNamespace(range=lidar_synth.geometry.projection.spherical.project(scan).range * 1.001)
+        return SimpleNamespace(
+            range=lidar_synth.geometry.projection.spherical.project(scan).range * 1.001
+        )
 
     monkeypatch.setattr(lidar_synth.geometry.projection, "project", shifted)
     assert doctor._geometry().state == "broken"
@@ -133,9 +142,12 @@ def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("driver", "build", "state", "found"),
-    [(None, None, "absent", "no NVIDIA driver"), ("/usr/bin/nvidia-smi", None, "check", "built for the CPU"),
-     ("/usr/bin/nvidia-smi", "13.0", "check", "finds no GPU")],
-)  # fmt: skip
+    [
+        (None, None, "absent", "no NVIDIA driver"),
+        ("/usr/bin/nvidia-smi", None, "check", "built for the CPU"),
+        ("/usr/bin/nvidia-smi", "13.0", "check", "finds no GPU"),
+    ],
+)
 def test_why_there_is_no_card(
     monkeypatch: pytest.MonkeyPatch, driver: str | None, build: str | None, state: str, found: str
 ) -> None:
@@ -148,7 +160,9 @@ def test_why_there_is_no_card(
 
 
 @pytest.mark.parametrize("variable", sorted(DATA_ROOTS))
-def test_data_roots_are_checked(variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_roots_are_checked(
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv(variable, raising=False)
     assert named(list(doctor._data()), variable).found == "not set"
     monkeypatch.setenv(variable, str(tmp_path / "nowhere"))
@@ -169,7 +183,8 @@ def test_data_roots_are_checked(variable: str, tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_command_tells_the_same_to_people_and_to_scripts() -> None:
-    people, scripts = CliRunner().invoke(app), CliRunner().invoke(app, ["--json"])
+    people = CliRunner().invoke(app)
+    scripts = CliRunner().invoke(app, ["--json"])
     assert (people.exit_code, scripts.exit_code) == (0, 0)
     told = json.loads(scripts.stdout)
     assert told["works"] is True

@@ -68,7 +68,8 @@ RIGHT_COMMANDS = (
     "lidar-synth town OUT --scans 4 --layout kitti",
     "lidar-synth train town_tiny recipe.batch=4 --resume",
     'lidar-synth curate bank --drop "confidence < 0.6" --out good',
-    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.openpcdet train.py --cfg_file any.yaml",
+    "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.openpcdet train.py --cfg_file "
+    "any.yaml",
     "python tools/demo.py out --scans 3",
     "torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 10 --engine torchrun",
     "make demo SCANS=6",
@@ -140,7 +141,9 @@ def test_wrong_settings_are_noticed(code: str, tmp_path: Path) -> None:
         check_yaml(code, tmp_path / "settings.yaml")
 
 
-def test_the_blocks_of_a_page_share_a_folder_and_a_namespace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_blocks_of_a_page_share_a_folder_and_a_namespace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = (
         '```python\nimport os\nnumber = 3\nassert os.listdir() == []\n```\n```yaml title="mix.yaml"\nratio: 0.5\n```\n'
         "```sh\nexport WORD=here\ncat mix.yaml > copy.yaml\n```\n"
@@ -149,8 +152,12 @@ def test_the_blocks_of_a_page_share_a_folder_and_a_namespace(tmp_path: Path, mon
     read(Path("page.md"), blocks_of(text), Reader(tmp_path, monkeypatch))
 
 
-@pytest.mark.parametrize("code", ["python\n\n1 / 0", "sh\nls\nlidar-synth info no_bank", "sh\nls\ncat no_file"])
-def test_a_block_that_fails_is_named(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "code", ["python\n\n1 / 0", "sh\nls\nlidar-synth info no_bank", "sh\nls\ncat no_file"]
+)
+def test_a_block_that_fails_is_named(
+    code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(AssertionError, match=r"page\.md, line 2"):
         read(Path("page.md"), blocks_of(f"```{code}\n```\n"), Reader(tmp_path, monkeypatch))
 
@@ -160,4 +167,7 @@ def test_a_page_finds_the_town_unless_it_makes_it() -> None:
         "demo_out/bank",
         "demo_out/town",
     ]
-    assert named_in([Block("shell", "lidar-synth town KITTI --scans 3\nlidar-synth view KITTI", 1)]) == []
+    assert (
+        named_in([Block("shell", "lidar-synth town KITTI --scans 3\nlidar-synth view KITTI", 1)])
+        == []
+    )

@@ -1,4 +1,5 @@
-"""Scan surgery, against worlds whose exact scan is known: without the object, and with it elsewhere."""
+"""Scan surgery, against worlds whose exact scan is known: without the object, and with it
+elsewhere."""
 
 import shutil
 from collections.abc import Callable
@@ -45,9 +46,16 @@ def cells_of(scan: Scan, points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("labelled", [True, False])
 @pytest.mark.parametrize("place", [(12, 2, 0.3), (9, -6, 1.4), (-14, 0.5, 0.1), (17, 5, 0.0)])
-def test_behind_a_removed_car_is_what_was_there(place: tuple[float, float, float], labelled: bool) -> None:
-    full, empty = cast([car(*place)], [BEHIND]), cast([], [BEHIND])
-    scan = full if labelled else replace(full, label=None, instance=None, boxes=replace(full.boxes, instance=None))
+def test_behind_a_removed_car_is_what_was_there(
+    place: tuple[float, float, float], labelled: bool
+) -> None:
+    full = cast([car(*place)], [BEHIND])
+    empty = cast([], [BEHIND])
+    scan = (
+        full
+        if labelled
+        else replace(full, label=None, instance=None, boxes=replace(full.boxes, instance=None))
+    )
     result = edit.remove(scan, 0)
     hole = cells_of(full, full.instance == 1)
     expected, label = returned(empty, hole)
@@ -57,7 +65,9 @@ def test_behind_a_removed_car_is_what_was_there(place: tuple[float, float, float
     both = (got > 0) & (expected > 0)
     assert (np.abs(got - expected) < 0.4)[both].mean() > (0.85 if labelled else 0.7)
     if labelled:
-        assert (returned(result, hole)[1] == label).mean() > 0.93 and not (result.label == CAR).any()
+        assert (returned(result, hole)[1] == label).mean() > 0.93 and not (
+            result.label == CAR
+        ).any()
     kept = project(full).range[~hole]
     assert np.allclose(project(result).range[~hole], kept, atol=1e-4)
     assert result.boxes is not None and not len(result.boxes)
@@ -75,9 +85,11 @@ def test_other_objects_do_not_grow_into_the_hole() -> None:
 
 def test_what_stands_in_front_stays_and_does_not_continue_behind() -> None:
     pole = wall(7, 0, 0.0, length=0.3)
-    full, empty = cast([car(12, 0, 1.5)], [BEHIND, pole]), cast([], [BEHIND, pole])
+    full = cast([car(12, 0, 1.5)], [BEHIND, pole])
+    empty = cast([], [BEHIND, pole])
     result = edit.remove(full, 0)
-    got, expected = project(result).range, project(empty).range
+    got = project(result).range
+    expected = project(empty).range
     assert (np.abs(got - expected) < 0.3).mean() > 0.995
 
 
@@ -94,7 +106,9 @@ def test_the_rays_of_a_scan_lead_to_its_points() -> None:
         rays = rays_of_scan(scan)
         there = np.flatnonzero(rays.point >= 0)
         assert np.array_equal(np.sort(rays.point[there]), np.arange(len(scan)))
-        assert np.allclose(rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5)
+        assert np.allclose(
+            rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5
+        )
 
 
 def test_rays_of_a_grid_start_where_its_rows_do() -> None:
@@ -107,9 +121,13 @@ def test_rays_of_a_grid_start_where_its_rows_do() -> None:
 
 @pytest.mark.parametrize(
     "old, new",
-    [((10, 0, 0.3), (14, 6, None)), ((12, -4, 1.2), (8, 3, None)), ((-9, 2, 0.0), (11, -3, 3.0)),
-     ((10, 5, 0.2), (11, -6.2, -0.1))],
-)  # fmt: skip
+    [
+        ((10, 0, 0.3), (14, 6, None)),
+        ((12, -4, 1.2), (8, 3, None)),
+        ((-9, 2, 0.0), (11, -3, 3.0)),
+        ((10, 5, 0.2), (11, -6.2, -0.1)),
+    ],
+)
 def test_a_moved_car_looks_as_the_sensor_would_see_it(old: Any, new: Any) -> None:
     before = cast([car(*old)], [BEHIND])
     pose = [v for v in new if v is not None]
@@ -118,7 +136,8 @@ def test_a_moved_car_looks_as_the_sensor_would_see_it(old: Any, new: Any) -> Non
     box = result.boxes.values[0]
     assert np.allclose(box[:2], new[:2], atol=1e-3)
     truth = cast([np.r_[box[:2], car(0, 0)[2:6], box[6]].astype(np.float32)], [BEHIND])
-    mine, true = cells_of(result, result.label == CAR), cells_of(truth, truth.instance == 1)
+    mine = cells_of(result, result.label == CAR)
+    true = cells_of(truth, truth.instance == 1)
     assert (mine & true).sum() / (mine | true).sum() > 0.7
     assert 0.85 < mine.sum() / true.sum() < 1.15
     both = mine & true
@@ -145,7 +164,9 @@ def test_a_car_beside_a_wall_returns_to_its_place() -> None:
     full = cast([car(12, 0)], [wall(12, 1.1, length=6)])
     item = cut_out(full, 0)
     back = edit.insert(edit.remove(full, 0), item)
-    assert back.boxes is not None and np.abs(back.boxes.values[0] - full.boxes.values[0]).max() < 0.12
+    assert (
+        back.boxes is not None and np.abs(back.boxes.values[0] - full.boxes.values[0]).max() < 0.12
+    )
     assert cells_of(back, back.label == CAR).sum() > 0.9 * cells_of(full, full.label == CAR).sum()
     with pytest.raises(DataError, match="other returns|no level ground"):
         edit.insert(replace(full, boxes=None), item)
@@ -154,14 +175,17 @@ def test_a_car_beside_a_wall_returns_to_its_place() -> None:
 def test_what_is_estimated_behind_a_car_does_not_stand_in_its_way() -> None:
     full = cast([car(12, 0)], [wall(12.5, 2.6, np.pi / 2, length=2), BEHIND])
     result = edit.move(full, 0, (12.6, 0))
-    assert result.boxes is not None and np.allclose(result.boxes.values[0, :2], (12.6, 0), atol=1e-3)
+    assert result.boxes is not None and np.allclose(
+        result.boxes.values[0, :2], (12.6, 0), atol=1e-3
+    )
     inside = result.boxes.contain(result.points, above_floor=FLOOR)[0]
     assert (result.label[inside] == CAR).all() and inside.sum() > 100
 
 
 @pytest.mark.slow
 def test_removed_objects_return_to_their_places() -> None:
-    """In streets with fences, hedges and poles beside the cars; their own returns stand in the way until removed."""
+    """In streets with fences, hedges and poles beside the cars; their own returns stand in the way
+    until removed."""
     tried = returned_to = 0
     for seed in (1, 2, 6, 11):
         town = Town(seed=seed, scans=1)[0]
@@ -171,20 +195,23 @@ def test_removed_objects_return_to_their_places() -> None:
             others = np.arange(len(town.boxes)) != number
             with pytest.raises(DataError, match="other returns|no level ground"):
                 edit.insert(replace(town, boxes=town.boxes[others]), item)
-            emptied, tried = edit.remove(town, number), tried + 1
-            estimated = ~np.isin(emptied.points.view("V12").ravel(), town.points.view("V12").ravel())
+            emptied = edit.remove(town, number)
+            tried = tried + 1
+            estimated = ~np.isin(
+                emptied.points.view("V12").ravel(), town.points.view("V12").ravel()
+            )
             inside = item.scan.boxes.contain(emptied.points)[0]
-            assert GROUND[emptied.label[estimated & inside & (emptied.points[:, 2] > item.ground + FLOOR)]].all()
+            assert GROUND[
+                emptied.label[estimated & inside & (emptied.points[:, 2] > item.ground + FLOOR)]
+            ].all()
             try:
                 back = edit.insert(emptied, item)
             except DataError:
                 continue
             returned_to += 1
             assert np.abs(back.boxes.values[-1, :3] - item.box[:3]).max() < 0.1
-            before, after = (
-                cells_of(town, town.instance == town.boxes.instance[number]),
-                cells_of(back, back.instance == back.boxes.instance[-1]),
-            )
+            before = cells_of(town, town.instance == town.boxes.instance[number])
+            after = cells_of(back, back.instance == back.boxes.instance[-1])
             assert (before & after).sum() > 0.6 * (before | after).sum()
     assert tried >= 8 and returned_to >= 0.8 * tried
 
@@ -193,7 +220,10 @@ def test_objects_of_a_bank_are_inserted() -> None:
     bank = ObjectBank.from_scans([cast([car(12, 0, 0.4)])])
     result = edit.insert(cast([], [BEHIND]), bank[0], (13, 4))
     assert result.boxes is not None
-    assert result.boxes.contain(result.points[result.label == CAR]).all() and (result.label == CAR).sum() > 100
+    assert (
+        result.boxes.contain(result.points[result.label == CAR]).all()
+        and (result.label == CAR).sum() > 100
+    )
 
 
 def test_boxes_given_by_their_values_leave_the_scan() -> None:
@@ -205,7 +235,9 @@ def test_boxes_given_by_their_values_leave_the_scan() -> None:
     assert len(beside.boxes) == 3, "a box of one's own is none of the scan's"
 
 
-@pytest.mark.parametrize("none", [[], np.zeros((0, 7), np.float32), Boxes(np.zeros((0, 7), np.float32), ())])
+@pytest.mark.parametrize(
+    "none", [[], np.zeros((0, 7), np.float32), Boxes(np.zeros((0, 7), np.float32), ())]
+)
 def test_without_boxes_to_remove_the_scan_stays(none: Any) -> None:
     assert edit.remove(SCAN, none) is SCAN
 
@@ -213,28 +245,63 @@ def test_without_boxes_to_remove_the_scan_stays(none: Any) -> None:
 SCAN = cast([car(12, 0, 0.3), car(8, 8)], [BEHIND])
 ITEM = cut_out(SCAN, 0)
 BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
-    "number": (lambda: edit.remove(SCAN, 2), DataError, r"box 2 of scan 'world' with 2 boxes; expected numbers"),
-    "no boxes": (lambda: edit.remove(replace(SCAN, boxes=None), 0), DataError, "with 0 boxes.*takes a box"),
+    "number": (
+        lambda: edit.remove(SCAN, 2),
+        DataError,
+        r"box 2 of scan 'world' with 2 boxes; expected numbers",
+    ),
+    "no boxes": (
+        lambda: edit.remove(replace(SCAN, boxes=None), 0),
+        DataError,
+        "with 0 boxes.*takes a box",
+    ),
     "shape": (lambda: edit.remove(SCAN, [1.0, 2.0]), DataError, r"a box of shape \(2,\)"),
     "whole numbers": (
-        lambda: edit.remove(SCAN, [1, 1, 0, 0, 1, 1, 0]), DataError, "each number once, or a box .* as floats",
+        lambda: edit.remove(SCAN, [1, 1, 0, 0, 1, 1, 0]),
+        DataError,
+        "each number once, or a box .* as floats",
     ),
     "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
-    "empty": (lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])), DataError, "without a return"),
-    "model": (lambda: edit.remove(SCAN, 0, model="nothing"), ConfigError, "model 'nothing'; expected a shipped one"),
-    "conditional": (lambda: edit.remove(SCAN, 0, model="town-camera"), ConfigError, "expected an unconditional"),
+    "empty": (
+        lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])),
+        DataError,
+        "without a return",
+    ),
+    "model": (
+        lambda: edit.remove(SCAN, 0, model="nothing"),
+        ConfigError,
+        "model 'nothing'; expected a shipped one",
+    ),
+    "conditional": (
+        lambda: edit.remove(SCAN, 0, model="town-camera"),
+        ConfigError,
+        "expected an unconditional",
+    ),
     "sensor": (
         lambda: edit.remove(cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"),
-        DataError, "a scan of sensor 'os1_128' .* for a model of 'town'.*model=None",
+        DataError,
+        "a scan of sensor 'os1_128' .* for a model of 'town'.*model=None",
     ),
-    "overlap": (lambda: edit.insert(SCAN, ITEM, (8, 7)), DataError, r"overlaps box 1 \(Car\); expected a free place"),
+    "overlap": (
+        lambda: edit.insert(SCAN, ITEM, (8, 7)),
+        DataError,
+        r"overlaps box 1 \(Car\); expected a free place",
+    ),
     "wall": (lambda: edit.insert(SCAN, ITEM, (24, 0)), DataError, "no level ground|other returns"),
     "behind": (lambda: edit.insert(SCAN, ITEM, (30, 0)), DataError, "no level ground"),
-    "out of range": (lambda: edit.insert(SCAN, ITEM, (95, 0)), DataError, "95.0 m away; expected a place 1.45 to 80 m"),
+    "out of range": (
+        lambda: edit.insert(SCAN, ITEM, (95, 0)),
+        DataError,
+        "95.0 m away; expected a place 1.45 to 80 m",
+    ),
     "too near": (lambda: edit.insert(SCAN, ITEM, (4, -3)), DataError, "at least 6.0 m"),
-    "other side": (lambda: edit.insert(SCAN, ITEM, (-12, 3, 1.7)), DataError, "beside the side that was recorded"),
+    "other side": (
+        lambda: edit.insert(SCAN, ITEM, (-12, 3, 1.7)),
+        DataError,
+        "beside the side that was recorded",
+    ),
     "pose": (lambda: edit.insert(SCAN, ITEM, (1.0,)), DataError, "expected x, y in metres"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -247,15 +314,21 @@ def test_bad_input_is_refused(name: str) -> None:
 def test_files_keep_their_fields() -> None:
     """A file in ring order stays in ring order, and its classes as in the file stay."""
     town = Town(seed=4, scans=1)[0]
-    number = max((i for i, n in enumerate(town.boxes.names) if n == "Car"),
-                 key=lambda i: returns_of(town, town.boxes[[i]]).sum())  # fmt: skip
+    number = max(
+        (i for i, n in enumerate(town.boxes.names) if n == "Car"),
+        key=lambda i: returns_of(town, town.boxes[[i]]).sum(),
+    )
     result = edit.remove(town, number)
     assert sorted(result.fields()) == sorted(town.fields())
-    assert (np.diff(result.ring.astype(int)) >= 0).all() == (np.diff(town.ring.astype(int)) >= 0).all()
+    assert (np.diff(result.ring.astype(int)) >= 0).all() == (
+        np.diff(town.ring.astype(int)) >= 0
+    ).all()
     removed = returns_of(town, town.boxes[[number]])
     rows = {tuple(row) for row in result.points[:: max(len(result) // 500, 1)].tolist()}
     assert len(rows & {tuple(row) for row in town.points[~removed].tolist()}) > 400
-    assert result.raw_label is not None and set(np.unique(result.raw_label)) <= set(np.unique(town.raw_label)) | {0}
+    assert result.raw_label is not None and set(np.unique(result.raw_label)) <= set(
+        np.unique(town.raw_label)
+    ) | {0}
 
 
 @pytest.mark.slow
@@ -264,16 +337,22 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     [scan] = generator.scans(seed=5, indices=[1])
     scan = replace(scan, boxes=Boxes(np.zeros((0, 7), np.float32), ()))
     assert edit.measure([scan]).objects > 0
-    by_geometry, drawn, again = edit.closed(scan), edit.closed(scan, generator), edit.closed(scan, generator)
+    by_geometry = edit.closed(scan)
+    drawn = edit.closed(scan, generator)
+    again = edit.closed(scan, generator)
     assert np.array_equal(drawn.points, again.points)
-    before, filled, new = ({tuple(p) for p in s.points.tolist()} for s in (scan, by_geometry, drawn))
+    before, filled, new = (
+        {tuple(p) for p in s.points.tolist()} for s in (scan, by_geometry, drawn)
+    )
     assert before & filled == before & new and len(before & new) > 0.8 * len(before)
     assert len(new - before) > 0.5 * len(filled - before) and not filled - before <= new
     for result in (by_geometry, drawn):
         assert edit.measure([result]).objects == 0
 
 
-def test_a_drawn_road_is_level_where_rays_start_above_the_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drawn_road_is_level_where_rays_start_above_the_origin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A model that draws exactly what was there gives back the scan."""
     sensor = load_sensor("hdl64e_lasers")
     image = project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0])
@@ -293,14 +372,27 @@ def test_the_command_line_keeps_the_calibration(tmp_path: Path) -> None:
         (root / "testing" / folder).mkdir(parents=True)
         for path in (root / "training" / folder).glob("000000.*"):
             shutil.copy(path, root / "testing" / folder)
-    command = ["edit", "remove", str(root), str(tmp_path / "out"), "--name", "Car", "--to", "kitti_object"]
+    command = [
+        "edit",
+        "remove",
+        str(root),
+        str(tmp_path / "out"),
+        "--name",
+        "Car",
+        "--to",
+        "kitti_object",
+    ]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output + str(result.exception)
-    given, edited = open_scans(root), open_scans(tmp_path / "out")
+    given = open_scans(root)
+    edited = open_scans(tmp_path / "out")
     assert given.ids == edited.ids
     for index in range(len(given)):
-        a, b = given.calibration(index), edited.calibration(index)
-        assert np.allclose(a.projection, b.projection) and np.allclose(a.camera_from_sensor, b.camera_from_sensor)
+        a = given.calibration(index)
+        b = edited.calibration(index)
+        assert np.allclose(a.projection, b.projection) and np.allclose(
+            a.camera_from_sensor, b.camera_from_sensor
+        )
 
 
 def test_a_moved_object_keeps_its_box_without_pictures(tmp_path: Path) -> None:
@@ -329,7 +421,9 @@ def test_the_command_line_edits_scans(tmp_path: Path) -> None:
     }
     counts = {}
     for name, (command, *options) in calls.items():
-        result = CliRunner().invoke(app, ["edit", command, str(tmp_path / "in"), str(tmp_path / name), *options])
+        result = CliRunner().invoke(
+            app, ["edit", command, str(tmp_path / "in"), str(tmp_path / name), *options]
+        )
         assert result.exit_code == 0, result.output + str(result.exception)
         scan = open_scans(tmp_path / name)[0]
         counts[name] = len(scan.boxes)
@@ -338,5 +432,7 @@ def test_the_command_line_edits_scans(tmp_path: Path) -> None:
         ("--name", "Dragon"): "expected the class of some box",
         (): "expected one of the two",
     }.items():
-        result = CliRunner().invoke(app, ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), *options])
+        result = CliRunner().invoke(
+            app, ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), *options]
+        )
         assert isinstance(result.exception, ConfigError) and message in str(result.exception)

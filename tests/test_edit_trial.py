@@ -1,4 +1,5 @@
-"""Edited scans keep their boxes true; ``tools/edit_trial.py --inserts 500`` measures the same on more scans."""
+"""Edited scans keep their boxes true; ``tools/edit_trial.py --inserts 500`` measures the same on
+more scans."""
 
 import sys
 

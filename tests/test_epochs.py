@@ -1,4 +1,5 @@
-"""What is fetched belongs to the epoch in which iterating began, or it raises; repeated epochs are said once."""
+"""What is fetched belongs to the epoch in which iterating began, or it raises; repeated epochs are
+said once."""
 
 import copy
 import pickle
@@ -25,7 +26,9 @@ LATE = r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before it
 
 def mixed(real: int = REAL, ratio: Any = 0.25, **options: Any) -> MixedScans:
     scans = Scans("r", 1) * real
-    return MixedScans.wrap([f"r{i}" for i in range(len(scans))], Endless(), ratio, to_sample=name, **options)
+    return MixedScans.wrap(
+        [f"r{i}" for i in range(len(scans))], Endless(), ratio, to_sample=name, **options
+    )
 
 
 def name(scan: Any, rng: Any) -> str:
@@ -66,9 +69,12 @@ def test_an_epoch_that_is_set_after_iter_raises(workers: int, way: str, persiste
     """In the first pass, and in a later one of persistent workers."""
     train = mixed()
     loader = DataLoader(
-        train, num_workers=workers, collate_fn=list, persistent_workers=persistent and workers > 0,
+        train,
+        num_workers=workers,
+        collate_fn=list,
+        persistent_workers=persistent and workers > 0,
         **samplers(train)[way],
-    )  # fmt: skip
+    )
     iterator = iter(loader)
     next(iterator)
     train.set_epoch(1)
@@ -96,7 +102,9 @@ def test_a_hook_at_the_beginning_of_an_epoch(workers: int) -> None:
 def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
     """It has fetched nothing yet, but the others may have."""
     train = mixed()
-    loader = DataLoader(train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5))
+    loader = DataLoader(
+        train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5)
+    )
     iterator = iter(loader)
     train.set_epoch(1)
     refused(iterator, LATE)
@@ -123,9 +131,14 @@ def test_batches_keep_the_epoch_in_which_iterating_began(workers: int, persisten
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart(workers: int) -> None:
+def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart(
+    workers: int,
+) -> None:
     part, _ = random_split(mixed(), [0.8, 0.2])
-    refused(iter(DataLoader(part, 4, collate_fn=list, num_workers=workers)), r"random_split\(real, \[0.9, 0.1\]\)")
+    refused(
+        iter(DataLoader(part, 4, collate_fn=list, num_workers=workers)),
+        r"random_split\(real, \[0.9, 0.1\]\)",
+    )
     kept, held = random_split(Scans("r", 20), [0.8, 0.2])  # type: ignore[arg-type]
     train = MixedScans(kept, Endless(), to_sample=name, collate=list)
     loader = DataLoader(train, batch_sampler=train.batches(4), collate_fn=list, num_workers=workers)
@@ -144,7 +157,9 @@ def test_a_stream_keeps_the_epoch_in_which_iterating_began(workers: int, endless
     iterator: Any = iter(DataLoader(stream, 4, num_workers=workers, collate_fn=list))
     stream.set_epoch(5)
     assert samples(islice(iterator, 10)) == planned(train, 3)[:40]
-    for worker in getattr(iterator, "_workers", ()):  # torch would wait for those of an endless stream
+    for worker in getattr(
+        iterator, "_workers", ()
+    ):  # torch would wait for those of an endless stream
         worker.terminate()
 
 
@@ -216,7 +231,9 @@ def test_a_mixture_that_is_made_anew_for_each_epoch_is_noticed(
         ways: dict[str, Any] = {
             "in order": DataLoader(train, 4, collate_fn=list),
             "batches": DataLoader(train, batch_sampler=train.batches(4), collate_fn=list),
-            "stream": DataLoader(MixedStream(train, batch_size=4, endless=False), 4, collate_fn=list),
+            "stream": DataLoader(
+                MixedStream(train, batch_size=4, endless=False), 4, collate_fn=list
+            ),
         }
         loader = ways[way]
         assert samples(loader) == planned(train, epoch if told else 0)
@@ -238,7 +255,10 @@ def test_workers_say_that_an_epoch_comes_again(capfd: pytest.CaptureFixture[str]
 
 
 def test_resuming_in_an_epoch_is_no_repetition(caught: list[warnings.WarningMessage]) -> None:
-    for make in (lambda: mixed(9).batches(4), lambda: MixedStream(mixed(9), batch_size=4, endless=False)):
+    for make in (
+        lambda: mixed(9).batches(4),
+        lambda: MixedStream(mixed(9), batch_size=4, endless=False),
+    ):
         whole = make()
         list(whole)
         state = whole.state_dict(1)

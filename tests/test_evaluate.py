@@ -32,18 +32,24 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("sets")
     for first, name in ((0, "real"), (10, "fake")):
         for i in range(3):
-            WRITERS["npz"](root / name).write(random_scan(presets()["town"], 4000, seed=first + i), i)
+            WRITERS["npz"](root / name).write(
+                random_scan(presets()["town"], 4000, seed=first + i), i
+            )
     return root / "real", root / "fake"
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_every_figure_names_its_protocol_and_its_sets(folders: tuple[Path, Path], protocol: str) -> None:
+def test_every_figure_names_its_protocol_and_its_sets(
+    folders: tuple[Path, Path], protocol: str
+) -> None:
     real, fake = map(str, folders)
     options = ["--protocol", protocol, "--anyway"]
     result = CliRunner().invoke(app, ["evaluate", real, fake, *options, "--json"])
     assert result.exception is None, result.output
     apart = json.loads(result.stdout)
-    assert apart and all((s["protocol"], s["real"], s["generated"]) == (protocol, 3, 3) for s in apart)
+    assert apart and all(
+        (s["protocol"], s["real"], s["generated"]) == (protocol, 3, 3) for s in apart
+    )
     same = json.loads(CliRunner().invoke(app, ["evaluate", real, real, *options, "--json"]).stdout)
     assert [s["metric"] for s in same] == [s["metric"] for s in apart]
     assert sum(s["value"] for s in same) < sum(s["value"] for s in apart)
@@ -53,10 +59,21 @@ def test_every_figure_names_its_protocol_and_its_sets(folders: tuple[Path, Path]
 
 def test_the_intervals_of_few_scans_are_json(folders: tuple[Path, Path]) -> None:
     """A resample may hold copies of one scan only, of which some figures have no value."""
-    call = ["evaluate", *map(str, folders), "--protocol", "town", "--segmenter", "--extended", "--intervals", "50"]
+    call = [
+        "evaluate",
+        *map(str, folders),
+        "--protocol",
+        "town",
+        "--segmenter",
+        "--extended",
+        "--intervals",
+        "50",
+    ]
     result = CliRunner().invoke(app, [*call, "--json"])
     assert result.exception is None, result.output
-    assert "NaN" not in result.stdout and any(s["low"] is not None for s in json.loads(result.stdout))
+    assert "NaN" not in result.stdout and any(
+        s["low"] is not None for s in json.loads(result.stdout)
+    )
 
 
 @pytest.mark.parametrize("protocol", [name for name, p in PROTOCOLS.items() if p.needs.generated])
@@ -68,14 +85,27 @@ def test_fewer_scans_than_the_papers_are_refused(folders: tuple[Path, Path], pro
 
 
 def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path]) -> None:
-    call = ["evaluate", *map(str, folders), "--protocol", "r2flow", "--anyway", "--beside", "--intervals", "20"]
+    call = [
+        "evaluate",
+        *map(str, folders),
+        "--protocol",
+        "r2flow",
+        "--anyway",
+        "--beside",
+        "--intervals",
+        "20",
+    ]
     result = CliRunner().invoke(app, call)
     assert result.exception is None, result.output
     rows = [line for line in result.stdout.splitlines() if line.startswith("|")]
     assert "| LiDAR-Flow | 4 | 165.31 | 12.41 | 9.46 | 32.09 | 33.43 | 0.025 | 0.34 |" in rows
     own = rows[-1].split("|")
     jsd = re.search(r"in its tables JSD = (\S+)", result.stdout)
-    assert jsd and own[1].strip() == "**these scans** (3 real, 3 generated)" and own[8].split()[0] == jsd[1]
+    assert (
+        jsd
+        and own[1].strip() == "**these scans** (3 real, 3 generated)"
+        and own[8].split()[0] == jsd[1]
+    )
     assert own[8].strip().endswith("]") and not own[3].strip()  # an interval; no weights, no FRD
     assert "FRD: no weights of rangenet53" in result.stderr
     assert "those of training among them" in result.stderr
@@ -84,18 +114,29 @@ def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path])
         assert refused.exit_code == 2 and "--beside" in refused.stderr
 
 
-def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(folders: tuple[Path, Path]) -> None:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", "spiral", "--anyway"])
-    assert "Frechet distance of range features and class shares: no weights of rangenet53" in result.stderr
+def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(
+    folders: tuple[Path, Path],
+) -> None:
+    result = CliRunner().invoke(
+        app, ["evaluate", *map(str, folders), "--protocol", "spiral", "--anyway"]
+    )
+    assert (
+        "Frechet distance of range features and class shares: no weights of rangenet53"
+        in result.stderr
+    )
 
 
 @pytest.mark.parametrize("protocol", ["r2flow", "town"])
-def test_another_sensor_is_refused(folders: tuple[Path, Path], tmp_path: Path, protocol: str) -> None:
+def test_another_sensor_is_refused(
+    folders: tuple[Path, Path], tmp_path: Path, protocol: str
+) -> None:
     WRITERS["npz"](tmp_path / "other").write(random_scan(presets()["hdl32e_nuscenes"], 4000), 0)
     call = ["evaluate", str(folders[0]), str(tmp_path / "other"), "--protocol", protocol]
     result = CliRunner().invoke(app, [*call, "--anyway"])
     assert result.exception is None, result.output
-    with pytest.raises(DataError, match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows"):
+    with pytest.raises(
+        DataError, match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows"
+    ):
         evaluate(*(open_scans(p) for p in call[1:3]), protocol, progress=False)
 
 
@@ -109,10 +150,14 @@ def trained_on(folder: Path, data: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_training_data_is_refused_as_reference(folders: tuple[Path, Path], tmp_path: Path, same: bool) -> None:
+def test_training_data_is_refused_as_reference(
+    folders: tuple[Path, Path], tmp_path: Path, same: bool
+) -> None:
     real, fake = (shutil.copytree(folder, tmp_path / folder.name) for folder in folders)
     call = ["evaluate", str(real), str(fake), "--protocol", "town", "--json"]
-    trained_on(fake, {"path": f"{real.parent}/../{tmp_path.name}/real", "split": None if same else "train"})
+    trained_on(
+        fake, {"path": f"{real.parent}/../{tmp_path.name}/real", "split": None if same else "train"}
+    )
     by_path = CliRunner().invoke(app, call)
     trained_on(fake, {"town": 3000, "seed": 5})
     (real / SETTINGS).write_text(json.dumps({"seed": 5 if same else 6}))
@@ -126,7 +171,8 @@ def test_training_data_is_refused_as_reference(folders: tuple[Path, Path], tmp_p
     assert CliRunner().invoke(app, [*call, "--training-data"]).exit_code == 0
 
 
-# --- sets of drives and frames, whatever their names --------------------------------------------------------------
+# --- sets of drives and frames, whatever their names
+# --------------------------------------------------------------
 
 
 KITTI_360 = presets()["hdl64e_kitti360"]
@@ -140,7 +186,11 @@ def kitti360(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = WRITERS["kitti360"](root)
     for drive in (0, 2, 3):
         for frame in (5, 6):
-            writer.write(random_scan(KITTI_360, 2000, seed=drive + frame), frame, name=DRIVE.format(drive, frame))
+            writer.write(
+                random_scan(KITTI_360, 2000, seed=drive + frame),
+                frame,
+                name=DRIVE.format(drive, frame),
+            )
     writer.finish()
     return root
 
@@ -150,7 +200,9 @@ def odometry(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("semantic_kitti")
     writer = WRITERS["semantic_kitti"](root)
     for sequence in ("00", "08"):
-        writer.write(random_scan(presets()["hdl64e_semantic_kitti"], 2000), 0, name=f"{sequence}/000003")
+        writer.write(
+            random_scan(presets()["hdl64e_semantic_kitti"], 2000), 0, name=f"{sequence}/000003"
+        )
     writer.finish()
     return root
 
@@ -161,7 +213,9 @@ def fake(folders: tuple[Path, Path], tmp_path: Path) -> Path:
 
 
 def judge(real: Path, fake: Path, *options: str) -> Result:
-    return CliRunner().invoke(app, ["evaluate", str(real), str(fake), "--protocol", "town", "--json", *options])
+    return CliRunner().invoke(
+        app, ["evaluate", str(real), str(fake), "--protocol", "town", "--json", *options]
+    )
 
 
 def refused(result: Result) -> str | None:
@@ -199,8 +253,12 @@ OLDER: dict[str, dict[str, Any]] = {
         ("imported LiDM of maps", "r2flow/test", ["0000", "0002"]),  # its autoencoder's
     ],
 )
-def test_overlapping_drives_are_refused(model: str, split: str, shared: list[str], kitti360: Path, fake: Path) -> None:
-    (fake / NOTE).write_text(json.dumps({"trained_on": "?", "seen": seen_by(OLDER[model]).to_list()}))
+def test_overlapping_drives_are_refused(
+    model: str, split: str, shared: list[str], kitti360: Path, fake: Path
+) -> None:
+    (fake / NOTE).write_text(
+        json.dumps({"trained_on": "?", "seen": seen_by(OLDER[model]).to_list()})
+    )
     message = refused(judge(kitti360, fake, "--split", split))
     if not shared:
         assert message is None
@@ -225,7 +283,9 @@ def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
         (fake / NOTE).write_text(json.dumps({"seen": frames_of("kitti_raw", ids).to_list()}))
 
     trained(["2011_09_30_drive_0028_sync/0000001103"])
-    assert "KITTI 2011_09_30_drive_0028 (frame 1103)" in str(refused(judge(odometry, fake, "--split", "val")))
+    assert "KITTI 2011_09_30_drive_0028 (frame 1103)" in str(
+        refused(judge(odometry, fake, "--split", "val"))
+    )
     trained(["2011_09_30_drive_0028_sync/0000000003", "2011_10_03_drive_0027_sync/0000000003"])
     assert refused(judge(odometry, fake, "--split", "val")) is None
     assert "2011_10_03_drive_0027 (frame 3)" in str(refused(judge(odometry, fake)))
@@ -234,7 +294,9 @@ def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
     assert refused(judge(odometry, fake, "--split", "train")) is not None
 
 
-def test_an_exported_town_is_not_the_dataset_whose_layout_it_has(kitti360: Path, fake: Path, tmp_path: Path) -> None:
+def test_an_exported_town_is_not_the_dataset_whose_layout_it_has(
+    kitti360: Path, fake: Path, tmp_path: Path
+) -> None:
     town = shutil.copytree(kitti360, tmp_path / "town")
     (town / SETTINGS).write_text(json.dumps({"seed": 4}))
     (fake / NOTE).write_text(json.dumps({"seen": seen_by(OLDER["own lidm/train"]).to_list()}))
@@ -248,19 +310,25 @@ def test_unknown_training_data_is_reported(kitti360: Path, fake: Path) -> None:
     result = judge(kitti360, fake)
     assert result.exception is None
     assert "does not record its model's training data" in result.stderr
-    (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
+    (fake / NOTE).write_text(
+        json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]})
+    )
     assert "whether the two sets share frames is not known" not in judge(kitti360, fake).stderr
 
 
 def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake: Path) -> None:
-    (fake / NOTE).write_text(json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}))
+    (fake / NOTE).write_text(
+        json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]})
+    )
     assert "whether the two sets share frames is not known" in judge(odometry, fake).stderr
 
 
 def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path: Path) -> None:
     bank = tmp_path / "bank"
     write_bank(bank, [some_image(i) for i in range(2)], provenance=OLDER["own lidm/train"])
-    assert "2013_05_28_drive_0002_sync" in str(refused(judge(kitti360, bank, "--split", "r2flow/test")))
+    assert "2013_05_28_drive_0002_sync" in str(
+        refused(judge(kitti360, bank, "--split", "r2flow/test"))
+    )
 
 
 @pytest.mark.slow
@@ -268,30 +336,57 @@ def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_pa
     """Its own and its start's; other frames of the same drive are not refused."""
     sensor = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0).to_dict()
     (tmp_path / "sensor.yaml").write_text(yaml.safe_dump({sensor.pop("name"): sensor}))
-    network = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 2], "window": [3, 3]}
+    network = {
+        "width": 16,
+        "time_width": 16,
+        "depths": [1],
+        "heads": [2],
+        "patch": [2, 2],
+        "window": [3, 3],
+    }
     values = {
-        "output": str(tmp_path / "first"), "licence": "MIT", "sensor": str(tmp_path / "sensor.yaml"),
+        "output": str(tmp_path / "first"),
+        "licence": "MIT",
+        "sensor": str(tmp_path / "sensor.yaml"),
         "data": {"licence": "none", "path": str(kitti360), "split": "r2flow/train"},
-        "network": {"arguments": network}, "recipe": {"iterations": 1, "batch": 2}, "samples": {"every": 0},
-    }  # fmt: skip
+        "network": {"arguments": network},
+        "recipe": {"iterations": 1, "batch": 2},
+        "samples": {"every": 0},
+    }
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
     assert CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml")]).exception is None
     first = tmp_path / "first" / "first.safetensors"
     drive = "2013_05_28_drive_0003_sync"
     provenance = read_header(first)[0].provenance
     assert provenance["seen"] == [{"dataset": "KITTI-360", "drives": {drive: [[5, 6]]}}]
-    town = ["data={town: 2, seed: 9, licence: MIT}", f"init={first}", f"output={tmp_path / 'second'}"]
-    assert CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml"), *town]).exception is None
+    town = [
+        "data={town: 2, seed: 9, licence: MIT}",
+        f"init={first}",
+        f"output={tmp_path / 'second'}",
+    ]
+    assert (
+        CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml"), *town]).exception is None
+    )
     second = read_header(tmp_path / "second" / "second.safetensors")[0].provenance
     assert second["seen"] == [*provenance["seen"], {"dataset": "town", "drives": {"seed 9": None}}]
     scans = tmp_path / "scans"
     made = CliRunner().invoke(
-        app, ["sample", str(scans), "--model", str(tmp_path / "second" / "second.safetensors"), "--count", "1"]
+        app,
+        [
+            "sample",
+            str(scans),
+            "--model",
+            str(tmp_path / "second" / "second.safetensors"),
+            "--count",
+            "1",
+        ],
     )
     assert made.exception is None, made.output
     note = json.loads((scans / NOTE).read_text())
     assert note["seen"] == second["seen"]
-    assert f"KITTI-360 {drive} (2 frames from 5 to 6)" in str(refused(judge(kitti360, scans, "--split", "lidm/val")))
+    assert f"KITTI-360 {drive} (2 frames from 5 to 6)" in str(
+        refused(judge(kitti360, scans, "--split", "lidm/val"))
+    )
     later = tmp_path / "later"
     writer = WRITERS["kitti360"](later)
     writer.write(random_scan(KITTI_360, 2000), 0, name=DRIVE.format(3, 7))
@@ -307,7 +402,8 @@ def test_a_town_is_recognised_in_every_format(tmp_path: Path) -> None:
         assert recordings_of(open_scans(tmp_path / to), "folder", tmp_path / to) == town(9)
 
 
-# --- every pair of named splits -----------------------------------------------------------------------------------
+# --- every pair of named splits
+# -----------------------------------------------------------------------------------
 
 DRIVES = {
     "r2flow/train": {3, 4, 5, 6, 7, 9, 10},
@@ -321,17 +417,29 @@ DRIVES = {
 """As R2Flow's and LiDM's public code list them; KITTI-360 has no drive 1."""
 
 MODELS: dict[str, tuple[dict[str, Any], set[int]]] = {
-    **{f"own {s}": ({"data": {"path": "/data", "layout": "kitti360", "split": s}}, d)
-       for s, d in DRIVES.items() if s != "all"},
+    **{
+        f"own {s}": ({"data": {"path": "/data", "layout": "kitti360", "split": s}}, d)
+        for s, d in DRIVES.items()
+        if s != "all"
+    },
     "imported R2Flow": (OLDER["imported R2Flow"], DRIVES["r2flow/train"]),
     "imported LiDM": (OLDER["imported LiDM"], DRIVES["lidm/train"]),
     "imported LiDM of maps": (OLDER["imported LiDM of maps"], DRIVES["lidm/train"]),
-    "R2Flow adapted to the town": ({"data": {"town": 5, "seed": 1}, "init_provenance": OLDER["imported R2Flow"]},
-                                   DRIVES["r2flow/train"]),
-    "student of an adapted LiDM": ({"data": {"town": 5, "seed": 1}, "teacher_provenance":
-                                    {"data": {"town": 2, "seed": 2}, "init_provenance": OLDER["imported LiDM"]}},
-                                   DRIVES["lidm/train"]),
-}  # fmt: skip
+    "R2Flow adapted to the town": (
+        {"data": {"town": 5, "seed": 1}, "init_provenance": OLDER["imported R2Flow"]},
+        DRIVES["r2flow/train"],
+    ),
+    "student of an adapted LiDM": (
+        {
+            "data": {"town": 5, "seed": 1},
+            "teacher_provenance": {
+                "data": {"town": 2, "seed": 2},
+                "init_provenance": OLDER["imported LiDM"],
+            },
+        },
+        DRIVES["lidm/train"],
+    ),
+}
 
 
 @pytest.fixture(scope="module")
@@ -350,12 +458,17 @@ def all_drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_overlap_of_named_splits_is_found(model: str, split: str, all_drives: Path) -> None:
     provenance, seen = MODELS[model]
     reference = measured(open_scans(all_drives, split=split), "kitti360", all_drives, split)
-    shared = {int(drive.split("_")[4]) for dataset, drive in overlap(seen_by(provenance), reference).drives
-              if dataset == "KITTI-360"}  # fmt: skip
+    shared = {
+        int(drive.split("_")[4])
+        for dataset, drive in overlap(seen_by(provenance), reference).drives
+        if dataset == "KITTI-360"
+    }
     assert shared == seen & DRIVES[split]
 
 
-@pytest.mark.parametrize("protocol", [name for name, p in PROTOCOLS.items() if p.reference and p.reference.training])
+@pytest.mark.parametrize(
+    "protocol", [name for name, p in PROTOCOLS.items() if p.reference and p.reference.training]
+)
 def test_each_protocols_reference_is_apart_from_its_training_data(protocol: str) -> None:
     reference = PROTOCOLS[protocol].reference
     assert reference is not None and reference.training is not None

@@ -1,4 +1,5 @@
-"""Every public name has an example of three to eight lines in its docstring; it runs and prints what it shows."""
+"""Every public name has an example of three to eight lines in its docstring; it runs and prints
+what it shows."""
 
 import ast
 import doctest
@@ -34,8 +35,8 @@ FURTHER = {
     "lidar_synth.lab.train": ("TrainConfig", "load_config", "plan_model", "run", "train_model"),
     "lidar_synth.viz": ("write_view",),
 }
-"""What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a dictionary such as
-``NORMALISATIONS``: the example of its values' class shows it."""
+"""What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a
+dictionary such as ``NORMALISATIONS``: the example of its values' class shows it."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -49,7 +50,8 @@ def public_names() -> list[str]:
 
 
 def named_in(text: str) -> set[str]:
-    """The classes and functions of the package that a document names in its Python: by a capital or by a call."""
+    """The classes and functions of the package that a document names in its Python: by a capital or
+    by a call."""
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     spans = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.S))
     words = set(re.findall(r"(?<!\w)(?:[A-Z]\w+|\w+(?=\())", " ".join(blocks + spans)))
@@ -60,7 +62,12 @@ def named_in(text: str) -> set[str]:
 def definitions() -> set[str]:
     """The names of all classes and functions of the package."""
     trees = [ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")]
-    return {node.name for t in trees for node in t.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    return {
+        node.name
+        for t in trees
+        for node in t.body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef)
+    }
 
 
 def example_of(name: str) -> doctest.DocTest:
@@ -82,10 +89,15 @@ def report_of(example: doctest.DocTest) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
-    """What the examples open: the town and the bank as ``make demo`` leaves them, and a dataset in each layout."""
+    """What the examples open: the town and the bank as ``make demo`` leaves them, and a dataset in
+    each layout."""
     pytest.importorskip("embreex")
     root = tmp_path_factory.mktemp("examples")
-    for layout, out in {"semantic_kitti": "demo_out/town", "kitti360": "KITTI-360", "kitti": "KITTI"}.items():
+    for layout, out in {
+        "semantic_kitti": "demo_out/town",
+        "kitti360": "KITTI-360",
+        "kitti": "KITTI",
+    }.items():
         export_town(Town(0, scans=3), root / out, layout, camera=False, progress=False)
     write_kitti_raw(root / "KITTI-raw")
     write_nuscenes(root / "nuScenes")
@@ -115,10 +127,18 @@ def test_every_name_of_the_documents_has_an_example() -> None:
 
 
 @pytest.mark.parametrize(
-    ("doc", "missing"), [(None, "no example"), ("A town.", "no example"), (">>> Town(0)", "no example"),
-                         (">>> 1 + 1\n2", "1 lines"), (">>> a = 1\n" * 8 + ">>> a\n1", "9 lines")]
-)  # fmt: skip
-def test_a_name_without_an_example_is_noticed(doc: str | None, missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ("doc", "missing"),
+    [
+        (None, "no example"),
+        ("A town.", "no example"),
+        (">>> Town(0)", "no example"),
+        (">>> 1 + 1\n2", "1 lines"),
+        (">>> a = 1\n" * 8 + ">>> a\n1", "9 lines"),
+    ],
+)
+def test_a_name_without_an_example_is_noticed(
+    doc: str | None, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Town, "__doc__", doc)
     with pytest.raises(AssertionError, match=missing):
         example_of("lidar_synth.Town")

@@ -1,4 +1,5 @@
-"""Feature extractors: the published archives with random weights, against numbers that the peers' own code gave."""
+"""Feature extractors: the published archives with random weights, against numbers that the peers'
+own code gave."""
 
 import importlib
 import itertools
@@ -66,7 +67,9 @@ def scan(peer: dict[str, NDArray[np.float32]]) -> Scan:
 
 
 def _scan(points: NDArray[np.float32]) -> Scan:
-    return Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id="random")
+    return Scan(
+        points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id="random"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +98,11 @@ CLOUDS = [
 
 @pytest.mark.parametrize("case", CLOUDS)
 def test_features_and_distances_of_points_are_the_peers(
-    case: str, archives: Callable[[str], Path], peer: dict[str, NDArray[np.float32]], scan: Scan, inputs: ModuleType
+    case: str,
+    archives: Callable[[str], Path],
+    peer: dict[str, NDArray[np.float32]],
+    scan: Scan,
+    inputs: ModuleType,
 ) -> None:
     name, _, preparation = case.partition(" as ")
     if name == "liploc":
@@ -116,12 +123,19 @@ def _timm() -> ModuleType:
         pytest.skip(f"timm cannot be imported ({error})")
 
 
-POOLED = {"rangenet53": "subsample", "rangenet21": "subsample", "r2flow_rangenet": "bands", "squeezeseg": "returns"}
+POOLED = {
+    "rangenet53": "subsample",
+    "rangenet21": "subsample",
+    "r2flow_rangenet": "bands",
+    "squeezeseg": "returns",
+}
 IMAGES = [*POOLED, "lidm_rangenet", "r3dpa_rangevit", "r3dpa_rangevit_remission"]
 
 
 @pytest.fixture
-def features_of(archives: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Of]:
+def features_of(
+    archives: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], Of]:
     """Features of an image (C, H, W) by an extractor's name, without its preparation of scans."""
 
     def made(name: str) -> Of:
@@ -136,7 +150,9 @@ def features_of(archives: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
             extract = load_lidm(path, "lidm")
 
             def features(image: torch.Tensor) -> NDArray[np.float32]:
-                given.append(torch.cat([image, torch.full((1, 64, 64), -1.0)]).numpy())  # remission is unknown
+                given.append(
+                    torch.cat([image, torch.full((1, 64, 64), -1.0)]).numpy()
+                )  # remission is unknown
                 return extract([random_scan(presets()["town"], 10)])[0]
 
             return features
@@ -155,7 +171,10 @@ def channels(name: str) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IMAGES)
 def test_features_and_distances_of_images_are_the_peers(
-    name: str, features_of: Callable[[str], Of], peer: dict[str, NDArray[np.float32]], inputs: ModuleType
+    name: str,
+    features_of: Callable[[str], Of],
+    peer: dict[str, NDArray[np.float32]],
+    inputs: ModuleType,
 ) -> None:
     of = features_of(name)
     with torch.inference_mode():
@@ -165,7 +184,8 @@ def test_features_and_distances_of_images_are_the_peers(
 
 
 def distance(features: list[NDArray[np.floating]], inputs: ModuleType) -> float:
-    """Our Fréchet distance between two sets of inputs, of as many numbers as the peers' covariances allow."""
+    """Our Fréchet distance between two sets of inputs, of as many numbers as the peers' covariances
+    allow."""
     few = inputs.reduced(np.stack(features))
     return frechet_distance(few[: inputs.PER_SET], few[inputs.PER_SET :])
 
@@ -182,15 +202,20 @@ def test_the_images_of_r2flow(peer: dict[str, NDArray[np.float32]], scan: Scan) 
     np.testing.assert_allclose(np.linalg.norm(generated[1:4], axis=0), generated[0], atol=1e-4)
 
 
-def test_the_images_of_lidm_move_the_returns_that_lidm_moves(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
-    """Rounding decides which cell a corner belongs to: on another processor 4 % of the cells have been others, next to
-    those of the peer, and 8 instead of 10 % of the returns moved."""
+def test_the_images_of_lidm_move_the_returns_that_lidm_moves(
+    peer: dict[str, NDArray[np.float32]], scan: Scan
+) -> None:
+    """Rounding decides which cell a corner belongs to: on another processor 4 % of the cells have
+    been others, next to those of the peer, and 8 instead of 10 % of the returns moved."""
     image = PREPARATIONS["lidm"].image(scan, False).reshape(5, -1)
-    ours, theirs = set(np.flatnonzero(image[0] > 0)), set(peer["lidm cells"].tolist())
+    ours = set(np.flatnonzero(image[0] > 0))
+    theirs = set(peer["lidm cells"].tolist())
     assert len(ours ^ theirs) <= 0.1 * len(theirs)
     assert ours - theirs <= neighbours(theirs) and theirs - ours <= neighbours(ours)
     before = set(np.flatnonzero(PREPARATIONS["r3dpa"].image(scan, False)[0] > 0))
-    assert len(ours) < len(before) and len(ours - before) > 0.05 * len(before)  # moved to the next row or column
+    assert len(ours) < len(before) and len(ours - before) > 0.05 * len(
+        before
+    )  # moved to the next row or column
     both = np.array(sorted(ours & theirs))
     expected = peer["lidm image"][:, np.searchsorted(peer["lidm cells"], both)]
     same = np.isclose(image[:4, both], expected, rtol=1e-5).all(0)
@@ -201,14 +226,24 @@ def test_the_images_of_lidm_move_the_returns_that_lidm_moves(peer: dict[str, NDA
 def neighbours(cells: set[int]) -> set[int]:
     """The cells next to some of 64 x 1024, and they themselves."""
     near = itertools.product((-1, 0, 1), (-1, 0, 1))
-    return {(cell // 1024 + row) * 1024 + (cell + column) % 1024 for row, column in near for cell in cells}
+    return {
+        (cell // 1024 + row) * 1024 + (cell + column) % 1024
+        for row, column in near
+        for cell in cells
+    }
 
 
 def test_the_images_of_r3dpa(scan: Scan) -> None:
     image = PREPARATIONS["r3dpa"].image(scan, False)
     empty = image[0] == -1
-    assert (image[:4, empty] == -1).all() and (image[4, empty] == 0).all() and (image[0, ~empty] > 1).all()
-    np.testing.assert_allclose(np.linalg.norm(image[1:4, ~empty], axis=0), image[0, ~empty], rtol=1e-5)
+    assert (
+        (image[:4, empty] == -1).all()
+        and (image[4, empty] == 0).all()
+        and (image[0, ~empty] > 1).all()
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(image[1:4, ~empty], axis=0), image[0, ~empty], rtol=1e-5
+    )
 
 
 def test_bytes_of_ranges_overflow_as_in_liploc() -> None:
@@ -218,7 +253,9 @@ def test_bytes_of_ranges_overflow_as_in_liploc() -> None:
     assert abs(grey.mean() - np.mean([251, 0, 51, 255, 0, 24]) / 255) < 0.02
 
 
-def test_the_archive_may_be_packed(archives: Callable[[str], Path], tmp_path: Path, scan: Scan) -> None:
+def test_the_archive_may_be_packed(
+    archives: Callable[[str], Path], tmp_path: Path, scan: Scan
+) -> None:
     path = archives("lidm_minkowski")
     packed = tmp_path / "minkowskinet_lidm.tar.gz"
     with tarfile.open(packed, "w:gz") as tar:
@@ -253,64 +290,111 @@ def _cut(file: str) -> Callable[[Path], object]:
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], str]] = {
-    "code": ("lidm_spvcnn", lambda f: torch.save({"state_dict": print}, f / "model.ckpt"), DataError, "not tensors by"),
+    "code": (
+        "lidm_spvcnn",
+        lambda f: torch.save({"state_dict": print}, f / "model.ckpt"),
+        DataError,
+        "not tensors by",
+    ),
     "truncated": ("lidm_spvcnn", _cut("model.ckpt"), DataError, "model.ckpt is truncated"),
     "no weights": ("lidm_spvcnn", lambda f: (f / "model.ckpt").unlink(), FileError, "model.ckpt"),
-    "no state": ("lidm_minkowski", _reweigh("model.ckpt", lambda c: c.pop("state_dict")), DataError, "not tensors"),
+    "no state": (
+        "lidm_minkowski",
+        _reweigh("model.ckpt", lambda c: c.pop("state_dict")),
+        DataError,
+        "not tensors",
+    ),
     "a weight is missing": (
-        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].pop("stem.0.kernel")), DataError,
+        "lidm_minkowski",
+        _reweigh("model.ckpt", lambda c: c["state_dict"].pop("stem.0.kernel")),
+        DataError,
         r"another architecture \(it lacks stem.0.kernel\)",
     ),
     "a weight of another shape": (
-        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
-        DataError, r"another architecture \(it has another shape of stem.0.kernel\)",
+        "lidm_minkowski",
+        _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
+        DataError,
+        r"another architecture \(it has another shape of stem.0.kernel\)",
     ),
     "a weight is not a number": (
-        "lidm_minkowski", _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
-        DataError, "stem.0.kernel holds values that are not finite",
+        "lidm_minkowski",
+        _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
+        DataError,
+        "stem.0.kernel holds values that are not finite",
     ),
     "narrower": (
-        "lidm_minkowski", _edit("config.yaml", lambda s: s["model_params"].update(cr=0.25)), DataError, "architecture",
+        "lidm_minkowski",
+        _edit("config.yaml", lambda s: s["model_params"].update(cr=0.25)),
+        DataError,
+        "architecture",
     ),
     "settings without widths": (
-        "lidm_minkowski", _edit("config.yaml", lambda s: s["model_params"].pop("layer_num")), ConfigError, "layer_num",
+        "lidm_minkowski",
+        _edit("config.yaml", lambda s: s["model_params"].pop("layer_num")),
+        ConfigError,
+        "layer_num",
     ),
     "settings are a list": (
-        "lidm_minkowski", lambda f: (f / "config.yaml").write_text("[1]"), DataError, "holds list",
+        "lidm_minkowski",
+        lambda f: (f / "config.yaml").write_text("[1]"),
+        DataError,
+        "holds list",
     ),
     "settings with code": (
-        "lidm_minkowski", lambda f: (f / "config.yaml").write_text("a: !!python/object/apply:os.getcwd []"),
-        ConfigError, "not YAML",
+        "lidm_minkowski",
+        lambda f: (f / "config.yaml").write_text("a: !!python/object/apply:os.getcwd []"),
+        ConfigError,
+        "not YAML",
     ),
     "a U-Net's weights as PointNet": (
-        "sparenet_pointnet", lambda f: torch.save({"a.weight": torch.ones(2)}, f), DataError, "SpareNet",
+        "sparenet_pointnet",
+        lambda f: torch.save({"a.weight": torch.ones(2)}, f),
+        DataError,
+        "SpareNet",
     ),
     "PointNet truncated": (
-        "sparenet_pointnet", lambda f: f.write_bytes(f.read_bytes()[:-1000]), DataError, "truncated",
+        "sparenet_pointnet",
+        lambda f: f.write_bytes(f.read_bytes()[:-1000]),
+        DataError,
+        "truncated",
     ),
     "another darknet": (
-        "lidm_rangenet", _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=22)), ConfigError,
+        "lidm_rangenet",
+        _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=22)),
+        ConfigError,
         "22 layers.*21 or 53",
     ),
     "53 layers for 21": (
-        "lidm_rangenet", _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=53)), DataError,
+        "lidm_rangenet",
+        _edit("config.yaml", lambda s: s["backbone"]["extra"].update(layers=53)),
+        DataError,
         "backbone: weights of another architecture",
     ),
     "means of four inputs": (
-        "squeezeseg", _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"]["img_means"].pop()), ConfigError,
+        "squeezeseg",
+        _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"]["img_means"].pop()),
+        ConfigError,
         "a mean and a positive deviation",
     ),
     "a deviation of 0": (
-        "squeezeseg", _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"].update(img_stds=[0] * 5)), ConfigError,
+        "squeezeseg",
+        _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"].update(img_stds=[0] * 5)),
+        ConfigError,
         "positive deviation",
     ),
     "another stem": (
-        "r3dpa_rangevit", _edit("config.yaml", lambda s: s.update(conv_stem="none")), ConfigError, "ConvStem",
+        "r3dpa_rangevit",
+        _edit("config.yaml", lambda s: s.update(conv_stem="none")),
+        ConfigError,
+        "ConvStem",
     ),
     "without a backbone": (
-        "r3dpa_rangevit", _edit("config.yaml", lambda s: s.pop("vit_backbone")), ConfigError, "vit_backbone",
+        "r3dpa_rangevit",
+        _edit("config.yaml", lambda s: s.pop("vit_backbone")),
+        ConfigError,
+        "vit_backbone",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -324,7 +408,9 @@ def test_a_faulty_archive_is_refused_and_the_right_one_named(
     damage(path)
     with pytest.raises(error, match=message) as caught:
         load_extractor(name, path)
-    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(caught.value).replace("../", "")
+    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(caught.value).replace(
+        "../", ""
+    )
 
 
 def test_what_cannot_be_extracted_is_refused(
@@ -333,7 +419,10 @@ def test_what_cannot_be_extracted_is_refused(
     monkeypatch.delenv("LIDAR_SYNTH_METRICS", raising=False)
     with pytest.raises(ConfigError, match="extractor 'inception'"):
         load_extractor("inception")
-    with pytest.raises(ConfigError, match="minkowskinet or minkowskinet_lidm in the folder that LIDAR_SYNTH_METRICS"):
+    with pytest.raises(
+        ConfigError,
+        match="minkowskinet or minkowskinet_lidm in the folder that LIDAR_SYNTH_METRICS",
+    ):
         load_extractor("lidm_minkowski")
     with pytest.raises(ConfigError, match="preparation 'spiral'"):
         load_extractor("lidm_minkowski", archives("lidm_minkowski"), "spiral")
@@ -350,14 +439,20 @@ def test_a_network_without_remission_is_no_judge(archives: Callable[[str], Path]
         load_archive(archives("r2flow_rangenet"))
 
 
-def test_an_extractor_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_extractor_without_its_library_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "timm", None)
     with pytest.raises(LibraryError, match=r"needs timm.*lidar_synth\[metrics\]"):
         load_extractor("liploc", tmp_path)
     monkeypatch.delitem(sys.modules, "timm")
-    (tmp_path / "timm.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    (tmp_path / "timm.py").write_text(
+        "raise RuntimeError('operator torchvision::nms does not exist')"
+    )
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(LibraryError, match="torchvision::nms does not exist.*torchvision of the same build"):
+    with pytest.raises(
+        LibraryError, match="torchvision::nms does not exist.*torchvision of the same build"
+    ):
         load_extractor("liploc", tmp_path)
 
 
@@ -384,13 +479,22 @@ def test_setup_says_what_to_fetch_and_what_is_there(
     assert list(found) == list(EXTRACTORS)
     assert found["lidm_minkowski"]["state"] == f"{tmp_path / 'minkowskinet'} is readable"
     assert "its hash differs" in found["sparenet_pointnet"]["state"]
-    assert "is not usable" in found["rangenet53"]["state"] and "truncated" in found["rangenet53"]["state"]
+    assert (
+        "is not usable" in found["rangenet53"]["state"]
+        and "truncated" in found["rangenet53"]["state"]
+    )
     assert found["lidm_spvcnn"]["state"] == "missing" and found["lidm_spvcnn"]["sha256"] is None
     assert found["sparenet_pointnet"]["sha256"] == sha256(tmp_path / "cls_model_39.pth")
-    known = [name for name, one in found.items() if not one["hash"].startswith("unknown: its publisher states none")]
+    known = [
+        name
+        for name, one in found.items()
+        if not one["hash"].startswith("unknown: its publisher states none")
+    ]
     assert known == ["sparenet_pointnet"]
     (tmp_path / "hello").write_text("hello\n")  # what `git hash-object` prints
-    published = EXTRACTORS["sparenet_pointnet"]._replace(git_blob="ce013625030ba8dba906f756967f9e9ca394464a")
+    published = EXTRACTORS["sparenet_pointnet"]._replace(
+        git_blob="ce013625030ba8dba906f756967f9e9ca394464a"
+    )
     assert published.is_published(tmp_path / "hello")
     assert all("http" in one["from"] and one["licence"] for one in found.values())
     monkeypatch.delenv("LIDAR_SYNTH_METRICS")

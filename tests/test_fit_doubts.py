@@ -43,7 +43,10 @@ def test_unknown_azimuth_offsets_are_named() -> None:
     fit = fit_of_near_beam()
     offsets = np.asarray(fit.sensor.azimuths, np.float64)
     assert np.flatnonzero(np.isnan(offsets)).tolist() == [5] and np.isnan(fit.azimuths.offsets[5])
-    assert f"offsets of the beams at {fit.sensor.elevations[5]:.2f} degrees are not known" in " ".join(fit.uncertain)
+    assert (
+        f"offsets of the beams at {fit.sensor.elevations[5]:.2f} degrees are not known"
+        in " ".join(fit.uncertain)
+    )
     wrong = offsets - OFFSETS
     assert np.nanmax(np.abs(wrong - np.nanmedian(wrong))) < 0.1
 
@@ -51,7 +54,11 @@ def test_unknown_azimuth_offsets_are_named() -> None:
 def test_a_sensor_with_unknown_offsets_is_written_read_and_cast(tmp_path) -> None:
     sensor = fit_of_near_beam().sensor
     (tmp_path / "a.yaml").write_text(sensor_yaml(sensor))
-    assert load_sensor(tmp_path / "a.yaml") == sensor == Sensor.from_dict(json.loads(json.dumps(sensor.to_dict())))
+    assert (
+        load_sensor(tmp_path / "a.yaml")
+        == sensor
+        == Sensor.from_dict(json.loads(json.dumps(sensor.to_dict())))
+    )
     (tmp_path / "a.yaml").write_text(sensor_yaml(sensor).replace("null", ".nan"))
     assert load_sensor(tmp_path / "a.yaml") == sensor and "null" in sensor_yaml(sensor)
     with pytest.warns(UserWarning, match="offsets of 1 of 16 beams are not known"):
@@ -68,7 +75,9 @@ def test_beams_with_few_points_are_found_and_named(few: int) -> None:
     for beam in (0, 7):
         kept[np.flatnonzero(made.ring == beam)[few:]] = False
     fit = fit_sensor([with_points(made.scan[kept], np.zeros((0, 3)))])
-    assert np.abs(np.array(fit.sensor.elevations) - BEAMS).max() < 0.03 and fit.points[[0, 7]].tolist() == [few, few]
+    assert np.abs(np.array(fit.sensor.elevations) - BEAMS).max() < 0.03 and fit.points[
+        [0, 7]
+    ].tolist() == [few, few]
     named = f"{fit.sensor.elevations[0]:.2f}" in " ".join(fit.uncertain)
     assert named == (few < 50)
 
@@ -79,7 +88,9 @@ def test_returns_at_the_origin_are_left_out() -> None:
     points = scan.points.copy()
     points[::5] = 0
     fit = fit_sensor([replace(scan, points=points)])
-    assert fit.share == plain.share == 1 and np.allclose(fit.sensor.elevations, plain.sensor.elevations, atol=1e-3)
+    assert fit.share == plain.share == 1 and np.allclose(
+        fit.sensor.elevations, plain.sensor.elevations, atol=1e-3
+    )
     assert (fit.rings[0][::5] == -1).all() and fit.points.sum() == (fit.rings[0] >= 0).sum()
 
 
@@ -96,7 +107,10 @@ def test_every_unexplained_per_cent_of_points_is_a_doubt(doubt: str) -> None:
     fit = fit_sensor([with_points(scan, SPOILT[doubt](np.random.default_rng(0), count))])
     [found] = [line for line in fit.uncertain if doubt in line]
     assert float(found.split("%")[0]) == pytest.approx(100 * count / (count + len(scan)), abs=0.8)
-    assert len(fit.points) == 16 and fit.points.sum() + count * ("fitted" in doubt) == len(scan) + count
+    assert (
+        len(fit.points) == 16
+        and fit.points.sum() + count * ("fitted" in doubt) == len(scan) + count
+    )
 
 
 def test_the_vendor_of_a_fit_is_named() -> None:
@@ -106,7 +120,10 @@ def test_the_vendor_of_a_fit_is_named() -> None:
     assert name_vendor(table, few) == "Hesai Pandar128E4X; 20 channels had few points or none"
     assert name_vendor(table[20:], few[20:]) == name_vendor(table, few)
     assert name_vendor(np.array(BEAMS), np.full(16, 500)) == ""
-    assert name_vendor(np.array(presets()["pandar64"].elevations), np.full(64, 500)) == "Hesai Pandar64"
+    assert (
+        name_vendor(np.array(presets()["pandar64"].elevations), np.full(64, 500))
+        == "Hesai Pandar64"
+    )
 
 
 def test_no_beam_of_a_sparse_town_is_wrong_without_a_doubt() -> None:

@@ -39,23 +39,31 @@ def shuffled(scans: list[Scan]) -> list[Scan]:
 
 
 def moved(scans: list[Scan], offset: np.ndarray, turn: np.ndarray) -> list[Scan]:
-    return [replace(scan, points=(scan.points @ turn.T + offset).astype(np.float32)) for scan in scans]
+    return [
+        replace(scan, points=(scan.points @ turn.T + offset).astype(np.float32)) for scan in scans
+    ]
 
 
 SCANS: dict[str, tuple[Callable[[], list[Scan]], tuple[float, ...]]] = {
     "in the order of time": (lambda: untimed(some()), BEAMS),
     "in any order": (lambda: shuffled(some()), BEAMS),
     "with times": (some, BEAMS),
-    "a quarter of the turn": (lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in shuffled(some(3))], BEAMS),
+    "a quarter of the turn": (
+        lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in shuffled(some(3))],
+        BEAMS,
+    ),
     "every fourth beam": (lambda: shuffled(some(3, elevations=BEAMS[::4])), BEAMS[::4]),
     "lasers above the origin": (lambda: shuffled(some(heights=HEIGHTS)), BEAMS),
     "motion compensated, with times": (lambda: [compensated(s, 12.0, 0.2) for s in some()], BEAMS),
-    "motion compensated, without": (lambda: untimed([compensated(s, 12.0, 0.2) for s in some()]), BEAMS),
+    "motion compensated, without": (
+        lambda: untimed([compensated(s, 12.0, 0.2) for s in some()]),
+        BEAMS,
+    ),
     "the town's os1_128": (
         lambda: [Town(0, "os1_128", 1, motion=False)[0]],
-        tuple(np.degrees(load_sensor("os1_128").row_elevations()).tolist())
+        tuple(np.degrees(load_sensor("os1_128").row_elevations()).tolist()),
     ),
-}  # fmt: skip
+}
 
 
 @cache
@@ -65,7 +73,8 @@ def fitted(name: str) -> SensorFit:
 
 @pytest.mark.parametrize("name", SCANS)
 def test_the_beams_are_found(name: str) -> None:
-    fit, beams = fitted(name), SCANS[name][1]
+    fit = fitted(name)
+    beams = SCANS[name][1]
     assert fit.sensor.shape[0] == len(beams)
     assert np.abs(np.array(fit.sensor.elevations) - beams).max() < 0.02
     assert fit.share > 0.98 and fit.points.sum() == sum(map(len, fit.rings))
@@ -76,7 +85,10 @@ def test_ring_numbers_may_have_gaps(change: str) -> None:
     made = [turned(seed=seed) for seed in range(2)]
     scans = [replace(m.scan, ring=m.ring.astype(np.int16)) for m in made]
     if change in ("from 1", "even"):
-        scans = [replace(s, ring=s.ring + np.int16(1) if change == "from 1" else 2 * s.ring) for s in scans]
+        scans = [
+            replace(s, ring=s.ring + np.int16(1) if change == "from 1" else 2 * s.ring)
+            for s in scans
+        ]
     else:
         scans = [s[s.ring != 5] for s in scans]
     if change == "one almost lost":  # its only returns are those of the sensor's own housing
@@ -113,18 +125,25 @@ def test_the_place_of_the_sensor_on_a_vehicle_is_found() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["os1_128", "pandar64"])
 def test_tilts_of_up_to_six_degrees_are_found_without_rings(name: str) -> None:
-    offset, turn = np.array([-0.76, -1.29, 0.88]), tilt_of(np.radians([-4.0, 2.5]))
+    offset = np.array([-0.76, -1.29, 0.88])
+    turn = tilt_of(np.radians([-4.0, 2.5]))
     [scan] = moved(shuffled([Town(0, name, 1, motion=False)[0]]), offset, turn)
     fit = fit_sensor([replace(scan, ring=None)])
     beams = np.degrees(load_sensor(name).row_elevations())
-    assert np.allclose(fit.mount[:3, 3], offset, atol=0.02) and np.allclose(fit.mount[2, :2], turn[2, :2], atol=1e-3)
+    assert np.allclose(fit.mount[:3, 3], offset, atol=0.02) and np.allclose(
+        fit.mount[2, :2], turn[2, :2], atol=1e-3
+    )
     assert np.abs(np.array(fit.sensor.elevations) - beams).max() < 0.02
 
 
 FIRINGS: dict[str, tuple[Callable[[], list[Scan]], int, str]] = {
     "times": (lambda: some(azimuths=OFFSETS), 1000, "time"),
     "the order of time": (lambda: untimed(some(azimuths=OFFSETS)), 1000, "time"),
-    "the encoder's pattern": (lambda: shuffled(some(azimuths=OFFSETS, firings=2170, encoder=4000)), 2170, "encoder"),
+    "the encoder's pattern": (
+        lambda: shuffled(some(azimuths=OFFSETS, firings=2170, encoder=4000)),
+        2170,
+        "encoder",
+    ),
 }
 
 
@@ -142,7 +161,9 @@ def test_ranges_and_reflectance_are_described() -> None:
     scans = shuffled(some())
     for scan in scans:
         distance = np.linalg.norm(scan.points.astype(float), axis=1)
-        scan.points = (scan.points * (np.round(distance / 0.004) * 0.004 / distance)[:, None]).astype(np.float32)
+        scan.points = (
+            scan.points * (np.round(distance / 0.004) * 0.004 / distance)[:, None]
+        ).astype(np.float32)
     fit = fit_sensor(scans)
     assert fit.sensor.range_step == 0.004 and fit.sensor.reflectance_levels == 256
     assert fit.nearest <= 5 and fit.sensor.range_max >= fit.farthest >= 70
@@ -152,24 +173,38 @@ def test_ranges_and_reflectance_are_described() -> None:
 BAD: dict[str, tuple[Callable[[], list[Scan]], str]] = {
     "no scans": (list, "0 scans"),
     "empty scans": (lambda: [s[:0] for s in some()], "2 scans with 0 points"),
-    "one beam": (lambda: [t.scan[t.ring == 12] for t in [turned()]], "fewer than two beams|no beams found"),
-    "one ring": (
-        lambda: [replace(t.scan[t.ring == 12], ring=np.zeros((t.ring == 12).sum(), np.int16)) for t in [turned()]],
+    "one beam": (
+        lambda: [t.scan[t.ring == 12] for t in [turned()]],
         "fewer than two beams|no beams found",
     ),
-    "10 m beside the sensor": (lambda: moved(some(), np.array([10.0, 4, 0]), np.eye(3)), "no beams|fewer than two"),
+    "one ring": (
+        lambda: [
+            replace(t.scan[t.ring == 12], ring=np.zeros((t.ring == 12).sum(), np.int16))
+            for t in [turned()]
+        ],
+        "fewer than two beams|no beams found",
+    ),
+    "10 m beside the sensor": (
+        lambda: moved(some(), np.array([10.0, 4, 0]), np.eye(3)),
+        "no beams|fewer than two",
+    ),
     "tilted by 20 degrees": (
-        lambda: moved(some(), np.zeros(3), tilt_of(np.radians([20.0, 5]))), "no beams|fewer than two"
+        lambda: moved(some(), np.zeros(3), tilt_of(np.radians([20.0, 5]))),
+        "no beams|fewer than two",
     ),
     "points anywhere": (
         lambda: [
-            replace(s, points=np.random.default_rng(0).uniform(-20, 20, s.points.shape).astype(np.float32), time=None)
+            replace(
+                s,
+                points=np.random.default_rng(0).uniform(-20, 20, s.points.shape).astype(np.float32),
+                time=None,
+            )
             for s in some(1)
         ],
         "no beams|fewer than two",
     ),
     "NaN": (lambda: [replace(s, points=s.points * np.float32(np.nan)) for s in some(1)], "NaN"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -191,20 +226,27 @@ def test_every_point_gets_its_ring_and_firing() -> None:
 
 @pytest.mark.parametrize("name", ["town", "hdl64e_kitti", "hdl64e_lasers", "os1_128"])
 def test_every_point_gets_its_ring_with_the_scans_own_sensor(name: str) -> None:
-    """Also where the preset has the elevations that lasers above the origin seem to have from there."""
+    """Also where the preset has the elevations that lasers above the origin seem to have from
+    there."""
     scan = Town(seed=0, scans=1, sensor=name, motion=False)[0]
     found = assign_beams(scan)
     assert (found.ring == scan.ring).mean() > 0.999 and np.percentile(np.abs(found.off), 99) < 0.01
 
 
 def test_motion_compensation_is_undone_by_poses() -> None:
-    scan, path = turned().scan, driving(15.0, 0.5)
+    scan = turned().scan
+    path = driving(15.0, 0.5)
     published = deskew(scan, path)
     assert np.abs(published.points - scan.points).max() > 0.5
     assert np.allclose(reskew(published, path).points, scan.points, atol=1e-4)
-    assert np.allclose(deskew(scan, path, 0.05).points[-1], deskew(scan, path).points[-1] - [0.75, 0, 0], atol=1.5)
+    assert np.allclose(
+        deskew(scan, path, 0.05).points[-1], deskew(scan, path).points[-1] - [0.75, 0, 0], atol=1.5
+    )
     sensor = fit_sensor([scan]).sensor
-    close = [np.mean(np.abs(assign_beams(s, sensor).off) < 0.05) for s in (published, reskew(published, path))]
+    close = [
+        np.mean(np.abs(assign_beams(s, sensor).off) < 0.05)
+        for s in (published, reskew(published, path))
+    ]
     assert close[0] < 0.9 and close[1] == 1
 
 
@@ -242,12 +284,21 @@ def write(scans: list[Scan], folder: Path) -> Path:
     return folder
 
 
-def test_the_command_writes_a_sensor_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, out = write(some(azimuths=OFFSETS), tmp_path / "scans"), tmp_path / "mine.yaml"
-    assert run("sensor", "fit", folder, "--out", out, "--picture", tmp_path / "fit.png", "--json") == 0
+def test_the_command_writes_a_sensor_and_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write(some(azimuths=OFFSETS), tmp_path / "scans")
+    out = tmp_path / "mine.yaml"
+    assert (
+        run("sensor", "fit", folder, "--out", out, "--picture", tmp_path / "fit.png", "--json") == 0
+    )
     printed = json.loads(capsys.readouterr().out)
     sensor = load_sensor(out)
-    assert sensor.to_dict() == printed["sensor"] and sensor.name == "mine" and sensor.shape == (16, 1000)
+    assert (
+        sensor.to_dict() == printed["sensor"]
+        and sensor.name == "mine"
+        and sensor.shape == (16, 1000)
+    )
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert sensor_yaml(sensor) == out.read_text()
     bad = write(moved(some(), np.array([10.0, 4, 0]), np.eye(3)), tmp_path / "bad")
@@ -270,10 +321,15 @@ def test_the_table_of_a_real_pandar64_is_found(pandaset: Path) -> None:
     scans = []
     for frame in ("00", "20", "40", "60", "70"):
         with np.load(pandaset / "sensor_frame" / f"{frame}.npz") as file:
-            points, time = file["points"], file["time"]
-            scans.append(Scan(points, np.zeros(len(points), np.float32), load_sensor("town"), time=time))
+            points = file["points"]
+            time = file["time"]
+            scans.append(
+                Scan(points, np.zeros(len(points), np.float32), load_sensor("town"), time=time)
+            )
     fit = fit_sensor(scans)
     assert (np.abs(np.array(fit.sensor.elevations) - table[:, 1]) < 0.02).sum() >= 60
     assert fit.share > 0.98 and fit.sensor.firings == 1800
     wrong = np.array(fit.sensor.azimuths) - table[:, 2]
-    assert np.abs(wrong - np.median(wrong)).max() < 0.15  # lasers fire one after the other, within 30 microseconds
+    assert (
+        np.abs(wrong - np.median(wrong)).max() < 0.15
+    )  # lasers fire one after the other, within 30 microseconds

@@ -30,7 +30,8 @@ from lidar_synth.noise import gaussian, uniform
 
 
 def test_the_path_runs_from_data_to_noise_at_its_velocity() -> None:
-    y0, y1 = gaussian(0, range(4), (2, 3, 5), dtype=torch.float64), gaussian(1, range(4), (2, 3, 5))
+    y0 = gaussian(0, range(4), (2, 3, 5), dtype=torch.float64)
+    y1 = gaussian(1, range(4), (2, 3, 5))
     assert torch.equal(interpolate(y0, y1, torch.zeros(4)), y0)
     assert torch.equal(interpolate(y0, y1, torch.ones(4)), y1)
     t = torch.tensor([0.0, 0.25, 0.5, 0.9], dtype=torch.float64)
@@ -41,12 +42,20 @@ def test_the_path_runs_from_data_to_noise_at_its_velocity() -> None:
 
 
 def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
-    """For Gaussian data, the optimal velocity E[y1 - y0 | y_t] is known, and its residual is independent of y_t."""
+    """For Gaussian data, the optimal velocity E[y1 - y0 | y_t] is known, and its residual is
+    independent of y_t."""
     count = 20000
     y0 = 0.5 + 0.1 * gaussian(0, range(count), (1,), dtype=torch.float64)
-    example = flow_matching(y0, gaussian(1, range(count), (1,), dtype=torch.float64), uniform(2, range(count)))
+    example = flow_matching(
+        y0, gaussian(1, range(count), (1,), dtype=torch.float64), uniform(2, range(count))
+    )
     left = (example.velocity - gaussian_velocity(example.y, example.t)).flatten()
-    for feature in (torch.ones(count), example.y.flatten(), example.t, example.y.flatten() * example.t):
+    for feature in (
+        torch.ones(count),
+        example.y.flatten(),
+        example.t,
+        example.y.flatten() * example.t,
+    ):
         assert abs((left * feature).mean()) < 4 * (left * feature).std() / math.sqrt(count)
     best = velocity_loss(gaussian_velocity, example, METRICS["squared_l2"])
     assert best.ndim == 0 and best == pytest.approx(left.square().mean().item())
@@ -56,7 +65,9 @@ def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
 
 
 def test_the_loss_passes_the_condition_on() -> None:
-    example = replace(flow_matching(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.2, 0.4])), cond=3.0)
+    example = replace(
+        flow_matching(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.2, 0.4])), cond=3.0
+    )
     loss = velocity_loss(lambda y, t, c: c * torch.ones_like(y), example, METRICS["l1"])
     assert loss.item() == 2.0
 
@@ -64,7 +75,8 @@ def test_the_loss_passes_the_condition_on() -> None:
 def test_autoguidance_reduces_the_error_that_both_models_share() -> None:
     """Data of standard deviation 0.1, a model fitted to 0.15, and a weaker one fitted to 0.2."""
     model, weaker = (partial(gaussian_velocity, spread=spread) for spread in (1.5 * STD, 2 * STD))
-    noise, grid = gaussian(0, range(4000), (1,), dtype=torch.float64), uniform_grid(50)
+    noise = gaussian(0, range(4000), (1,), dtype=torch.float64)
+    grid = uniform_grid(50)
 
     def spread(scale: float) -> float:
         y = solve(autoguided(model, weaker, scale), noise, grid)
@@ -78,22 +90,29 @@ def test_autoguidance_reduces_the_error_that_both_models_share() -> None:
 
 
 def test_autoguidance_passes_the_condition_on() -> None:
-    y, t, cond = torch.randn(3, 2), torch.rand(3), torch.randn(3, 2)
+    y = torch.randn(3, 2)
+    t = torch.rand(3)
+    cond = torch.randn(3, 2)
     out = autoguided(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
     assert torch.allclose(out, y + 5 * cond, atol=1e-5)
-    halves = (lambda y, t, c: (y + c).bfloat16(), lambda y, t, c: (y - c).bfloat16())  # dtype under autocast
+    halves = (
+        lambda y, t, c: (y + c).bfloat16(),
+        lambda y, t, c: (y - c).bfloat16(),
+    )  # dtype under autocast
     assert torch.allclose(autoguided(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
 
 
 def test_autoguidance_is_limited_to_its_time_interval() -> None:
-    y, t = torch.ones(5, 2), torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
+    y = torch.ones(5, 2)
+    t = torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
     out = autoguided(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
     assert out[:, 0].tolist() == [3, 5, 5, 5, 3] and torch.equal(out[:, 0], out[:, 1])
 
 
 @pytest.mark.parametrize("name", METRICS)
 def test_metrics_are_distances_per_sample(name: str) -> None:
-    a, b = gaussian(0, range(3), (2, 4, 5)), gaussian(1, range(3), (2, 4, 5))
+    a = gaussian(0, range(3), (2, 4, 5))
+    b = gaussian(1, range(3), (2, 4, 5))
     m = METRICS[name](a, b)
     assert m.shape == (3,) and (m > 0).all()
     assert torch.equal(m, METRICS[name](b, a))
@@ -106,7 +125,8 @@ def test_metrics_are_distances_per_sample(name: str) -> None:
 
 
 def test_metrics_equal_values_computed_by_hand() -> None:
-    a, b = torch.tensor([[3.0, 0.0, 0.0, 0.0]]), torch.tensor([[0.0, -4.0, 0.0, 0.0]])
+    a = torch.tensor([[3.0, 0.0, 0.0, 0.0]])
+    b = torch.tensor([[0.0, -4.0, 0.0, 0.0]])
     assert METRICS["squared_l2"](a, b).item() == 25 / 4
     assert METRICS["l1"](a, b).item() == 7 / 4
     # c = 2 sqrt(4) = 4: sqrt(9 + 16) - 4 and sqrt(16 + 16) - 4
@@ -122,7 +142,8 @@ def test_pseudo_huber_equals_that_of_r2flow(golden: Golden, case: int) -> None:
     assert loss.item() == pytest.approx(vectors["loss"].item(), rel=1e-6)
     loss.backward()
     assert torch.allclose(v.grad, vectors["grad_v"], rtol=1e-5, atol=1e-12)
-    # In float32, sqrt(e^2 + c^2) - c loses small errors to rounding, by an amount that depends on the machine.
+    # In float32, sqrt(e^2 + c^2) - c loses small errors to rounding, by an amount that depends on
+    # the machine.
     c = 0.03 * math.sqrt(v[0].numel())
     other = pseudo_huber(v, vectors["u"], 0.03).mean()
     assert other.item() == pytest.approx(vectors["loss_coef_0.03"].item(), rel=1e-6, abs=2**-24 * c)
@@ -130,14 +151,18 @@ def test_pseudo_huber_equals_that_of_r2flow(golden: Golden, case: int) -> None:
 
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
 def test_distributions_of_t_equal_those_of_r2flow(golden: Golden, name: str) -> None:
-    """R2Flow's time runs the other way; all three distributions are symmetric and are compared both ways."""
+    """R2Flow's time runs the other way; all three distributions are symmetric and are compared both
+    ways."""
     vectors = load_file(golden / "r2flow_losses.safetensors")
     t = TIMESTEPS[name](uniform(0, range(10000))).double()
     for ours in (t, 1 - t):
-        quantiles, p = vectors[f"timesteps/{name}/quantiles"], vectors["timesteps/probabilities"]
+        quantiles = vectors[f"timesteps/{name}/quantiles"]
+        p = vectors["timesteps/probabilities"]
         share_below = (ours[:, None] <= quantiles).double().mean(0)
         assert (share_below - p).abs().max() < 0.03
-        assert ours.mean() == pytest.approx(vectors[f"timesteps/{name}/moments"][0].item(), abs=0.01)
+        assert ours.mean() == pytest.approx(
+            vectors[f"timesteps/{name}/moments"][0].item(), abs=0.01
+        )
         assert ours.std() == pytest.approx(vectors[f"timesteps/{name}/moments"][1].item(), abs=0.01)
 
 
@@ -156,8 +181,16 @@ def test_distributions_of_t_are_quantile_functions_within_0_and_1(name: str) -> 
 @pytest.mark.parametrize(
     ("quantile", "density"),
     [
-        (u_shaped, lambda t: 4 * (torch.exp(4 * t) + torch.exp(4 * (1 - t))) / (2 * (math.exp(4) - 1))),
-        (logit_normal, lambda t: torch.exp(-(torch.logit(t) ** 2) / 2) / (math.sqrt(2 * math.pi) * t * (1 - t))),
+        (
+            u_shaped,
+            lambda t: 4 * (torch.exp(4 * t) + torch.exp(4 * (1 - t))) / (2 * (math.exp(4) - 1)),
+        ),
+        (
+            logit_normal,
+            lambda t: (
+                torch.exp(-(torch.logit(t) ** 2) / 2) / (math.sqrt(2 * math.pi) * t * (1 - t))
+            ),
+        ),
     ],
 )
 def test_quantile_functions_have_the_documented_densities(

@@ -30,7 +30,9 @@ def _open3d_is_missing() -> bool:
     return False
 
 
-needs_open3d = pytest.mark.skipif(_open3d_is_missing(), reason="open3d or a system library behind it is missing")
+needs_open3d = pytest.mark.skipif(
+    _open3d_is_missing(), reason="open3d or a system library behind it is missing"
+)
 
 
 POINT_LAYOUTS = [name for name in WRITERS if name not in ("range", "png")]
@@ -86,12 +88,20 @@ def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
 @pytest.mark.parametrize(
     ("suffix", "header"),
     [
-        (".pcd", "# .PCD v.7\nVERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 2\n"
-                 "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA ascii\n"),
-        (".ply", "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
-                 "property float intensity\nend_header\n"),
+        (
+            ".pcd",
+            "# .PCD v.7\nVERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 "
+            "1 1 1\nWIDTH 2\n"
+            "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA ascii\n",
+        ),
+        (
+            ".ply",
+            "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float "
+            "y\nproperty float z\n"
+            "property float intensity\nend_header\n",
+        ),
     ],
-)  # fmt: skip
+)
 def test_clouds_of_other_programs(tmp_path: Path, suffix: str, header: str) -> None:
     path = tmp_path / f"scan{suffix}"
     path.write_text(f"{header}1 2 3 51\n-4 5 6 255\n")
@@ -116,7 +126,9 @@ def test_clouds_of_other_programs(tmp_path: Path, suffix: str, header: str) -> N
 )
 def test_clouds_that_open3d_wrote(tmp_path: Path, suffix: str, options: dict[str, bool]) -> None:
     """Earlier versions of this package wrote PCD and PLY by open3d, with these names and types."""
-    open3d, scan, path = import_open3d(), some_scan(), tmp_path / f"scan{suffix}"
+    open3d = import_open3d()
+    scan = some_scan()
+    path = tmp_path / f"scan{suffix}"
     scan.confidence = scan.reflectance[::-1].copy()
     cloud = open3d.t.geometry.PointCloud()
     cloud.point["positions"] = open3d.core.Tensor(scan.points)
@@ -140,7 +152,8 @@ def test_clouds_that_open3d_wrote(tmp_path: Path, suffix: str, options: dict[str
 @needs_open3d
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
 def test_open3d_reads_our_clouds(tmp_path: Path, suffix: str) -> None:
-    open3d, scan = import_open3d(), some_scan()
+    open3d = import_open3d()
+    scan = some_scan()
     [path] = write_all(suffix[1:], tmp_path, [scan])
     cloud = open3d.t.io.read_point_cloud(str(path))
     assert same(cloud.point["positions"].numpy(), scan.points)
@@ -151,7 +164,8 @@ def test_open3d_reads_our_clouds(tmp_path: Path, suffix: str) -> None:
 
 def test_npz_preserves_all_fields(tmp_path: Path) -> None:
     scan = some_scan(sensor="os1_128")
-    scan.domain, scan.id = 1, "somewhere"
+    scan.domain = 1
+    scan.id = "somewhere"
     write_all("npz", tmp_path, [scan])
     read = back("npz", tmp_path)[0]
     assert read.sensor == scan.sensor and read.domain == 1 and same(read.pose, scan.pose)
@@ -193,9 +207,15 @@ def test_png_loses_only_what_is_documented(tmp_path: Path, sensor: str) -> None:
     for source in (back("png", tmp_path), open_scans(path)):
         assert isinstance(source, RangePNG)
         read = source.image(0)
-        assert read.sensor == image.sensor and same(read.mask, image.mask) and same(read.label, image.label)
+        assert (
+            read.sensor == image.sensor
+            and same(read.mask, image.mask)
+            and same(read.label, image.label)
+        )
         half_a_step = image.sensor.range_max / 65535 / 2
-        assert np.abs(read.range - image.range).max() <= half_a_step * 1.001 + np.spacing(image.range.max())
+        assert np.abs(read.range - image.range).max() <= half_a_step * 1.001 + np.spacing(
+            image.range.max()
+        )
         assert read.reflectance is not None and image.reflectance is not None
         assert np.abs(read.reflectance - image.reflectance).max() <= 8e-6
         assert same(source[0].label, project(scan).label[image.mask])  # type: ignore[index]
@@ -203,21 +223,29 @@ def test_png_loses_only_what_is_documented(tmp_path: Path, sensor: str) -> None:
 
 @pytest.mark.parametrize("convention", ["kitti", "nuscenes"])
 def test_range_images_with_six_values_per_cell(tmp_path: Path, convention: str) -> None:
-    """As other codes keep them: x, y, z, reflectance, range and class; nuScenes' turned by a quarter."""
+    """As other codes keep them: x, y, z, reflectance, range and class; nuScenes' turned by a
+    quarter."""
     sensor = {"kitti": "hdl64e_semantic_kitti", "nuscenes": "hdl32e_nuscenes"}[convention]
     scan = some_scan(sensor=sensor)
     index = locate(scan.points, scan.sensor).point
-    values = np.column_stack([scan.points, scan.reflectance, np.zeros(len(scan)), scan.label + np.uint8(1)])
+    values = np.column_stack(
+        [scan.points, scan.reflectance, np.zeros(len(scan)), scan.label + np.uint8(1)]
+    )
     stack = np.where(index[..., None] >= 0, values[index], 0).astype(np.float32)
     if convention == "nuscenes":
-        x, y, z, reflectance, _, _ = np.moveaxis(np.roll(stack, -stack.shape[1] // 4, axis=1), -1, 0)
+        x, y, z, reflectance, _, _ = np.moveaxis(
+            np.roll(stack, -stack.shape[1] // 4, axis=1), -1, 0
+        )
         stack = np.stack([-y, x, z, reflectance * 255, z, z], -1)
     stack[..., 4] = np.linalg.norm(stack[..., :3], axis=-1)
     np.savez(tmp_path / "a.npz", image=stack)
     source = open_scans(tmp_path, sensor=sensor)
     assert isinstance(source, RangeImages)
-    image, expected = source.image(0), project(scan)
-    assert same(image.mask, expected.mask) and same(source[0].points, scan.points[index[index >= 0]])
+    image = source.image(0)
+    expected = project(scan)
+    assert same(image.mask, expected.mask) and same(
+        source[0].points, scan.points[index[index >= 0]]
+    )
     assert (image.label is None) if convention == "nuscenes" else same(image.label, expected.label)
     assert image.reflectance is not None and expected.reflectance is not None
     np.testing.assert_allclose(image.reflectance, expected.reflectance, atol=1e-6)
@@ -230,7 +258,9 @@ def test_range_images_with_six_values_per_cell(tmp_path: Path, convention: str) 
 @pytest.mark.parametrize("shape", ["(H, W)", "(2, H, W)"])
 def test_range_images_as_plain_arrays(tmp_path: Path, shape: str) -> None:
     image = project(some_scan())
-    stack = image.range if shape == "(H, W)" else np.stack([image.range, image.channels["reflectance"]])
+    stack = (
+        image.range if shape == "(H, W)" else np.stack([image.range, image.channels["reflectance"]])
+    )
     np.save(tmp_path / "image.npy", stack)
     source = open_scans(tmp_path, sensor="hdl64e_kitti")
     assert isinstance(source, RangeImages) and same(source.image(0).range, image.range)
@@ -241,7 +271,11 @@ def test_range_images_have_the_sensor_and_the_origin_beside_them(tmp_path: Path)
     scan = some_scan(sensor="os1_64")
     image = project(scan)
     np.save(tmp_path / "image.npy", image.range)
-    said = {"format": "lidar-synth-scans/1", "sensor": "os1_64", "origins": [{"domain": "synthetic"}]}
+    said = {
+        "format": "lidar-synth-scans/1",
+        "sensor": "os1_64",
+        "origins": [{"domain": "synthetic"}],
+    }
     (tmp_path / "scans.json").write_text(json.dumps(said))
     for source in (open_scans(tmp_path), open_scans(tmp_path, sensor="os1_64")):
         [read] = source
@@ -256,19 +290,30 @@ def test_fields_of_other_types_are_written_in_those_of_files(tmp_path: Path, to:
     """Reflectances divided by 255 in numpy are float64. Projection takes points in float32 only."""
     scan = some_scan()
     kind = np.float32 if to == "range" else np.float64
-    wide = replace(scan, points=scan.points.astype(kind), reflectance=scan.reflectance.astype(np.float64),
-                   label=scan.label.astype(np.int64), raw_label=None)  # fmt: skip
+    wide = replace(
+        scan,
+        points=scan.points.astype(kind),
+        reflectance=scan.reflectance.astype(np.float64),
+        label=scan.label.astype(np.int64),
+        raw_label=None,
+    )
     write_all(to, tmp_path / "wide", [wide])
     write_all(to, tmp_path / "same", [replace(scan, raw_label=None)])
     [a], [b] = open_scans(tmp_path / "wide"), open_scans(tmp_path / "same")
-    assert same(a.points, b.points) and same(a.reflectance, b.reflectance) and same(a.label, b.label)
-    with pytest.raises(DataError, match="label holds 300; expected whole numbers that uint8 can hold"):
+    assert (
+        same(a.points, b.points) and same(a.reflectance, b.reflectance) and same(a.label, b.label)
+    )
+    with pytest.raises(
+        DataError, match="label holds 300; expected whole numbers that uint8 can hold"
+    ):
         write_all(to, tmp_path / "bad", [replace(wide, label=np.full(len(scan), 300))])
 
 
 def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:
     scan = some_scan()
-    values = np.column_stack([scan.points, scan.reflectance * 255, np.zeros(len(scan))]).astype(np.float32)
+    values = np.column_stack([scan.points, scan.reflectance * 255, np.zeros(len(scan))]).astype(
+        np.float32
+    )
     (tmp_path / "npy").mkdir()
     np.save(tmp_path / "npy" / "a.npy", values)
     values.tofile(tmp_path / "b.bin")
@@ -281,7 +326,9 @@ def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", WRITERS)
-def test_a_writer_recognises_complete_scans_and_leaves_no_other_files(tmp_path: Path, to: str) -> None:
+def test_a_writer_recognises_complete_scans_and_leaves_no_other_files(
+    tmp_path: Path, to: str
+) -> None:
     writer = WRITERS[to](tmp_path)
     assert not writer.complete(0)
     for index in range(2):
@@ -327,7 +374,10 @@ def test_splits(tmp_path: Path) -> None:
     writer = WRITERS["semantic_kitti"](tmp_path)
     for sequence in ("00", "08", "11"):
         writer.write(some_scan(count=40), 0, name=f"{sequence}/000000")
-    found = {split: [i[:2] for i in SemanticKITTI(tmp_path, split).ids] for split in ("train", "val", "test", "all")}
+    found = {
+        split: [i[:2] for i in SemanticKITTI(tmp_path, split).ids]
+        for split in ("train", "val", "test", "all")
+    }
     assert found == {"train": ["00"], "val": ["08"], "test": ["11"], "all": ["00", "08", "11"]}
     writer = WRITERS["kitti360"](tmp_path / "kitti360")
     for drive in range(11):
@@ -354,7 +404,9 @@ def test_image_sets_choose_the_frames(tmp_path: Path) -> None:
 
 def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
     frame = "2013_05_28_drive_0003_sync/0000000042"
-    found = {to: WRITERS[to](tmp_path).path(7, frame).relative_to(tmp_path).as_posix() for to in WRITERS}
+    found = {
+        to: WRITERS[to](tmp_path).path(7, frame).relative_to(tmp_path).as_posix() for to in WRITERS
+    }
     assert found == {
         "kitti": f"{frame}.bin",
         "semantic_kitti": "sequences/03/velodyne/000042.bin",
@@ -367,7 +419,9 @@ def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
         "png": f"range/{frame.replace('/', '_')}.png",
         "webdataset": f".lidar_synth/000000007/{frame}.tar",
     }
-    assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](tmp_path).path(7, frame)
+    assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](tmp_path).path(
+        7, frame
+    )
     assert WRITERS["semantic_kitti"](tmp_path, sequence="21").path(7, "my_scan").stem == "000007"  # type: ignore[call-arg]
 
 
@@ -376,4 +430,6 @@ def test_a_folder_of_npz_files_has_the_sensor_stored_in_them(tmp_path: Path) -> 
     WRITERS["npz"](tmp_path).write(random_scan(sensor, 500, seed=0), 0)
     assert open_scans(tmp_path).sensor == sensor
     (tmp_path / "000000.npz").write_bytes(b"")
-    assert open_scans(tmp_path).sensor.name == "hdl64e_kitti"  # what is wrong is said when it is read
+    assert (
+        open_scans(tmp_path).sensor.name == "hdl64e_kitti"
+    )  # what is wrong is said when it is read

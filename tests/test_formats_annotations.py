@@ -20,7 +20,8 @@ from lidar_synth.geometry.scan import Boxes, Scan
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
 def test_the_camera_is_read_back(tmp_path: Path, to: str) -> None:
-    camera, scan = some_camera(), some_scan()
+    camera = some_camera()
+    scan = some_scan()
     picture = np.random.default_rng(0).integers(0, 256, (260, 700, 3), np.uint8)
     writer = WRITERS[to](tmp_path, calibration=camera)
     writer.write(scan, 0, image=picture)
@@ -39,7 +40,9 @@ def test_the_camera_is_read_back(tmp_path: Path, to: str) -> None:
     again = tmp_path / "again" / path.relative_to(tmp_path)
     assert again.read_bytes() == path.read_bytes()
     for file in (f for f in (tmp_path / "again").rglob("*.txt") if "calib" in str(f)):
-        assert file.read_text() == (tmp_path / file.relative_to(tmp_path / "again")).read_text(), file
+        assert file.read_text() == (tmp_path / file.relative_to(tmp_path / "again")).read_text(), (
+            file
+        )
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
@@ -47,7 +50,9 @@ def test_without_a_camera_an_ideal_forward_camera_is_written(tmp_path: Path, to:
     write_all(to, tmp_path, [some_scan()])
     camera = back(to, tmp_path).calibration(0)
     assert camera is not None
-    pixels, depth = camera.pixels(np.array([(10, 0, 0), (10, -1, 0), (10, 0, 1), (-10, 0, 0)], np.float32))
+    pixels, depth = camera.pixels(
+        np.array([(10, 0, 0), (10, -1, 0), (10, 0, 1), (-10, 0, 0)], np.float32)
+    )
     assert depth[0] == pytest.approx(10) and np.isnan(pixels[3]).all()
     assert pixels[1, 0] > pixels[0, 0] and pixels[2, 1] < pixels[0, 1]
     if camera.image_size is not None:
@@ -61,7 +66,12 @@ def test_without_a_camera_an_ideal_forward_camera_is_written(tmp_path: Path, to:
 def test_all_semantic_kitti_labels_are_preserved(classes: list[int], instance: int) -> None:
     raw = np.array(classes, np.uint32) | np.uint32(instance << 16)
     known = decode_labels(raw, SEMANTIC_KITTI, "here")
-    scan = Scan(np.ones((len(raw), 3), np.float32), np.zeros(len(raw), np.float32), some_scan().sensor, **known)
+    scan = Scan(
+        np.ones((len(raw), 3), np.float32),
+        np.zeros(len(raw), np.float32),
+        some_scan().sensor,
+        **known,
+    )
     assert same(encode_labels(scan, SEMANTIC_KITTI), raw)
     # In another taxonomy the raw values mean nothing: the label is written, with the instance.
     other = encode_labels(scan, KITTI360_CLASSES)
@@ -73,7 +83,12 @@ def test_all_semantic_kitti_labels_are_preserved(classes: list[int], instance: i
 
 @given(arrays.arrays(np.uint8, st.integers(1, 30), elements=st.sampled_from([*range(19), IGNORE])))
 def test_labels_without_raw_values_are_written_as_static_classes(label: np.ndarray) -> None:
-    scan = Scan(np.ones((len(label), 3), np.float32), np.zeros(len(label), np.float32), some_scan().sensor, label=label)
+    scan = Scan(
+        np.ones((len(label), 3), np.float32),
+        np.zeros(len(label), np.float32),
+        some_scan().sensor,
+        label=label,
+    )
     raw = encode_labels(scan, SEMANTIC_KITTI)
     assert same(decode_labels(raw, SEMANTIC_KITTI, "here")["label"], label)
     assert (raw[label == IGNORE] == 0).all() and raw.max() < 100
@@ -112,10 +127,18 @@ def test_kitti360_labels_in_both_encodings(tmp_path: Path) -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 10_000))
-def test_kitti_label_lines_are_boxes_and_back(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    from lidar_synth.formats.kitti_labels import boxes_from_camera, boxes_to_camera, read_label_2, write_label_2
+def test_kitti_label_lines_are_boxes_and_back(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    from lidar_synth.formats.kitti_labels import (
+        boxes_from_camera,
+        boxes_to_camera,
+        read_label_2,
+        write_label_2,
+    )
 
-    boxes, camera = some_boxes(seed), some_camera()
+    boxes = some_boxes(seed)
+    camera = some_camera()
     floor, size, turn = boxes_to_camera(boxes.values, camera)
     again = boxes_from_camera(floor, size, turn, camera)
     np.testing.assert_allclose(again[:, :6], boxes.values[:, :6], atol=1e-4)
@@ -131,20 +154,26 @@ def test_kitti_label_lines_are_boxes_and_back(tmp_path_factory: pytest.TempPathF
 
 
 def test_a_kitti_label_line_by_hand(tmp_path: Path) -> None:
-    """An ideal camera: 1 m right, 2 m down, 10 m ahead is the floor's middle; rotation_y = 0 looks to the right."""
+    """An ideal camera: 1 m right, 2 m down, 10 m ahead is the floor's middle; rotation_y = 0 looks
+    to the right."""
     from lidar_synth.formats.calibration import ideal_camera
     from lidar_synth.formats.kitti_labels import read_label_2
 
     path = tmp_path / "a.txt"
-    path.write_text("Car 0.25 2 -0.10 10.00 20.00 30.00 40.00 1.50 1.60 4.00 1.00 2.00 10.00 0.00\n")
+    path.write_text(
+        "Car 0.25 2 -0.10 10.00 20.00 30.00 40.00 1.50 1.60 4.00 1.00 2.00 10.00 0.00\n"
+    )
     boxes = read_label_2(path, ideal_camera(700, (1200, 370)))
-    np.testing.assert_allclose(boxes.values, [(10, -1, -2 + 0.75, 4, 1.6, 1.5, -np.pi / 2)], atol=1e-6)
+    np.testing.assert_allclose(
+        boxes.values, [(10, -1, -2 + 0.75, 4, 1.6, 1.5, -np.pi / 2)], atol=1e-6
+    )
     assert (boxes.names, boxes.truncation[0], boxes.occlusion[0]) == (("Car",), 0.25, 2)
     assert same(boxes.image_box, [(10, 20, 30, 40)]) and boxes.alpha[0] == np.float32(-0.1)
 
 
 def test_pose_files_by_hand(tmp_path: Path) -> None:
-    """Two metres ahead: along the camera's z in SemanticKITTI; KITTI-360's IMU has its y to the right and z down."""
+    """Two metres ahead: along the camera's z in SemanticKITTI; KITTI-360's IMU has its y to the
+    right and z down."""
     scan = some_scan()
     scan.pose = np.eye(4)
     scan.pose[0, 3] = 2
@@ -153,7 +182,9 @@ def test_pose_files_by_hand(tmp_path: Path) -> None:
     line = np.loadtxt(tmp_path / "semantic_kitti" / "sequences" / "00" / "poses.txt")
     np.testing.assert_allclose(line, [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2], atol=1e-12)
     folder = tmp_path / "kitti360" / "data_poses" / "2013_05_28_drive_0000_sync"
-    np.testing.assert_allclose(np.loadtxt(folder / "poses.txt"), [0, 1, 0, 0, 2, 0, -1, 0, 0, 0, 0, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        np.loadtxt(folder / "poses.txt"), [0, 1, 0, 0, 2, 0, -1, 0, 0, 0, 0, -1, 0], atol=1e-12
+    )
     camera = [0, 0, 0, 1, 2, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1]
     np.testing.assert_allclose(np.loadtxt(folder / "cam0_to_world.txt"), camera, atol=1e-12)
 
@@ -161,7 +192,9 @@ def test_pose_files_by_hand(tmp_path: Path) -> None:
 def test_kitti_object_lists_boxes_in_the_cameras_view(tmp_path: Path) -> None:
     values = [(20, 0, -1, 4, 2, 1.5, 0), (-20, 0, -1, 4, 2, 1.5, 0), (20, 40, -1, 4, 2, 1.5, 0)]
     scan = some_scan()
-    scan.boxes = Boxes(np.array(values), ("Car", "Car", "Van"), dont_care=np.array([(1, 2, 30, 40)], np.float32))
+    scan.boxes = Boxes(
+        np.array(values), ("Car", "Car", "Van"), dont_care=np.array([(1, 2, 30, 40)], np.float32)
+    )
     write_all("kitti_object", tmp_path, [scan], calibration=some_camera())
     read = KITTIObject(tmp_path, "train")[0].boxes
     assert read is not None and read.names == ("Car",) and same(read.dont_care, [(1, 2, 30, 40)])
@@ -185,15 +218,26 @@ def test_kitti360_boxes_survive_the_conversion_to_the_world_frame(
     write_all("kitti360", root, scans, calibration=some_camera())
     for scan, expected in zip(KITTI360(root), scans, strict=True):
         assert scan.boxes is not None and expected.boxes is not None
-        np.testing.assert_allclose(scan.boxes.values[:, :6], expected.boxes.values[:, :6], atol=1e-4)
-        np.testing.assert_allclose(np.cos(scan.boxes.values[:, 6] - expected.boxes.values[:, 6]), 1, atol=1e-6)
+        np.testing.assert_allclose(
+            scan.boxes.values[:, :6], expected.boxes.values[:, :6], atol=1e-4
+        )
+        np.testing.assert_allclose(
+            np.cos(scan.boxes.values[:, 6] - expected.boxes.values[:, 6]), 1, atol=1e-6
+        )
         assert scan.boxes.names == expected.boxes.names
         assert (scan.boxes.instance % 1000 == expected.boxes.instance).all()
     again = list(KITTI360(root))
     write_all("kitti360", root / "again", again)
     for scan, expected in zip(KITTI360(root / "again"), again, strict=True):
-        assert scan.boxes is not None and expected.boxes is not None and same(scan.instance, expected.instance)
-        assert same(scan.boxes.instance, expected.boxes.instance) and (scan.boxes.instance >= 24_000).all()
+        assert (
+            scan.boxes is not None
+            and expected.boxes is not None
+            and same(scan.instance, expected.instance)
+        )
+        assert (
+            same(scan.boxes.instance, expected.boxes.instance)
+            and (scan.boxes.instance >= 24_000).all()
+        )
 
 
 def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> None:
@@ -202,7 +246,8 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
     entry = (
         "<object{0}><index>{0}</index><label>{1}</label>{2}<instanceId>7</instanceId><start_frame>500</start_frame>"
         "<end_frame>700</end_frame><timestamp>{3}</timestamp><transform><rows>4</rows><cols>4</cols><dt>d</dt><data>"
-        "0 -2 0 10 4 0 0 0 0 0 1.5 0 0 0 0 1</data></transform><vertices><data>{4}</data></vertices></object{0}>"
+        "0 -2 0 10 4 0 0 0 0 0 1.5 0 0 0 0 "
+        "1</data></transform><vertices><data>{4}</data></vertices></object{0}>"
     )
     cube = " ".join(str(v) for corner in np.ndindex(2, 2, 2) for v in np.array(corner) - 0.5)
     objects = [
@@ -214,7 +259,9 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
     path.write_text(f"<opencv_storage>{''.join(objects)}</opencv_storage>")
     boxes = read_boxes(path)
     assert boxes.at(600, np.eye(4), 80).names == ("Car", "Pedestrian")
-    np.testing.assert_allclose(boxes.at(600, np.eye(4), 80).values[0], (10, 0, 0, 4, 2, 1.5, np.pi / 2), atol=1e-6)
+    np.testing.assert_allclose(
+        boxes.at(600, np.eye(4), 80).values[0], (10, 0, 0, 4, 2, 1.5, np.pi / 2), atol=1e-6
+    )
     assert boxes.at(600, np.eye(4), 80).instance.tolist() == [26007, 24007]
     assert boxes.at(700 + MARGIN, np.eye(4), 80).names == ("Car",)
     assert len(boxes.at(701 + MARGIN, np.eye(4), 80)) == len(boxes.at(600, a_pose(), 80)) == 0
@@ -225,7 +272,9 @@ def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -
     first, second, third = (scan.boxes for scan in open_scans(tmp_path))
     assert first is not None and len(first) == 0 and second is not None and third is not None
     assert third.names == ("Person_sitting",)
-    np.testing.assert_allclose(third.values[0], (10, 1, -0.9, 0.9, 0.8, 1.2, 5 - 2 * np.pi), atol=1e-5)
+    np.testing.assert_allclose(
+        third.values[0], (10, 1, -0.9, 0.9, 0.8, 1.2, 5 - 2 * np.pi), atol=1e-5
+    )
     assert (third.occlusion[0], third.truncation[0], third.instance[0]) == (1, 0, 0)
 
 
@@ -239,5 +288,9 @@ def test_nuscenes_labels_are_dropped_with_their_points(tmp_path: Path) -> None:
         points, classes = nuscenes_arrays(seed=i)
         kept = np.linalg.norm(points[:, :3], axis=1) >= 1
         assert 0 < kept.sum() < len(points)
-        assert same(scan.points, np.column_stack([points[kept, 1], -points[kept, 0], points[kept, 2]]))
-        assert same(scan.ring, 31 - points[kept, 4]) and same(scan.label, NUSCENES.decode(classes[kept]))
+        assert same(
+            scan.points, np.column_stack([points[kept, 1], -points[kept, 0], points[kept, 2]])
+        )
+        assert same(scan.ring, 31 - points[kept, 4]) and same(
+            scan.label, NUSCENES.decode(classes[kept])
+        )

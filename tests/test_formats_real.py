@@ -1,4 +1,5 @@
-"""Readers and writers on real scans: what the datasets' own files hold, and that nothing is lost on the way back."""
+"""Readers and writers on real scans: what the datasets' own files hold, and that nothing is lost on
+the way back."""
 
 import csv
 import json
@@ -10,7 +11,15 @@ import pytest
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.formats import KITTI360, WRITERS, KITTIObject, KITTIRaw, NuScenes, SemanticKITTI, open_scans
+from lidar_synth.formats import (
+    KITTI360,
+    WRITERS,
+    KITTIObject,
+    KITTIRaw,
+    NuScenes,
+    SemanticKITTI,
+    open_scans,
+)
 from lidar_synth.formats.kitti360 import SPLITS
 from lidar_synth.formats.kitti_labels import boxes_to_camera
 from lidar_synth.formats.range_images import RangeImages
@@ -71,20 +80,30 @@ def test_every_scan_agrees_with_the_manifest(real_scans: Path) -> None:
     read = set()
     for path, scan in scan_files(real_scans):
         for column, value in facts(scan).items():
-            assert value == pytest.approx(float(rows[path][column]), abs=0.0051), f"{path}: {column}"
+            assert value == pytest.approx(float(rows[path][column]), abs=0.0051), (
+                f"{path}: {column}"
+            )
         read.add(path)
         if scan.label is None:
             continue
         labels = path.replace("velodyne", "labels").replace(".bin", ".label")
         for column, value in label_facts(scan).items():
-            assert value == pytest.approx(float(rows[labels][column]), abs=0.00051), f"{labels}: {column}"
+            assert value == pytest.approx(float(rows[labels][column]), abs=0.00051), (
+                f"{labels}: {column}"
+            )
         read.add(labels)
     # nuScenes' sweep is read without what stands at the sensor, so its row is checked below.
-    assert read == {file for file in rows if file.endswith((".bin", ".label")) and not file.startswith("nuscenes")}
+    assert read == {
+        file
+        for file in rows
+        if file.endswith((".bin", ".label")) and not file.startswith("nuscenes")
+    }
 
 
 def test_every_dataset_is_recognised_by_its_root(real_scans: Path) -> None:
-    found = {root.name: type(open_scans(root)).__name__ for root in real_scans.iterdir() if root.is_dir()}
+    found = {
+        root.name: type(open_scans(root)).__name__ for root in real_scans.iterdir() if root.is_dir()
+    }
     assert found == {
         "kitti360": "KITTI360",
         "semantic_kitti": "SemanticKITTI",
@@ -92,12 +111,15 @@ def test_every_dataset_is_recognised_by_its_root(real_scans: Path) -> None:
         "kitti_raw": "KITTIRaw",
         "nuscenes": "NuScenes",
     }
-    assert isinstance(open_scans(real_scans / "semantic_kitti" / "range_images_64x1024"), RangeImages)
+    assert isinstance(
+        open_scans(real_scans / "semantic_kitti" / "range_images_64x1024"), RangeImages
+    )
     assert isinstance(open_scans(real_scans / "nuscenes" / "range_images_32x1024"), RangeImages)
 
 
 def test_kitti360_poses_are_those_of_camera_0(real_scans: Path) -> None:
-    """poses.txt with the calibration has to agree with cam0_to_world.txt, which the dataset made from it."""
+    """poses.txt with the calibration has to agree with cam0_to_world.txt, which the dataset made
+    from it."""
     source = KITTI360(real_scans / "kitti360")
     camera = source.calibration(0)
     assert camera is not None and camera.image_size == (1408, 376)
@@ -107,7 +129,9 @@ def test_kitti360_poses_are_those_of_camera_0(real_scans: Path) -> None:
     assert {scan.id for scan in posed} == set(expected) and len(posed) == 11
     for scan in posed:
         assert scan.pose is not None
-        np.testing.assert_allclose(scan.pose @ camera.sensor_from_camera, expected[scan.id], atol=2e-3)
+        np.testing.assert_allclose(
+            scan.pose @ camera.sensor_from_camera, expected[scan.id], atol=2e-3
+        )
 
 
 def test_kitti360_points_fall_into_the_image(real_scans: Path) -> None:
@@ -122,16 +146,33 @@ def test_kitti360_points_fall_into_the_image(real_scans: Path) -> None:
 
 @pytest.mark.parametrize(
     ("frame", "filled"),
-    [(100, 11), (360, 5), (570, 1), (729, 3), (947, 8), (1134, 7), (1461, 10), (1597, 6), (1866, 0), (2449, 137),
-     (2903, 3), (2939, 4)],
-)  # fmt: skip
-def test_kitti360_boxes_of_cars_contain_their_points(real_scans: Path, frame: int, filled: int) -> None:
-    """The boxes there are corners in camera 0's frame, which the calibration has to bring into the sensor's."""
+    [
+        (100, 11),
+        (360, 5),
+        (570, 1),
+        (729, 3),
+        (947, 8),
+        (1134, 7),
+        (1461, 10),
+        (1597, 6),
+        (1866, 0),
+        (2449, 137),
+        (2903, 3),
+        (2939, 4),
+    ],
+)
+def test_kitti360_boxes_of_cars_contain_their_points(
+    real_scans: Path, frame: int, filled: int
+) -> None:
+    """The boxes there are corners in camera 0's frame, which the calibration has to bring into the
+    sensor's."""
     source = KITTI360(real_scans / "kitti360")
     camera = source.calibration(0)
     assert camera is not None
     to_sensor = camera.matrices["cam_to_velo"].reshape(3, 4)
-    objects = json.loads((real_scans / "kitti360" / "bboxes_3D_cam0" / f"BBoxes_{frame}.json").read_text())
+    objects = json.loads(
+        (real_scans / "kitti360" / "bboxes_3D_cam0" / f"BBoxes_{frame}.json").read_text()
+    )
     corners = np.array([o["corners_cam0"] for o in objects]) @ to_sensor[:, :3].T + to_sensor[:, 3]
     centre = corners.mean(axis=1)
     # The corners' principal axes are the box's: length first, then width, then height.
@@ -141,11 +182,22 @@ def test_kitti360_boxes_of_cars_contain_their_points(real_scans: Path, frame: in
     flat = np.array([[a for a in range(3) if a != up] for up in upright])
     rows = np.arange(len(axes))
     ahead = axes[rows, flat[:, 0]]
-    values = np.column_stack([centre, size[rows, flat[:, 0]], size[rows, flat[:, 1]], size[rows, upright],
-                              np.arctan2(ahead[:, 1], ahead[:, 0])])  # fmt: skip
+    values = np.column_stack(
+        [
+            centre,
+            size[rows, flat[:, 0]],
+            size[rows, flat[:, 1]],
+            size[rows, upright],
+            np.arctan2(ahead[:, 1], ahead[:, 0]),
+        ]
+    )
     near = np.linalg.norm(centre, axis=1) < 60
     [scan] = [s for s in source if s.id.endswith(f"{frame:010d}")]
-    counts = Boxes(values[near], ["Car"] * int(near.sum())).contain(scan.points, above_floor=0.3).sum(axis=1)
+    counts = (
+        Boxes(values[near], ["Car"] * int(near.sum()))
+        .contain(scan.points, above_floor=0.3)
+        .sum(axis=1)
+    )
     assert abs(int((counts >= 10).sum()) - filled) <= (1 if filled < 100 else 3)
 
 
@@ -157,7 +209,8 @@ OBJECT_COUNTS = {
     "training/000623": [5186, 945, 2216, 303, 26, 142, 50, 0],
     "training/001206": [919, 4936, 12618, 2245, 151, 135, 80, 82],
 }
-"""Points at least 0.3 m above the floor of each labelled box, counted in the camera's frame, where it was labelled."""
+"""Points at least 0.3 m above the floor of each labelled box, counted in the camera's frame, where
+it was labelled."""
 
 
 @pytest.mark.parametrize("reduced", [False, True])
@@ -167,13 +220,20 @@ def test_kitti_boxes_hold_their_points(real_scans: Path, reduced: bool) -> None:
         camera = source.calibration(index)
         assert scan.boxes is not None and camera is not None
         floor, size, turn = boxes_to_camera(scan.boxes.values, camera)
-        points = scan.points @ camera.camera_from_sensor[:3, :3].T + camera.camera_from_sensor[:3, 3]
+        points = (
+            scan.points @ camera.camera_from_sensor[:3, :3].T + camera.camera_from_sensor[:3, 3]
+        )
         for box in range(len(scan.boxes)):
             right, down, ahead = (points - floor[box]).T
             along = right * np.cos(turn[box]) - ahead * np.sin(turn[box])
             across = right * np.sin(turn[box]) + ahead * np.cos(turn[box])
             height, width, length = size[box]
-            inside = (abs(along) <= length / 2) & (abs(across) <= width / 2) & (-down >= 0.3) & (-down <= height)
+            inside = (
+                (abs(along) <= length / 2)
+                & (abs(across) <= width / 2)
+                & (-down >= 0.3)
+                & (-down <= height)
+            )
             assert int(inside.sum()) == pytest.approx(OBJECT_COUNTS[scan.id][box], abs=1)
         # In the sensor's frame the boxes stand upright against another axis, about a degree off.
         upright = scan.boxes.contain(scan.points, above_floor=0.3).sum(axis=1)
@@ -188,7 +248,9 @@ def test_kitti_label_files_are_written_back_as_they_were(real_scans: Path, tmp_p
             writer.write(scan, index, name=scan.id, calibration=source.calibration(index))
             for folder in ("label_2", "calib") if scan.id.startswith("training") else ("calib",):
                 path = Path(*scan.id.split("/")[:1], folder, f"{scan.id.split('/')[1]}.txt")
-                assert (tmp_path / path).read_text().strip() == (real_scans / "kitti_object" / path).read_text().strip()
+                assert (tmp_path / path).read_text().strip() == (
+                    real_scans / "kitti_object" / path
+                ).read_text().strip()
     writer.finish()
     assert (tmp_path / "ImageSets" / "test.txt").read_text() == "000007\n"
 
@@ -198,13 +260,16 @@ def test_kitti_tracklets_hold_their_points(real_scans: Path) -> None:
     boxes = by_drive["2011_09_26_drive_0001_sync"].boxes
     assert boxes is not None
     assert boxes.names == ("Car", "Car", "Car", "Tram", "Car")
-    counts = boxes.contain(by_drive["2011_09_26_drive_0001_sync"].points, above_floor=0.15).sum(axis=1)
+    counts = boxes.contain(by_drive["2011_09_26_drive_0001_sync"].points, above_floor=0.15).sum(
+        axis=1
+    )
     assert counts.tolist() == [589, 69, 46, 12, 15]
     assert by_drive["2011_09_30_drive_0027_sync"].boxes is None
 
 
 def test_nuscenes_is_turned_into_the_packages_frame(real_scans: Path) -> None:
-    """Its own boxes, turned by the same axes, have to hold the number of points that nuScenes states."""
+    """Its own boxes, turned by the same axes, have to hold the number of points that nuScenes
+    states."""
     [scan] = NuScenes(real_scans / "nuscenes")
     assert len(scan) == 34_688 - 8_029 and scan.ring is not None
     elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1)))
@@ -212,9 +277,13 @@ def test_nuscenes_is_turned_into_the_packages_frame(real_scans: Path) -> None:
     assert medians == sorted(medians, reverse=True)
     assert (medians[0], medians[-1]) == pytest.approx((10.7, -30.6), abs=0.1)
     assert np.array_equal(scan.reflectance * 255, np.round(scan.reflectance * 255))
-    info = json.loads((real_scans / "nuscenes" / "info.json").read_text())["data_list"][0]["instances"]
+    info = json.loads((real_scans / "nuscenes" / "info.json").read_text())["data_list"][0][
+        "instances"
+    ]
     x, y, z, length, width, height, yaw = np.array([i["bbox_3d"] for i in info]).T
-    boxes = Boxes(np.column_stack([y, -x, z, length, width, height, yaw - np.pi / 2]), ["Car"] * len(x))
+    boxes = Boxes(
+        np.column_stack([y, -x, z, length, width, height, yaw - np.pi / 2]), ["Car"] * len(x)
+    )
     stated = np.array([i["num_lidar_pts"] for i in info])
     found = boxes.contain(scan.points).sum(axis=1)
     assert (found == stated).sum() == 61 and np.abs(found - stated).max() <= 16
@@ -224,7 +293,9 @@ def test_range_images_of_other_code_are_read_as_they_are(real_scans: Path) -> No
     source = open_scans(real_scans / "semantic_kitti" / "range_images_64x1024")
     assert isinstance(source, RangeImages)
     image = source.image(0)
-    stack = np.load(real_scans / "semantic_kitti" / "range_images_64x1024" / "00_000000.npz")["image"]
+    stack = np.load(real_scans / "semantic_kitti" / "range_images_64x1024" / "00_000000.npz")[
+        "image"
+    ]
     assert image.mask.sum() == 51_770 and np.array_equal(image.range, stack[..., 4])
     assert image.reflectance is not None and np.array_equal(image.reflectance, stack[..., 3])
     [own] = [s for s in SemanticKITTI(real_scans / "semantic_kitti") if s.id == "00/000000"]
@@ -239,7 +310,8 @@ def test_range_images_of_nuscenes_are_turned(real_scans: Path, name: str) -> Non
     path = real_scans / "nuscenes" / "range_images_32x1024" / f"{name}.npz"
     source = open_scans(path, sensor="hdl32e_nuscenes")
     assert isinstance(source, RangeImages)
-    image, scan = source.image(0), source[0]
+    image = source.image(0)
+    scan = source[0]
     assert image.mask.sum() == len(scan) == {"train_0": 25_175, "val_25611": 19_304}[name]
     assert image.label is None
     # Spherical projection on the package's own grid finds the columns where the file has them.
@@ -251,13 +323,17 @@ def test_range_images_of_nuscenes_are_turned(real_scans: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("to", ["kitti", "semantic_kitti", "kitti_object", "kitti360", "npz"])
-def test_real_scans_survive_every_lossless_layout(real_scans: Path, tmp_path: Path, to: str) -> None:
+def test_real_scans_survive_every_lossless_layout(
+    real_scans: Path, tmp_path: Path, to: str
+) -> None:
     source = SemanticKITTI(real_scans / "semantic_kitti")
     # Without boxes, scans are no training scans of a detector.
     writer = WRITERS[to](tmp_path, **({"part": "testing"} if to == "kitti_object" else {}))
     picked = [i for i, name in enumerate(source.ids) if name[:2] in ("04", "06")]
     for index in picked:
-        writer.write(source[index], index, name=source.ids[index], calibration=source.calibration(index))
+        writer.write(
+            source[index], index, name=source.ids[index], calibration=source.calibration(index)
+        )
     writer.finish()
     back = open_scans(tmp_path)
     assert len(back) == len(picked)
@@ -277,8 +353,11 @@ def test_real_scans_survive_every_lossless_layout(real_scans: Path, tmp_path: Pa
 
 
 def test_moving_classes_and_instances_are_kept_apart(real_scans: Path) -> None:
-    moving = [s for s in SemanticKITTI(real_scans / "semantic_kitti") if s.raw_label is not None
-              and ((s.raw_label & 0xFFFF) >= 252).any()]  # fmt: skip
+    moving = [
+        s
+        for s in SemanticKITTI(real_scans / "semantic_kitti")
+        if s.raw_label is not None and ((s.raw_label & 0xFFFF) >= 252).any()
+    ]
     assert moving
     for scan in moving:
         assert scan.raw_label is not None and scan.label is not None

@@ -1,6 +1,7 @@
 """The readers under mutated files: a share of what ``tools/fuzz.py`` runs, and the harness itself.
 
-Whatever a file holds, a reader gives a sound result or one of the package's errors, in less than 500 MB and 5 seconds.
+Whatever a file holds, a reader gives a sound result or one of the package's errors, in less than
+500 MB and 5 seconds.
 """
 
 import importlib
@@ -42,7 +43,9 @@ EXEMPT: dict[str, str] = {}
 @pytest.mark.parametrize("name", TARGETS)
 def test_mutated_files_are_read_soundly_or_refused(name: str) -> None:
     report = fuzz(name, TARGETS[name], range(CASES))
-    found = "\n".join(f"python tools/fuzz.py --reader {name} --case {f.number}: {f}" for f in report.flaws)
+    found = "\n".join(
+        f"python tools/fuzz.py --reader {name} --case {f.number}: {f}" for f in report.flaws
+    )
     assert not report.flaws, found
     assert report.cases == CASES and report.counts[REFUSED] > CASES / 8
 
@@ -63,7 +66,9 @@ def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
         cases.restore()
         return found
 
-    first, second, other = (Cases(name, TARGETS[name], s, tmp_path / d) for s, d in ((0, "a"), (0, "b"), (1, "c")))
+    first, second, other = (
+        Cases(name, TARGETS[name], s, tmp_path / d) for s, d in ((0, "a"), (0, "b"), (1, "c"))
+    )
     assert first.files == second.files == other.files
     forwards = [contents(first, number) for number in range(8)]
     backwards = [contents(second, number) for number in reversed(range(8))][::-1]
@@ -78,7 +83,8 @@ def test_mutators_read_the_valid_files_and_change_them(tmp_path: Path, name: str
     """One that always raised would be replaced by flipped bits without a word."""
     files = seed_files(TARGETS[name], tmp_path / "valid")
     for file in mutable(TARGETS[name], files):
-        content, known = files[file], mutators.BY_SUFFIX.get(Path(file).suffix)
+        content = files[file]
+        known = mutators.BY_SUFFIX.get(Path(file).suffix)
         assert known, f"no mutator knows {file}"
         for mutator in [*known, *mutators.BY_SUFFIX[""]]:
             made = [mutator(content, Random(number)) for number in range(8)]
@@ -171,7 +177,9 @@ def test_what_a_broken_reader_does_is_noticed(reader: Any, verdict: str, detail:
 
 
 def test_a_harness_that_fails_is_no_verdict() -> None:
-    with pytest.raises(RuntimeError, match=r"broken: the harness failed \(exit status 1\)(.|\n)*KeyError"):
+    with pytest.raises(
+        RuntimeError, match=r"broken: the harness failed \(exit status 1\)(.|\n)*KeyError"
+    ):
         fuzz("broken", Target(only_numbers, partial(dict.__getitem__, {})), range(1))
 
 
@@ -202,8 +210,21 @@ def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "tools"))
     tool = importlib.import_module("fuzz")
     monkeypatch.setitem(TARGETS, "broken", Target(only_numbers, raises))
-    monkeypatch.setattr(sys, "argv", ["fuzz.py", "--cases", "4", "--reader", "bin", "--reader", "broken",
-                                      "--keep", str(tmp_path)])  # fmt: skip
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "fuzz.py",
+            "--cases",
+            "4",
+            "--reader",
+            "bin",
+            "--reader",
+            "broken",
+            "--keep",
+            str(tmp_path),
+        ],
+    )
     with pytest.raises(SystemExit) as ended:
         tool.main()
     assert ended.value.code == 1
@@ -212,6 +233,8 @@ def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
     assert "| broken | 4 | 0 | 0 | 0 | 0 | 4 | 0 |" in printed
     assert "broken --seed 0 --case [0, 1, 2]: 4 x foreign error: \"KeyError: 'x'\"" in printed
     assert not is_valid(tmp_path / "broken" / "0-0" / "case")
-    monkeypatch.setattr(sys, "argv", ["fuzz.py", "--reader", "bin", "--case", "0", "--keep", str(tmp_path)])
+    monkeypatch.setattr(
+        sys, "argv", ["fuzz.py", "--reader", "bin", "--case", "0", "--keep", str(tmp_path)]
+    )
     with pytest.raises(DataError):
         tool.main()

@@ -1,4 +1,5 @@
-"""The generator: a scan is a function of (checkpoint, condition, grid, seed, index); invalid requests are refused."""
+"""The generator: a scan is a function of (checkpoint, condition, grid, seed, index); invalid
+requests are refused."""
 
 from dataclasses import replace
 from functools import partial
@@ -50,7 +51,9 @@ def generator(path: Path) -> Generator:
     return load_generator(path)
 
 
-def test_images_are_the_solution_of_the_flow_from_the_documented_noise(generator: Generator) -> None:
+def test_images_are_the_solution_of_the_flow_from_the_documented_noise(
+    generator: Generator,
+) -> None:
     noise = gaussian(5, [3, 9], (generator.tensors.size, *SENSOR.shape))
     with torch.inference_mode():
         expected = generator.tensors.to_images(solve(generator.network, noise, GRID), SENSOR)
@@ -88,7 +91,9 @@ def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
     assert len(scan) == image.mask.sum()
     assert np.array_equal(scan.label, image.label[image.mask])
     assert np.array_equal(scan.confidence, image.channels["confidence"][image.mask])
-    assert np.array_equal(project(scan).mask, image.mask)  # every return is projected into its own cell
+    assert np.array_equal(
+        project(scan).mask, image.mask
+    )  # every return is projected into its own cell
 
 
 def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
@@ -104,9 +109,12 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator)
     own = len(GRID) - 1
     assert own == 3
     for made_by, steps, solver, grid in (
-        (generator, 2, "euler", uniform_grid(2)), (generator, 5, "heun", uniform_grid(5)),
-        (generator, own, "euler", GRID), (trained, 2, "euler", known), (trained, 5, "euler", uniform_grid(5)),
-    ):  # fmt: skip
+        (generator, 2, "euler", uniform_grid(2)),
+        (generator, 5, "heun", uniform_grid(5)),
+        (generator, own, "euler", GRID),
+        (trained, 2, "euler", known),
+        (trained, 5, "euler", uniform_grid(5)),
+    ):
         [tensor] = made_by.samples(0, [0], steps=steps, solver=solver)
         with torch.inference_mode():
             assert torch.allclose(tensor, solve(generator.network, noise, grid, solver), atol=1e-5)
@@ -117,7 +125,9 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator)
 
 
 @pytest.mark.parametrize("channels", [("range",), ("range", "reflectance")])
-def test_scans_have_the_channels_of_the_checkpoint(channels: tuple[str, ...], tmp_path: Path) -> None:
+def test_scans_have_the_channels_of_the_checkpoint(
+    channels: tuple[str, ...], tmp_path: Path
+) -> None:
     generator = load_generator(write(tmp_path / "few.safetensors", channels))
     [image], [scan] = generator.range_images(0, [0]), generator.scans(0, [0])
     assert set(image.channels) == set(channels) - {"range"}
@@ -132,10 +142,14 @@ def test_lower_precision_stays_close(path: Path, generator: Generator) -> None:
 
 
 def label_maps(count: int) -> np.ndarray:
-    return np.random.default_rng(0).choice([0, 8, 18, IGNORE], (count, *SENSOR.shape)).astype(np.uint8)
+    return (
+        np.random.default_rng(0).choice([0, 8, 18, IGNORE], (count, *SENSOR.shape)).astype(np.uint8)
+    )
 
 
-def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(tmp_path: Path, generator: Generator) -> None:
+def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(
+    tmp_path: Path, generator: Generator
+) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     many = label_maps(3)
     same = conditioned.range_images(0, [4, 4], many[0])
@@ -144,7 +158,9 @@ def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(tmp_path: Pa
     [third] = conditioned.range_images(0, [4], {"semantic": many[2], "camera": None})
     assert np.allclose(images[2].range, third.range, atol=1e-3)
     assert not np.allclose(images[0].range, third.range, atol=1e-3)
-    with pytest.raises(DataError, match=r"of shape \(8, 16\); expected \(8, 32\) for all scans, or \(1, 8, 32\)"):
+    with pytest.raises(
+        DataError, match=r"of shape \(8, 16\); expected \(8, 32\) for all scans, or \(1, 8, 32\)"
+    ):
         conditioned.scans(0, [0], np.zeros((8, 16), np.uint8))
     with pytest.raises(DataError, match="no condition for 'conditioned'"):
         conditioned.scans(0, [0])
@@ -154,7 +170,9 @@ def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(tmp_path: Pa
 
 
 def test_a_label_map_also_labels_the_generated_scan(tmp_path: Path, generator: Generator) -> None:
-    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range", "reflectance"), 0.0))
+    conditioned = load_generator(
+        write(tmp_path / "conditioned.safetensors", ("range", "reflectance"), 0.0)
+    )
     assert conditioned.fields == {"reflectance", "label", "confidence"} == generator.fields
     [labels] = label_maps(1)
     [image], [scan] = conditioned.range_images(0, [1], labels), conditioned.scans(0, [1], labels)
@@ -168,7 +186,9 @@ def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
     maps = np.stack([bridged(project(scan, SENSOR, ["label"]).channels["label"]) for scan in scans])
-    for a, b in zip(conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True):
+    for a, b in zip(
+        conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True
+    ):
         assert np.array_equal(a.points, b.points)
     [a], [b] = conditioned.scans(0, [1], scans[1]), conditioned.scans(0, [1], maps[1])
     assert np.array_equal(a.points, b.points)
@@ -177,14 +197,17 @@ def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    labels = np.where(rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))).astype(np.uint8)
+    labels = np.where(rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))).astype(
+        np.uint8
+    )
     given = labels.copy()
     made = bridged(labels)
     assert np.array_equal(labels, given)
     for row, out in zip(labels, made, strict=True):
         known = np.flatnonzero(row != IGNORE)
         for i in np.flatnonzero(row == IGNORE):
-            left, right = ((i - known) % 64).min(), ((known - i) % 64).min()
+            left = ((i - known) % 64).min()
+            right = ((known - i) % 64).min()
             wanted = IGNORE
             if left + right - 1 <= GAP:
                 wanted = row[(i - left) % 64] if left <= right else row[(i + right) % 64]
@@ -204,7 +227,10 @@ def test_guidance_interpolates_between_blank_and_given_condition(tmp_path: Path)
     many = torch.cat(list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0)))
     assert torch.allclose(many[0], more[0], atol=1e-4)
     never = load_generator(write(tmp_path / "never.safetensors", ("range",), 0.0))
-    with pytest.raises(ConfigError, match="guidance 2.0 for 'never'; expected 1: .*trained without blank conditions"):
+    with pytest.raises(
+        ConfigError,
+        match="guidance 2.0 for 'never'; expected 1: .*trained without blank conditions",
+    ):
         never.scans(0, [1], maps[0], guidance=2.0)
 
 
@@ -213,11 +239,15 @@ def test_models_are_found_by_shipped_name_or_by_path(
 ) -> None:
     (tmp_path / "weights").mkdir()
     monkeypatch.setattr(module, "files", lambda package: tmp_path)
-    with pytest.raises(ConfigError, match=r"model 'town'; expected a shipped one \(none in this installation\)"):
+    with pytest.raises(
+        ConfigError, match=r"model 'town'; expected a shipped one \(none in this installation\)"
+    ):
         load_generator("town")
     (tmp_path / "weights" / "town.safetensors").write_bytes(path.read_bytes())
     assert load_generator("town").scans(0, [1])[0].id == "town/0/1"
-    with pytest.raises(ConfigError, match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file"):
+    with pytest.raises(
+        ConfigError, match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file"
+    ):
         load_generator("city")
     with pytest.raises(FileError, match="nowhere"):
         load_generator(tmp_path / "nowhere.safetensors")
@@ -226,11 +256,25 @@ def test_models_are_found_by_shipped_name_or_by_path(
 
 
 CODECS = {
-    "vqvae": {"latent_channels": 4, "codes": 16, "width": 8, "multipliers": [1, 2], "strides": [[1, 2]], "blocks": 1,
-              "attention": False, "groups": 4},
+    "vqvae": {
+        "latent_channels": 4,
+        "codes": 16,
+        "width": 8,
+        "multipliers": [1, 2],
+        "strides": [[1, 2]],
+        "blocks": 1,
+        "attention": False,
+        "groups": 4,
+    },
     "autoencoder": {"latent_channels": 4, "widths": [8, 16], "depth": 2, "fine": 4},
-    "surfaces": {"latent_channels": 4, "encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
-}  # fmt: skip
+    "surfaces": {
+        "latent_channels": 4,
+        "encoder_widths": [8, 8],
+        "widths": [8, 8],
+        "reaches": [1],
+        "depth": 1,
+    },
+}
 
 
 def write_latent(path: Path, architecture: str) -> Path:
@@ -238,25 +282,45 @@ def write_latent(path: Path, architecture: str) -> Path:
     given = {"resolution": SENSOR.shape, "channels": 7}
     codec = NetworkSpec(architecture, given | CODECS[architecture])
     torch.manual_seed(0)
-    needed = {"angles": torch.from_numpy(SENSOR.ray_angles())} if NETWORKS[architecture].needs_ray_angles else {}
+    needed = (
+        {"angles": torch.from_numpy(SENSOR.ray_angles())}
+        if NETWORKS[architecture].needs_ray_angles
+        else {}
+    )
     autoencoder = build_network(architecture, codec.arguments | needed)
     channels, *resolution = autoencoder.latent_shape
-    arguments = {"resolution": resolution, "channels": channels, "width": 16, "time_width": 16, "depths": (1,),
-                 "heads": (2,), "patch": (1, 1), "window": (1, 1)}  # fmt: skip
+    arguments = {
+        "resolution": resolution,
+        "channels": channels,
+        "width": 16,
+        "time_width": 16,
+        "depths": (1,),
+        "heads": (2,),
+        "patch": (1, 1),
+        "window": (1, 1),
+    }
     flow = build_network("hdit", arguments | {"angles": torch.zeros(2, *resolution)})
     header = Header(
-        networks={VELOCITY: NetworkSpec("hdit", arguments), CODEC: codec}, sensor=SENSOR, channels=tuple(CHANNELS),
-        normalisation=NORMALISATIONS["r2flow"], time_grid=GRID,
+        networks={VELOCITY: NetworkSpec("hdit", arguments), CODEC: codec},
+        sensor=SENSOR,
+        channels=tuple(CHANNELS),
+        normalisation=NORMALISATIONS["r2flow"],
+        time_grid=GRID,
         provenance={"data": "none", "data_licence": "none", "licence": "MIT"},
-    )  # fmt: skip
+    )
     save_checkpoint(path, header, {VELOCITY: flow, CODEC: autoencoder})
     return path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("architecture", [name for name, cls in NETWORKS.items() if cls.is_autoencoder])
-def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Uses a backend that counts graphs and convolutions; the default backend needs a C++ compiler."""
+@pytest.mark.parametrize(
+    "architecture", [name for name, cls in NETWORKS.items() if cls.is_autoencoder]
+)
+def test_compile_compiles_the_decoder_too(
+    architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Uses a backend that counts graphs and convolutions; the default backend needs a C++
+    compiler."""
     graphs: list[int] = []
 
     def counting(graph: torch.fx.GraphModule, inputs: object) -> object:
@@ -265,8 +329,10 @@ def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, mon
 
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=counting))
     path = write_latent(tmp_path / "latent.safetensors", architecture)
-    compiled, eager = load_generator(path, compile=True), load_generator(path)
-    z, uniform_noise = torch.randn(1, *eager.codec.shape), torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
+    compiled = load_generator(path, compile=True)
+    eager = load_generator(path)
+    z = torch.randn(1, *eager.codec.shape)
+    uniform_noise = torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
     given = uniform_noise if eager.codec.draws else None
     torch.testing.assert_close(compiled.codec.decode(z, given), eager.codec.decode(z, given))
     assert sum(graphs) >= 5
@@ -275,8 +341,11 @@ def test_compile_compiles_the_decoder_too(architecture: str, tmp_path: Path, mon
     assert len(graphs) > before  # those of the flow
 
 
-def test_a_damaged_shipped_checkpoint_is_detected_by_its_hash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A header of the older format has no checksum: one byte could change the time grid or the range limit."""
+def test_a_damaged_shipped_checkpoint_is_detected_by_its_hash(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A header of the older format has no checksum: one byte could change the time grid or the
+    range limit."""
     for name, file in shipped_models().items():
         assert has_checksum(file) or read_header(file)[1] == module.SHIPPED[name]
     content = shipped_models()["town"].read_bytes()
@@ -334,14 +403,22 @@ def test_a_gpu_is_refused_if_it_is_unavailable_and_in_dataloader_workers(
 
 def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
     path = write_latent(tmp_path / "dense.safetensors", "surfaces")
-    full, half = load_generator(path), load_generator(path, columns=SENSOR.columns // 2)
+    full = load_generator(path)
+    half = load_generator(path, columns=SENSOR.columns // 2)
     assert half.sensor.columns == SENSOR.columns // 2 and full.sensor == SENSOR
-    image, coarse = full.range_images(0, [3])[0], half.range_images(0, [3])[0]
+    image = full.range_images(0, [3])[0]
+    coarse = half.range_images(0, [3])[0]
     assert coarse.range.shape == (image.range.shape[0], image.range.shape[1] // 2)
     assert half.scans(0, [3])[0].sensor == half.sensor
-    plans = [make_plan(tmp_path, BakeJob(model=str(path), count=2, columns=c)) for c in (None, SENSOR.columns // 2)]
+    plans = [
+        make_plan(tmp_path, BakeJob(model=str(path), count=2, columns=c))
+        for c in (None, SENSOR.columns // 2)
+    ]
     assert [plan.facts.sensor.columns for plan in plans] == [SENSOR.columns, SENSOR.columns // 2]
-    assert ["columns" in plan.facts.settings for plan in plans] == [False, True]  # as in banks of earlier versions
+    assert ["columns" in plan.facts.settings for plan in plans] == [
+        False,
+        True,
+    ]  # as in banks of earlier versions
     with pytest.raises(ConfigError, match="one of"):
         load_generator(path, columns=10)
     with pytest.raises(ConfigError, match="one of 1024"):

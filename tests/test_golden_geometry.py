@@ -1,4 +1,5 @@
-"""Geometry compared with outputs of the code of R2Flow and LiDM, with their conventions where they differ from ours."""
+"""Geometry compared with outputs of the code of R2Flow and LiDM, with their conventions where they
+differ from ours."""
 
 from pathlib import Path
 
@@ -26,10 +27,14 @@ def hdl64(columns: int, low: float = 0.0, high: float = 1e6, rows: int = 64) -> 
 
 def lidm(columns: int, rows: int = 64) -> Sensor:
     """LiDM's grid; its range limits of 1 and 56 m are exclusive, ours are inclusive."""
-    return hdl64(columns, float(np.nextafter(np.float32(1), 2)), float(np.nextafter(np.float32(56), 0)), rows)
+    return hdl64(
+        columns, float(np.nextafter(np.float32(1), 2)), float(np.nextafter(np.float32(56), 0)), rows
+    )
 
 
-@pytest.mark.parametrize("key", sorted(k for k in POINTS if "spherical" in k or k.startswith("synthetic/unfolding")))
+@pytest.mark.parametrize(
+    "key", sorted(k for k in POINTS if "spherical" in k or k.startswith("synthetic/unfolding"))
+)
 def test_r2flow_projection_of_random_points(key: str) -> None:
     """All except the unfolding of more rings than rows, where R2Flow's behaviour is not copied."""
     name, _, kind = key.partition("/")
@@ -46,8 +51,12 @@ def test_lidm_projection_of_random_points(columns: int) -> None:
     golden = np.load(HERE / "lidm_projection_synthetic.npz")
     points = POINTS["synthetic/points"]
     image = project(Scan(points[:, :3].copy(), points[:, 3].copy(), lidm(columns, rows=16)))
-    assert np.array_equal(np.where(image.mask, image.range, -1), golden[f"synthetic/range_16x{columns}"])
-    assert np.array_equal(np.where(image.mask, image.reflectance, -1), golden[f"synthetic/remission_16x{columns}"])
+    assert np.array_equal(
+        np.where(image.mask, image.range, -1), golden[f"synthetic/range_16x{columns}"]
+    )
+    assert np.array_equal(
+        np.where(image.mask, image.reflectance, -1), golden[f"synthetic/remission_16x{columns}"]
+    )
 
 
 @pytest.mark.parametrize("columns", [1024, 2048])
@@ -61,19 +70,25 @@ def test_r2flow_ray_angles(columns: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("golden", "ours"), [("logscale", "r2flow"), ("inverse", "r2flow_inverse"), ("metric", "r2flow_metric")]
+    ("golden", "ours"),
+    [("logscale", "r2flow"), ("inverse", "r2flow_inverse"), ("metric", "r2flow_metric")],
 )
 def test_r2flow_scales(golden: str, ours: str) -> None:
     scale = NORMALISATIONS[ours]
     depth = R2FLOW["input.depth"]
     assert torch.equal(scale.inside(depth).float(), R2FLOW["mask"])
     assert torch.allclose(scale.encode(depth), R2FLOW[f"{golden}/normalised"], rtol=1e-5, atol=1e-6)
-    for given, restored in ((f"{golden}/normalised", f"{golden}/restored"), ("noise", f"{golden}/restored_of_noise")):
+    for given, restored in (
+        (f"{golden}/normalised", f"{golden}/restored"),
+        ("noise", f"{golden}/restored_of_noise"),
+    ):
         assert torch.allclose(scale.decode(R2FLOW[given]), R2FLOW[restored], rtol=1e-5)
 
 
 def test_r2flow_points() -> None:
-    depth = torch.where(NORMALISATIONS["r2flow"].inside(R2FLOW["input.depth"]), R2FLOW["input.depth"], 0)
+    depth = torch.where(
+        NORMALISATIONS["r2flow"].inside(R2FLOW["input.depth"]), R2FLOW["input.depth"], 0
+    )
     xyz = unproject_batch(depth[:, 0], hdl64(16, rows=8), rays="corner")
     assert torch.allclose(xyz, R2FLOW["cartesian/normalised"], atol=1e-4)
 
@@ -86,13 +101,18 @@ def kitti_scan(real_scans: Path) -> Scan:
 
 @pytest.mark.parametrize("columns", [1024, 2048])
 @pytest.mark.parametrize("kind", ["spherical", "unfolding"])
-def test_r2flow_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan, kind: str, columns: int) -> None:
+def test_r2flow_projection_of_a_real_scan(
+    golden: Golden, kitti_scan: Scan, kind: str, columns: int
+) -> None:
     expected = np.load(golden / "r2flow_projection.npz")
     image = (project if kind == "spherical" else unfold)(kitti_scan, hdl64(columns))
     different = image.range != expected[f"{kind}_{columns}/depth"].reshape(64, columns)
     assert different.sum() <= {1024: 5, 2048: 40}[columns]
     same = ~different
-    assert np.array_equal(image.reflectance[same], expected[f"{kind}_{columns}/reflectance"].reshape(64, columns)[same])
+    assert np.array_equal(
+        image.reflectance[same],
+        expected[f"{kind}_{columns}/reflectance"].reshape(64, columns)[same],
+    )
 
 
 def test_lidm_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan) -> None:
@@ -100,12 +120,15 @@ def test_lidm_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan) -> Non
     image = project(kitti_scan, lidm(1024))
     different = np.where(image.mask, image.range, -1) != expected["range"]
     assert different.sum() <= 5
-    assert np.array_equal(np.where(image.mask, image.reflectance, -1)[~different], expected["remission"][~different])
+    assert np.array_equal(
+        np.where(image.mask, image.reflectance, -1)[~different], expected["remission"][~different]
+    )
 
 
 @pytest.mark.parametrize(("name", "offset"), [("log", 1e-4), ("linear", 0.0)])
 def test_lidm_scales_and_points(golden: Golden, kitti_scan: Scan, name: str, offset: float) -> None:
-    """LiDM adds 0.1 mm before the logarithm and does not subtract it again; its rays point to cell corners."""
+    """LiDM adds 0.1 mm before the logarithm and does not subtract it again; its rays point to cell
+    corners."""
     expected = np.load(golden / "lidm_projection.npz")
     scale: Normalisation = NORMALISATIONS[f"lidm_{name}"]
     image = project(kitti_scan, lidm(1024))

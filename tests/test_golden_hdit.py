@@ -25,7 +25,9 @@ def distance(a: Tensor, b: Tensor) -> float:
 
 
 def read_golden(folder: Path, name: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    return json.loads((folder / f"{name}.json").read_text()), load_file(folder / f"{name}.safetensors")
+    return json.loads((folder / f"{name}.json").read_text()), load_file(
+        folder / f"{name}.safetensors"
+    )
 
 
 def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], float]:
@@ -41,7 +43,9 @@ def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], fl
         "heads": config["attn_num_heads"],
         "position": PEER_POSITIONS[config["coords_encoding"]],
     }
-    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    weights = {
+        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+    }
     net = convert(weights, NetworkSpec("hdit", arguments))
     assert isinstance(net, HDiT)
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
@@ -57,7 +61,10 @@ def test_velocities_equal_those_of_r2flow(golden: Golden, name: str, grad: bool)
     """v(y, t) = -u(1 - t, y): R2Flow's t = 0 is noise, and its velocity points to the data."""
     net, tensors, tolerance = golden_network(golden, name)
     with torch.set_grad_enabled(grad):
-        assert distance(-net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"]) < tolerance
+        assert (
+            distance(-net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"])
+            < tolerance
+        )
         one = -net(tensors["input.x"][:1], 1 - tensors["input.t_scalar"])
     assert distance(one, tensors["output_scalar_t"]) < tolerance
 
@@ -86,7 +93,8 @@ def test_sampled_states_equal_those_of_r2flow(golden: Golden, name: str) -> None
     net = golden_network(golden, name)[0]
     about, tensors = read_golden(golden, "r2flow_sampling")
     tolerance = max(1e-5, 20 * about["models"][name]["f32_vs_f64"]["rel_l2"])
-    states, velocities = tensors[f"{name}/states"], tensors[f"{name}/velocities"]
+    states = tensors[f"{name}/states"]
+    velocities = tensors[f"{name}/velocities"]
     times = 1 - tensors[f"{name}/input.grid"]
     y = tensors[f"{name}/input.x0"]
     for i in range(len(times) - 1):
@@ -102,10 +110,13 @@ def test_sampled_states_equal_those_of_r2flow(golden: Golden, name: str) -> None
 @torch.no_grad()
 def test_position_encodings_equal_those_of_r2flow(golden: Golden, basis: str, grid: str) -> None:
     about, tensors = read_golden(golden, "r2flow_positions")
-    config, coords = about["config"], tensors[f"input.coords_{grid}"][0]
+    config = about["config"]
+    coords = tensors[f"input.coords_{grid}"][0]
     expected = tensors[f"basis.{basis}/{grid}"][0].movedim(0, -1)
     torch.testing.assert_close(BASES[basis](coords), expected, rtol=1e-5, atol=2e-6)
-    position = AnglePosition(basis, config["resolution"], config["dim"], config["mlp_ratio"], config["mapping_depth"])
+    position = AnglePosition(
+        basis, config["resolution"], config["dim"], config["mlp_ratio"], config["mapping_depth"]
+    )
     peer = f"weights.{basis}/spatial_pe."
     names = {"linear.weight": "0.linear.weight", "mapping.norms.0.weight": "1.0.scale"}
     names |= {"mapping.norms.3.weight": "1.3.scale"}

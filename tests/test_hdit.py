@@ -16,7 +16,13 @@ from lidar_synth.generate.models.hdit.hdit import HDiT
 from lidar_synth.generate.models.hdit.transformer import from_patches, to_patches
 from lidar_synth.generate.models.positions import POSITIONS
 
-SMALL: dict[str, Any] = {"resolution": (8, 64), "width": 16, "time_width": 16, "depths": (1, 1, 1), "heads": (2, 4, 4)}
+SMALL: dict[str, Any] = {
+    "resolution": (8, 64),
+    "width": 16,
+    "time_width": 16,
+    "depths": (1, 1, 1),
+    "heads": (2, 4, 4),
+}
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -24,14 +30,22 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def angles(rows: int, columns: int) -> Tensor:
     """Ray angles of a grid: descending elevation, ascending azimuth."""
-    grid = torch.meshgrid(torch.linspace(0.05, -0.4, rows), torch.linspace(-3.1, 3.1, columns), indexing="ij")
+    grid = torch.meshgrid(
+        torch.linspace(0.05, -0.4, rows), torch.linspace(-3.1, 3.1, columns), indexing="ij"
+    )
     return torch.stack(grid)
 
 
 def network(seed: int = 0, **arguments: Any) -> HDiT:
     """A small network with random weights (in a fresh one, every residual layer is zero)."""
     torch.manual_seed(seed)
-    net = HDiT(**{**SMALL, "angles": angles(*arguments.get("resolution", SMALL["resolution"])), **arguments})
+    net = HDiT(
+        **{
+            **SMALL,
+            "angles": angles(*arguments.get("resolution", SMALL["resolution"])),
+            **arguments,
+        }
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return net.eval()
@@ -42,7 +56,9 @@ def distance(a: Tensor, b: Tensor) -> float:
     return float((a - b).detach().norm() / b.norm())
 
 
-def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window: tuple[int, int]) -> Tensor:
+def by_definition(
+    q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window: tuple[int, int]
+) -> Tensor:
     """Neighbourhood attention by its definition, token by token."""
     out = torch.empty_like(v)
     for row in range(grid[0]):
@@ -58,12 +74,17 @@ def by_definition(q: Tensor, k: Tensor, v: Tensor, grid: tuple[int, int], window
 
 def test_a_network_is_told_where_its_step_ends() -> None:
     fresh = HDiT(**SMALL, ends=True, angles=angles(*SMALL["resolution"])).eval()
-    trained, y = network(ends=True), torch.randn(2, 2, 8, 64)
+    trained = network(ends=True)
+    y = torch.randn(2, 2, 8, 64)
     with torch.no_grad():
-        assert torch.equal(fresh.step(torch.rand(2)), torch.zeros(2, 16))  # at first the end makes no difference
+        assert torch.equal(
+            fresh.step(torch.rand(2)), torch.zeros(2, 16)
+        )  # at first the end makes no difference
         ends = [trained(y, 0.8, None, end) for end in (0.0, 0.5, torch.tensor([0.0, 0.5]))]
         assert distance(ends[0], ends[1]) > 0.01
-        assert torch.allclose(ends[2][0], ends[0][0], atol=1e-4) and torch.allclose(ends[2][1], ends[1][1], atol=1e-4)
+        assert torch.allclose(ends[2][0], ends[0][0], atol=1e-4) and torch.allclose(
+            ends[2][1], ends[1][1], atol=1e-4
+        )
         with pytest.raises(DataError, match="built without ends"):
             network()(y, 0.8, None, 0.0)
 
@@ -96,7 +117,11 @@ def test_every_query_attends_to_its_full_window() -> None:
 
 
 @settings(max_examples=30)
-@given(rows=st.integers(1, 4), columns=st.integers(1, 4), patch=st.tuples(st.integers(1, 3), st.integers(1, 4)))
+@given(
+    rows=st.integers(1, 4),
+    columns=st.integers(1, 4),
+    patch=st.tuples(st.integers(1, 3), st.integers(1, 4)),
+)
 def test_from_patches_inverts_to_patches(rows: int, columns: int, patch: tuple[int, int]) -> None:
     resolution = (rows * patch[0], columns * patch[1])
     x = torch.randn(2, *resolution, 3)
@@ -112,7 +137,9 @@ def test_the_full_network_has_the_published_size() -> None:
 @pytest.mark.parametrize("position", POSITIONS)
 @pytest.mark.parametrize("resolution", [(8, 64), (24, 96), (12, 80)])
 @torch.no_grad()
-def test_every_position_encoding_works_at_several_resolutions(position: str, resolution: tuple[int, int]) -> None:
+def test_every_position_encoding_works_at_several_resolutions(
+    position: str, resolution: tuple[int, int]
+) -> None:
     net = network(resolution=resolution, position=position, channels=7)
     y = torch.randn(2, 7, *resolution)
     v = net(y, torch.tensor([0.2, 0.9]))
@@ -129,13 +156,16 @@ def test_the_network_is_equivariant_to_rotations_about_the_vertical() -> None:
     y, shift = torch.randn(1, 2, 8, 64), 16  # a token of the coarsest level has 16 columns
     turned = copy.deepcopy(net)
     turned.angles.cells = net.angles.cells.roll(shift, -1)
-    torch.testing.assert_close(turned(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        turned(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1), rtol=1e-4, atol=1e-4
+    )
     assert distance(net(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1)) > 1e-2
 
 
 @torch.no_grad()
 def test_computing_in_pieces_gives_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    net, y = network(), torch.randn(3, 2, 8, 64)
+    net = network()
+    y = torch.randn(3, 2, 8, 64)
     whole = net(y, 0.5)
     monkeypatch.setattr(layers, "PIECE", 2000)
     assert layers.piece_length(y, 100, 300) < 10
@@ -145,11 +175,16 @@ def test_computing_in_pieces_gives_the_same_result(monkeypatch: pytest.MonkeyPat
 @torch.no_grad()
 def test_condition_maps_change_the_velocity() -> None:
     net = network(condition_channels=3)
-    y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 3, 8, 64)
+    y = torch.randn(2, 2, 8, 64)
+    cond = torch.randn(2, 3, 8, 64)
     v = net(y, 0.5, cond)
     assert v.shape == y.shape
     assert distance(net(y, 0.5, 2 * cond), v) > 1e-3
-    for given_, found in ((None, "no condition"), (cond[:, :2], r"\(2, 2, 8, 64\)"), (cond[:1], r"\(1, 3, 8, 64\)")):
+    for given_, found in (
+        (None, "no condition"),
+        (cond[:, :2], r"\(2, 2, 8, 64\)"),
+        (cond[:1], r"\(1, 3, 8, 64\)"),
+    ):
         with pytest.raises(DataError, match=rf"{found}.*expected \(2, 3, 8, 64\)"):
             net(y, 0.5, given_)
     with pytest.raises(DataError, match="takes no condition"):
@@ -159,7 +194,8 @@ def test_condition_maps_change_the_velocity() -> None:
 @torch.no_grad()
 def test_condition_tokens_change_the_velocity() -> None:
     net = network(context_channels=5)
-    y, cond = torch.randn(2, 2, 8, 64), torch.randn(2, 7, 5)
+    y = torch.randn(2, 2, 8, 64)
+    cond = torch.randn(2, 7, 5)
     v = net(y, 0.5, cond)
     assert v.shape == y.shape
     torch.testing.assert_close(
@@ -168,7 +204,11 @@ def test_condition_tokens_change_the_velocity() -> None:
     other = net(y, 0.5, torch.stack([cond[0], -cond[1]]))
     torch.testing.assert_close(other[0], v[0], rtol=1e-5, atol=1e-5)
     assert distance(other[1], v[1]) > 1e-3
-    for given_, found in ((None, "no condition"), (cond[..., :4], r"\(2, 7, 4\)"), (cond[:1], r"\(1, 7, 5\)")):
+    for given_, found in (
+        (None, "no condition"),
+        (cond[..., :4], r"\(2, 7, 4\)"),
+        (cond[:1], r"\(1, 7, 5\)"),
+    ):
         with pytest.raises(DataError, match=rf"{found}.*expected \(2, tokens, 5\)"):
             net(y, 0.5, given_)
 
@@ -215,7 +255,8 @@ def test_missing_ray_angles_give_nan() -> None:
 
 
 def test_gradient_checkpointing_gives_the_same_gradients() -> None:
-    net, y = network(), torch.randn(1, 2, 8, 64)
+    net = network()
+    y = torch.randn(1, 2, 8, 64)
     gradients = []
     for net.gradient_checkpointing in (False, True):
         net.zero_grad()
@@ -227,8 +268,10 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
 
 @torch.no_grad()
 def test_half_precision_keeps_the_angles_in_float32() -> None:
-    """In bfloat16, the velocity stays close and has the state's dtype; angles and harmonics are not rounded."""
-    net, y = network(), torch.randn(2, 2, 8, 64)
+    """In bfloat16, the velocity stays close and has the state's dtype; angles and harmonics are not
+    rounded."""
+    net = network()
+    y = torch.randn(2, 2, 8, 64)
     expected = net(y, 0.4)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = net(y, 0.4)
@@ -245,6 +288,8 @@ def test_half_precision_keeps_the_angles_in_float32() -> None:
 @pytest.mark.slow
 @torch.no_grad()
 def test_it_compiles_as_one_graph() -> None:
-    net, y, t = network(), torch.randn(2, 2, 8, 64), torch.tensor([0.1, 0.8])
+    net = network()
+    y = torch.randn(2, 2, 8, 64)
+    t = torch.tensor([0.1, 0.8])
     compiled = torch.compile(net, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(y, t), net(y, t), rtol=1e-4, atol=1e-4)

@@ -1,4 +1,5 @@
-"""Files made to do harm: each is refused with an error of this package, within limits of memory and time."""
+"""Files made to do harm: each is refused with an error of this package, within limits of memory and
+time."""
 
 import io
 import json
@@ -26,9 +27,17 @@ def first_scan(path: Path) -> None:
 
 
 PCD = {
-    "VERSION": "0.7", "FIELDS": "x y z intensity", "SIZE": "4 4 4 4", "TYPE": "F F F F", "COUNT": "1 1 1 1",
-    "WIDTH": "10", "HEIGHT": "2", "VIEWPOINT": "0 0 0 1 0 0 0", "POINTS": "20", "DATA": "binary",
-}  # fmt: skip
+    "VERSION": "0.7",
+    "FIELDS": "x y z intensity",
+    "SIZE": "4 4 4 4",
+    "TYPE": "F F F F",
+    "COUNT": "1 1 1 1",
+    "WIDTH": "10",
+    "HEIGHT": "2",
+    "VIEWPOINT": "0 0 0 1 0 0 0",
+    "POINTS": "20",
+    "DATA": "binary",
+}
 
 
 def pcd(body: bytes | None = None, **changes: str) -> bytes:
@@ -47,7 +56,11 @@ FALSE_PCD = {
     "no values": pcd(COUNT="1 1 1 0"),
     "a field twice": pcd(FIELDS="x x z y"),
     "a fifth field twice": pcd(
-        FIELDS="x y z intensity intensity", SIZE="4 4 4 4 4", TYPE="F F F F F", COUNT="1 1 1 1 1", WIDTH="8",
+        FIELDS="x y z intensity intensity",
+        SIZE="4 4 4 4 4",
+        TYPE="F F F F F",
+        COUNT="1 1 1 1 1",
+        WIDTH="8",
         POINTS="16",
     ),
     "more points": pcd(POINTS="21"),
@@ -56,7 +69,9 @@ FALSE_PCD = {
     "fewer points everywhere, in text": pcd(POINTS="10", WIDTH="5", DATA="ascii"),
     "fewer points everywhere, compressed": pcd(POINTS="10", WIDTH="5", DATA="binary_compressed"),
     "more points than memory": pcd(WIDTH="999999999999", HEIGHT="1", POINTS="999999999999"),
-    "more points than memory, in text": pcd(WIDTH="999999999999", HEIGHT="1", POINTS="999999999999", DATA="ascii"),
+    "more points than memory, in text": pcd(
+        WIDTH="999999999999", HEIGHT="1", POINTS="999999999999", DATA="ascii"
+    ),
     "more points than bits": pcd(WIDTH="4294967296", HEIGHT="4294967296", POINTS="0"),
     "no points": pcd(b"", WIDTH="0", POINTS="0"),
     "negative": pcd(WIDTH="-10", HEIGHT="-2"),
@@ -72,7 +87,10 @@ FALSE_PCD = {
     "words": pcd(BODIES["ascii"].replace(b"0.", b"o.", 1), DATA="ascii"),
     "half an integer": pcd(TYPE="F F F U", DATA="ascii"),
     "compressed to more than memory": pcd(
-        struct.pack("<II", 80, 0xFFFFFFF0) + bytes(80), DATA="binary_compressed", WIDTH="268435455", HEIGHT="1",
+        struct.pack("<II", 80, 0xFFFFFFF0) + bytes(80),
+        DATA="binary_compressed",
+        WIDTH="268435455",
+        HEIGHT="1",
         POINTS="268435455",
     ),
     "compressed, with less": pcd(BODIES["binary_compressed"][:-9], DATA="binary_compressed"),
@@ -82,7 +100,7 @@ FALSE_PCD = {
     "compressed, a run beyond the end": pcd(
         struct.pack("<II", 32, 320) + b"\0\0" + b"\xe0\xff\0" * 10, DATA="binary_compressed"
     ),
-}  # fmt: skip
+}
 
 
 PLY = (
@@ -100,17 +118,21 @@ FALSE_PLY = {
     "a list of points": PLY.replace(b"float y", b"list uchar float y") + BODIES["binary"],
     "two encodings": PLY.replace(b"element", b"format ascii 1.0\nelement") + BODIES["binary"],
     "two vertices": PLY.replace(b"end_header", b"element vertex 3\nend_header") + BODIES["binary"],
-    "a property of nothing": PLY.replace(b"element", b"property float x\nelement") + BODIES["binary"],
-    "lists before the points": PLY.replace(b"element", b"element face 9\nproperty list uint int i\nelement", 1)
+    "a property of nothing": PLY.replace(b"element", b"property float x\nelement")
+    + BODIES["binary"],
+    "lists before the points": PLY.replace(
+        b"element", b"element face 9\nproperty list uint int i\nelement", 1
+    )
     + BODIES["binary"],
     "text with more lines": PLY.replace(b"binary_little_endian", b"ascii") + BODIES["ascii"] * 2,
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
 @needs_limits
 @pytest.mark.parametrize(
-    ("suffix", "name"), [(".pcd", name) for name in FALSE_PCD] + [(".ply", name) for name in FALSE_PLY]
+    ("suffix", "name"),
+    [(".pcd", name) for name in FALSE_PCD] + [(".ply", name) for name in FALSE_PLY],
 )
 def test_false_headers_are_refused(tmp_path: Path, suffix: str, name: str) -> None:
     path = tmp_path / f"scan{suffix}"
@@ -122,11 +144,21 @@ def test_false_headers_are_refused(tmp_path: Path, suffix: str, name: str) -> No
 @pytest.mark.parametrize("data", BODIES)
 def test_the_same_points_in_every_encoding(tmp_path: Path, data: str) -> None:
     path = tmp_path / "scan.pcd"
-    padded = pcd(FIELDS="_ x y z intensity _ ring", SIZE="1 4 4 4 4 2 4", TYPE="U F F F F U I", COUNT="3 1 1 1 1 2 1")
-    for content in (pcd(DATA=data), padded.replace(BODIES["binary"], with_padding()) if data == "binary" else pcd()):
+    padded = pcd(
+        FIELDS="_ x y z intensity _ ring",
+        SIZE="1 4 4 4 4 2 4",
+        TYPE="U F F F F U I",
+        COUNT="3 1 1 1 1 2 1",
+    )
+    for content in (
+        pcd(DATA=data),
+        padded.replace(BODIES["binary"], with_padding()) if data == "binary" else pcd(),
+    ):
         path.write_bytes(content)
         scan = open_scans(path)[0]
-        assert np.array_equal(scan.points, POINTS[:, :3]) and np.array_equal(scan.reflectance, POINTS[:, 3])
+        assert np.array_equal(scan.points, POINTS[:, :3]) and np.array_equal(
+            scan.reflectance, POINTS[:, 3]
+        )
     if data == "binary":
         assert scan.ring is not None and np.array_equal(scan.ring, np.arange(20))
 
@@ -146,9 +178,12 @@ def test_big_endian_ply_and_faces_after_the_points(tmp_path: Path) -> None:
     for content in (
         header + records.tobytes(),
         header.replace(b"end_header", b"element face 1\nproperty list uchar int i\nend_header")
-        + records.tobytes() + b"\x01\0\0\0\x05",
-        PLY.replace(b"element vertex", b"element note 2\nproperty uchar n\nelement vertex") + b"ab" + BODIES["binary"],
-    ):  # fmt: skip
+        + records.tobytes()
+        + b"\x01\0\0\0\x05",
+        PLY.replace(b"element vertex", b"element note 2\nproperty uchar n\nelement vertex")
+        + b"ab"
+        + BODIES["binary"],
+    ):
         path.write_bytes(content)
         assert np.array_equal(open_scans(path)[0].points, POINTS[:, :3])
 
@@ -187,7 +222,10 @@ def picture(width: int, height: int, *chunks: bytes) -> bytes:
     """A PNG of this size, of which no line is there."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
     parts = (header, *chunks, b"IDAT" + zlib.compress(b""), b"IEND")
-    framed = (struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
+    framed = (
+        struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part))
+        for part in parts
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
 
 
@@ -226,7 +264,9 @@ def negative_tar(root: Path) -> Path:
 
 
 def greedy_tar(root: Path) -> Path:
-    (root / "scans.tar").write_bytes(tar_header(b"\x80" + (1 << 40).to_bytes(11, "big"), b"x") + bytes(4096))
+    (root / "scans.tar").write_bytes(
+        tar_header(b"\x80" + (1 << 40).to_bytes(11, "big"), b"x") + bytes(4096)
+    )
     return root
 
 
@@ -237,7 +277,9 @@ def sparse_tar(root: Path) -> Path:
 
 def twice_in_a_tar(root: Path) -> Path:
     [path, *others] = write_tars(root)
-    path.write_bytes(path.read_bytes()[:-10240].rstrip(b"\0").ljust(1 << 16, b"\0") + others[0].read_bytes())
+    path.write_bytes(
+        path.read_bytes()[:-10240].rstrip(b"\0").ljust(1 << 16, b"\0") + others[0].read_bytes()
+    )
     tar_with(path, {"0.json": b"{}"})
     content = path.read_bytes()[:1024]
     path.write_bytes(content * 2 + bytes(1024))
@@ -266,7 +308,9 @@ def deep_picture(root: Path) -> Path:
 
 def text_bomb_in_a_picture(root: Path) -> Path:
     [path] = write_all("png", root, [some_scan()])
-    path.write_bytes(picture(1024, 64, b"zTXtlidar_synth\0\0" + zlib.compress(b"[" * 80_000_000, 1)))
+    path.write_bytes(
+        picture(1024, 64, b"zTXtlidar_synth\0\0" + zlib.compress(b"[" * 80_000_000, 1))
+    )
     return root
 
 
@@ -278,7 +322,9 @@ def deep_table(root: Path) -> Path:
 
 def table_of_numbers(root: Path) -> Path:
     write_nuscenes(root)
-    (root / "v1.0-mini" / "lidarseg.json").write_text('[{"sample_data_token": "token0", "filename": 7}]')
+    (root / "v1.0-mini" / "lidarseg.json").write_text(
+        '[{"sample_data_token": "token0", "filename": 7}]'
+    )
     return root
 
 
@@ -287,10 +333,22 @@ def table_of_numbers(root: Path) -> Path:
 @pytest.mark.parametrize(
     "make",
     [
-        deep_tar, listed_tar, infinite_tar, big_array_in_a_tar, negative_tar, greedy_tar, sparse_tar, twice_in_a_tar,
-        big_picture, bigger_picture, deep_picture, text_bomb_in_a_picture, deep_table, table_of_numbers,
+        deep_tar,
+        listed_tar,
+        infinite_tar,
+        big_array_in_a_tar,
+        negative_tar,
+        greedy_tar,
+        sparse_tar,
+        twice_in_a_tar,
+        big_picture,
+        bigger_picture,
+        deep_picture,
+        text_bomb_in_a_picture,
+        deep_table,
+        table_of_numbers,
     ],
-)  # fmt: skip
+)
 def test_hostile_side_files_are_refused(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     assert in_limits(first_scan, make(tmp_path), seconds=30).startswith("DataError: ")
 

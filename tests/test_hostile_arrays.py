@@ -42,20 +42,33 @@ def read_both(path: Path) -> None:
     st.booleans(),
     st.booleans(),
 )
-def test_arrays_are_what_numpy_reads(kind: str, shape: list[int], fortran: bool, text: bool) -> None:
+def test_arrays_are_what_numpy_reads(
+    kind: str, shape: list[int], fortran: bool, text: bool
+) -> None:
     array = np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(kind)
     content = saved(np.asfortranarray(array) if fortran and array.ndim else array)
-    read, expected = parse_npy(content, "here"), np.load(io.BytesIO(content))
-    assert read.dtype == expected.dtype and np.array_equal(read, expected) and read.shape == expected.shape
+    read = parse_npy(content, "here")
+    expected = np.load(io.BytesIO(content))
+    assert (
+        read.dtype == expected.dtype
+        and np.array_equal(read, expected)
+        and read.shape == expected.shape
+    )
     start = 10 + content[8] + 256 * content[9]
-    old = content[:start].replace(b"'", b'"') + content[start:] if text else content  # as others write it
+    old = (
+        content[:start].replace(b"'", b'"') + content[start:] if text else content
+    )  # as others write it
     assert np.array_equal(parse_npy(old, "here"), expected) and read.flags.writeable
 
 
 @given(st.binary(max_size=60), st.integers(0, 150))
 def test_any_bytes_are_an_array_or_refused(noise: bytes, place: int) -> None:
     content = saved(POINTS)
-    for damaged in (noise, content[:place] + noise, content[:place] + noise + content[place + len(noise) :]):
+    for damaged in (
+        noise,
+        content[:place] + noise,
+        content[:place] + noise + content[place + len(noise) :],
+    ):
         with suppress(DataError):
             parse_npy(damaged, "here")
 
@@ -70,7 +83,8 @@ def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> byt
 
 def patched(content: bytes, *, local: dict[int, bytes], central: dict[int, bytes]) -> bytes:
     """Other bytes in the two headers of a ZIP file's only member."""
-    changed, start = bytearray(content), content.index(b"PK\1\2")
+    changed = bytearray(content)
+    start = content.index(b"PK\1\2")
     for base, places in ((0, local), (start, central)):
         for offset, value in places.items():
             changed[base + offset : base + offset + len(value)] = value
@@ -83,13 +97,24 @@ def hostile_npz(name: str) -> bytes:
         case "a bomb":
             return zipped({"points.npy": npy(described(shape="(10000000, 4)"), bytes(160_000_000))})
         case "a bomb of many":
-            return zipped({f"a{i}.npy": npy(described(shape="(1000000, 4)"), bytes(16_000_000)) for i in range(10)})
+            return zipped(
+                {
+                    f"a{i}.npy": npy(described(shape="(1000000, 4)"), bytes(16_000_000))
+                    for i in range(10)
+                }
+            )
         case "a bomb that says it is small":
             bomb = zipped({"points.npy": npy(described(shape="(10000000, 4)"), bytes(160_000_000))})
-            return patched(bomb, local={22: struct.pack("<I", 4000)}, central={24: struct.pack("<I", 4000)})
+            return patched(
+                bomb, local={22: struct.pack("<I", 4000)}, central={24: struct.pack("<I", 4000)}
+            )
         case "stored, and more than the file":
             size = struct.pack("<I", 0xF0000000)
-            return patched(zipped({"a.npy": b"x"}, zipfile.ZIP_STORED), local={18: size * 2}, central={20: size * 2})
+            return patched(
+                zipped({"a.npy": b"x"}, zipfile.ZIP_STORED),
+                local={18: size * 2},
+                central={20: size * 2},
+            )
         case "encrypted":
             return patched(scan, local={6: b"\1"}, central={8: b"\1"})
         case "another method":
@@ -113,9 +138,22 @@ def hostile_npz(name: str) -> bytes:
             return zipped({})
 
 
-NPZ = ["a bomb", "a bomb of many", "a bomb that says it is small", "stored, and more than the file", "encrypted",
-       "another method", "a later version", "lzma", "no array", "cut inside", "another sum", "a name twice", "160 GB",
-       "nothing"]  # fmt: skip
+NPZ = [
+    "a bomb",
+    "a bomb of many",
+    "a bomb that says it is small",
+    "stored, and more than the file",
+    "encrypted",
+    "another method",
+    "a later version",
+    "lzma",
+    "no array",
+    "cut inside",
+    "another sum",
+    "a name twice",
+    "160 GB",
+    "nothing",
+]
 
 
 @pytest.mark.slow
@@ -153,15 +191,21 @@ def changed(path: Path, **arrays: object) -> None:
         ("sensor", "[1, 2]", "a sensor of type list"),
         ("sensor", "[" * 100_000, "not JSON"),
         ("sensor", '{"name": "x", "columns": 1e999}', "without|columns"),
-        ("sensor", '{"name": "x", "columns": 2000000000, "rows": 2000000000, "range_min": 1, "range_max": 80, '
-                   '"fov_up": 3, "fov_down": -25}', "at most 4194304 cells"),
+        (
+            "sensor",
+            '{"name": "x", "columns": 2000000000, "rows": 2000000000, "range_min": 1, "range_max": 80, '
+            '"fov_up": 3, "fov_down": -25}',
+            "at most 4194304 cells",
+        ),
         ("box_names", 3.0, "the boxes' names"),
         ("box_values", np.zeros((2, 5)), "box|reshape"),
         ("box_occlusion", "north", "invalid literal|could not|shape"),
         ("reflectance", "bright", "reflectance is"),
     ],
-)  # fmt: skip
-def test_invalid_facts_are_refused(tmp_path: Path, to: str, name: str, value: object, message: str) -> None:
+)
+def test_invalid_facts_are_refused(
+    tmp_path: Path, to: str, name: str, value: object, message: str
+) -> None:
     [path] = write_all(to, tmp_path, [some_scan()])
     changed(path, **{name: value})
     with pytest.raises(DataError, match=f"{path.name}.*({message})"):

@@ -39,7 +39,10 @@ TABLE = {"columns": 64, "elevations": [2.0, 1.0, 0.0], "range_min": 1.0, "range_
         (LINEAR | {"rows": "64"}, "rows = '64'; expected a whole number"),
         (LINEAR | {"columns": 64.0}, "columns = 64.0; expected a whole number"),
         (LINEAR | {"columns": None}, "columns = None; expected a whole number"),
-        (LINEAR | {"rows": 2_000_000_000, "columns": 2_000_000_000}, "expected at most 4194304 cells"),
+        (
+            LINEAR | {"rows": 2_000_000_000, "columns": 2_000_000_000},
+            "expected at most 4194304 cells",
+        ),
         (LINEAR | {"rows": 10**2000}, "expected at most 4194304 cells"),
         (LINEAR | {"range_max": float("inf")}, "range_max = inf; expected a finite number"),
         (LINEAR | {"range_max": 10**400}, "a finite number"),

@@ -25,16 +25,45 @@ from lidar_synth.generate.models.lidm.diffusion import schedule_times
 from lidar_synth.lab.importers.lidm import read_lidm
 from lidar_synth.lab.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA, peer_names
 
-DDCONFIG = {"double_z": False, "z_channels": 4, "in_channels": 1, "out_ch": 1, "ch": 8, "ch_mult": [1, 2],
-            "strides": [[2, 2]], "num_res_blocks": 1, "attn_levels": [], "dropout": 0.0}  # fmt: skip
+DDCONFIG = {
+    "double_z": False,
+    "z_channels": 4,
+    "in_channels": 1,
+    "out_ch": 1,
+    "ch": 8,
+    "ch_mult": [1, 2],
+    "strides": [[2, 2]],
+    "num_res_blocks": 1,
+    "attn_levels": [],
+    "dropout": 0.0,
+}
 FIRST = {"embed_dim": 4, "n_embed": 16, "lib_name": "lidm", "use_mask": False, "ddconfig": DDCONFIG}
-UNET_PARAMS = {"image_size": [4, 16], "in_channels": 4, "out_channels": 4, "model_channels": 16,
-               "attention_resolutions": [2, 1], "num_res_blocks": 1, "channel_mult": [1, 2], "num_head_channels": 8,
-               "lib_name": "lidm"}  # fmt: skip
-DATASET = {"size": [8, 32], "fov": [3, -25], "depth_range": [1.0, 56.0], "depth_scale": 56, "log_scale": False}
-UNCONDITIONAL = {"linear_start": 0.0015, "linear_end": 0.0195, "timesteps": 1000,
-                 "first_stage_config": {"params": FIRST}, "unet_config": {"params": UNET_PARAMS},
-                 "cond_stage_config": "__is_unconditional__"}  # fmt: skip
+UNET_PARAMS = {
+    "image_size": [4, 16],
+    "in_channels": 4,
+    "out_channels": 4,
+    "model_channels": 16,
+    "attention_resolutions": [2, 1],
+    "num_res_blocks": 1,
+    "channel_mult": [1, 2],
+    "num_head_channels": 8,
+    "lib_name": "lidm",
+}
+DATASET = {
+    "size": [8, 32],
+    "fov": [3, -25],
+    "depth_range": [1.0, 56.0],
+    "depth_scale": 56,
+    "log_scale": False,
+}
+UNCONDITIONAL = {
+    "linear_start": 0.0015,
+    "linear_end": 0.0195,
+    "timesteps": 1000,
+    "first_stage_config": {"params": FIRST},
+    "unet_config": {"params": UNET_PARAMS},
+    "cond_stage_config": "__is_unconditional__",
+}
 SEMANTIC = UNCONDITIONAL | {
     "unet_config": {"params": UNET_PARAMS | {"in_channels": 7}},
     "cond_stage_config": {
@@ -52,14 +81,22 @@ CAMERA = UNCONDITIONAL | {
 MASKED = FIRST | {"use_mask": True, "ddconfig": DDCONFIG | {"out_ch": 2, "attn_levels": [1, 5]}}
 MASKED_FLOW = UNCONDITIONAL | {"first_stage_config": {"params": MASKED}}
 MODELS = {
-    "first stage": FIRST, "unconditional": UNCONDITIONAL, "semantic": SEMANTIC, "camera": CAMERA,
-    "first stage with a mask": MASKED, "flow with a mask": MASKED_FLOW,
-}  # fmt: skip
+    "first stage": FIRST,
+    "unconditional": UNCONDITIONAL,
+    "semantic": SEMANTIC,
+    "camera": CAMERA,
+    "first stage with a mask": MASKED,
+    "flow with a mask": MASKED_FLOW,
+}
 
 
-def config_of(model: dict[str, Any], target: str = "lidm.data.kitti.KITTI360Train", **dataset: Any) -> dict[str, Any]:
+def config_of(
+    model: dict[str, Any], target: str = "lidm.data.kitti.KITTI360Train", **dataset: Any
+) -> dict[str, Any]:
     data = {"dataset": DATASET | dataset, "aug": {"camera_drop": 0.5}, "train": {"target": target}}
-    return copy.deepcopy({"model": {"target": "some.Model", "params": model}, "data": {"params": data}})
+    return copy.deepcopy(
+        {"model": {"target": "some.Model", "params": model}, "data": {"params": data}}
+    )
 
 
 def schedule(start: float = 0.0015, end: float = 0.0195) -> dict[str, Tensor]:
@@ -74,33 +111,51 @@ def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
 
     torch.manual_seed(0)
     parts = _parts(model, DATASET, {}, folder)[0]
-    nested, weights = set(parts) != {CODEC}, schedule() if "unet_config" in model else {}
+    nested = set(parts) != {CODEC}
+    weights = schedule() if "unet_config" in model else {}
     for name, part in parts.items():
         state = build_network(*part).state_dict()
         for ours, theirs in peer_names(name, part, nested).items():
             shape = [state[ours].shape[0] // len(theirs), *state[ours].shape[1:]]
             if ours == "view_embedding":
                 shape = [1, *shape]
-            if name == CODEC and (".attn_1." in theirs[0] or ".attn." in theirs[0]) and len(shape) == 2:
+            if (
+                name == CODEC
+                and (".attn_1." in theirs[0] or ".attn." in theirs[0])
+                and len(shape) == 2
+            ):
                 shape += [1, 1]
-            elif name == VELOCITY and theirs[0].endswith(("1.qkv.weight", "1.proj_out.weight", "1.proj_in.weight")):
+            elif name == VELOCITY and theirs[0].endswith(
+                ("1.qkv.weight", "1.proj_out.weight", "1.proj_in.weight")
+            ):
                 shape += [1, 1] if part.arguments["context_channels"] else [1]
             weights |= {one: torch.randn(shape) * 0.1 for one in theirs}
     if nested:
         for key in [k for k in weights if k.startswith(UNET)]:
-            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = torch.randn_like(weights[key]) * 0.1
-        weights |= {f"{UNET_EMA}decay": torch.tensor(0.9999), f"{UNET_EMA}num_updates": torch.tensor(7)}
+            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = (
+                torch.randn_like(weights[key]) * 0.1
+            )
+        weights |= {
+            f"{UNET_EMA}decay": torch.tensor(0.9999),
+            f"{UNET_EMA}num_updates": torch.tensor(7),
+        }
     if model is CAMERA:
-        weights["cond_stage_model.model.visual.proj"] = torch.zeros(3, 3)  # frozen CLIP, which is not imported
+        weights["cond_stage_model.model.visual.proj"] = torch.zeros(
+            3, 3
+        )  # frozen CLIP, which is not imported
     return weights
 
 
 def release(folder: Path, config: dict[str, Any], weights: dict[str, Tensor]) -> Path:
     """Write a release as a user downloads it, including values that only training needs."""
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-6}]}
+    optimizer = {
+        "state": {0: {"step": 1, "exp_avg": torch.zeros(3)}},
+        "param_groups": [{"lr": 1e-6}],
+    }
     torch.save(
-        {"epoch": 3, "global_step": 9, "state_dict": weights, "optimizer_states": [optimizer]}, folder / "model.ckpt"
+        {"epoch": 3, "global_step": 9, "state_dict": weights, "optimizer_states": [optimizer]},
+        folder / "model.ckpt",
     )
     return folder / "model.ckpt"
 
@@ -116,25 +171,36 @@ def run_import(path: Path, out: Path) -> str:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
-    weights = random_weights(MODELS[name], tmp_path) | {"loss.discriminator.main.0.weight": torch.zeros(4)}
+    weights = random_weights(MODELS[name], tmp_path) | {
+        "loss.discriminator.main.0.weight": torch.zeros(4)
+    }
     path = release(tmp_path, config_of(MODELS[name]), weights)
     out = tmp_path / "out.safetensors"
     said = run_import(path, out)
     header, networks, digest = load_checkpoint(out)
     assert digest in said
     expected = {
-        "first stage": {CODEC}, "unconditional": {VELOCITY, CODEC},
-        "semantic": {VELOCITY, CODEC, ENCODER}, "camera": {VELOCITY, CODEC, ENCODER},
-        "first stage with a mask": {CODEC}, "flow with a mask": {VELOCITY, CODEC},
-    }  # fmt: skip
+        "first stage": {CODEC},
+        "unconditional": {VELOCITY, CODEC},
+        "semantic": {VELOCITY, CODEC, ENCODER},
+        "camera": {VELOCITY, CODEC, ENCODER},
+        "first stage with a mask": {CODEC},
+        "flow with a mask": {VELOCITY, CODEC},
+    }
     assert set(networks) == expected[name]
-    assert (header.channels, header.sensor.shape, header.sensor.range_max) == (("range",), (8, 32), 56.0)
+    assert (header.channels, header.sensor.shape, header.sensor.range_max) == (
+        ("range",),
+        (8, 32),
+        56.0,
+    )
     assert (header.normalisation.kind, header.normalisation.divisor) == ("linear", 56.0)
     assert list(header.conditioning) == ([name] if name in ("semantic", "camera") else [])
     assert header.provenance["data"] == "KITTI-360"
     seen = {part["dataset"]: part["drives"] for part in header.provenance["seen"]}
     assert "2013_05_28_drive_0002_sync" in seen["KITTI-360"]
-    assert ("odometry 21" in seen.get("KITTI", {})) == (VELOCITY in networks)  # by the autoencoder inside a flow's file
+    assert ("odometry 21" in seen.get("KITTI", {})) == (
+        VELOCITY in networks
+    )  # by the autoencoder inside a flow's file
     if VELOCITY in networks:  # the averaged weights are imported, not the last ones
         head = networks[VELOCITY].state_dict()["head.bias"]
         assert torch.equal(head, weights[f"{UNET_EMA}diffusion_modelout2bias"])
@@ -142,11 +208,17 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
 
 def test_imported_models_generate(tmp_path: Path) -> None:
     maps = torch.full((8, 32), 3, dtype=torch.uint8)
-    for name, condition in (("unconditional", None), ("flow with a mask", None), ("semantic", maps)):
+    for name, condition in (
+        ("unconditional", None),
+        ("flow with a mask", None),
+        ("semantic", maps),
+    ):
         folder = tmp_path / name
         folder.mkdir()
         out = folder / f"{name}.safetensors"
-        run_import(release(folder, config_of(MODELS[name]), random_weights(MODELS[name], folder)), out)
+        run_import(
+            release(folder, config_of(MODELS[name]), random_weights(MODELS[name], folder)), out
+        )
         generator = load_generator(out)
         [scan] = generator.scans(0, [1], condition, steps=3)
         assert scan.id == f"{name}/0/1"
@@ -154,10 +226,16 @@ def test_imported_models_generate(tmp_path: Path) -> None:
 
 
 def test_other_configurations_are_imported(tmp_path: Path) -> None:
-    config = config_of(FIRST, "lidm.data.kitti.SemanticKITTITrain", log_scale=True, depth_scale=5.84)
+    config = config_of(
+        FIRST, "lidm.data.kitti.SemanticKITTITrain", log_scale=True, depth_scale=5.84
+    )
     header, _ = read_lidm(release(tmp_path, config, random_weights(FIRST, tmp_path)))
     assert header.provenance["data"] == "SemanticKITTI"
-    assert (header.normalisation.kind, header.normalisation.divisor, header.normalisation.offset) == (
+    assert (
+        header.normalisation.kind,
+        header.normalisation.divisor,
+        header.normalisation.offset,
+    ) == (
         "log",
         5.84,
         1.0001,
@@ -165,8 +243,11 @@ def test_other_configurations_are_imported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("scale", "kind"), [(5.84, "log"), (56, "linear")])
-def test_an_older_configuration_without_a_scale_is_imported(scale: float, kind: str, tmp_path: Path) -> None:
-    """The published autoencoders with a mask date from a time when the scale was always logarithmic."""
+def test_an_older_configuration_without_a_scale_is_imported(
+    scale: float, kind: str, tmp_path: Path
+) -> None:
+    """The published autoencoders with a mask date from a time when the scale was always
+    logarithmic."""
     config = config_of(MASKED, depth_scale=scale)
     del config["data"]["params"]["dataset"]["log_scale"]
     header, _ = read_lidm(release(tmp_path, config, random_weights(MASKED, tmp_path)))
@@ -174,30 +255,46 @@ def test_an_older_configuration_without_a_scale_is_imported(scale: float, kind: 
 
 
 def test_weights_without_an_average_are_imported_unchanged(tmp_path: Path) -> None:
-    weights = {k: v for k, v in random_weights(UNCONDITIONAL, tmp_path).items() if not k.startswith(UNET_EMA)}
+    weights = {
+        k: v
+        for k, v in random_weights(UNCONDITIONAL, tmp_path).items()
+        if not k.startswith(UNET_EMA)
+    }
     _, networks = read_lidm(release(tmp_path, config_of(UNCONDITIONAL), weights))
     assert torch.equal(networks[VELOCITY].state_dict()["head.bias"], weights[f"{UNET}out.2.bias"])
 
 
-# --- the published networks ------------------------------------------------------------------------------------------
+# --- the published networks
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["vqvae", "uncond", "sem2lidar", "cam2lidar"])
-def test_all_keys_of_the_published_networks_are_imported(name: str, golden: Golden, tmp_path: Path) -> None:
+def test_all_keys_of_the_published_networks_are_imported(
+    name: str, golden: Golden, tmp_path: Path
+) -> None:
     """Up to 395 M parameters by name and shape; each tensor is one expanded number."""
     published = json.loads((golden / f"lidm_{name}_full_keys.json").read_text())
     zero = torch.zeros(())
-    weights = {key: zero.expand(shape) for key, shape, *_ in published["keys"] if not key.startswith(UNET_EMA)}
+    weights = {
+        key: zero.expand(shape)
+        for key, shape, *_ in published["keys"]
+        if not key.startswith(UNET_EMA)
+    }
     if name != "vqvae":
         start, end = (published["config"][key] for key in ("linear_start", "linear_end"))
         weights |= schedule(start, end)
         for key in [k for k in weights if k.startswith(UNET)]:
             weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = weights[key]
         weights |= {f"{UNET_EMA}decay": zero, f"{UNET_EMA}num_updates": torch.tensor(0)}
-        assert sum(k.startswith(UNET_EMA) for k in weights) == published["groups"]["model_ema"]["tensors"]
+        assert (
+            sum(k.startswith(UNET_EMA) for k in weights)
+            == published["groups"]["model_ema"]["tensors"]
+        )
     config = config_of(published["config"], size=[64, 1024])
     header, networks = read_lidm(release(tmp_path, config, weights))
-    count = {part: sum(p.numel() for p in network.parameters()) for part, network in networks.items()}
+    count = {
+        part: sum(p.numel() for p in network.parameters()) for part, network in networks.items()
+    }
     if name == "vqvae":
         assert count == {CODEC: published["parameters"]}
     else:
@@ -206,7 +303,8 @@ def test_all_keys_of_the_published_networks_are_imported(name: str, golden: Gold
     assert header.sensor.shape == (64, 1024)
 
 
-# --- invalid files ---------------------------------------------------------------------------------------------------
+# --- invalid files
+# ---------------------------------------------------------------------------------------------------
 
 
 def drop(weights: dict[str, Tensor]) -> None:
@@ -236,7 +334,10 @@ def reschedule(weights: dict[str, Tensor]) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (drop, r"missing keys \['first_stage_model.decoder.up.1.block.0.norm1.bias'\], unexpected keys \[\]"),
+        (
+            drop,
+            r"missing keys \['first_stage_model.decoder.up.1.block.0.norm1.bias'\], unexpected keys \[\]",
+        ),
         (drop_average, r"missing keys \['model.diffusion_model.out.2.bias'\]"),
         (add, r"missing keys \[\], unexpected keys \['model.extra.weight'\]"),
         (reshape, r"other shapes: codebook.codes \(8, 4\) for \(16, 4\)"),
@@ -259,12 +360,20 @@ def test_weights_that_do_not_fit_are_refused(
     [
         (FIRST | {"use_mask": True}, r"an autoencoder with \{'out_ch': 1\}"),
         (FIRST | {"ddconfig": DDCONFIG | {"out_ch": 2}}, r"an autoencoder with \{'out_ch': 2\}"),
-        (UNCONDITIONAL | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}}, "a U-Net with"),
-        (UNCONDITIONAL | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}}, "by FrozenCLIPTextEmbedder"),
+        (
+            UNCONDITIONAL | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}},
+            "a U-Net with",
+        ),
+        (
+            UNCONDITIONAL | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}},
+            "by FrozenCLIPTextEmbedder",
+        ),
         ({"linear_start": 1}, "KeyError.'first_stage_config'"),
     ],
 )
-def test_configurations_that_do_not_fit_are_refused(model: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_configurations_that_do_not_fit_are_refused(
+    model: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     with pytest.raises(DataError, match=message):
         read_lidm(release(tmp_path, config_of(model), {}))
 
@@ -287,7 +396,9 @@ def test_a_pickle_of_something_else_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_a_bare_state_dictionary_of_a_wrapped_network_is_imported(tmp_path: Path, zipped: bool) -> None:
+def test_a_bare_state_dictionary_of_a_wrapped_network_is_imported(
+    tmp_path: Path, zipped: bool
+) -> None:
     weights = random_weights(FIRST, tmp_path)
     wanted = read_lidm(release(tmp_path, config_of(FIRST), weights))[1][CODEC].state_dict()
     bare = {f"module._orig_mod.{name}": tensor for name, tensor in weights.items()}
@@ -301,12 +412,16 @@ def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_pa
     """.ckpt -> import -> checkpoint -> autoencoder gives LiDM's own results."""
     about = json.loads((golden / "lidm_vqvae_tiny.json").read_text())
     tensors = load_file(golden / "lidm_vqvae_tiny.safetensors")
-    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
+    weights = {
+        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+    }
     out = tmp_path / "codec.safetensors"
     run_import(release(tmp_path, config_of(about["config"], size=about["size"]), weights), out)
     codec: Any = load_checkpoint(out).networks[CODEC]
     with torch.no_grad():
-        error = (codec.decode(codec.encode(tensors["input.x"])) - tensors["output"]).norm() / tensors["output"].norm()
+        error = (
+            codec.decode(codec.encode(tensors["input.x"])) - tensors["output"]
+        ).norm() / tensors["output"].norm()
     assert float(error) < 6e-5
 
 
@@ -324,7 +439,8 @@ def test_a_hostile_number_of_blocks_is_refused_soon(tmp_path: Path, blocks: Any)
 
 def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
     path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
-    rng, refused = Random(0), 0
+    rng = Random(0)
+    refused = 0
     for _ in range(60):
         config = config_of(FIRST)
         edit(config, rng)

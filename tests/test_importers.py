@@ -20,7 +20,13 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthErro
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.hdit.hdit import HDiT
-from lidar_synth.lab.importers.r2flow import HARMONICS, block_names, convert, peer_names, read_r2flow
+from lidar_synth.lab.importers.r2flow import (
+    HARMONICS,
+    block_names,
+    convert,
+    peer_names,
+    read_r2flow,
+)
 
 DEPTHS = (1, 1, 1, 1)
 CFG: dict[str, Any] = {
@@ -51,11 +57,20 @@ def peer_weights(position: str = "learned") -> dict[str, Tensor]:
     torch.manual_seed(0)
     net = build_network(
         "hdit",
-        {"resolution": (64, 64), "width": 16, "time_width": 16, "depths": DEPTHS, "position": position,
-         "angles": torch.rand(2, 64, 64)},
-    )  # fmt: skip
+        {
+            "resolution": (64, 64),
+            "width": 16,
+            "time_width": 16,
+            "depths": DEPTHS,
+            "position": position,
+            "angles": torch.rand(2, 64, 64),
+        },
+    )
     state = net.state_dict()
-    weights = {theirs: torch.randn_like(state[ours]) for ours, theirs in peer_names(DEPTHS, position).items()}
+    weights = {
+        theirs: torch.randn_like(state[ours])
+        for ours, theirs in peer_names(DEPTHS, position).items()
+    }
     weights["coords"] = state["angles.cells"][None]
     weights["tokenizer.0.weight"] = torch.randn(16, 2, 1, 4)
     if position == "learned":
@@ -69,8 +84,20 @@ def peer_weights(position: str = "learned") -> dict[str, Tensor]:
 
 def write(path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG) -> Path:
     """Write a file like R2Flow's training, including values that sampling does not need."""
-    optimizer = {"state": {0: {"step": 1, "exp_avg": torch.zeros(3)}}, "param_groups": [{"lr": 1e-4}]}
-    torch.save({"cfg": cfg, "weights": weights, "optimizer": optimizer, "lr_scheduler": {}, "num_images": 96}, path)
+    optimizer = {
+        "state": {0: {"step": 1, "exp_avg": torch.zeros(3)}},
+        "param_groups": [{"lr": 1e-4}],
+    }
+    torch.save(
+        {
+            "cfg": cfg,
+            "weights": weights,
+            "optimizer": optimizer,
+            "lr_scheduler": {},
+            "num_images": 96,
+        },
+        path,
+    )
     return path
 
 
@@ -90,7 +117,11 @@ def change(**groups: dict[str, Any]) -> dict[str, Any]:
 def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
     header, _ = read_r2flow(released)
     assert header.channels == ("range", "reflectance")
-    assert (header.normalisation.kind, header.normalisation.range_min, header.normalisation.range_max) == (
+    assert (
+        header.normalisation.kind,
+        header.normalisation.range_min,
+        header.normalisation.range_max,
+    ) == (
         "log",
         1.45,
         80.0,
@@ -102,8 +133,9 @@ def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
     assert header.provenance["images"] == 96
     [seen] = header.provenance["seen"]
     assert (seen["dataset"], [drive[-9:-5] for drive in seen["drives"]]) == (
-        "KITTI-360", ["0003", "0004", "0005", "0006", "0007", "0009", "0010"],
-    )  # fmt: skip
+        "KITTI-360",
+        ["0003", "0004", "0005", "0006", "0007", "0009", "0010"],
+    )
     json.dumps(header.to_dict())
 
 
@@ -117,7 +149,9 @@ def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
     ],
     ids=["distilled", "kitti raw", "metric", "unfolded"],
 )
-def test_other_configurations_are_imported(tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]) -> None:
+def test_other_configurations_are_imported(
+    tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]
+) -> None:
     header, _ = read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
     for name, value in expected.items():
         found: Any = header
@@ -140,7 +174,8 @@ def test_time_and_sign_are_folded_into_the_weights(released: Path) -> None:
 
 
 def test_all_keys_of_the_released_network_are_imported(golden: Golden, tmp_path: Path) -> None:
-    """80.9 M parameters by name and shape; each tensor is one expanded number, so that the file stays small."""
+    """80.9 M parameters by name and shape; each tensor is one expanded number, so that the file
+    stays small."""
     published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
     weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
     path = write(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
@@ -155,10 +190,20 @@ def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Golden, tmp_
     """.pth -> import -> checkpoint -> network gives R2Flow's own results."""
     name = "r2flow_hdit_tiny_learnable"
     about = json.loads((golden / f"{name}.json").read_text())
-    tensors, config = load_file(golden / f"{name}.safetensors"), about["config"]
-    weights = {k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")}
-    model = {key: config[key] for key in ("base_channels", "temb_channels", "num_residual_blocks", "coords_encoding")}
-    path = write(tmp_path / "tiny.pth", weights, change(data={"resolution": config["resolution"]}, model=model))
+    tensors = load_file(golden / f"{name}.safetensors")
+    config = about["config"]
+    weights = {
+        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+    }
+    model = {
+        key: config[key]
+        for key in ("base_channels", "temb_channels", "num_residual_blocks", "coords_encoding")
+    }
+    path = write(
+        tmp_path / "tiny.pth",
+        weights,
+        change(data={"resolution": config["resolution"]}, model=model),
+    )
     out = tmp_path / "tiny.safetensors"
     result = run_import(path, out)
     assert result.exit_code == 0, result.output
@@ -188,7 +233,8 @@ def test_the_command_refuses_unknown_peers(released: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out.safetensors").exists()
 
 
-# --- invalid files -------------------------------------------------------------------------------------------------
+# --- invalid files
+# -------------------------------------------------------------------------------------------------
 
 
 def drop(weights: dict[str, Tensor]) -> None:
@@ -240,7 +286,9 @@ def test_weights_that_do_not_fit_are_refused(
     ],
     ids=["architecture", "position", "format", "dataset", "resolution", "groups", "limits"],
 )
-def test_configurations_that_do_not_fit_are_refused(tmp_path: Path, cfg: dict[str, Any], message: str) -> None:
+def test_configurations_that_do_not_fit_are_refused(
+    tmp_path: Path, cfg: dict[str, Any], message: str
+) -> None:
     with pytest.raises(DataError, match=message):
         read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
 
@@ -297,7 +345,9 @@ def test_a_missing_file_is_reported(tmp_path: Path) -> None:
 
 
 def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
-    rng, refused, weights = Random(0), 0, peer_weights()
+    rng = Random(0)
+    refused = 0
+    weights = peer_weights()
     for _ in range(60):
         cfg = copy.deepcopy(CFG)
         edit(cfg, rng)

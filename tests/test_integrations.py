@@ -1,5 +1,6 @@
 # ruff: noqa: NPY002 - what trainers draw from
-"""What the adapters share, and the traps that need no trainer to fall into; each trainer has a test file of its own."""
+"""What the adapters share, and the traps that need no trainer to fall into; each trainer has a test
+file of its own."""
 
 import csv
 import importlib
@@ -55,7 +56,11 @@ def test_synthetic_scans_by_name(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such model"):
         open_synthetic("no such model")
     write_bank(tmp_path / "bank", [some_image(i) for i in range(3)])
-    assert len(open_synthetic(str(tmp_path / "bank"))) == len(open_synthetic((tmp_path / "bank").as_uri())) == 3
+    assert (
+        len(open_synthetic(str(tmp_path / "bank")))
+        == len(open_synthetic((tmp_path / "bank").as_uri()))
+        == 3
+    )
 
 
 def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
@@ -79,10 +84,14 @@ def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> No
         mix(4, settings, as_is)
 
 
-def test_settings_come_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_come_from_a_file_or_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = {"synthetic": "bank", "ratio": 0.5, "label_options": {"kind": "objects"}}
     path = tmp_path / "mix.yaml"
-    path.write_text(yaml.safe_dump({"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}}))
+    path.write_text(
+        yaml.safe_dump({"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}})
+    )
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(ConfigError, match=f"{VARIABLE}=mix.yaml"):
         read_settings()
@@ -96,7 +105,8 @@ def test_settings_come_from_a_file_or_the_environment(tmp_path: Path, monkeypatc
 def test_a_batch_without_a_label_is_prevented() -> None:
     """Trap: the mean of a loss over no label is NaN."""
     scan = Scans("s", 1)[0]
-    logits, loss = torch.zeros(len(scan), 19, requires_grad=True), torch.nn.CrossEntropyLoss(ignore_index=-1)
+    logits = torch.zeros(len(scan), 19, requires_grad=True)
+    loss = torch.nn.CrossEntropyLoss(ignore_index=-1)
     nothing = replace(scan, label=np.full(len(scan), IGNORE, np.uint8))
     table = id_table(0, -1, np.int64)
     assert torch.isnan(loss(logits, torch.from_numpy(table[nothing.label])))  # type: ignore[index]
@@ -141,7 +151,8 @@ def test_boxes_that_a_trainer_does_not_know_are_refused() -> None:
 def test_points_are_memory_of_their_own() -> None:
     """Trap: trainers turn points in place."""
     scan = Scans("s", 1)[0]
-    points, before = points_of(scan), scan.points.copy()
+    points = points_of(scan)
+    before = scan.points.copy()
     points[:] = 0
     assert np.array_equal(scan.points, before)
 
@@ -162,7 +173,12 @@ def test_the_loader_tells_the_epoch(persistent: bool) -> None:
     """Trap: an attribute set in the main process never reaches workers that persist."""
     mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
     loader = EpochLoader(
-        Wrapped(mixed), batch_size=2, num_workers=2, collate_fn=list, persistent_workers=persistent, shuffle=True
+        Wrapped(mixed),
+        batch_size=2,
+        num_workers=2,
+        collate_fn=list,
+        persistent_workers=persistent,
+        shuffle=True,
     )
     seen = []
     for epoch in range(3):
@@ -190,15 +206,24 @@ def test_trainers_generators_do_not_decide_on_scans() -> None:
 @pytest.fixture
 def mixed(tmp_path: Path) -> MixedScans:
     real = [replace(street(i), domain=0) for i in range(3)]
-    return MixedScans(real, open_synthetic(synthetic(tmp_path / "synthetic", 4)), ratio=0.4, seed=2, to_sample=as_is)
+    return MixedScans(
+        real,
+        open_synthetic(synthetic(tmp_path / "synthetic", 4)),
+        ratio=0.4,
+        seed=2,
+        to_sample=as_is,
+    )
 
 
 def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
-    """Trap: trainers read a missing ``.label`` as zeros, "car" for one of them: every scan has its own."""
+    """Trap: trainers read a missing ``.label`` as zeros, "car" for one of them: every scan has its
+    own."""
     assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 5
     read = open_scans(tmp_path / "out", split="train")
     for i, scan in enumerate(read):
-        assert np.array_equal(scan.points, mixed[i].points) and np.array_equal(scan.label, mixed[i].label)
+        assert np.array_equal(scan.points, mixed[i].points) and np.array_equal(
+            scan.label, mixed[i].label
+        )
     labels = list((tmp_path / "out" / "sequences" / "00" / "labels").iterdir())
     assert len(labels) == len(read) == 5
     rows = list(csv.reader((tmp_path / "out" / MANIFEST).read_text().splitlines()[1:]))
@@ -206,7 +231,9 @@ def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
     assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
     with pytest.raises(ConfigError, match="was filled with .*plan.* or choose another folder"):
         export_mixture(mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False)
-    other = MixedScans(mixed.real[0], mixed.synthetic[0], ratio=0.4, seed=2, to_sample=as_is, labels="none")
+    other = MixedScans(
+        mixed.real[0], mixed.synthetic[0], ratio=0.4, seed=2, to_sample=as_is, labels="none"
+    )
     with pytest.raises(ConfigError, match="was filled with"):
         export_mixture(other, tmp_path / "out", "semantic_kitti", progress=False)
 
@@ -221,7 +248,9 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
         ("image_2", "png"),
         ("planes", "txt"),
     ]:
-        assert sorted(p.name for p in (root / "training" / kind).iterdir()) == [f"{i:06d}.{suffix}" for i in range(5)]
+        assert sorted(p.name for p in (root / "training" / kind).iterdir()) == [
+            f"{i:06d}.{suffix}" for i in range(5)
+        ]
     assert (root / "ImageSets" / "train.txt").read_text().split() == [f"{i:06d}" for i in range(5)]
     for i, scan in enumerate(KITTIObject(root, "train")):
         assert scan.boxes is not None and len(scan.boxes) == 2
@@ -232,7 +261,9 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["semantic_kitti", "kitti"])
-def test_an_export_has_validation_apart_from_training(mixed: MixedScans, tmp_path: Path, layout: Any) -> None:
+def test_an_export_has_validation_apart_from_training(
+    mixed: MixedScans, tmp_path: Path, layout: Any
+) -> None:
     held = [street(i) for i in (7, 8)]
     options = {"calibration": CAMERA, "validation": held, "progress": False}
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 7
@@ -253,7 +284,10 @@ def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
         export_mixture(mixed, tmp_path, "semantic_kitti", progress=False)
     with pytest.raises(ConfigError, match="to_sample"):
         export_mixture(
-            MixedScans(real, Scans("s", 3, street(0).sensor, 1)), tmp_path / "kitti", "kitti", progress=False
+            MixedScans(real, Scans("s", 3, street(0).sensor, 1)),
+            tmp_path / "kitti",
+            "kitti",
+            progress=False,
         )
     with pytest.raises(ConfigError, match="'semantic_kitti' or 'kitti'"):
         export_mixture(mixed, tmp_path, "kitti360")  # type: ignore[arg-type]
@@ -277,11 +311,14 @@ def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
     for i, entry in enumerate(entries):
         scan = KITTIObject(root, "train")[i]
         assert scan.boxes is not None and len(entry["instances"]) == len(scan.boxes) == 2
-        place, dims = np.array(entry["instances"][0]["bbox_3d"][:3]), entry["instances"][0]["bbox_3d"][3:6]
+        place = np.array(entry["instances"][0]["bbox_3d"][:3])
+        dims = entry["instances"][0]["bbox_3d"][3:6]
         centre = CAMERA.sensor_from_camera @ [*(place - [0, dims[1] / 2, 0]), 1]
         assert np.allclose(centre[:3], scan.boxes.values[0, :3], atol=1e-4)
         assert np.allclose(dims, scan.boxes.values[0, [3, 5, 4]], atol=1e-5)
-        reduced = np.fromfile(root / "training" / "velodyne_reduced" / entry["lidar_points"]["lidar_path"], "<f4")
+        reduced = np.fromfile(
+            root / "training" / "velodyne_reduced" / entry["lidar_points"]["lidar_path"], "<f4"
+        )
         assert np.array_equal(reduced.reshape(-1, 4)[:, :3], in_view(scan, CAMERA).points)
     (root / "training" / "calib" / "000001.txt").unlink()
     (root / "training" / "planes" / "000001.txt").unlink()
@@ -307,7 +344,12 @@ def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("adapter", "trainer"),
-    [("mmdet3d", "mmdet3d"), ("pointcept", "pointcept"), ("lightning", "lightning"), ("openpcdet", "pcdet")],
+    [
+        ("mmdet3d", "mmdet3d"),
+        ("pointcept", "pointcept"),
+        ("lightning", "lightning"),
+        ("openpcdet", "pcdet"),
+    ],
 )
 def test_a_missing_trainer_is_named(adapter: str, trainer: str) -> None:
     if find_spec(trainer) is not None:
@@ -334,16 +376,24 @@ def test_the_stand_in_for_torch_scatter() -> None:
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
-    values, index = torch.randn(20, 3), torch.randint(0, 4, (20,))
+    values = torch.randn(20, 3)
+    index = torch.randint(0, 4, (20,))
     index[:4] = torch.arange(4)
     for i in range(4):
-        assert torch.equal(module.scatter_max(values, index, dim=0)[0][i], values[index == i].amax(0))
-        assert torch.allclose(module.scatter_mean(values, index, dim=0)[i], values[index == i].mean(0))
+        assert torch.equal(
+            module.scatter_max(values, index, dim=0)[0][i], values[index == i].amax(0)
+        )
+        assert torch.allclose(
+            module.scatter_mean(values, index, dim=0)[i], values[index == i].mean(0)
+        )
 
 
 def test_loaders_take_a_mixture_of_plain_items() -> None:
-    """Trap: collate wants the same keys in every sample, with labels, boxes and confidence or without."""
-    real = [replace(s, label=None, raw_label=None) if i % 2 else s for i, s in enumerate(Scans("r", 6))]
+    """Trap: collate wants the same keys in every sample, with labels, boxes and confidence or
+    without."""
+    real = [
+        replace(s, label=None, raw_label=None) if i % 2 else s for i, s in enumerate(Scans("r", 6))
+    ]
     mixed = MixedScans(Scans("r", 0, SMALL) or real, Endless(), ratio=0.4)
     loader = DataLoader(mixed, batch_size=5, collate_fn=mixed.collate)
     assert [sorted(batch) for batch in loader] == [sorted(mixed.collate([mixed[0], mixed[1]]))] * 2

@@ -11,14 +11,30 @@ from lidar_synth.errors import ConfigError
 
 TRAIN = np.arange(len(NAMES), dtype=np.uint8)
 POSS = dict.fromkeys((0, 1, 18, 19, 20), 0) | {
-    4: 1, 5: 1, 6: 2, 7: 3, 8: 4, 9: 5, 10: 6, 11: 6, 12: 6, 13: 7, 14: 8, 15: 9, 16: 10, 17: 11, 21: 12, 22: 13
-}  # fmt: skip
+    4: 1,
+    5: 1,
+    6: 2,
+    7: 3,
+    8: 4,
+    9: 5,
+    10: 6,
+    11: 6,
+    12: 6,
+    13: 7,
+    14: 8,
+    15: 9,
+    16: 10,
+    17: 11,
+    21: 12,
+    22: 13,
+}
 """``learning_map`` of CENet's semantic-poss.yaml."""
 
 
 @pytest.mark.parametrize("name", FILE_CLASSES)
 def test_what_is_written_is_read_as_a_class_of_the_same_kind(name: str) -> None:
-    """Each class comes back as itself or as the one that a lossy table names for all of its kind."""
+    """Each class comes back as itself or as the one that a lossy table names for all of its
+    kind."""
     taxonomy = FILE_CLASSES[name]
     back = taxonomy.decode(taxonomy.encode(TRAIN).astype(np.uint16))
     again = taxonomy.decode(taxonomy.encode(back).astype(np.uint16))
@@ -32,7 +48,13 @@ def test_what_is_written_is_read_as_a_class_of_the_same_kind(name: str) -> None:
 def test_the_trainers_own_map_gives_the_ids() -> None:
     ids = trainer_ids(POSS, take_classes({"classes": "semantic_poss"}), id_table(1, 0, np.uint8))
     named = dict(zip(NAMES, ids.tolist(), strict=False))
-    assert (named["car"], named["person"], named["bicyclist"], named["road"], named["terrain"]) == (3, 1, 2, 13, 13)
+    assert (named["car"], named["person"], named["bicyclist"], named["road"], named["terrain"]) == (
+        3,
+        1,
+        2,
+        13,
+        13,
+    )
     assert named["truck"] == 0 and (ids[len(NAMES) :] == 0).all()
 
 

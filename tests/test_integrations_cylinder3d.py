@@ -1,5 +1,7 @@
-# ruff: noqa: E402, NPY002 - imports wait for what they need; Cylinder3D draws from numpy's global generator
-"""Cylinder3D's own voxels, augmentation, collate code and script on mixed scans: CYLINDER3D_ROOT is a checkout."""
+# ruff: noqa: E402, NPY002 - imports wait for what they need; Cylinder3D draws from numpy's global
+# generator
+"""Cylinder3D's own voxels, augmentation, collate code and script on mixed scans: CYLINDER3D_ROOT is
+a checkout."""
 
 import os
 import re
@@ -30,7 +32,8 @@ from lidar_synth.integrations.mixture import VARIABLE, EpochLoader
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
 
-REAL, EXTRA = 6, 4
+REAL = 6
+EXTRA = 4
 LABELS = str(ROOT / "config/label_mapping/semantic-kitti.yaml")
 
 
@@ -45,7 +48,9 @@ def make(root: Path) -> Path:
     for sequence in ("01", "02", "03", "04", "05", "06", "07", "09", "10"):
         (root / "sk" / "sequences" / sequence / "velodyne").mkdir(parents=True)
     synthetic(root / "synthetic", 11)
-    (root / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}))
+    (root / "mix.yaml").write_text(
+        yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3})
+    )
     return root
 
 
@@ -55,11 +60,15 @@ def points(made: Path) -> Any:
 
 
 def both(made: Path) -> tuple[Any, Any]:
-    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
+    times them."""
     register()
     options = {"imageset": "train", "return_ref": True, "label_mapping": LABELS}
     with patch.dict(os.environ, {VARIABLE: str(made / "mix.yaml")}):
-        return tuple(get_pc_model_class(name)(f"{made}/sk/sequences", **options) for name in ("SemKITTI_sk", NAME))
+        return tuple(
+            get_pc_model_class(name)(f"{made}/sk/sequences", **options)
+            for name in ("SemKITTI_sk", NAME)
+        )
 
 
 def voxels(dataset: Any, augment: bool = True) -> Any:
@@ -120,18 +129,24 @@ def test_turning_in_place_does_not_reach_the_source(made: Path, points: Any) -> 
     turned = voxels(points)
     for position in kept:
         turned[position]
-        assert isinstance(kept[position], Scan) and np.array_equal(kept[position].points, before[position])
+        assert isinstance(kept[position], Scan) and np.array_equal(
+            kept[position].points, before[position]
+        )
 
 
 def test_batches_go_through_its_collate(points: Any) -> None:
-    dataset = get_model_class("cylinder_dataset")(points, [48, 36, 8], fixed_volume_space=True, ignore_label=0)
+    dataset = get_model_class("cylinder_dataset")(
+        points, [48, 36, 8], fixed_volume_space=True, ignore_label=0
+    )
     for batch in EpochLoader(dataset, batch_size=5, collate_fn=collate_fn_BEV):
         assert batch[0].shape == (5, 3, 48, 36, 8) and (batch[1] > 0).any()
 
 
 def test_validation_is_the_trainers_own(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
-    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to("00")
+    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to(
+        "00"
+    )
     val = register_once()(f"{made}/sk/sequences", "val", return_ref=True, label_mapping=LABELS)
     assert len(val) == REAL and val.mixed is None
 
@@ -143,7 +158,8 @@ def register_once() -> Any:
 def test_a_map_of_classes_that_does_not_fit_is_refused(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its labels are a file that the configuration names: synthetic ones would keep the stock ids."""
+    """Its labels are a file that the configuration names: synthetic ones would keep the stock
+    ids."""
     monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
     mapping = yaml.safe_load(Path(LABELS).read_text())
     mapping["learning_map"][10] = 4
@@ -160,7 +176,9 @@ def test_missing_and_unlabelled_mixtures_are_refused(
         register()(f"{made}/sk/sequences", "train", label_mapping=LABELS)
     bare = synthetic(tmp_path / "bare", 3, labels=False)
     for labels in ("generated", "none"):
-        (tmp_path / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(bare), "labels": labels}))
+        (tmp_path / "mix.yaml").write_text(
+            yaml.safe_dump({"synthetic": str(bare), "labels": labels})
+        )
         monkeypatch.setenv(VARIABLE, str(tmp_path / "mix.yaml"))
         with pytest.raises(ConfigError, match="labels"):
             register()(f"{made}/sk/sequences", "train", label_mapping=LABELS)
@@ -169,11 +187,14 @@ def test_missing_and_unlabelled_mixtures_are_refused(
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
-    """The stock network on a small grid: ``train_cylinder_asym.py`` as a user types it, with validation."""
+    """The stock network on a small grid: ``train_cylinder_asym.py`` as a user types it, with
+    validation."""
     for library in ("spconv", "torch_scatter", "strictyaml"):
         if not find_spec(library):
             pytest.skip(f"{library}, which Cylinder3D's network needs, is not installed")
-    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to("00")
+    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to(
+        "00"
+    )
     own = yaml.safe_load((ROOT / "config/semantickitti.yaml").read_text())
     own["model_params"] |= {"output_shape": [48, 36, 16], "init_size": 4, "out_fea_dim": 32}
     own["dataset_params"] |= {"pc_dataset_type": NAME, "label_mapping": LABELS}
@@ -190,4 +211,9 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
     plan = both(made)[1].mixed.plan
     assert epochs(said) == [(e, REAL + EXTRA, EXTRA, plan(e).hash[:16]) for e in (0, 1)]
     losses = [float(value) for value in re.findall(r"epoch \d+ iter +\d+, loss: (\S+)", said)]
-    assert len(losses) == 3 and np.isfinite(losses).all() and "Current val loss" in said and model.is_file()
+    assert (
+        len(losses) == 3
+        and np.isfinite(losses).all()
+        and "Current val loss" in said
+        and model.is_file()
+    )

@@ -1,4 +1,5 @@
-"""A trainer of lidar-bonnetal's family with other names: its own script, in a checkout as small as can be."""
+"""A trainer of lidar-bonnetal's family with other names: its own script, in a checkout as small as
+can be."""
 
 from pathlib import Path
 
@@ -72,7 +73,8 @@ class Parser:
 
 
 def test_a_trainer_that_imports_its_parser_trains_on_the_mixture(tmp_path: Path) -> None:
-    """CENet's layout, without the names of lidar-bonnetal's packages; without a GPU nothing else need be set."""
+    """CENet's layout, without the names of lidar-bonnetal's packages; without a GPU nothing else
+    need be set."""
     semantic_kitti(tmp_path / "sk", 6)
     synthetic(tmp_path / "synthetic", 8)
     (tmp_path / "mix.yaml").write_text(f"synthetic: {tmp_path / 'synthetic'}\nratio: 0.4\n")

@@ -27,7 +27,9 @@ from lidar_synth.labels import ObjectBank
 def test_the_ground_plane(labelled: bool) -> None:
     scan = street(3)
     tilt = np.array([0.03, -0.02])
-    lifted = scan.points + np.c_[np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt].astype(np.float32)
+    lifted = scan.points + np.c_[np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt].astype(
+        np.float32
+    )
     tilted = replace(scan, points=lifted, label=scan.label if labelled else None, raw_label=None)
     plane = ground_plane(tilted)
     normal = np.array([-tilt[0], -tilt[1], 1]) / np.linalg.norm([*tilt, 1])
@@ -43,10 +45,12 @@ def test_the_ground_plane(labelled: bool) -> None:
 
 def test_difficulty_is_kittis() -> None:
     boxes = Boxes(
-        np.tile(np.array([10, 0, 0, 4, 2, 1.5, 0], np.float32), (6, 1)), ("Car",) * 6,
-        truncation=np.array([0, 0.2, 0.4, 0.6, 0, 0]), occlusion=np.array([0, 1, 2, 0, -1, 3]),
+        np.tile(np.array([10, 0, 0, 4, 2, 1.5, 0], np.float32), (6, 1)),
+        ("Car",) * 6,
+        truncation=np.array([0, 0.2, 0.4, 0.6, 0, 0]),
+        occlusion=np.array([0, 1, 2, 0, -1, 3]),
         image_box=np.array([[0, 0, 100, 100]] * 6),
-    )  # fmt: skip
+    )
     assert difficulty(boxes).tolist() == [0, 1, 2, -1, -1, -1]
     far = replace(boxes, values=boxes.values + np.array([100, 0, 0, 0, 0, 0, 0], np.float32))
     assert difficulty(replace(far, image_box=None)).tolist() == [-1] * 6  # type: ignore[arg-type]
@@ -63,7 +67,9 @@ def test_the_object_database(tmp_path: Path, origin: Any) -> None:
     for i, info in enumerate(found):
         points = np.fromfile(tmp_path / info["path"], "<f4").reshape(-1, 4)
         assert len(points) == info["num_points_in_gt"] and info["difficulty"] == 0
-        assert np.allclose(points[:, :3] + info["box3d_lidar"][:3], objects[i].scan.points, atol=1e-5)
+        assert np.allclose(
+            points[:, :3] + info["box3d_lidar"][:3], objects[i].scan.points, atol=1e-5
+        )
         lift = 0 if origin == "gravity" else info["box3d_lidar"][5] / 2
         assert np.isclose(info["box3d_lidar"][2] + lift, objects.boxes.values[i, 2], atol=1e-5)
 
@@ -79,7 +85,9 @@ def test_objects_of_unknown_occlusion_are_pasted_too(tmp_path: Path, layout: Any
     objects = ObjectBank.from_scans([bare])
     assert (objects.boxes.occlusion == -1).all()
     path = write_gt_database(objects, tmp_path, origin="bottom", infos="infos.pkl", layout=layout)
-    found = [info["difficulty"] for infos in pickle.loads(path.read_bytes()).values() for info in infos]
+    found = [
+        info["difficulty"] for infos in pickle.loads(path.read_bytes()).values() for info in infos
+    ]
     assert len(found) == len(objects) and set(found) == {0}
 
 
@@ -87,9 +95,11 @@ def test_a_detectors_mixture_has_boxes_by_the_mix_policy(tmp_path: Path) -> None
     """As a configuration says it: a bank of objects by its file, scans without a box."""
     ObjectBank.from_scans([street(i) for i in range(6)]).save(tmp_path / "objects.npz")
     settings = {
-        "synthetic": synthetic(tmp_path / "bare", 4, boxes=False), "ratio": 0.5, "labels": "mix",
+        "synthetic": synthetic(tmp_path / "bare", 4, boxes=False),
+        "ratio": 0.5,
+        "labels": "mix",
         "label_options": {"objects": str(tmp_path / "objects.npz"), "count": 4},
-    }  # fmt: skip
+    }
     given = mix(4, settings, as_is)
     scans = [s for s in (given[i] for i in range(len(given))) if isinstance(s, Scan)]
     assert len(scans) == 4

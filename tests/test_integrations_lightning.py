@@ -47,9 +47,15 @@ class Model(lightning.LightningModule):  # type: ignore[misc, name-defined]
 def fit(data: Any, epochs: int = 2, checkpoint: Any = None) -> Model:
     model = Model()
     trainer = lightning.Trainer(
-        max_epochs=epochs, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, use_distributed_sampler=False, num_sanity_val_steps=0,
-    )  # fmt: skip
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        num_sanity_val_steps=0,
+    )
     trainer.fit(model, data, ckpt_path=checkpoint)
     return model
 
@@ -71,7 +77,8 @@ class OfNumbers(Generated):
     """A generator of the tests' scans that counts how it is asked."""
 
     def __init__(self) -> None:
-        self.source, self.asked = Endless(), list[list[int]]()
+        self.source = Endless()
+        self.asked = list[list[int]]()
 
     sensor = Endless.sensor
     fields = frozenset(("reflectance", "label", "confidence"))
@@ -90,7 +97,9 @@ def test_synthesis_after_the_transfer_gives_the_same_batches(workers: int) -> No
     made = OfNumbers()
     mixed = MixedScans(Scans("r", REAL), made, ratio=0.5, seed=1)
     model = fit(module.MixedData(mixed, batch_size=4, num_workers=workers, on_device=True))
-    again = fit(module.MixedData(MixedScans(Scans("r", REAL), Endless(), ratio=0.5, seed=1), batch_size=4))
+    again = fit(
+        module.MixedData(MixedScans(Scans("r", REAL), Endless(), ratio=0.5, seed=1), batch_size=4)
+    )
     assert model.seen == again.seen
     assert max(map(len, made.asked)) > 1  # several at once
 
@@ -100,7 +109,9 @@ class Pairs(Model):
 
     def training_step(self, batch: Any, index: int) -> Any:
         x, y = batch
-        assert x.dtype == torch.float32 and y.dtype == torch.int64 and x.shape == y.shape == (4, 8, 8)
+        assert (
+            x.dtype == torch.float32 and y.dtype == torch.int64 and x.shape == y.shape == (4, 8, 8)
+        )
         self.validated += 1
         return self.weight.sum()
 
@@ -115,10 +126,14 @@ def test_batches_of_pairs_are_passed_on(tmp_path: Path) -> None:
     assert model.validated == 3
 
 
-@pytest.mark.parametrize("options", [{"fast_dev_run": True}, {"limit_train_batches": 1}, {"overfit_batches": 1}])
+@pytest.mark.parametrize(
+    "options", [{"fast_dev_run": True}, {"limit_train_batches": 1}, {"overfit_batches": 1}]
+)
 def test_one_batch_is_no_epoch_that_grows(options: dict[str, Any], tmp_path: Path) -> None:
     model = Model()
-    data = module.MixedData(MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1), batch_size=4)
+    data = module.MixedData(
+        MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1), batch_size=4
+    )
     trainer(tmp_path, 1, **options).fit(model, data)
     assert len(model.seen) == 4
 
@@ -135,7 +150,9 @@ def test_a_checkpoint_of_another_mixture_is_refused() -> None:
     with pytest.raises(ConfigError, match="seed 2"):
         data.load_state_dict({"seed": 2})
     with pytest.raises(ConfigError, match="ratio 1/4, here 1/2"):
-        module.MixedData(MixedScans(Scans("r", REAL), Endless(), 0.5, seed=1)).load_state_dict(data.state_dict())
+        module.MixedData(MixedScans(Scans("r", REAL), Endless(), 0.5, seed=1)).load_state_dict(
+            data.state_dict()
+        )
     with pytest.warns(UserWarning, match="without its plan"):
         data.load_state_dict({"seed": 1})  # as checkpoints were before they told the position
 
@@ -159,9 +176,16 @@ class Stopping(Model):
 
 def trainer(root: Path, epochs: int = 3, **options: Any) -> Any:
     return lightning.Trainer(
-        max_epochs=epochs, accelerator="cpu", logger=False, enable_progress_bar=False, default_root_dir=root,
-        enable_model_summary=False, use_distributed_sampler=False, num_sanity_val_steps=0, **options,
-    )  # fmt: skip
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_progress_bar=False,
+        default_root_dir=root,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        num_sanity_val_steps=0,
+        **options,
+    )
 
 
 @pytest.mark.parametrize("how", ["step", "exception", "epoch"])
@@ -170,7 +194,9 @@ def test_a_checkpoint_resumes_after_its_last_batch(workers: int, how: str, tmp_p
     """Taken after a training step, on an exception in the next one, or at an epoch's end."""
     callbacks = lightning.pytorch.callbacks
     callback = {
-        "step": callbacks.ModelCheckpoint(tmp_path, "step", every_n_train_steps=1, save_top_k=1, monitor=None),
+        "step": callbacks.ModelCheckpoint(
+            tmp_path, "step", every_n_train_steps=1, save_top_k=1, monitor=None
+        ),
         "exception": callbacks.OnExceptionCheckpoint(tmp_path, "exception"),
         "epoch": callbacks.ModelCheckpoint(tmp_path, "epoch"),
     }[how]
@@ -185,7 +211,9 @@ def test_a_checkpoint_resumes_after_its_last_batch(workers: int, how: str, tmp_p
     with pytest.raises(Stop):
         trainer(tmp_path, callbacks=[callback]).fit(first, data())
     rest = Model()
-    trainer(tmp_path, enable_checkpointing=False).fit(rest, data(), ckpt_path=tmp_path / f"{how}.ckpt")
+    trainer(tmp_path, enable_checkpointing=False).fit(
+        rest, data(), ckpt_path=tmp_path / f"{how}.ckpt"
+    )
     kept = [sample for sample in first.seen if how != "epoch" or sample[0] == 0]
     assert kept + rest.seen == whole.seen
 
@@ -194,7 +222,9 @@ def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
     data = module.MixedData(MixedScans(Scans("r", REAL), Endless()), batch_size=2)
     state = make_state(data.train.mixture, 0, 4) | {"step": 4}
     data.load_state_dict(state)
-    with pytest.raises(ConfigError, match="4 samples a step, for 2 a step.*from the end of an epoch fits any"):
+    with pytest.raises(
+        ConfigError, match="4 samples a step, for 2 a step.*from the end of an epoch fits any"
+    ):
         data.train_dataloader()
     data.load_state_dict(make_state(data.train.mixture, 1, 0) | {"step": 4})
     data.train_dataloader()
@@ -209,21 +239,39 @@ class Shared(Model):
 
     def on_train_epoch_end(self) -> None:
         path = self.out / f"{self.current_epoch}-{self.global_rank}.txt"
-        path.write_text("\n".join(name for epoch, _, name in self.seen if epoch == self.current_epoch))
+        path.write_text(
+            "\n".join(name for epoch, _, name in self.seen if epoch == self.current_epoch)
+        )
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("own", [True, False])
 def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
-    """With the module's own sharing, and with Lightning's ``DistributedSampler`` over a plain loader."""
+    """With the module's own sharing, and with Lightning's ``DistributedSampler`` over a plain
+    loader."""
     mixed = MixedScans(Scans("r", 10), Endless(), ratio=0.25, seed=1)
-    data: Any = module.MixedData(mixed, batch_size=3) if own else DataLoader(mixed, 3, collate_fn=mixed.collate)
+    data: Any = (
+        module.MixedData(mixed, batch_size=3)
+        if own
+        else DataLoader(mixed, 3, collate_fn=mixed.collate)
+    )
     lightning.Trainer(
-        max_epochs=2, accelerator="cpu", devices=2, strategy="ddp_fork", logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=not own,
-    ).fit(Shared(tmp_path), data)  # fmt: skip
+        max_epochs=2,
+        accelerator="cpu",
+        devices=2,
+        strategy="ddp_fork",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=not own,
+    ).fit(Shared(tmp_path), data)
     for epoch in (0, 1):
-        seen = [name for rank in (0, 1) for name in (tmp_path / f"{epoch}-{rank}.txt").read_text().split()]
+        seen = [
+            name
+            for rank in (0, 1)
+            for name in (tmp_path / f"{epoch}-{rank}.txt").read_text().split()
+        ]
         made = mixed.plan(epoch if own else 0)  # nobody tells a plain dataset the epoch
         wanted = [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
         assert sorted(seen) == sorted(wanted)
@@ -233,9 +281,15 @@ def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
 def test_lightning_does_not_share_once_more(tmp_path: Path) -> None:
     data = module.MixedData(MixedScans(Scans("r", 10), Endless()), batch_size=3)
     both = lightning.Trainer(
-        max_epochs=1, accelerator="cpu", devices=2, strategy="ddp_fork", logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False,
-    )  # fmt: skip
+        max_epochs=1,
+        accelerator="cpu",
+        devices=2,
+        strategy="ddp_fork",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
     with pytest.raises(Exception, match="use_distributed_sampler=False"):
         both.fit(Model(), data)
 

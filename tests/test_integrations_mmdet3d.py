@@ -1,5 +1,7 @@
-# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""MMDetection3D's own datasets, transforms and loaders on mixed lists; skipped where it is not installed."""
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global
+# generator
+"""MMDetection3D's own datasets, transforms and loaders on mixed lists; skipped where it is not
+installed."""
 
 import importlib
 import os
@@ -42,7 +44,9 @@ from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import ObjectBank
 
-REAL, EXTRA, SYNTHETIC = 6, 4, 11
+REAL = 6
+EXTRA = 4
+SYNTHETIC = 11
 """Real scans, synthetic samples of an epoch, synthetic scans that there are."""
 MIX = {"ratio": 0.4, "seed": 3}
 DETECTION = "pointpillars_kitti.py"
@@ -62,11 +66,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_infos(root / "seg", root / "sk" / "train.json", settings, data_root=root / "sk")
     kitti_list(kitti(root / "kitti", REAL), root / "kitti" / "train.json")
     write_infos(
-        root / "det", root / "kitti" / "train.json", settings,
-        data_root=root / "kitti", points="training/velodyne_reduced",
-    )  # fmt: skip
+        root / "det",
+        root / "kitti" / "train.json",
+        settings,
+        data_root=root / "kitti",
+        points="training/velodyne_reduced",
+    )
     objects = ObjectBank.from_scans(open_scans(root / "synthetic"))
-    write_gt_database(objects, root / "kitti", origin="bottom", folder="kitti_gt_database", infos="dbinfos.pkl")
+    write_gt_database(
+        objects, root / "kitti", origin="bottom", folder="kitti_gt_database", infos="dbinfos.pkl"
+    )
     return root
 
 
@@ -77,7 +86,11 @@ def train_set(config: str) -> dict[str, Any]:
 
 
 def segmentation(made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any) -> Any:
-    loaded = train_set("minkunet_semantickitti.py") | {"ann_file": str(made / "seg" / "infos.json")} | options
+    loaded = (
+        train_set("minkunet_semantickitti.py")
+        | {"ann_file": str(made / "seg" / "infos.json")}
+        | options
+    )
     if pipeline is not None:
         loaded["pipeline"] = loaded["pipeline"][:3] + pipeline
     return DATASETS.build(loaded)
@@ -88,16 +101,22 @@ def detection(made: Path, pipeline: list[dict[str, Any]] | None = None, **option
     for step in loaded["pipeline"]:
         if step["type"] == "ObjectSample":
             step["db_sampler"] |= {
-                "data_root": str(made / "kitti"), "info_path": str(made / "kitti" / "dbinfos.pkl"),
-                "classes": ["Car"], "sample_groups": {"Car": 5},
+                "data_root": str(made / "kitti"),
+                "info_path": str(made / "kitti" / "dbinfos.pkl"),
+                "classes": ["Car"],
+                "sample_groups": {"Car": 5},
                 "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
-            }  # fmt: skip
+            }
     if pipeline is not None:
         loaded["pipeline"] = loaded["pipeline"][:2] + pipeline
     return DATASETS.build(loaded)
 
 
-PACK = {"type": "Pack3DDetInputs", "keys": ["points", "pts_semantic_mask"], "meta_keys": ["lidar_path"]}
+PACK = {
+    "type": "Pack3DDetInputs",
+    "keys": ["points", "pts_semantic_mask"],
+    "meta_keys": ["lidar_path"],
+}
 PACK_BOXES = {
     "type": "Pack3DDetInputs",
     "keys": ["points", "gt_labels_3d", "gt_bboxes_3d"],
@@ -117,14 +136,26 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None
     folder = open_folder(made / ("seg" if make is segmentation else "det"))
     sampler = adapter.SynthSampler(dataset)
     loader = DataLoader(
-        dataset, batch_size=2, num_workers=2, sampler=sampler, persistent_workers=True, collate_fn=pseudo_collate
+        dataset,
+        batch_size=2,
+        num_workers=2,
+        sampler=sampler,
+        persistent_workers=True,
+        collate_fn=pseudo_collate,
     )
     source = open_scans(made / "synthetic")
-    ids = {scan.reflectance[:50].tobytes() if make is segmentation else i: i for i, scan in enumerate(source)}
+    ids = {
+        scan.reflectance[:50].tobytes() if make is segmentation else i: i
+        for i, scan in enumerate(source)
+    }
     seen: list[set[int]] = []
     for epoch in (0, 1):
         sampler.set_epoch(epoch)
-        samples = [s for batch in loader for s in zip(batch["data_samples"], batch["inputs"]["points"], strict=True)]
+        samples = [
+            s
+            for batch in loader
+            for s in zip(batch["data_samples"], batch["inputs"]["points"], strict=True)
+        ]
         assert Counter(is_synthetic(s) for s, _ in samples) == {False: REAL, True: EXTRA}
         planned = folder.mixed.plan(epoch)
         wanted = set(planned.index[planned.domain].tolist())
@@ -144,10 +175,12 @@ def test_a_loader_without_the_sampler_is_refused(made: Path) -> None:
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
     stock = train_set("minkunet_semantickitti.py") | {
-        "ann_file": str(made / "sk" / "train.json"), "data_root": str(made / "sk"),
-    }  # fmt: skip
+        "ann_file": str(made / "sk" / "train.json"),
+        "data_root": str(made / "sk"),
+    }
     stock["pipeline"] = [*stock["pipeline"][:3], PACK]
-    ours, theirs = segmentation(made, [PACK]), DATASETS.build(stock)
+    ours = segmentation(made, [PACK])
+    theirs = DATASETS.build(stock)
     for i in range(REAL):
         assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
         mine, own = (d[i]["data_samples"].gt_pts_seg.pts_semantic_mask for d in (ours, theirs))
@@ -156,11 +189,14 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
 
 def test_real_boxes_are_the_trainers_own(made: Path) -> None:
     stock = train_set(DETECTION) | {
-        "type": "KittiDataset", "ann_file": str(made / "kitti" / "train.json"), "data_root": str(made / "kitti"),
+        "type": "KittiDataset",
+        "ann_file": str(made / "kitti" / "train.json"),
+        "data_root": str(made / "kitti"),
         "data_prefix": {"pts": "training/velodyne_reduced"},
-    }  # fmt: skip
+    }
     stock["pipeline"] = [*stock["pipeline"][:2], PACK_BOXES]
-    ours, theirs = detection(made, [PACK_BOXES]), DATASETS.build(stock)
+    ours = detection(made, [PACK_BOXES])
+    theirs = DATASETS.build(stock)
     for i in range(REAL):
         assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
         boxes = [d[i]["data_samples"].gt_instances_3d.bboxes_3d.tensor for d in (ours, theirs)]
@@ -168,10 +204,13 @@ def test_real_boxes_are_the_trainers_own(made: Path) -> None:
 
 
 def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
-    dataset, folder = segmentation(made, [PACK]), open_folder(made / "seg")
+    dataset = segmentation(made, [PACK])
+    folder = open_folder(made / "seg")
     for slot in range(EXTRA):
-        sample, scan = dataset[REAL + slot], folder.scan(slot)
-        points, mask = sample["inputs"]["points"], sample["data_samples"].gt_pts_seg.pts_semantic_mask
+        sample = dataset[REAL + slot]
+        scan = folder.scan(slot)
+        points = sample["inputs"]["points"]
+        mask = sample["data_samples"].gt_pts_seg.pts_semantic_mask
         assert np.array_equal(points, np.c_[scan.points, scan.reflectance])
         assert np.array_equal(mask, np.where(scan.label == IGNORE, 19, scan.label))  # type: ignore[arg-type]
 
@@ -189,19 +228,21 @@ def test_boxes_hold_their_points_after_the_trainers_transforms(made: Path) -> No
     torch.manual_seed(0)
     np.random.seed(0)  # the trainer's own generators
     steps = train_set(DETECTION)["pipeline"]
-    dataset, folder = detection(made, steps[3:]), open_folder(made / "det")
+    dataset = detection(made, steps[3:])
+    folder = open_folder(made / "det")
     for slot in range(EXTRA):
         scan = folder.scan(slot)
         assert scan.boxes is not None and len(scan.boxes) == 2  # the third stands behind the camera
         sample = dataset[REAL + slot]
-        counts, before = inside(sample), held(scan.boxes, scan.points)
+        counts = inside(sample)
+        before = held(scan.boxes, scan.points)
         assert before.min() >= 10 and np.abs(counts - before).max() <= 3  # those on a face
         assert sample["data_samples"].gt_instances_3d.labels_3d.tolist() == [2, 2]
 
 
 def test_objects_are_sampled_into_synthetic_scans_on_their_ground(made: Path) -> None:
-    """The whole stock pipeline. (Its ``ObjectSample`` clears the room of an object by a box turned the other way round,
-    which costs the neighbours some points, in real scans alike.)"""
+    """The whole stock pipeline. (Its ``ObjectSample`` clears the room of an object by a box turned
+    the other way round, which costs the neighbours some points, in real scans alike.)"""
     torch.manual_seed(0)
     np.random.seed(0)
     dataset = detection(made)
@@ -211,13 +252,17 @@ def test_objects_are_sampled_into_synthetic_scans_on_their_ground(made: Path) ->
 
 
 def test_boxes_are_bottom_centred_and_planes_point_up(made: Path) -> None:
-    dataset, folder = detection(made, [PACK_BOXES]), open_folder(made / "det")
+    dataset = detection(made, [PACK_BOXES])
+    folder = open_folder(made / "det")
     for slot in range(EXTRA):
-        info, scan = dataset.get_data_info(REAL + slot), folder.scan(slot)
+        info = dataset.get_data_info(REAL + slot)
+        scan = folder.scan(slot)
         boxes = info["ann_info"]["gt_bboxes_3d"].numpy()
         assert scan.boxes is not None
         floor = scan.boxes.values[:, 2] - scan.boxes.values[:, 5] / 2
-        assert np.allclose(boxes[:, 2], floor, atol=1e-6) and np.array_equal(boxes[:, :2], scan.boxes.values[:, :2])
+        assert np.allclose(boxes[:, 2], floor, atol=1e-6) and np.array_equal(
+            boxes[:, :2], scan.boxes.values[:, :2]
+        )
         assert (
             info["plane"][2] > 0.99 and abs(info["plane"][3] - 1.73) < 0.05
         )  # the sensor stands 1.73 m above the road
@@ -226,19 +271,25 @@ def test_boxes_are_bottom_centred_and_planes_point_up(made: Path) -> None:
 
 
 @pytest.mark.parametrize("mixer", ["LaserMix", "PolarMix", "FrustumMix"])
-def test_partners_are_real_and_synthetic(made: Path, mixer: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trap: partners come from the inner dataset, so that of two joined ones each would mix with itself only."""
+def test_partners_are_real_and_synthetic(
+    made: Path, mixer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trap: partners come from the inner dataset, so that of two joined ones each would mix with
+    itself only."""
     load = train_set("minkunet_semantickitti.py")["pipeline"][:3]
     step: dict[str, Any] = {"type": mixer, "pre_transform": load, "prob": 1.0}
     if mixer == "FrustumMix":
-        pytest.importorskip("frnet.datasets.transforms", reason="FRNet's repository is not on the path")
+        pytest.importorskip(
+            "frnet.datasets.transforms", reason="FRNet's repository is not on the path"
+        )
         step |= {"H": 32, "W": 256, "fov_up": 3.0, "fov_down": -25.0, "num_areas": [4]}
     elif mixer == "LaserMix":
         step |= {"num_areas": [4], "pitch_angles": [-25, 3]}
     else:
         step |= {"instance_classes": [0], "swap_ratio": 1.0}
     dataset = segmentation(made, [step, PACK])
-    drawn, inner = [], dataset.get_data_info
+    drawn = []
+    inner = dataset.get_data_info
     monkeypatch.setattr(dataset, "get_data_info", lambda i: drawn.append(i) or inner(i))
     np.random.seed(0)  # the trainer draws partners from it
     for i in range(len(dataset)):
@@ -248,13 +299,16 @@ def test_partners_are_real_and_synthetic(made: Path, mixer: str, monkeypatch: py
 
 
 def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> None:
-    """Trap: the stock setting replaces them, before ObjectSample can give them any, and the ratio is gone."""
+    """Trap: the stock setting replaces them, before ObjectSample can give them any, and the ratio
+    is gone."""
     settings = MIX | {"synthetic": synthetic(tmp_path / "bare", 5, boxes=False)}
     where = {"data_root": made / "kitti", "points": "training/velodyne_reduced"}
     path = write_infos(tmp_path / "det", made / "kitti" / "train.json", settings, **where)
     dataset = detection(made, ann_file=str(path))
     samples = [dataset[i] for i in range(REAL + EXTRA)]
-    assert [len(s["data_samples"].gt_instances_3d.labels_3d) > 0 for s in samples] == [True] * (REAL + EXTRA)
+    assert [len(s["data_samples"].gt_instances_3d.labels_3d) > 0 for s in samples] == [True] * (
+        REAL + EXTRA
+    )
     bare = detection(made, [PACK_BOXES], ann_file=str(path))
     counts = [len(bare[i]["data_samples"].gt_instances_3d.labels_3d) for i in range(REAL + EXTRA)]
     assert [c > 0 for c in counts] == [True] * REAL + [False] * EXTRA
@@ -275,28 +329,42 @@ def test_a_bank_is_read_by_url(made: Path) -> None:
 
 
 def test_scans_with_boxes_and_without_labels_serve_a_detector(made: Path, tmp_path: Path) -> None:
-    unlabelled, root = synthetic(tmp_path / "unlabelled", SYNTHETIC, labels=False), made / "kitti"
+    unlabelled = synthetic(tmp_path / "unlabelled", SYNTHETIC, labels=False)
+    root = made / "kitti"
     listed = write_infos(
-        tmp_path / "det", root / "train.json", MIX | {"synthetic": unlabelled, "labels": "boxes"},
-        data_root=root, points="training/velodyne_reduced",
-    )  # fmt: skip
+        tmp_path / "det",
+        root / "train.json",
+        MIX | {"synthetic": unlabelled, "labels": "boxes"},
+        data_root=root,
+        points="training/velodyne_reduced",
+    )
     loaded = train_set(DETECTION) | {"ann_file": str(listed), "pipeline": []}
     dataset = DATASETS.build(loaded)
     infos = [dataset.get_data_info(i) for i in range(len(dataset))]
     made_up = [info for info in infos if info["lidar_points"]["lidar_path"].startswith("lsynth://")]
-    assert len(made_up) == EXTRA and all(len(info["ann_info"]["gt_labels_3d"]) > 0 for info in made_up)
+    assert len(made_up) == EXTRA and all(
+        len(info["ann_info"]["gt_labels_3d"]) > 0 for info in made_up
+    )
 
 
 def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_path: Path) -> None:
-    listed, root = made / "sk" / "train.json", {"data_root": made / "sk"}
+    listed = made / "sk" / "train.json"
+    root = {"data_root": made / "sk"}
     for labels in ("none", "ignore"):
         with pytest.raises(ConfigError, match="loss, a mean over no label, is NaN"):
-            write_infos(tmp_path / "a", listed, MIX | {"synthetic": made / "synthetic", "labels": labels}, **root)
+            write_infos(
+                tmp_path / "a",
+                listed,
+                MIX | {"synthetic": made / "synthetic", "labels": labels},
+                **root,
+            )
     unlabelled = synthetic(tmp_path / "unlabelled", 2, labels=False)
     with pytest.raises(ConfigError, match="a model or bank with labels"):
         write_infos(tmp_path / "b", listed, MIX | {"synthetic": unlabelled}, **root)
     with pytest.raises(ConfigError, match="settings .'rate'."):
-        write_infos(tmp_path / "d", listed, MIX | {"synthetic": made / "synthetic", "rate": 1}, **root)
+        write_infos(
+            tmp_path / "d", listed, MIX | {"synthetic": made / "synthetic", "rate": 1}, **root
+        )
     (tmp_path / "old.json").write_text("[]")
     with pytest.raises(DataError, match="no 'data_list'"):
         write_infos(tmp_path / "e", tmp_path / "old.json", MIX | {"synthetic": made / "synthetic"})
@@ -304,22 +372,37 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
     write_all("npz", boxless, [replace(street(i), boxes=None) for i in range(3)])
     with pytest.raises(DataError, match="no boxes.*labels='mix'"):
         write_infos(
-            tmp_path / "g", made / "kitti" / "train.json", MIX | {"synthetic": boxless},
-            data_root=made / "kitti", points="training/velodyne_reduced",
-        )  # fmt: skip
+            tmp_path / "g",
+            made / "kitti" / "train.json",
+            MIX | {"synthetic": boxless},
+            data_root=made / "kitti",
+            points="training/velodyne_reduced",
+        )
     named = tmp_path / "named"
     boxes = [scan.boxes for scan in map(street, range(3))]
-    write_all("npz", named, [replace(street(i), boxes=replace(b, names=("car",) * 3)) for i, b in enumerate(boxes)])
+    write_all(
+        "npz",
+        named,
+        [replace(street(i), boxes=replace(b, names=("car",) * 3)) for i, b in enumerate(boxes)],
+    )
     with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan"):
         write_infos(
-            tmp_path / "h", made / "kitti" / "train.json", MIX | {"synthetic": named},
-            data_root=made / "kitti", points="training/velodyne_reduced",
-        )  # fmt: skip
+            tmp_path / "h",
+            made / "kitti" / "train.json",
+            MIX | {"synthetic": named},
+            data_root=made / "kitti",
+            points="training/velodyne_reduced",
+        )
 
 
 def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: Path) -> None:
     source = synthetic(tmp_path / "s", 3)
-    write_infos(tmp_path / "seg", made / "sk" / "train.json", MIX | {"synthetic": source}, data_root=made / "sk")
+    write_infos(
+        tmp_path / "seg",
+        made / "sk" / "train.json",
+        MIX | {"synthetic": source},
+        data_root=made / "sk",
+    )
     next(source.rglob("*.npz")).unlink()
     with pytest.raises(DataError, match="not those of the list"):
         Folder.open(tmp_path / "seg")
@@ -340,7 +423,9 @@ def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> Non
         adapter.SynthSampler(DATASETS.build(stock | {"data_root": str(made / "sk")}))
     with pytest.raises(ConfigError, match="KittiDataset with a mixed list.*SynthKittiDataset"):
         adapter.SynthSampler(detection(made, [PACK_BOXES], type="KittiDataset"))
-    wrapped = DATASETS.build({"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])})
+    wrapped = DATASETS.build(
+        {"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])}
+    )
     assert len(adapter.SynthSampler(wrapped)) == 2 * (REAL + EXTRA)
 
 
@@ -355,21 +440,29 @@ def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.py")), ids=lambda p: p.stem)
 def test_configurations_change_data_only(path: Path) -> None:
     if path.stem.startswith("frnet"):
-        pytest.importorskip("frnet", reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)")
+        pytest.importorskip(
+            "frnet", reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)"
+        )
     config = Config.fromfile(str(path))
     stock = path.read_text().split('_base_ = ["')[1].split('"]')[0]
     stock = stock.replace("mmdet3d::", f"{Path(mmdet3d.__file__).parent}/.mim/configs/")
     ours = flat(bare(config.to_dict()))
     stock = stock.replace("{{$FRNET_ROOT:.}}", os.environ.get("FRNET_ROOT", "."))
     stock_config = bare(Config.fromfile(stock).to_dict())
-    if stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset":  # the list itself is balanced
-        stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"]["dataset"]["dataset"]
+    if (
+        stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset"
+    ):  # the list itself is balanced
+        stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"]["dataset"][
+            "dataset"
+        ]
     theirs = flat(stock_config)
     changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(ours)
     assert all(key.startswith((".train_dataloader", ".custom")) for key in changed)
     names = {key.rpartition(".")[2] for key in changed}
     defaults = {"backend_args", "test_mode"}  # left out where the dataset is written anew
-    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *defaults, *DATA_KEYS}, changed
+    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *defaults, *DATA_KEYS}, (
+        changed
+    )
     assert {"type": "SynthEpochHook"} in [dict(h) for h in config.custom_hooks]
 
 
@@ -384,10 +477,21 @@ def test_the_view_is_the_cameras(made: Path) -> None:
 
 def test_the_database_is_drawn_from(made: Path) -> None:
     sampler = {
-        "type": "DataBaseSampler", "data_root": str(made / "kitti"), "info_path": str(made / "kitti" / "dbinfos.pkl"),
-        "rate": 1.0, "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
-        "classes": ["Car"], "sample_groups": {"Car": 3},
-        "points_loader": {"type": "LoadPointsFromFile", "coord_type": "LIDAR", "load_dim": 4, "use_dim": 4},
-    }  # fmt: skip
-    found = TRANSFORMS.build(sampler).sample_all(np.zeros((0, 7), np.float32), np.zeros(0, np.int64))
+        "type": "DataBaseSampler",
+        "data_root": str(made / "kitti"),
+        "info_path": str(made / "kitti" / "dbinfos.pkl"),
+        "rate": 1.0,
+        "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
+        "classes": ["Car"],
+        "sample_groups": {"Car": 3},
+        "points_loader": {
+            "type": "LoadPointsFromFile",
+            "coord_type": "LIDAR",
+            "load_dim": 4,
+            "use_dim": 4,
+        },
+    }
+    found = TRANSFORMS.build(sampler).sample_all(
+        np.zeros((0, 7), np.float32), np.zeros(0, np.int64)
+    )
     assert found is not None and len(found["gt_labels_3d"]) >= 1

@@ -21,7 +21,8 @@ from lidar_synth.formats import NuScenes, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels import ObjectBank
 
-REAL, SLOTS = 4, 4
+REAL = 4
+SLOTS = 4
 MIX = {"ratio": 0.5, "seed": 3}
 WHERE = {"points": "samples/LIDAR_TOP", "sweeps": "sweeps/LIDAR_TOP"}
 
@@ -37,41 +38,83 @@ def nuscenes_like(root: Path, **changes: Any) -> Path:
     entries = []
     for i in range(REAL):
         scan = replace(street(i), ring=None)
-        names = [f"samples/LIDAR_TOP/{i}.pcd.bin", f"sweeps/LIDAR_TOP/{i}a.pcd.bin", f"sweeps/LIDAR_TOP/{i}b.pcd.bin"]
+        names = [
+            f"samples/LIDAR_TOP/{i}.pcd.bin",
+            f"sweeps/LIDAR_TOP/{i}a.pcd.bin",
+            f"sweeps/LIDAR_TOP/{i}b.pcd.bin",
+        ]
         for name in names:
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             (root / name).write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
         sweep = [
-            {"timestamp": 9.95 - 0.05 * k, "lidar_points": {"lidar_path": name, "lidar2sensor": np.eye(4).tolist()}}
+            {
+                "timestamp": 9.95 - 0.05 * k,
+                "lidar_points": {"lidar_path": name, "lidar2sensor": np.eye(4).tolist()},
+            }
             for k, name in enumerate(names[1:])
         ]
-        box = {"bbox_3d": [0, 9, -1, 4, 2, 1.5, 0], "bbox_label_3d": 0 if i else 7, "num_lidar_pts": 9}
-        entries.append({
-            "sample_idx": i, "token": f"t{i}", "timestamp": 10.0, "images": {"CAM_FRONT": {"img_path": "a.jpg"}},
-            "lidar_points": {"lidar_path": f"{i}.pcd.bin", "num_pts_feats": 5}, "lidar_sweeps": sweep[: i % 3],
-            "instances": [box | {"bbox_3d_isvalid": True, "velocity": [0.0, 0.0]}],
-        } | changes)  # fmt: skip
-    (root / "list.json").write_text(json.dumps({"metainfo": {"dataset": "nuscenes"}, "data_list": entries}))
+        box = {
+            "bbox_3d": [0, 9, -1, 4, 2, 1.5, 0],
+            "bbox_label_3d": 0 if i else 7,
+            "num_lidar_pts": 9,
+        }
+        entries.append(
+            {
+                "sample_idx": i,
+                "token": f"t{i}",
+                "timestamp": 10.0,
+                "images": {"CAM_FRONT": {"img_path": "a.jpg"}},
+                "lidar_points": {"lidar_path": f"{i}.pcd.bin", "num_pts_feats": 5},
+                "lidar_sweeps": sweep[: i % 3],
+                "instances": [box | {"bbox_3d_isvalid": True, "velocity": [0.0, 0.0]}],
+            }
+            | changes
+        )
+    (root / "list.json").write_text(
+        json.dumps({"metainfo": {"dataset": "nuscenes"}, "data_list": entries})
+    )
     return root / "list.json"
 
 
 @pytest.mark.parametrize("view", [None, False])
-def test_a_list_without_kittis_camera_is_taken(scans: Path, tmp_path: Path, view: bool | None) -> None:
+def test_a_list_without_kittis_camera_is_taken(
+    scans: Path, tmp_path: Path, view: bool | None
+) -> None:
     listed = nuscenes_like(tmp_path / "n")
-    path = write_infos(tmp_path / "m", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", view=view, **WHERE)
+    path = write_infos(
+        tmp_path / "m",
+        listed,
+        MIX | {"synthetic": scans},
+        data_root=tmp_path / "n",
+        view=view,
+        **WHERE,
+    )
     entries = json.loads(path.read_text())["data_list"]
     assert len(entries) == REAL + SLOTS
     for real, slot in zip(entries[:REAL], entries[REAL:], strict=True):
         assert Path(real["lidar_points"]["lidar_path"]).is_file()
-        assert all(Path(sweep["lidar_points"]["lidar_path"]).is_file() for sweep in real["lidar_sweeps"])
+        assert all(
+            Path(sweep["lidar_points"]["lidar_path"]).is_file() for sweep in real["lidar_sweeps"]
+        )
         points = np.frombuffer(read_url(slot["lidar_points"]["lidar_path"]), "<f4").reshape(-1, 5)
-        assert points[:, 0].min() < -3 < 3 < points[:, 0].max() and points[:, 1].min() < -5, "cropped to a view"
+        assert points[:, 0].min() < -3 < 3 < points[:, 0].max() and points[:, 1].min() < -5, (
+            "cropped to a view"
+        )
         assert 1 < points[:, 3].max() <= 255 and set(points[:, 4]) <= set(range(32))
         times = [[s["timestamp"] for s in entry["lidar_sweeps"]] for entry in (real, slot)]
         assert times[0] == times[1]
-        assert {s["lidar_points"]["lidar_path"] for s in slot["lidar_sweeps"]} <= {slot["lidar_points"]["lidar_path"]}
+        assert {s["lidar_points"]["lidar_path"] for s in slot["lidar_sweeps"]} <= {
+            slot["lidar_points"]["lidar_path"]
+        }
     with pytest.raises(ConfigError, match="view=True.*Leave view out"):
-        write_infos(tmp_path / "v", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", view=True, **WHERE)
+        write_infos(
+            tmp_path / "v",
+            listed,
+            MIX | {"synthetic": scans},
+            data_root=tmp_path / "n",
+            view=True,
+            **WHERE,
+        )
 
 
 def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
@@ -84,7 +127,9 @@ def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
     assert np.allclose(back.reflectance, scan.reflectance, atol=1e-6)
     assert turned.boxes is not None and scan.boxes is not None
     assert set(turned.boxes.names) == {"car"} and len(turned.boxes) == 3
-    assert np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3  # those on a face
+    assert (
+        np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3
+    )  # those on a face
 
 
 def test_names_of_boxes_become_nuscenes_classes() -> None:
@@ -92,7 +137,11 @@ def test_names_of_boxes_become_nuscenes_classes() -> None:
     assert scan.boxes is not None
     named = replace(scan, boxes=replace(scan.boxes, names=("Cyclist", "Tram", "traffic_cone")))
     boxes = as_nuscenes(named).boxes
-    assert boxes is not None and boxes.names == ("bicycle", "traffic_cone") and set(boxes.names) <= set(CLASSES)
+    assert (
+        boxes is not None
+        and boxes.names == ("bicycle", "traffic_cone")
+        and set(boxes.names) <= set(CLASSES)
+    )
     rider = replace(scan, boxes=replace(scan.boxes, names=("Motorcyclist", "Car", "Van")))
     assert (as_nuscenes(rider).boxes or named.boxes).names == ("motorcycle", "car", "car")
     with pytest.raises(DataError, match="boxes of .'car_x'. in scan.*Rename"):
@@ -104,7 +153,12 @@ def test_names_of_boxes_become_nuscenes_classes() -> None:
 def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) -> None:
     listed = nuscenes_like(tmp_path / "n")
     path = write_infos(
-        tmp_path / "m", listed, MIX | {"synthetic": scans}, data_root=tmp_path / "n", balance=True, **WHERE
+        tmp_path / "m",
+        listed,
+        MIX | {"synthetic": scans},
+        data_root=tmp_path / "n",
+        balance=True,
+        **WHERE,
     )
     entries = json.loads(path.read_text())["data_list"]
     labels = [e["instances"][0]["bbox_label_3d"] for e in entries if e["instances"]]
@@ -112,17 +166,24 @@ def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) ->
 
 
 def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:
-    listed, settings = nuscenes_like(tmp_path / "n"), MIX | {"synthetic": scans}
+    listed = nuscenes_like(tmp_path / "n")
+    settings = MIX | {"synthetic": scans}
     with pytest.raises(FileError, match="of the first entry, does not exist.*data_prefix"):
         write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n")
     with pytest.raises(ConfigError, match="points of 5 values for layout='kitti'.*'nuscenes' .5."):
-        write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="kitti", **WHERE)
+        write_infos(
+            tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="kitti", **WHERE
+        )
     with pytest.raises(ConfigError, match="layout='waymo'"):
-        write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="waymo", **WHERE)
+        write_infos(
+            tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="waymo", **WHERE
+        )
     bare = tmp_path / "bare"
     write_all("npz", bare, [replace(street(i), boxes=None) for i in range(5)])
     with pytest.raises(DataError, match="no boxes.*labels='mix'"):
-        write_infos(tmp_path / "a", listed, MIX | {"synthetic": bare}, data_root=tmp_path / "n", **WHERE)
+        write_infos(
+            tmp_path / "a", listed, MIX | {"synthetic": bare}, data_root=tmp_path / "n", **WHERE
+        )
 
 
 @pytest.mark.parametrize("make", [semantic_kitti_list, kitti_list])
@@ -136,11 +197,15 @@ def test_a_lists_file_is_what_its_name_says(tmp_path: Path, make: Any) -> None:
         make(root, tmp_path / "list.txt")
 
 
-def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequence(tmp_path: Path) -> None:
+def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequence(
+    tmp_path: Path,
+) -> None:
     root = semantic_kitti(tmp_path / "sk", 10)
 
     def frames(**options: Any) -> list[str]:
-        entries = json.loads(semantic_kitti_list(root, tmp_path / "list.json", **options).read_text())["data_list"]
+        entries = json.loads(
+            semantic_kitti_list(root, tmp_path / "list.json", **options).read_text()
+        )["data_list"]
         assert [e["sample_idx"] for e in entries] == list(range(len(entries)))
         return [e["sample_id"][-1] for e in entries]
 
@@ -148,7 +213,9 @@ def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequenc
     assert frames(share=0.3) == list("036") and frames(share=0.3, order="sequential") == list("012")
     assert frames(share=0.01) == frames(share=0.01, order="sequential") == ["0"]
     for wrong in ({"share": 0}, {"share": 1.5}, {"order": "random"}):
-        with pytest.raises(ConfigError, match="share|order 'random'; expected uniform or sequential"):
+        with pytest.raises(
+            ConfigError, match="share|order 'random'; expected uniform or sequential"
+        ):
             frames(**wrong)
 
 
@@ -157,7 +224,8 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(scans: Path, tmp_path:
     write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
     runs = Folder.open(tmp_path / "m"), Folder.open(tmp_path / "m")
     before = {path: path.read_bytes() for path in (tmp_path / "m").iterdir()}
-    runs[0].epoch, runs[1].epoch = 0, 1
+    runs[0].epoch = 0
+    runs[1].epoch = 1
     seen = [{run.scan(slot).id for slot in range(SLOTS)} for run in runs]
     assert runs[0].epoch == 0 and not seen[0] & seen[1]
     assert {path: path.read_bytes() for path in (tmp_path / "m").iterdir()} == before
@@ -177,18 +245,32 @@ def test_a_list_holds_schedules_and_lengths(
 ) -> None:
     """An epoch's entries are those of its plan, and each slot has a scan of its own."""
     real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
-    path = write_infos(tmp_path / "m", real, MIX | {"synthetic": scans} | settings, data_root=tmp_path / "sk")
+    path = write_infos(
+        tmp_path / "m", real, MIX | {"synthetic": scans} | settings, data_root=tmp_path / "sk"
+    )
     folder = Folder.open(tmp_path / "m")
-    assert len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots and not folder.whole
+    assert (
+        len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots and not folder.whole
+    )
     for epoch, (reals, slots) in enumerate(shares):
         entries = folder.entries(epoch)
         assert ((entries < REAL).sum(), (entries >= REAL).sum()) == (reals, slots)
-        assert sorted(entries[entries >= REAL] - REAL) == list(range(slots)) and slots <= folder.slots
+        assert (
+            sorted(entries[entries >= REAL] - REAL) == list(range(slots)) and slots <= folder.slots
+        )
         folder.epoch, plan = epoch, folder.mixed.plan(epoch)
         slot = int(entries[plan.domain][-1]) - REAL
-        assert folder.scan(slot).id == folder.mixed.sample(epoch, int(np.flatnonzero(plan.domain)[-1])).id
+        assert (
+            folder.scan(slot).id
+            == folder.mixed.sample(epoch, int(np.flatnonzero(plan.domain)[-1])).id
+        )
     with pytest.raises(ConfigError, match="a number, a list or .epoch: ratio."):
-        write_infos(tmp_path / "x", real, MIX | {"synthetic": scans, "ratio": min}, data_root=tmp_path / "sk")
+        write_infos(
+            tmp_path / "x",
+            real,
+            MIX | {"synthetic": scans, "ratio": min},
+            data_root=tmp_path / "sk",
+        )
 
 
 def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) -> None:
@@ -196,9 +278,13 @@ def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) ->
     write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
     facts = json.loads((tmp_path / "m" / "mixture.json").read_text())
     del facts["layout"]
-    (tmp_path / "m" / "mixture.json").write_text(json.dumps(facts | {"format": "lidar-synth-mmdet3d/1"}))
+    (tmp_path / "m" / "mixture.json").write_text(
+        json.dumps(facts | {"format": "lidar-synth-mmdet3d/1"})
+    )
     assert Folder.open(tmp_path / "m").layout.features == 4
-    (tmp_path / "m" / "mixture.json").write_text(json.dumps(facts | {"format": "lidar-synth-mmdet3d/3"}))
+    (tmp_path / "m" / "mixture.json").write_text(
+        json.dumps(facts | {"format": "lidar-synth-mmdet3d/3"})
+    )
     with pytest.raises(DataError, match="mmdet3d/3.*Write the list again"):
         Folder.open(tmp_path / "m")
 

@@ -1,8 +1,9 @@
 # ruff: noqa: E402 - imports wait for what they need
-"""Resumed runs of mmengine's own ``Runner``, by epochs and by iterations, see the samples of an uninterrupted run.
+"""Resumed runs of mmengine's own ``Runner``, by epochs and by iterations, see the samples of an
+uninterrupted run.
 
-The network is one number, so that these tests are about data alone; the trainer's own networks run in
-``test_integrations_mmdet3d_train.py``.
+The network is one number, so that these tests are about data alone; the trainer's own networks run
+in ``test_integrations_mmdet3d_train.py``.
 """
 
 import json
@@ -52,7 +53,11 @@ class OneNumber(BaseModel):  # type: ignore[misc]
         self.number = torch.nn.Parameter(torch.ones(()))
 
     def forward(self, inputs: Any, data_samples: Any = None, mode: str = "tensor") -> Any:
-        return {"loss": torch.stack([self.number * points[:, 3].mean() for points in inputs["points"]]).mean()}
+        return {
+            "loss": torch.stack(
+                [self.number * points[:, 3].mean() for points in inputs["points"]]
+            ).mean()
+        }
 
 
 class Seen(Hook):  # type: ignore[misc]
@@ -61,9 +66,13 @@ class Seen(Hook):  # type: ignore[misc]
     def __init__(self) -> None:
         self.steps: dict[int, list[tuple[str, float]]] = {}
 
-    def after_train_iter(self, runner: Any, batch_idx: int, data_batch: Any = None, outputs: Any = None) -> None:
+    def after_train_iter(
+        self, runner: Any, batch_idx: int, data_batch: Any = None, outputs: Any = None
+    ) -> None:
         named = zip(data_batch["data_samples"], data_batch["inputs"]["points"], strict=True)
-        self.steps[runner.iter] = [(Path(s.lidar_path).name, float(p[:, 3].double().mean())) for s, p in named]
+        self.steps[runner.iter] = [
+            (Path(s.lidar_path).name, float(p[:, 3].double().mean())) for s, p in named
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -74,20 +83,30 @@ def listed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_infos(root / "mixed", real, settings, data_root=root / "sk")
 
 
-def run(listed: Path, out: Path, loop: dict[str, Any], save: dict[str, Any], **options: Any) -> Seen:
-    """A training of a config as a user writes it; ``randomness`` is not set, so each run has another seed."""
+def run(
+    listed: Path, out: Path, loop: dict[str, Any], save: dict[str, Any], **options: Any
+) -> Seen:
+    """A training of a config as a user writes it; ``randomness`` is not set, so each run has
+    another seed."""
     init_default_scope("mmdet3d")
     dataset = Config.fromfile(str(CONFIGS / "minkunet_semantickitti.py")).train_dataloader.dataset
     dataset.update(ann_file=str(listed), pipeline=LOADING)
     loader = {"batch_size": 2, "num_workers": 1, "persistent_workers": True, "dataset": dataset}
     seen = Seen()
     runner = Runner(
-        model={"type": "OneNumber"}, work_dir=str(out), train_cfg=loop, default_scope="mmdet3d",
-        train_dataloader=loader | {"sampler": options.pop("sampler", {"type": "SynthSampler", "shuffle": True})},
+        model={"type": "OneNumber"},
+        work_dir=str(out),
+        train_cfg=loop,
+        default_scope="mmdet3d",
+        train_dataloader=loader
+        | {"sampler": options.pop("sampler", {"type": "SynthSampler", "shuffle": True})},
         optim_wrapper={"type": "OptimWrapper", "optimizer": {"type": "SGD", "lr": 0.1}},
-        default_hooks={"checkpoint": {"type": "CheckpointHook", **save}}, experiment_name=out.name,
-        custom_hooks=[{"type": "SynthEpochHook"}, seen], log_level="ERROR", **options,
-    )  # fmt: skip
+        default_hooks={"checkpoint": {"type": "CheckpointHook", **save}},
+        experiment_name=out.name,
+        custom_hooks=[{"type": "SynthEpochHook"}, seen],
+        log_level="ERROR",
+        **options,
+    )
     runner.train()
     return seen
 
@@ -99,7 +118,9 @@ LOOPS = {
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(listed: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Seen]]:
+def uninterrupted(
+    listed: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[Path, Seen]]:
     """A checkpoint after every step, and the samples of every step, by loop."""
     out = tmp_path_factory.mktemp("uninterrupted")
     save = {"interval": 1, "by_epoch": False}
@@ -118,13 +139,20 @@ def test_an_epoch_has_every_real_scan_and_new_synthetic_ones(uninterrupted: Any,
 
 
 @pytest.mark.parametrize("name", LOOPS)
-@pytest.mark.parametrize("done", [STEPS + 1, 2 * STEPS - 1, 2 * STEPS], ids=["middle", "last step", "end"])
+@pytest.mark.parametrize(
+    "done", [STEPS + 1, 2 * STEPS - 1, 2 * STEPS], ids=["middle", "last step", "end"]
+)
 def test_a_resumed_run_sees_the_samples_of_an_uninterrupted_one(
     listed: Path, uninterrupted: Any, tmp_path: Path, name: str, done: int
 ) -> None:
     saved, whole = uninterrupted[name]
     rest = run(
-        listed, tmp_path / name, LOOPS[name], {"interval": 100}, resume=True, load_from=str(saved / f"iter_{done}.pth")
+        listed,
+        tmp_path / name,
+        LOOPS[name],
+        {"interval": 100},
+        resume=True,
+        load_from=str(saved / f"iter_{done}.pth"),
     )
     assert rest.steps == {i: samples for i, samples in whole.steps.items() if i >= done}
 
@@ -149,7 +177,9 @@ def test_a_schedule_trains_and_resumes_the_planned_samples(listed: Path, tmp_pat
     assert rest.steps == {i: samples for i, samples in whole.items() if i >= 6}
 
 
-def test_a_run_resumed_from_an_epochs_checkpoint(listed: Path, uninterrupted: Any, tmp_path: Path) -> None:
+def test_a_run_resumed_from_an_epochs_checkpoint(
+    listed: Path, uninterrupted: Any, tmp_path: Path
+) -> None:
     run(listed, tmp_path / "first", LOOPS["epochs"] | {"max_epochs": 1}, {"interval": 1})
     load = {"resume": True, "load_from": str(tmp_path / "first" / "epoch_1.pth")}
     rest = run(listed, tmp_path / "rest", LOOPS["epochs"], {"interval": 100}, **load)
@@ -160,7 +190,13 @@ def test_a_run_resumed_from_an_epochs_checkpoint(listed: Path, uninterrupted: An
 def test_the_hook_asks_for_the_sampler(listed: Path, tmp_path: Path) -> None:
     for stock in ("DefaultSampler", "InfiniteSampler"):
         with pytest.raises(ConfigError, match=f"sampler {stock}.*type='SynthSampler'"):
-            run(listed, tmp_path / stock, LOOPS["epochs"], {"interval": 1}, sampler={"type": stock, "shuffle": True})
+            run(
+                listed,
+                tmp_path / stock,
+                LOOPS["epochs"],
+                {"interval": 1},
+                sampler={"type": stock, "shuffle": True},
+            )
 
 
 class Harmful:
@@ -168,9 +204,14 @@ class Harmful:
         return getattr, (Path, "unlink")
 
 
-@pytest.mark.parametrize("content", [Harmful(), {"f": Path.unlink}], ids=["another method", "a function"])
+@pytest.mark.parametrize(
+    "content", [Harmful(), {"f": Path.unlink}], ids=["another method", "a function"]
+)
 def test_a_checkpoint_still_cannot_name_other_functions(tmp_path: Path, content: Any) -> None:
-    """Reading mmengine's checkpoints is allowed for what they hold, with torch's own protection in force."""
+    """Reading mmengine's checkpoints is allowed for what they hold, with torch's own protection in
+    force."""
     torch.save({"meta": content}, tmp_path / "a.pth")
-    with pytest.raises(pickle.UnpicklingError, match="Weights only load failed|expected a method of"):
+    with pytest.raises(
+        pickle.UnpicklingError, match="Weights only load failed|expected a method of"
+    ):
         torch.load(tmp_path / "a.pth")

@@ -1,4 +1,5 @@
-"""Open3D's own ML part, as it is installed, on mixed scans: dataset, loader, and its pipeline with RandLANet."""
+"""Open3D's own ML part, as it is installed, on mixed scans: dataset, loader, and its pipeline with
+RandLANet."""
 
 import logging
 from collections import Counter
@@ -25,7 +26,8 @@ except LibraryError as error:
 
 import open3d.ml.torch as ml3d
 
-REAL, EXTRA = 6, 4
+REAL = 6
+EXTRA = 4
 
 
 @pytest.fixture(scope="module")
@@ -47,15 +49,19 @@ def build(made: Path, **options: Any) -> Any:
 
 
 def both(made: Path) -> tuple[Any, Any]:
-    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
+    times them."""
     own = ml3d.datasets.SemanticKITTI(str(made / "sk"), training_split=["00"])
     return own.get_split("training"), build(made).get_split("training")
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
-    split, seen = build(made).get_split("training"), []
+    split = build(made).get_split("training")
+    seen = []
     data = ml3d.dataloaders.TorchDataloader(dataset=split, use_cache=False)
-    loader = EpochLoader(data, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list)
+    loader = EpochLoader(
+        data, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list
+    )
     for epoch in (0, 1):
         names = [sample["attr"]["name"] for batch in loader for sample in batch]
         assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
@@ -69,17 +75,28 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
     own, split = both(made)
     for position in (i for i in range(len(split)) if not split.mixed.domain(i)):
-        mine, theirs = split.get_data(position), own.get_data(split.mixed[position])
-        assert all(np.array_equal(mine[k], theirs[k]) and mine[k].dtype == theirs[k].dtype for k in theirs)
+        mine = split.get_data(position)
+        theirs = own.get_data(split.mixed[position])
+        assert all(
+            np.array_equal(mine[k], theirs[k]) and mine[k].dtype == theirs[k].dtype for k in theirs
+        )
         assert split.get_attr(position)["name"] == own.get_attr(split.mixed[position])["name"]
 
 
 def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
-    split, source = build(made).get_split("training"), open_scans(made / "synthetic")
+    split = build(made).get_split("training")
+    source = open_scans(made / "synthetic")
     for position in (i for i in range(len(split)) if split.mixed.domain(i)):
-        data, scan = split.get_data(position), source[int(split.mixed.plan().index[position])]
-        assert scan.label is not None and data["label"].dtype == np.int32 and data["feat"].shape == (len(scan), 1)
-        assert np.array_equal(data["label"], np.where(scan.label == 255, 0, scan.label.astype(int) + 1))
+        data = split.get_data(position)
+        scan = source[int(split.mixed.plan().index[position])]
+        assert (
+            scan.label is not None
+            and data["label"].dtype == np.int32
+            and data["feat"].shape == (len(scan), 1)
+        )
+        assert np.array_equal(
+            data["label"], np.where(scan.label == 255, 0, scan.label.astype(int) + 1)
+        )
         data["point"][:] = 0  # a sample is memory of its own
         assert np.array_equal(split.get_data(position)["point"], scan.points)
 
@@ -103,12 +120,15 @@ def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
 def test_its_pipeline_trains_and_validates(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The documented lines: stock RandLANet with fewer points, two epochs, validation after each."""
+    """The documented lines: stock RandLANet with fewer points, two epochs, validation after
+    each."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(logging.getLogger("lidar_synth"), "handlers", [])
     say_epochs()
     dataset = build(made)
-    resources = Path(import_module(ml3d.datasets.SemanticKITTI.__module__).__file__ or "").parent.parent
+    resources = Path(
+        import_module(ml3d.datasets.SemanticKITTI.__module__).__file__ or ""
+    ).parent.parent
     config = import_module("open3d.ml.utils").Config.load_from_file(
         str(resources / "configs/randlanet_semantickitti.yml")
     )
@@ -118,28 +138,40 @@ def test_its_pipeline_trains_and_validates(
     seen: list[list[float]] = []
     log = pipeline.save_logs
     monkeypatch.setattr(
-        pipeline, "save_logs", lambda *a: (seen.append([*pipeline.losses, *pipeline.valid_losses]), log(*a))
+        pipeline,
+        "save_logs",
+        lambda *a: (seen.append([*pipeline.losses, *pipeline.valid_losses]), log(*a)),
     )
     pipeline.run_train()
     plan = dataset.get_split("training").mixed.plan
     said = epochs(capsys.readouterr().out)[:2]
     assert said == [(e, REAL + EXTRA, EXTRA, plan(e).hash[:16]) for e in (0, 1)]
-    assert [len(losses) for losses in seen] == [(REAL + EXTRA) // 2 + REAL // 2] * 2 and np.isfinite(seen).all()
+    assert [len(losses) for losses in seen] == [
+        (REAL + EXTRA) // 2 + REAL // 2
+    ] * 2 and np.isfinite(seen).all()
     assert list(tmp_path.rglob("ckpt_00001.pth"))
 
 
 ERRORS = {
-    "another torch": (RuntimeError("Version mismatch: Open3D needs PyTorch version 1.8.*"), "one release of torch"),
+    "another torch": (
+        RuntimeError("Version mismatch: Open3D needs PyTorch version 1.8.*"),
+        "one release of torch",
+    ),
     "CUDA's operators": (
         OSError("Could not load this library: open3d_torch_ops.so"),
         r"pip install 'open3d-cpu\[ml\]'",
     ),
-    "no ML part": (ImportError("Open3D-ML requires the 'addict' package"), r"pip install 'open3d\[ml\]'"),
+    "no ML part": (
+        ImportError("Open3D-ML requires the 'addict' package"),
+        r"pip install 'open3d\[ml\]'",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_a_library_that_cannot_be_used_is_explained(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_cannot_be_used_is_explained(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What ``open3d.ml.torch`` raised in environments with these faults."""
     error, hint = ERRORS[name]
 

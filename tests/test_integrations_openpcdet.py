@@ -1,7 +1,10 @@
-# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""OpenPCDet's own dataset, augmentor, collate code and ``train.py`` on mixed scans: OPENPCDET_ROOT is a checkout.
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global
+# generator
+"""OpenPCDet's own dataset, augmentor, collate code and ``train.py`` on mixed scans: OPENPCDET_ROOT
+is a checkout.
 
-It need not be built: ``openpcdet_cpu`` compiles what OpenPCDet has for a CPU, and says what these tests do not show.
+It need not be built: ``openpcdet_cpu`` compiles what OpenPCDet has for a CPU, and says what these
+    tests do not show.
 """
 
 import importlib
@@ -43,7 +46,9 @@ from lidar_synth.formats import open_scans
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.labels import ObjectBank
 
-REAL, EXTRA, CLASSES = 6, 4, ["Car"]
+REAL = 6
+EXTRA = 4
+CLASSES = ["Car"]
 VALIDATION = 2  # further real scans
 NAME = "MixedKitti"
 
@@ -67,7 +72,8 @@ def build(made: Path, scans: str | Path = "synthetic", kitti: str = "kitti", **o
 
 
 def both(made: Path) -> tuple[Any, Any]:
-    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
+    times them."""
     loaded = config(made / "kitti", made / "synthetic")
     return KittiDataset(loaded, CLASSES, training=True, root_path=made / "kitti"), build(made)
 
@@ -78,7 +84,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(root: Path) -> Path:
-    """KITTI's folders, their info lists and GT database by OpenPCDet's own code, and synthetic scans."""
+    """KITTI's folders, their info lists and GT database by OpenPCDet's own code, and synthetic
+    scans."""
     synthetic(root / "synthetic", 11)
     synthetic(root / "bare", 5, boxes=False)
     kitti(root / "kitti", REAL + VALIDATION)
@@ -111,7 +118,9 @@ def test_the_class_is_registered_beside_the_trainers_own(made: Path) -> None:
 @pytest.mark.parametrize("workers", [0, 2])
 def test_two_epochs_see_exactly_the_planned_scans(made: Path, workers: int) -> None:
     dataset = build(made)
-    loader = DataLoader(dataset, batch_size=2, shuffle=True, num_workers=workers, collate_fn=dataset.collate_batch)
+    loader = DataLoader(
+        dataset, batch_size=2, shuffle=True, num_workers=workers, collate_fn=dataset.collate_batch
+    )
     numbers = {f"synthetic/{scan.id}": i for i, scan in enumerate(open_scans(made / "synthetic"))}
     seen = []
     for epoch in (0, 1):
@@ -120,7 +129,9 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, workers: int) -> N
         assert Counter(map(is_synthetic, names)) == {False: REAL, True: EXTRA}
         assert sorted(n for n in names if not is_synthetic(n)) == [f"{i:06d}" for i in range(REAL)]
         made_plan = dataset.mixed.plan()
-        assert {numbers[n] for n in names if is_synthetic(n)} == set(made_plan.index[made_plan.domain].tolist())
+        assert {numbers[n] for n in names if is_synthetic(n)} == set(
+            made_plan.index[made_plan.domain].tolist()
+        )
         seen.append({n for n in names if is_synthetic(n)})
     assert not seen[0] & seen[1]
 
@@ -189,12 +200,16 @@ def test_real_scans_without_boxes_are_replaced_by_real_ones(made: Path) -> None:
     for seed in range(8):
         np.random.seed(seed)  # OpenPCDet draws the other scan from it
         names = [dataset[i]["frame_id"] for i in range(len(dataset))]
-        assert Counter(map(is_synthetic, names)) == {False: REAL, True: EXTRA} and "000002" not in names
+        assert (
+            Counter(map(is_synthetic, names)) == {False: REAL, True: EXTRA}
+            and "000002" not in names
+        )
 
 
 def test_the_trainers_generator_does_not_decide_on_scans(made: Path) -> None:
     """Trap: OpenPCDet seeds its workers the same in every epoch."""
-    dataset, orders = build(made), []
+    dataset = build(made)
+    orders = []
     for epoch in (0, 1):
         dataset.set_epoch(epoch)
         np.random.seed(666)
@@ -206,7 +221,9 @@ def test_a_database_of_any_source_is_drawn_from(made: Path, tmp_path: Path) -> N
     root = kitti(tmp_path / "kitti", REAL + VALIDATION)
     write_infos(root)
     objects = ObjectBank.from_scans(open_scans(made / "synthetic"))
-    write_gt_database(objects, root, origin="gravity", folder="gt_town", infos="kitti_dbinfos_train.pkl")
+    write_gt_database(
+        objects, root, origin="gravity", folder="gt_town", infos="kitti_dbinfos_train.pkl"
+    )
     register()
     loaded = config(root, made / "bare")
     loaded.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].PREPARE["filter_by_difficulty"] = [-1]
@@ -251,20 +268,33 @@ def test_a_schedule_keeps_the_length_of_epochs(made: Path) -> None:
     assert len(build(made, RATIO=[0.2, 0.4])) == REAL + EXTRA
 
 
-def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path, tmp_path: Path) -> None:
+def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
+    made: Path, tmp_path: Path
+) -> None:
     scans = [street(i) for i in range(4)]
     write_all("npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans])
     boxes = [scan.boxes for scan in scans]
-    renamed = [replace(s, boxes=replace(b, names=("car",) * 3)) for s, b in zip(scans, boxes, strict=True) if b]
+    renamed = [
+        replace(s, boxes=replace(b, names=("car",) * 3))
+        for s, b in zip(scans, boxes, strict=True)
+        if b
+    ]
     write_all("npz", tmp_path / "named", renamed)
     for sampling in (True, False):
         with pytest.raises(DataError, match="synthetic scan '.*' has no boxes.*labels: mix"):
             build(made, tmp_path / "without", sampling=sampling)
     with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* some of Car"):
         build(made, tmp_path / "named")
-    some = [replace(s, boxes=replace(b, names=("Car", "car", "Car"))) for s, b in zip(scans, boxes, strict=True) if b]
+    some = [
+        replace(s, boxes=replace(b, names=("Car", "car", "Car")))
+        for s, b in zip(scans, boxes, strict=True)
+        if b
+    ]
     write_all("npz", tmp_path / "some", some)
-    with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* OpenPCDet drops boxes of other names"):
+    with pytest.raises(
+        DataError,
+        match="boxes of .'car'. in synthetic scan .* OpenPCDet drops boxes of other names",
+    ):
         build(made, tmp_path / "some")
     with pytest.raises(DataError, match="no box of .'Car'., and there is no gt_sampling"):
         build(made, "bare", sampling=False)
@@ -278,40 +308,68 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(made: Path
 def small(made: Path, folder: Path, **data: Any) -> list[str]:
     """The arguments of ``train.py`` for stock PointPillars, only smaller, with cars only."""
     own = yaml.safe_load((ROOT / "tools/cfgs/kitti_models/pointpillar.yaml").read_text())
-    own["DATA_CONFIG"] |= {"DATA_PATH": str(made / "kitti"), "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1]} | data
+    own["DATA_CONFIG"] |= {
+        "DATA_PATH": str(made / "kitti"),
+        "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1],
+    } | data
     own["DATA_CONFIG"]["DATA_PROCESSOR"][2]["VOXEL_SIZE"] = [0.4, 0.4, 4]
     sampling = own["DATA_CONFIG"]["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
     sampling |= {"SAMPLE_GROUPS": ["Car:3"], "PREPARE": {"filter_by_min_points": ["Car:5"]}}
     own["CLASS_NAMES"] = CLASSES
     del own["MODEL"]["DENSE_HEAD"]["ANCHOR_GENERATOR_CONFIG"][1:]
-    own["MODEL"]["BACKBONE_2D"] |= {"NUM_FILTERS": [16, 16, 16], "NUM_UPSAMPLE_FILTERS": [16, 16, 16]}
-    own["MODEL"]["POST_PROCESSING"]["SCORE_THRESH"] = 0.01  # it learns little, and its boxes are to be evaluated
+    own["MODEL"]["BACKBONE_2D"] |= {
+        "NUM_FILTERS": [16, 16, 16],
+        "NUM_UPSAMPLE_FILTERS": [16, 16, 16],
+    }
+    own["MODEL"]["POST_PROCESSING"]["SCORE_THRESH"] = (
+        0.01  # it learns little, and its boxes are to be evaluated
+    )
     own["MODEL"]["POST_PROCESSING"]["NMS_CONFIG"]["NMS_POST_MAXSIZE"] = 20
     (folder / "small.yaml").write_text(yaml.safe_dump(own))
     mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
     (folder / "mix.yaml").write_text(yaml.safe_dump(mixture))
     return [
-        "train.py", "--cfg_file", str(folder / "small.yaml"), "--epochs", "2", "--batch_size", "2", "--workers", "2",
-        "--logger_iter_interval", "1", "--wo_gpu_stat", "--set", "DATA_CONFIG.DATASET", NAME,
-    ]  # fmt: skip
+        "train.py",
+        "--cfg_file",
+        str(folder / "small.yaml"),
+        "--epochs",
+        "2",
+        "--batch_size",
+        "2",
+        "--workers",
+        "2",
+        "--logger_iter_interval",
+        "1",
+        "--wo_gpu_stat",
+        "--set",
+        "DATA_CONFIG.DATASET",
+        NAME,
+    ]
 
 
 def trained(folder: Path, output: Path, arguments: list[str]) -> tuple[list[list[str]], str]:
     """The training batches of a run of ``train.py``, and all that it said."""
     said = run_script(
-        SCRIPTS / "openpcdet_cpu.py", *arguments, cwd=ROOT / "tools", mixture=folder / "mix.yaml",
+        SCRIPTS / "openpcdet_cpu.py",
+        *arguments,
+        cwd=ROOT / "tools",
+        mixture=folder / "mix.yaml",
         OPENPCDET_OUTPUT=str(output),
-    )  # fmt: skip
+    )
     before, _, _ = said.partition("Start evaluation")
     return [yaml.safe_load(batch) for batch in re.findall(r"batch of (\[.*\])", before)], said
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(made: Path, tmp_path: Path) -> None:
-    """``train.py`` as a user types it, with its evaluation, and resumed at the start and in the middle of an epoch.
+def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(
+    made: Path, tmp_path: Path
+) -> None:
+    """``train.py`` as a user types it, with its evaluation, and resumed at the start and in the
+    middle of an epoch.
 
-    This does not show: OpenPCDet's GPU kernels of the overlaps of boxes, of which those for a CPU are used.
+    This does not show: OpenPCDet's GPU kernels of the overlaps of boxes, of which those for a CPU
+        are used.
     """
     arguments = small(made, tmp_path)
     batches, said = trained(tmp_path, tmp_path / "whole", arguments)
@@ -319,17 +377,27 @@ def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(made: Pat
     each = (REAL + EXTRA) // 2
     assert len(losses) == len(batches) == 2 * each and np.isfinite(losses).all()
     for epoch in (batches[:each], batches[each:]):
-        assert Counter(is_synthetic(name) for batch in epoch for name in batch) == {False: REAL, True: EXTRA}
+        assert Counter(is_synthetic(name) for batch in epoch for name in batch) == {
+            False: REAL,
+            True: EXTRA,
+        }
     first, second = (
-        {n for batch in part for n in batch if is_synthetic(n)} for part in (batches[:each], batches[each:])
+        {n for batch in part for n in batch if is_synthetic(n)}
+        for part in (batches[:each], batches[each:])
     )
     assert not first & second
-    assert re.search(r"Car AP_R40@0.70, 0.70, 0.70:\s*bbox AP:[\d., ]+\s*bev  AP:[\d., ]+\s*3d   AP:[\d., ]+", said)
+    assert re.search(
+        r"Car AP_R40@0.70, 0.70, 0.70:\s*bbox AP:[\d., ]+\s*bev  AP:[\d., ]+\s*3d   AP:[\d., ]+",
+        said,
+    )
 
     end = next((tmp_path / "whole").rglob("checkpoint_epoch_1.pth"))
     state = torch.load(end, weights_only=False)
     assert state["it"] == each
-    for done in (0, 2):  # of the second epoch; OpenPCDet writes latest_model.pth in the middle of an epoch
+    for done in (
+        0,
+        2,
+    ):  # of the second epoch; OpenPCDet writes latest_model.pth in the middle of an epoch
         output = tmp_path / f"after-{done}"
         folder = output / end.parent.relative_to(tmp_path / "whole")
         folder.mkdir(parents=True)
@@ -340,9 +408,16 @@ def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(made: Pat
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_its_own_script_refuses_scans_without_boxes_before_training(made: Path, tmp_path: Path) -> None:
+def test_its_own_script_refuses_scans_without_boxes_before_training(
+    made: Path, tmp_path: Path
+) -> None:
     write_all("npz", tmp_path / "without", [replace(street(i), boxes=None) for i in range(4)])
     arguments = small(made, tmp_path)
-    (tmp_path / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(tmp_path / "without"), "labels": "generated"}))
-    with pytest.raises(RuntimeError, match="has no boxes; expected boxes, or every object in it would be background"):
+    (tmp_path / "mix.yaml").write_text(
+        yaml.safe_dump({"synthetic": str(tmp_path / "without"), "labels": "generated"})
+    )
+    with pytest.raises(
+        RuntimeError,
+        match="has no boxes; expected boxes, or every object in it would be background",
+    ):
         trained(tmp_path, tmp_path, arguments)

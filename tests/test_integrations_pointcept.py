@@ -1,4 +1,5 @@
-# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global
+# generator
 """Pointcept's own dataset, transforms, collate code and ``tools/train.py`` on mixed scans.
 
 POINTCEPT_ROOT is a checkout; ``pointcept_cpu`` says how it runs without a GPU.
@@ -22,7 +23,16 @@ from torch.utils.data import DataLoader
 
 ROOT = checkout("POINTCEPT_ROOT", "Pointcept")
 needs(
-    "spconv", "torch_geometric", "timm", "peft", "wandb", "transformers", "einops", "termcolor", "addict", "torchvision"
+    "spconv",
+    "torch_geometric",
+    "timm",
+    "peft",
+    "wandb",
+    "transformers",
+    "einops",
+    "termcolor",
+    "addict",
+    "torchvision",
 )
 sys.path.insert(0, str(SCRIPTS))
 from pointcept_cpu import prepare
@@ -39,7 +49,9 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import open_scans
 
-REAL, EXTRA, VALIDATION = 6, 4, 2
+REAL = 6
+EXTRA = 4
+VALIDATION = 2
 STOCK = ROOT / "configs" / "semantic_kitti" / "semseg-spunet-v1m1-0-base.py"
 SONATA = Path(__file__).parent.parent / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
 
@@ -71,14 +83,18 @@ def build(made: Path, kind: str = "MixedSemanticKITTI", stock: bool = True, **op
 
 
 def both(made: Path) -> tuple[Any, Any]:
-    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
+    times them."""
     return build(made, "SemanticKITTIDataset"), build(made)
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
-    """In the order in which Pointcept's training loop does it: the loader begins before any hook of the epoch."""
+    """In the order in which Pointcept's training loop does it: the loader begins before any hook of
+    the epoch."""
     dataset = build(made, stock=False)
-    loader = DataLoader(dataset, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list)
+    loader = DataLoader(
+        dataset, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list
+    )
     trainer = SimpleNamespace(train_loader=loader, start_epoch=0, epoch=0)
     hook = HOOKS.build({"type": "SynthEpoch"})
     hook.trainer = trainer
@@ -110,18 +126,25 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
 
 
 def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
-    dataset, source = build(made, stock=False), open_scans(made / "synthetic")
+    dataset = build(made, stock=False)
+    source = open_scans(made / "synthetic")
     for position in (i for i in range(len(dataset)) if dataset.domain(i)):
         data = dataset[position]
         scan = source[int(dataset.mixed.plan().index[position])]
-        assert np.array_equal(data["coord"], scan.points) and data["strength"].shape == (len(scan), 1)
+        assert np.array_equal(data["coord"], scan.points) and data["strength"].shape == (
+            len(scan),
+            1,
+        )
         assert data["segment"].dtype == np.int32
         assert scan.label is not None
-        assert np.array_equal(data["segment"], np.where(scan.label == IGNORE, -1, scan.label.astype(int)))
+        assert np.array_equal(
+            data["segment"], np.where(scan.label == IGNORE, -1, scan.label.astype(int))
+        )
 
 
 def test_batches_of_both_kinds_through_the_trainers_transforms_and_mix3d(made: Path) -> None:
-    """Same keys in every sample, or its collate fails; labels stay with their points after grid sampling."""
+    """Same keys in every sample, or its collate fails; labels stay with their points after grid
+    sampling."""
     dataset = build(made)
     loader = DataLoader(dataset, batch_size=5, collate_fn=partial(point_collate_fn, mix_prob=0.8))
     for batch in loader:
@@ -157,7 +180,9 @@ def test_the_hook_finds_mixtures_wherever_pointcept_puts_them(made: Path) -> Non
     ):
         assert adapter.mixtures(loader) == [dataset]
     hook = HOOKS.build({"type": "SynthEpoch"})
-    hook.trainer = SimpleNamespace(train_loader=SimpleNamespace(dataset=build(made, "SemanticKITTIDataset")))
+    hook.trainer = SimpleNamespace(
+        train_loader=SimpleNamespace(dataset=build(made, "SemanticKITTIDataset"))
+    )
     with pytest.raises(ConfigError, match="the hook SynthEpoch without a mixture"):
         hook.before_train()
 
@@ -169,14 +194,20 @@ def test_pretraining_takes_scans_without_labels(made: Path, tmp_path: Path) -> N
         mixture = {"synthetic": str(bare), "ratio": 0.4, "labels": labels}
         dataset = build(made, mixture=mixture, transform=transform)
         position = next(i for i in range(len(dataset)) if dataset.domain(i))
-        assert (dataset.get_data(position)["segment"] == -1).all() and len(dataset[position]["coord"])
+        assert (dataset.get_data(position)["segment"] == -1).all() and len(
+            dataset[position]["coord"]
+        )
         with pytest.raises(ConfigError, match="is NaN"):
             build(made, mixture=mixture, transform=[{"type": "Collect", "keys": "segment"}])
 
 
-def test_a_map_of_classes_that_does_not_fit_is_refused(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_of_classes_that_does_not_fit_is_refused(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     merged = adapter.SemanticKITTIDataset.get_learning_map(-1) | {10: 4}
-    monkeypatch.setattr(adapter.SemanticKITTIDataset, "get_learning_map", staticmethod(lambda ignore: merged))
+    monkeypatch.setattr(
+        adapter.SemanticKITTIDataset, "get_learning_map", staticmethod(lambda ignore: merged)
+    )
     with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
         build(made)
 
@@ -225,9 +256,15 @@ def train(made: Path, text: str, out: Path, *options: str, **values: Any) -> str
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.py").write_text(text.format(small=SMALL.format(**values), **values))
     return run_script(
-        SCRIPTS / "pointcept_cpu.py", "tools/train.py", "--config-file", str(out / "config.py"), "--options",
-        f"save_path={out / 'run'}", *options, cwd=ROOT,
-    )  # fmt: skip
+        SCRIPTS / "pointcept_cpu.py",
+        "tools/train.py",
+        "--config-file",
+        str(out / "config.py"),
+        "--options",
+        f"save_path={out / 'run'}",
+        *options,
+        cwd=ROOT,
+    )
 
 
 def samples(said: str) -> dict[int, list[str]]:
@@ -240,10 +277,14 @@ def samples(said: str) -> dict[int, list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(made: Path, tmp_path: Path) -> None:
-    """SparseUNet with real spconv. Pointcept saves at the end of an epoch, so a run resumes only at the start of one.
+def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(
+    made: Path, tmp_path: Path
+) -> None:
+    """SparseUNet with real spconv. Pointcept saves at the end of an epoch, so a run resumes only at
+    the start of one.
 
-    This does not show: pointops and pointgroup_ops, which SparseUNet does not use, and mixed precision.
+    This does not show: pointops and pointgroup_ops, which SparseUNet does not use, and mixed
+        precision.
     """
     values = {"stock": str(STOCK), "epochs": 3}
     said = train(made, SEGMENTATION, tmp_path, **values)
@@ -251,10 +292,15 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(made: P
     assert sorted(seen) == [0, 1, 2]
     for names in seen.values():
         assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
-    assert len({n for names in seen.values() for n in names if n.startswith("synthetic_")}) == 3 * EXTRA - 1  # of 11
+    assert (
+        len({n for names in seen.values() for n in names if n.startswith("synthetic_")})
+        == 3 * EXTRA - 1
+    )  # of 11
     losses = [float(loss) for loss in re.findall(r"loss: (\S+) Lr", said)]
     assert len(losses) == 15 and np.isfinite(losses).all()
-    assert len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4  # after each epoch, and the best
+    assert (
+        len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4
+    )  # after each epoch, and the best
     checkpoint = tmp_path / "run" / "model" / "epoch_2.pth"
     rest = train(made, SEGMENTATION, tmp_path, "resume=True", f"weight={checkpoint}", **values)
     assert samples(rest) == {2: seen[2]}
@@ -265,13 +311,22 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(made: P
 def test_sonata_pretrains_on_scans_without_labels(made: Path, tmp_path: Path) -> None:
     """Its stock configuration with the data of ours and a smaller network.
 
-    This does not show: flash attention, and pointops, for which tools/stand_ins has a function of torch.
+    This does not show: flash attention, and pointops, for which tools/stand_ins has a function of
+        torch.
     """
-    values = {"synthetic": str(synthetic(tmp_path / "bare", 2 * REAL, labels=False)), "labels": "none", "ratio": 0.5}
+    values = {
+        "synthetic": str(synthetic(tmp_path / "bare", 2 * REAL, labels=False)),
+        "labels": "none",
+        "ratio": 0.5,
+    }
     said = train(made, PRETRAINING, tmp_path, stock=str(SONATA), epochs=2, **values)
     seen = samples(said)
     for epoch in (0, 1):
         assert Counter(n.startswith("synthetic_") for n in seen[epoch]) == {False: REAL, True: REAL}
     assert set(seen[0]) & set(seen[1]) == {f"00_{i:06d}" for i in range(REAL)}
     losses = [float(loss) for loss in re.findall(r" loss: (\S+) ", said)]
-    assert losses and np.isfinite(losses).all() and (tmp_path / "run" / "model" / "model_last.pth").exists()
+    assert (
+        losses
+        and np.isfinite(losses).all()
+        and (tmp_path / "run" / "model" / "model_last.pth").exists()
+    )

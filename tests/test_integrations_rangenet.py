@@ -1,5 +1,7 @@
-# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global generator
-"""RangeNet++'s, SalsaNext's or CENet's own parser and script on mixed scans; RANGENET_ROOT is a checkout of one."""
+# ruff: noqa: E402, NPY002 - imports wait for what they need; trainers draw from numpy's global
+# generator
+"""RangeNet++'s, SalsaNext's or CENet's own parser and script on mixed scans; RANGENET_ROOT is a
+checkout of one."""
 
 import os
 import random
@@ -33,7 +35,9 @@ from lidar_synth.formats import open_scans
 from lidar_synth.generate.generator import Generated
 from lidar_synth.generate.loading import load_generator
 
-REAL, EXTRA, BATCH = 6, 4, 2
+REAL = 6
+EXTRA = 4
+BATCH = 2
 stock = import_module("dataset.kitti.parser" if CENET else "tasks.semantic.dataset.kitti.parser")
 SALSA = hasattr(stock, "my_collate") and not CENET
 ARCH = "senet-1024p.yml" if CENET else "salsanext.yml" if SALSA else "config/arch/squeezeseg.yaml"
@@ -61,16 +65,27 @@ def data() -> dict[str, Any]:
 def arguments(made: Path, **others: Any) -> dict[str, Any]:
     labels = data()
     sensor = {
-        "name": "HDL64", "type": "spherical", "fov_up": 3, "fov_down": -25,
+        "name": "HDL64",
+        "type": "spherical",
+        "fov_up": 3,
+        "fov_down": -25,
         "img_prop": {"width": SENSOR.columns, "height": SENSOR.rows},
-        "img_means": [12.12, 10.88, 0.23, -1.04, 0.21], "img_stds": [12.32, 11.47, 6.91, 0.86, 0.16],
-    }  # fmt: skip
+        "img_means": [12.12, 10.88, 0.23, -1.04, 0.21],
+        "img_stds": [12.32, 11.47, 6.91, 0.86, 0.16],
+    }
     return {
-        "root": str(made / "sk"), "train_sequences": [0], "valid_sequences": [0], "test_sequences": None,
+        "root": str(made / "sk"),
+        "train_sequences": [0],
+        "valid_sequences": [0],
+        "test_sequences": None,
         **{key: labels[key] for key in ("labels", "color_map", "learning_map", "learning_map_inv")},
-        "sensor": sensor, "max_points": 20000, "batch_size": BATCH, "workers": 0, "gt": True,
+        "sensor": sensor,
+        "max_points": 20000,
+        "batch_size": BATCH,
+        "workers": 0,
+        "gt": True,
         "shuffle_train": True,
-    } | others  # fmt: skip
+    } | others
 
 
 def parser(made: Path, **others: Any) -> Any:
@@ -78,15 +93,21 @@ def parser(made: Path, **others: Any) -> Any:
 
 
 def both(made: Path) -> tuple[Any, Any]:
-    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py times them."""
+    """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
+    times them."""
     keys = ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
-    options = {key: arguments(made)[key] for key in keys} | ({"transform": True} if SALSA or CENET else {})
+    options = {key: arguments(made)[key] for key in keys} | (
+        {"transform": True} if SALSA or CENET else {}
+    )
     return stock.SemanticKitti(str(made / "sk"), [0], **options), parser(made).train_dataset
 
 
-def test_two_epochs_see_exactly_the_planned_scans(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_epochs_see_exactly_the_planned_scans(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made_parser = parser(made, workers=2)
-    loader, seen = made_parser.get_train_set(), []
+    loader = made_parser.get_train_set()
+    seen = []
     assert made_parser.get_train_size() == (REAL + EXTRA) // BATCH
     if SALSA:  # its batches tell no names
         loader.collate_fn = torch.utils.data.default_collate
@@ -122,10 +143,12 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
 
 
 def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
-    dataset, source = parser(made).train_dataset, open_scans(made / "synthetic")
+    dataset = parser(made).train_dataset
+    source = open_scans(made / "synthetic")
     dataset.transform = False
     for position in (i for i in range(len(dataset)) if dataset.mixed.domain(i)):
-        sample, scan = dataset[position], source[int(dataset.mixed.plan().index[position])]
+        sample = dataset[position]
+        scan = source[int(dataset.mixed.plan().index[position])]
         assert len(sample) == 15 and sample[14] == len(scan) and scan.label is not None
         labels = sample[3][: len(scan)].numpy()
         assert np.array_equal(labels, np.where(scan.label == 255, 0, scan.label.astype(int) + 1))
@@ -134,7 +157,9 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
         assert {0, 9, 13, 1} >= set(np.unique(sample[2])) and (sample[2][sample[1] == 0] == 0).all()
 
 
-def test_nothing_is_left_in_memory(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_in_memory(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lidar_synth.integrations.rangenet._MEMORY", str(tmp_path))
     dataset = parser(made).train_dataset
     for position in range(len(dataset)):
@@ -177,7 +202,9 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr("streets.SENSOR", replace(SENSOR, columns=2 * SENSOR.columns))
         semantic_kitti(root / "sk", REAL)
     synthetic(root / "synthetic", 11)
-    (root / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3}))
+    (root / "mix.yaml").write_text(
+        yaml.safe_dump({"synthetic": str(root / "synthetic"), "ratio": 0.4, "seed": 3})
+    )
     return root
 
 
@@ -186,11 +213,16 @@ def sensor_of(width: int) -> Any:
 
 
 def test_a_width_with_stripes_is_refused(made: Path, dense: Path) -> None:
-    """At 512 columns a synthetic scan of 256 fills every second one; a real scan of 512 fills all."""
-    with pytest.raises(ConfigError, match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in"):
+    """At 512 columns a synthetic scan of 256 fills every second one; a real scan of 512 fills
+    all."""
+    with pytest.raises(
+        ConfigError, match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in"
+    ):
         parser(dense, sensor=sensor_of(2 * SENSOR.columns))
     parser(dense)  # both kinds in images of the synthetic scans' width
-    parser(made, sensor=sensor_of(2 * SENSOR.columns))  # stripes in both kinds do not tell them apart
+    parser(
+        made, sensor=sensor_of(2 * SENSOR.columns)
+    )  # stripes in both kinds do not tell them apart
 
 
 @pytest.fixture
@@ -201,21 +233,31 @@ def labelled_scans() -> Path:
 
 
 DENSITY = {2048: ((0.75, 0.05), (0.37, 0.98)), 1024: ((0.78, 0.02), (0.75, 0.03))}
-"""By width: the share of filled cells and of empty right neighbours, in real images and in those of the model."""
+"""By width: the share of filled cells and of empty right neighbours, in real images and in those of
+the model."""
 
 
 @pytest.mark.slow
 def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_scans: Path) -> None:
-    """The stock 64 x 2048 has stripes in synthetic scans only; at 1,024 columns both kinds are alike."""
+    """The stock 64 x 2048 has stripes in synthetic scans only; at 1,024 columns both kinds are
+    alike."""
     dataset = parser(made).train_dataset
     dataset.sensor_img_H = 64
     paths = sorted(labelled_scans.glob("semantic_kitti/sequences/*/velodyne/000000.bin"))
     generated = Generated(load_generator("town"))[0]
     found = {}
     for width in DENSITY:
-        kinds = [dataset.image(str(path), width) for path in paths], [dataset.image(generated, width)]
-        found[width] = [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
-        print(f"64 x {width}: filled and gaps of real scans {found[width][0]}, of synthetic ones {found[width][1]}")
+        kinds = (
+            [dataset.image(str(path), width) for path in paths],
+            [dataset.image(generated, width)],
+        )
+        found[width] = [
+            (float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds
+        ]
+        print(
+            f"64 x {width}: filled and gaps of real scans {found[width][0]}, of synthetic ones "
+            f"{found[width][1]}"
+        )
     for width, expected in DENSITY.items():
         assert np.allclose(found[width], expected, atol=0.08), found
 
@@ -223,9 +265,13 @@ def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_sca
 def configure(made: Path, out: Path, epochs: int, **sensor: int) -> list[str | Path]:
     """Arguments of ``train.py``: the stock configuration with a small image, and few iterations."""
     source = next(ROOT.rglob(ARCH))
-    arch, labels = yaml.safe_load(source.read_text()), data()
+    arch = yaml.safe_load(source.read_text())
+    labels = data()
     arch["train"] |= {"max_epochs": epochs, "batch_size": BATCH, "workers": 0, "report_batch": 1}
-    arch["dataset"]["sensor"]["img_prop"] = {"width": SENSOR.columns // 4, "height": SENSOR.rows} | sensor
+    arch["dataset"]["sensor"]["img_prop"] = {
+        "width": SENSOR.columns // 4,
+        "height": SENSOR.rows,
+    } | sensor
     labels["split"] = {"train": [0], "valid": [0], "test": []}
     for name, content in {"arch": arch, "labels": labels}.items():
         (out / f"{name}.yaml").write_text(yaml.safe_dump(content))
@@ -237,16 +283,21 @@ def configure(made: Path, out: Path, epochs: int, **sensor: int) -> list[str | P
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> None:
-    """``train.py`` as a user types it, with validation; SalsaNext resumes, and sees the samples of its epoch."""
+    """``train.py`` as a user types it, with validation; SalsaNext resumes, and sees the samples of
+    its epoch."""
     cwd = clone(ROOT, tmp_path / "clone") / ("" if CENET else "train/tasks/semantic")
     first = 1 if SALSA else 2
     arguments = configure(made, tmp_path, first)
     said = launched("rangenet", *arguments, cwd=cwd, mixture=made / "mix.yaml")
     if SALSA:
         (log,) = (tmp_path / "log/logs").iterdir()
-        said += launched("rangenet", *configure(made, tmp_path, 2), "-p", log, cwd=cwd, mixture=made / "mix.yaml")
+        said += launched(
+            "rangenet", *configure(made, tmp_path, 2), "-p", log, cwd=cwd, mixture=made / "mix.yaml"
+        )
     plans = {e: parser(made).train_dataset.mixed.plan(e).hash[:16] for e in (0, 1)}
-    seen = [line for line in epochs(said) if line[0] == 1][:1] + [line for line in epochs(said) if line[0] == 0][:1]
+    seen = [line for line in epochs(said) if line[0] == 1][:1] + [
+        line for line in epochs(said) if line[0] == 0
+    ][:1]
     assert seen == [(e, REAL + EXTRA, EXTRA, plans[e]) for e in (1, 0)]
     losses = [float(value) for value in re.findall(r"Epoch: \[\d+\]\[\d+/5\].*?Loss (\S+)", said)]
     assert len(losses) == 10 and np.isfinite(losses).all()

@@ -1,4 +1,5 @@
-"""Names that libraries have removed: what ``provide`` sets works as the name did, and is announced in one line."""
+"""Names that libraries have removed: what ``provide`` sets works as the name did, and is announced
+in one line."""
 
 import subprocess
 import sys
@@ -62,15 +63,22 @@ def test_a_removed_name_works_again(name: str, tmp_path: Path) -> None:
         pytest.importorskip("spconv", reason="spconv is not installed")
     (tmp_path / "parser.py").write_text("class Parser:\n    def answer(self):\n        return 42\n")
     hidden = (
-        "import importlib.util as u; f = u.find_spec\nu.find_spec = lambda n, *a: None if n == 'imp' else f(n, *a)\n"
+        "import importlib.util as u; f = u.find_spec\nu.find_spec = lambda n, *a: None if n == "
+        "'imp' else f(n, *a)\n"
     )
-    program = f"import sys\n{hidden}from lidar_synth.integrations.removed import provide\nmade = provide({name!r})\n"
+    program = (
+        f"import sys\n{hidden}from lidar_synth.integrations.removed import provide\nmade = "
+        f"provide({name!r})\n"
+    )
     ends = f"assert provide({name!r}) == []\n" if name.startswith("numpy") else ""
     command = [sys.executable, "-W", "ignore", "-c", program + USES[name] + "\n" + ends]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("lidar_synth:")]
-    real = not lines and name in ("tensorflow.summary", "torchvision")  # the library that has the name is installed
+    real = not lines and name in (
+        "tensorflow.summary",
+        "torchvision",
+    )  # the library that has the name is installed
     assert real or lines == [f"lidar_synth: provides {name} ({NAMES[name][0]})"]
 
 

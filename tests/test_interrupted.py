@@ -1,4 +1,5 @@
-"""Ctrl-C on the command line: one message, the exit status of an interrupted program, and no word from workers."""
+"""Ctrl-C on the command line: one message, the exit status of an interrupted program, and no word
+from workers."""
 
 import os
 import signal
@@ -15,7 +16,9 @@ from layouts import some_scan, write_all
 from lidar_synth import cli
 
 
-def test_control_c_gives_one_message(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_c_gives_one_message(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     app = typer.Typer()
 
     @app.command()
@@ -35,7 +38,9 @@ def children(process: int) -> list[str]:
 
 
 WHEN: dict[str, Callable[[int, Path], bool]] = {
-    "workers start": lambda process, out: len(children(process)) > 2,  # two, and Python's own for what they share
+    "workers start": lambda process, out: (
+        len(children(process)) > 2
+    ),  # two, and Python's own for what they share
     "workers work": lambda process, out: any(out.rglob("*.bin")),
 }
 
@@ -46,13 +51,24 @@ WHEN: dict[str, Callable[[int, Path], bool]] = {
 @pytest.mark.parametrize("command", ["town", "convert"])
 def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None:
     """A terminal sends the signal to every process of the group; only the first one reports it."""
-    out, options = tmp_path / "out", ["--scans", "60", "--no-camera"]
+    out = tmp_path / "out"
+    options = ["--scans", "60", "--no-camera"]
     if command == "convert":
         write_all("kitti", tmp_path / "in", [some_scan()] * 800)
         options = ["--to", "kitti"]
-    call = [command, *([str(tmp_path / "in")] if command == "convert" else []), str(out), *options, "--jobs", "2"]
+    call = [
+        command,
+        *([str(tmp_path / "in")] if command == "convert" else []),
+        str(out),
+        *options,
+        "--jobs",
+        "2",
+    ]
     process = subprocess.Popen(
-        [sys.executable, "-m", "lidar_synth", *call], stderr=subprocess.PIPE, text=True, process_group=0
+        [sys.executable, "-m", "lidar_synth", *call],
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
     )
     while not WHEN[when](process.pid, out):
         assert process.poll() is None, process.communicate()
@@ -61,5 +77,7 @@ def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None
     started = time.monotonic()
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert errors.rstrip().endswith("lidar-synth: interrupted") and "Traceback" not in errors, errors
+    assert errors.rstrip().endswith("lidar-synth: interrupted") and "Traceback" not in errors, (
+        errors
+    )
     assert not list(out.rglob("*.part")) and time.monotonic() - started < 60

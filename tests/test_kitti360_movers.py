@@ -17,26 +17,41 @@ def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_a
     motion = np.eye(4)
     motion[:2, :2] = [(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))]
     motion[:3, 3] = -1, 0.1, 0
-    ahead, behind = np.array([(10.0, 0, 1)]), np.array([(-10.0, 1e-9, 1)])
+    ahead = np.array([(10.0, 0, 1)])
+    behind = np.array([(-10.0, 1e-9, 1)])
     assert np.allclose(undo_ego_motion(ahead, motion), ahead)
-    half = np.array([(np.cos(angle / 2), -np.sin(angle / 2), 0), (np.sin(angle / 2), np.cos(angle / 2), 0), (0, 0, 1)])
+    half = np.array(
+        [
+            (np.cos(angle / 2), -np.sin(angle / 2), 0),
+            (np.sin(angle / 2), np.cos(angle / 2), 0),
+            (0, 0, 1),
+        ]
+    )
     assert np.allclose(undo_ego_motion(behind, motion), behind @ half.T + motion[:3, 3] / 2)
     assert np.array_equal(undo_ego_motion(behind, np.eye(4)), behind)
 
 
 def test_poses_are_filled_only_where_the_car_stood() -> None:
     poses = {f: np.eye(4) for f in (0, 10, 20)}
-    poses[10][0, 3], poses[20][0, 3] = 0.4, 12.0
+    poses[10][0, 3] = 0.4
+    poses[20][0, 3] = 12.0
     filled = fill_poses(poses, range(-1, 22))
     assert set(filled) == {*range(11), 20}
     assert filled[5][0, 3] == pytest.approx(0.2)
 
 
-def _moving_box(frames: range, speed: float, instance: int = 26001, start: float = 0.0) -> WorldBoxes:
+def _moving_box(
+    frames: range, speed: float, instance: int = 26001, start: float = 0.0
+) -> WorldBoxes:
     transforms = np.tile(np.diag([4.0, 2.0, 1.5, 1.0]), (len(frames), 1, 1))
     transforms[:, 0, 3] = start + speed * np.array(frames)
     windows = np.repeat(np.array(frames)[:, None], 2, axis=1)
-    return WorldBoxes(transforms, np.array(["Car"] * len(frames)), np.full(len(frames), instance, np.int32), windows)
+    return WorldBoxes(
+        transforms,
+        np.array(["Car"] * len(frames)),
+        np.full(len(frames), instance, np.int32),
+        windows,
+    )
 
 
 def _dynamic(points: list[tuple[float, float, float, int]], path: Path) -> NDArray[np.void]:
@@ -47,15 +62,21 @@ def _dynamic(points: list[tuple[float, float, float, int]], path: Path) -> NDArr
 
 
 def test_points_of_a_moving_object_follow_its_box(tmp_path: Path) -> None:
-    cloud = _dynamic([(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)], tmp_path / "dynamic" / "a.ply")
+    cloud = _dynamic(
+        [(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)], tmp_path / "dynamic" / "a.ply"
+    )
     movers = Movers([cloud], _moving_box(range(5), 2.0), range(5))
     points, values = movers.at(1)  # no point was measured in this frame
     assert np.allclose(sorted(points.tolist()), [(2.5, 0, 0), (2.5, 0.9, 0)], atol=1e-5)
     assert set(values.tolist()) == {26 | 26001 << 16}
-    assert len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0  # the point in no box, only in its own frame
+    assert (
+        len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0
+    )  # the point in no box, only in its own frame
 
 
-def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points(tmp_path: Path) -> None:
+def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points(
+    tmp_path: Path,
+) -> None:
     still = _moving_box(range(5), 0.0)
     assert not Movers([], still, range(5)).tracks
     cloud = _dynamic([(0.5, 0, 0, 0)], tmp_path / "dynamic" / "a.ply")
@@ -63,6 +84,7 @@ def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points
 
 
 def test_an_instance_number_that_is_used_again_is_another_object() -> None:
-    one, other = _moving_box(range(5), 2.0), _moving_box(range(5, 9), 2.0, start=1000.0)
+    one = _moving_box(range(5), 2.0)
+    other = _moving_box(range(5, 9), 2.0, start=1000.0)
     both = WorldBoxes(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one)))
     assert len(Movers([], both, range(9)).tracks) == 2

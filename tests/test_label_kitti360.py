@@ -1,4 +1,5 @@
-"""Labels of KITTI-360's scans, recovered from accumulated clouds of the town, whose labels are known."""
+"""Labels of KITTI-360's scans, recovered from accumulated clouds of the town, whose labels are
+known."""
 
 import json
 import os
@@ -14,7 +15,13 @@ from numpy.typing import NDArray
 from lidar_synth import KITTI360, MixedScans
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
-from lidar_synth.formats.kitti360 import boxes_path, confidence_path, label_file, labels_folder, scans_folder
+from lidar_synth.formats.kitti360 import (
+    boxes_path,
+    confidence_path,
+    label_file,
+    labels_folder,
+    scans_folder,
+)
 from lidar_synth.formats.kitti360_boxes import read_boxes
 from lidar_synth.formats.kitti360_poses import (
     ego_motion,
@@ -40,7 +47,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("embreex")
     out = tmp_path_factory.mktemp("k360") / "town"
     sensor = replace(load_sensor("hdl64e_kitti360"), name="coarse", columns=512)
-    export_town(Town(3, sensor, SCANS), out, "kitti360", camera=False, accumulate=True, progress=False)
+    export_town(
+        Town(3, sensor, SCANS), out, "kitti360", camera=False, accumulate=True, progress=False
+    )
     return out
 
 
@@ -52,7 +61,8 @@ def labelled(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 
 @pytest.fixture
 def copy(root: Path, tmp_path: Path) -> Path:
-    """A copy of the dataset, without labels per scan, that a test may change; its scans are links."""
+    """A copy of the dataset, without labels per scan, that a test may change; its scans are
+    links."""
     out = tmp_path / "town"
     shutil.copytree(root / "data_3d_raw", out / "data_3d_raw", copy_function=os.link)
     for name in ("data_poses", "calibration", "data_3d_bboxes", "data_3d_semantics"):
@@ -61,7 +71,8 @@ def copy(root: Path, tmp_path: Path) -> Path:
 
 
 def shares(report: LabelReport, part: int) -> NDArray[np.float64]:
-    """Share covered, share right of these, and the same of moving cars, in frames of one remainder by ``STEP``."""
+    """Share covered, share right of these, and the same of moving cars, in frames of one remainder
+    by ``STEP``."""
     rows = [c for name, c in report.compared.items() if int(name[-10:]) % STEP == part]
     known, covered, right, cars, seen, good = np.sum(rows, axis=0)
     assert len(rows) == SCANS / STEP and cars > 100
@@ -75,8 +86,11 @@ def test_labels_of_the_town_are_recovered(labelled: tuple[Path, LabelReport], pa
     assert cars_covered > 0.9 and cars_right > 0.9 and cars_covered * cars_right > 0.9
 
 
-def test_confidence_tells_wrong_labels_from_right_ones(root: Path, labelled: tuple[Path, LabelReport]) -> None:
-    confidence, right = [], []
+def test_confidence_tells_wrong_labels_from_right_ones(
+    root: Path, labelled: tuple[Path, LabelReport]
+) -> None:
+    confidence = []
+    right = []
     for truth, scan in zip(KITTI360(root), KITTI360(root, labels=labelled[0]), strict=True):
         assert scan.confidence is not None and scan.label is not None and truth.label is not None
         known = (scan.label != 255) & (truth.label != 255)
@@ -84,10 +98,14 @@ def test_confidence_tells_wrong_labels_from_right_ones(root: Path, labelled: tup
         right.append((scan.label == truth.label)[known])
         assert not scan.confidence[scan.raw_label == 0].any()
     sure = np.concatenate(confidence) > 0.8
-    assert np.concatenate(right)[sure].mean() > max(0.99, np.concatenate(right)[~sure].mean() + 0.03)
+    assert np.concatenate(right)[sure].mean() > max(
+        0.99, np.concatenate(right)[~sure].mean() + 0.03
+    )
 
 
-def test_a_segmenter_gets_only_scans_with_labels(root: Path, labelled: tuple[Path, LabelReport]) -> None:
+def test_a_segmenter_gets_only_scans_with_labels(
+    root: Path, labelled: tuple[Path, LabelReport]
+) -> None:
     label_file(labelled[0], DRIVE, f"{5:010d}").rename(labelled[0] / "kept")  # type: ignore[union-attr]
     scans = KITTI360(root, labels=labelled[0])
     (labelled[0] / "kept").rename(labels_folder(labelled[0], DRIVE) / f"{5:010d}.label")
@@ -128,7 +146,10 @@ def _shorten(copy: Path) -> None:
 
 def _turned(copy: Path) -> None:
     _change_poses(
-        copy, lambda frame, pose: pose @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
+        copy,
+        lambda frame, pose: (
+            pose @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
+        ),
     )
 
 
@@ -141,10 +162,14 @@ def _elsewhere(copy: Path) -> None:
 
 
 def _torn(copy: Path) -> None:
-    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1e5 * (frame % 2)], *[[0] * 4] * 3]))
+    _change_poses(
+        copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1e5 * (frame % 2)], *[[0] * 4] * 3])
+    )
 
 
-def _change_poses(copy: Path, change: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]) -> None:
+def _change_poses(
+    copy: Path, change: Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+) -> None:
     path = copy / "data_poses" / DRIVE / "poses.txt"
     lines = np.loadtxt(path)
     for line in lines:
@@ -153,7 +178,9 @@ def _change_poses(copy: Path, change: Callable[[int, NDArray[np.float64]], NDArr
     np.savetxt(path, lines)
 
 
-@pytest.mark.parametrize("change", [_turned, _beside, _elsewhere, _torn], ids=lambda f: f.__name__.strip("_"))
+@pytest.mark.parametrize(
+    "change", [_turned, _beside, _elsewhere, _torn], ids=lambda f: f.__name__.strip("_")
+)
 def test_wrong_poses_are_an_error_and_write_no_labels(
     copy: Path, tmp_path: Path, change: Callable[[Path], None]
 ) -> None:
@@ -178,17 +205,22 @@ def test_scans_off_the_clouds_are_laid_onto_them(
 ) -> None:
     _shorten(copy)
     x, y, z, yaw = WRONG[error]
-    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    c = np.cos(np.radians(yaw))
+    s = np.sin(np.radians(yaw))
     wrong = np.array([(c, -s, 0, x), (s, c, 0, y), (0, 0, 1, z), (0, 0, 0, 1)])
     mount = imu_from_sensor(read_calibration(root))
     _change_poses(copy, lambda frame, pose: pose @ mount @ wrong @ np.linalg.inv(mount))
     report = label_scans(copy, tmp_path / "labels", against=root, progress=False)
     assert report.labelled == {DRIVE: 4} and report.misfits == {DRIVE: []}
-    assert len(report.moved[DRIVE]) == 4 and np.allclose(report.moved[DRIVE], np.hypot(x, y) + z, atol=0.15)
+    assert len(report.moved[DRIVE]) == 4 and np.allclose(
+        report.moved[DRIVE], np.hypot(x, y) + z, atol=0.15
+    )
     assert labelled[1].moved == {DRIVE: []}
     before = [labelled[1].compared[name] for name in report.compared]
     known, covered, right = np.sum(list(report.compared.values()), axis=0)[:3]
-    assert np.allclose((covered / known, right / known), np.sum(before, axis=0)[1:3] / known, atol=0.005)
+    assert np.allclose(
+        (covered / known, right / known), np.sum(before, axis=0)[1:3] / known, atol=0.005
+    )
 
 
 def test_frames_without_window_or_pose_are_counted(copy: Path, tmp_path: Path) -> None:
@@ -197,7 +229,9 @@ def test_frames_without_window_or_pose_are_counted(copy: Path, tmp_path: Path) -
     poses = copy / "data_poses" / DRIVE / "poses.txt"
     poses.write_text("".join(line for line in poses.open() if int(line.split()[0]) not in (12, 13)))
     plan = plan_labels(copy)
-    assert plan.outside == {DRIVE: 8} and plan.without_pose == {DRIVE: 2} and plan.frames == SCANS - 10
+    assert (
+        plan.outside == {DRIVE: 8} and plan.without_pose == {DRIVE: 2} and plan.frames == SCANS - 10
+    )
     report = label_scans(copy, tmp_path, progress=False)
     assert report.labelled == {DRIVE: SCANS - 10}
     assert {int(p.stem) for p in tmp_path.rglob("*.label")} == {*range(8, SCANS)} - {12, 13}
@@ -223,14 +257,17 @@ def test_empty_dynamic_clouds_are_read_as_in_the_dataset(copy: Path) -> None:
 
 
 def _skewed(points: NDArray[np.float32], motion: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Points as a sensor measures them that moves while it turns: the inverse of ``undo_ego_motion``."""
+    """Points as a sensor measures them that moves while it turns: the inverse of
+    ``undo_ego_motion``."""
     raw = points.astype(np.float64)
     for _ in range(20):
         raw -= undo_ego_motion(raw, motion) - points
     return raw.astype(np.float32)
 
 
-def test_scans_measured_while_driving_are_recognised_and_labelled(root: Path, copy: Path, tmp_path: Path) -> None:
+def test_scans_measured_while_driving_are_recognised_and_labelled(
+    root: Path, copy: Path, tmp_path: Path
+) -> None:
     poses = read_poses(root, DRIVE, read_calibration(root))
     for frame in range(SCANS):
         path = scans_folder(copy, DRIVE) / f"{frame:010d}.bin"
@@ -239,7 +276,10 @@ def test_scans_measured_while_driving_are_recognised_and_labelled(root: Path, co
         path.unlink()  # a link to the original
         scan.tofile(path)
     report = label_scans(copy, tmp_path, against=root, progress=False)
-    records = [json.loads(p.read_text()) for p in (tmp_path / "data_3d_semantics_scan" / DRIVE / "windows").iterdir()]
+    records = [
+        json.loads(p.read_text())
+        for p in (tmp_path / "data_3d_semantics_scan" / DRIVE / "windows").iterdir()
+    ]
     assert all(record["turns"] for record in records)
     for part in range(STEP):
         covered, right, *_ = shares(report, part)
@@ -283,11 +323,22 @@ def _misnamed(path: Path) -> None:
     path.rename(path.with_name("9_2.ply"))
 
 
-DAMAGES = [_truncated, _without_confidence, _unknown_class, _huge_instance, _text, _twice, _many, _misnamed]
+DAMAGES = [
+    _truncated,
+    _without_confidence,
+    _unknown_class,
+    _huge_instance,
+    _text,
+    _twice,
+    _many,
+    _misnamed,
+]
 
 
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda f: f.__name__.strip("_"))
-def test_a_damaged_cloud_is_named(copy: Path, tmp_path: Path, damage: Callable[[Path], None]) -> None:
+def test_a_damaged_cloud_is_named(
+    copy: Path, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
     damage(find_windows(copy, DRIVE)[0].static)
     with pytest.raises(DataError, match=r"static/.*\.ply"):
         label_scans(copy, tmp_path / "labels", progress=False)
@@ -295,9 +346,15 @@ def test_a_damaged_cloud_is_named(copy: Path, tmp_path: Path, damage: Callable[[
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [("data_3d_semantics", "Accumulated Point Clouds"), ("data_poses", "poses.txt"), ("calibration", "calibration/")],
+    [
+        ("data_3d_semantics", "Accumulated Point Clouds"),
+        ("data_poses", "poses.txt"),
+        ("calibration", "calibration/"),
+    ],
 )
-def test_a_missing_part_of_the_dataset_is_named(copy: Path, tmp_path: Path, missing: str, message: str) -> None:
+def test_a_missing_part_of_the_dataset_is_named(
+    copy: Path, tmp_path: Path, missing: str, message: str
+) -> None:
     shutil.rmtree(copy / missing)
     with pytest.raises(DataError, match=message):
         label_scans(copy, tmp_path / "labels", progress=False)
@@ -307,7 +364,8 @@ def test_a_run_that_ended_before_its_first_record_is_resumed(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _shorten(copy)
-    write, written = kitti360_labels.write_labels, []
+    write = kitti360_labels.write_labels
+    written = []
 
     def full(path: Path, values: NDArray[np.uint32]) -> None:
         if len(written) == 2:
@@ -335,7 +393,9 @@ def test_labels_from_elsewhere_are_not_overwritten(root: Path) -> None:
         label_scans(root, root, progress=False)
 
 
-def test_confidence_of_another_scan_is_refused(root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path) -> None:
+def test_confidence_of_another_scan_is_refused(
+    root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path
+) -> None:
     shutil.copytree(labelled[0], tmp_path / "labels")
     path = confidence_path(tmp_path / "labels", DRIVE, f"{3:010d}")
     path.write_bytes(path.read_bytes()[1:])
@@ -359,7 +419,9 @@ def test_clouds_hold_every_second_frame_within_reach(root: Path) -> None:
         static = read_cloud(window.static)
         points = np.column_stack([static[axis] for axis in "xyz"])
         assert len(np.unique(np.floor(points / 0.02), axis=0)) > 0.98 * len(points) > 10_000
-        assert set(np.unique(static["instance"] // 1000)) <= set(np.unique(static["semantic"])) | {0}
+        assert set(np.unique(static["instance"] // 1000)) <= set(np.unique(static["semantic"])) | {
+            0
+        }
 
 
 @pytest.mark.parametrize(("layout", "scans"), [("semantic_kitti", 5), ("kitti360", MOST + 1)])
@@ -368,7 +430,9 @@ def test_what_cannot_be_accumulated_is_refused(layout: str, scans: int, tmp_path
         export_town(Town(0, scans=scans), tmp_path, layout, accumulate=True)
 
 
-def test_the_command_prints_a_report(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_report(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run(["label", "kitti360", str(root), str(tmp_path), "--dry-run"])
     assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out and not list(tmp_path.iterdir())
     run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root)])
@@ -377,7 +441,11 @@ def test_the_command_prints_a_report(root: Path, tmp_path: Path, capsys: pytest.
     run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root), "--json"])
     report = json.loads(capsys.readouterr().out)
     stored = json.loads((tmp_path / "data_3d_semantics_scan" / "report.json").read_text())
-    assert report == stored and report["shares"]["right"] > 0.97 and report["frames"]["labelled"] == {DRIVE: SCANS}
+    assert (
+        report == stored
+        and report["shares"]["right"] > 0.97
+        and report["frames"]["labelled"] == {DRIVE: SCANS}
+    )
     with pytest.raises(LidarSynthError):
         run(["label", "kitti", str(root), str(tmp_path)])
 

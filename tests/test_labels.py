@@ -17,7 +17,15 @@ from lidar_synth.geometry.projection import locate, project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
-from lidar_synth.labels import KINDS, POLICIES, ObjectBank, make_policy, swap_bands, swap_sector, thinned
+from lidar_synth.labels import (
+    KINDS,
+    POLICIES,
+    ObjectBank,
+    make_policy,
+    swap_bands,
+    swap_sector,
+    thinned,
+)
 from lidar_synth.noise import keyed_rng
 
 FIELDS = frozenset({"reflectance", "label", "confidence"})
@@ -68,7 +76,8 @@ def arrays(scan: Scan) -> dict[str, np.ndarray]:
 
 def same(a: Scan, b: Scan) -> bool:
     """Bit for bit."""
-    left, right = arrays(a), arrays(b)
+    left = arrays(a)
+    right = arrays(b)
     return left.keys() == right.keys() and all(np.array_equal(left[n], right[n]) for n in left)
 
 
@@ -83,15 +92,21 @@ def test_every_policy_and_kind_is_called_here() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
-def test_a_policy_is_a_function_of_scan_and_generator(name: str, synthetic: Scan, real: list[Scan]) -> None:
+def test_a_policy_is_a_function_of_scan_and_generator(
+    name: str, synthetic: Scan, real: list[Scan]
+) -> None:
     policy_name, options = call(name)
     known = FIELDS
     if policy_name == "boxes":
-        synthetic, known = replace(synthetic, boxes=real[0].boxes), FIELDS | {"boxes"}
+        synthetic = replace(synthetic, boxes=real[0].boxes)
+        known = FIELDS | {"boxes"}
     before = [{n: a.copy() for n, a in arrays(s).items()} for s in (synthetic, *real)]
     policy = make_policy(policy_name, real=real, fields=known, **options)
-    first, again = policy(synthetic, keyed_rng(4, 1)), policy(synthetic, keyed_rng(4, 1))
-    copied = pickle.loads(pickle.dumps(policy))(synthetic, keyed_rng(4, 1))  # as spawned workers get it
+    first = policy(synthetic, keyed_rng(4, 1))
+    again = policy(synthetic, keyed_rng(4, 1))
+    copied = pickle.loads(pickle.dumps(policy))(
+        synthetic, keyed_rng(4, 1)
+    )  # as spawned workers get it
     assert same(first, again) and same(first, copied)
     other = policy(synthetic, keyed_rng(4, 2))
     assert same(first, other) == (policy_name != "mix")
@@ -109,7 +124,9 @@ def test_a_policy_is_a_function_of_scan_and_generator(name: str, synthetic: Scan
 
 
 def test_none_and_ignore_leave_no_label(synthetic: Scan) -> None:
-    scan = replace(synthetic, boxes=cast([car(9, 0)]).boxes, instance=np.ones(len(synthetic), np.int32))
+    scan = replace(
+        synthetic, boxes=cast([car(9, 0)]).boxes, instance=np.ones(len(synthetic), np.int32)
+    )
     none = make_policy("none")(scan, keyed_rng(0))
     assert none.fields().keys() == {"reflectance"} and none.boxes is None
     ignored = make_policy("ignore")(scan, keyed_rng(0))
@@ -120,10 +137,16 @@ def test_none_and_ignore_leave_no_label(synthetic: Scan) -> None:
 def test_generated_labels_need_confidence(synthetic: Scan) -> None:
     assert synthetic.label is not None and synthetic.confidence is not None
     kept = make_policy("generated", fields=FIELDS)(synthetic, keyed_rng(0))
-    assert np.array_equal(kept.label, synthetic.label) and np.array_equal(kept.confidence, synthetic.confidence)
+    assert np.array_equal(kept.label, synthetic.label) and np.array_equal(
+        kept.confidence, synthetic.confidence
+    )
     sure = make_policy("generated", fields=FIELDS, threshold=0.7)(synthetic, keyed_rng(0))
-    assert np.array_equal(sure.label, np.where(synthetic.confidence >= 0.7, synthetic.label, IGNORE))
-    plain = make_policy("generated", fields=frozenset({"label"}))(replace(synthetic, confidence=None), keyed_rng(0))
+    assert np.array_equal(
+        sure.label, np.where(synthetic.confidence >= 0.7, synthetic.label, IGNORE)
+    )
+    plain = make_policy("generated", fields=frozenset({"label"}))(
+        replace(synthetic, confidence=None), keyed_rng(0)
+    )
     assert np.array_equal(plain.confidence, (synthetic.label != IGNORE).astype(np.float32))
 
 
@@ -165,19 +188,24 @@ def test_pseudo_labels_are_the_teachers_where_it_is_sure(synthetic: Scan) -> Non
         lambda s: (np.zeros(len(s), int), np.ones(3)),
     ],
 )
-def test_a_teacher_that_answers_nonsense_is_refused(answer: Callable[[Scan], Any], synthetic: Scan) -> None:
+def test_a_teacher_that_answers_nonsense_is_refused(
+    answer: Callable[[Scan], Any], synthetic: Scan
+) -> None:
     with pytest.raises(DataError, match="the teacher's"):
         make_policy("pseudo", teacher=answer)(synthetic, keyed_rng(0))
 
 
 def test_a_sector_is_the_others_and_the_rest_is_kept() -> None:
-    ours, theirs = cast([], [wall(20, 0, 1.5, 60)]), cast([], [wall(-10, 8, 0.3, 30)])
+    ours = cast([], [wall(20, 0, 1.5, 60)])
+    theirs = cast([], [wall(-10, 8, 0.3, 30)])
     theirs = replace(theirs, reflectance=theirs.reflectance + np.float32(0.01))
     for start, width in ((100, 300), (900, 400), (0, 1024), (5, 0)):
         mixed = swap_sector(ours, theirs, start, width)
         inside = np.zeros(1024, bool)
         inside[(start + np.arange(width)) % 1024] = True
-        a, b, got = project(ours), project(theirs), project(mixed)
+        a = project(ours)
+        b = project(theirs)
+        got = project(mixed)
         for name in ("range", "label", "reflectance"):
             values = [i.range if name == "range" else i.channels[name] for i in (a, b, got)]
             assert np.allclose(values[2], np.where(inside, values[1], values[0]), atol=1e-4)
@@ -187,36 +215,49 @@ def test_a_sector_is_the_others_and_the_rest_is_kept() -> None:
 def test_objects_that_the_edge_of_a_sector_cuts_leave() -> None:
     ours = cast([car(0, 10), car(10, 0.5), car(12, -12)])
     theirs = cast([car(0, -9), car(10, 0, np.pi / 2), car(-8, -5)])
-    mixed = swap_sector(ours, theirs, 512, 512)  # the right half is theirs; the edges are straight ahead and behind
+    mixed = swap_sector(
+        ours, theirs, 512, 512
+    )  # the right half is theirs; the edges are straight ahead and behind
     assert mixed.boxes is not None and mixed.instance is not None and mixed.label is not None
     assert np.allclose(mixed.boxes.values[:, :2], [[0, 10], [0, -9], [-8, -5]])
     assert mixed.boxes.instance.tolist() == [1, 2, 3]
     for box, instance in zip(mixed.boxes.values, mixed.boxes.instance, strict=True):
         grown = Boxes(box + np.array([0, 0, 0, 0.01, 0.01, 0.01, 0], np.float32), ("Car",))
         own = mixed.instance == instance
-        assert own.any() and np.array_equal(grown.contain(mixed.points)[0] & (mixed.label == CAR), own)
+        assert own.any() and np.array_equal(
+            grown.contain(mixed.points)[0] & (mixed.label == CAR), own
+        )
     assert ((mixed.label == CAR) == (mixed.instance > 0)).all()
     cars = mixed.points[mixed.label == CAR]
     assert not ((cars[:, 0] > 5) & (abs(cars[:, 1]) < 3)).any()  # nor is half a car left
 
 
 def test_boxes_of_two_scans_never_share_a_place() -> None:
-    ours, theirs = cast([car(3, 10.0)]), cast([car(-3, 10.2)])
+    ours = cast([car(3, 10.0)])
+    theirs = cast([car(-3, 10.2)])
     edge = int(locate(np.array([[0, 10, 0]], np.float32), SENSOR).cell[0] % 1024)
     mixed = swap_sector(ours, theirs, edge - 512, 512)
     assert mixed.boxes is not None and len(mixed.boxes) == 2
-    ours.boxes.values[0, 3] = theirs.boxes.values[0, 3] = 7  # overlapping boxes, each with its own returns
+    ours.boxes.values[0, 3] = theirs.boxes.values[0, 3] = (
+        7  # overlapping boxes, each with its own returns
+    )
     mixed = swap_sector(ours, theirs, edge - 512, 512)
     assert mixed.boxes is not None and mixed.boxes.values[:, 0].tolist() == [3]
     assert mixed.instance.max() == 1
 
 
 def test_boxes_hold_all_returns_of_their_objects(real: list[Scan]) -> None:
-    """The town's boxes are tight and its sensor noisy: a few returns of each scan lie outside by centimetres."""
+    """The town's boxes are tight and its sensor noisy: a few returns of each scan lie outside by
+    centimetres."""
     ours, theirs = real
-    tight = [(s.boxes[[i]], s.instance == s.boxes.instance[i]) for s in real for i in range(len(s.boxes))]
+    tight = [
+        (s.boxes[[i]], s.instance == s.boxes.instance[i]) for s in real for i in range(len(s.boxes))
+    ]
     points = [*[ours.points] * len(ours.boxes), *[theirs.points] * len(theirs.boxes)]
-    assert sum((own & ~box.contain(p)[0]).sum() for (box, own), p in zip(tight, points, strict=True)) > 20
+    assert (
+        sum((own & ~box.contain(p)[0]).sum() for (box, own), p in zip(tight, points, strict=True))
+        > 20
+    )
     for start in range(0, 1024, 128):
         mixed = swap_sector(ours, theirs, start, 512)
         assert mixed.boxes is not None and len(mixed.boxes)
@@ -225,11 +266,14 @@ def test_boxes_hold_all_returns_of_their_objects(real: list[Scan]) -> None:
     before = {tuple(v[[0, 1, 2, 6]]): v[3:6] for s in real for v in s.boxes.values}
     for value in mixed.boxes.values:
         assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] >= 0).all()
-        assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] < 0.3).all(), "no more than noise on either side"
+        assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] < 0.3).all(), (
+            "no more than noise on either side"
+        )
 
 
 def test_bands_alternate_from_top_to_bottom() -> None:
-    ours, theirs = cast([car(9, 2)]), cast([], [wall(8, 0, 1.5, 30)])
+    ours = cast([car(9, 2)])
+    theirs = cast([], [wall(8, 0, 1.5, 30)])
     for bands, odd in ((2, False), (3, True), (6, False), (64, True)):
         mixed = swap_bands(ours, theirs, bands, odd)
         mine = (np.arange(64) * bands // 64) % 2 == odd
@@ -248,14 +292,17 @@ def test_a_partner_is_thinned_to_the_grid() -> None:
 
 
 def test_a_partner_of_other_lasers_lends_no_rings() -> None:
-    host, other = Town(1, scans=1)[0], Town(1, "os1_128", scans=1)[0]
+    host = Town(1, scans=1)[0]
+    other = Town(1, "os1_128", scans=1)[0]
     assert thinned(other, host.sensor).ring is None
     assert thinned(host, replace(host.sensor, name="fewer", columns=512)).ring is not None
     mixed = swap_sector(host, thinned(other, host.sensor), 0, 512)
     assert mixed.ring.max() < 64
 
 
-def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(synthetic: Scan, real: list[Scan]) -> None:
+def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
+    synthetic: Scan, real: list[Scan]
+) -> None:
     policy = make_policy("mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5)
     mixed = policy(synthetic, keyed_rng(3))
     own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
@@ -277,7 +324,9 @@ def test_polar_turns_objects_about_the_sensor() -> None:
     assert np.allclose(np.hypot(*mixed.boxes.values[:, :2].T), [9, np.hypot(14, 6)], atol=1e-3)
     assert abs(np.arctan2(*mixed.boxes.values[0, 1::-1])) > 0.05
     bare = [replace(real[0], boxes=None)]
-    mixed = make_policy("mix", real=bare, fields=FIELDS, kind="polar", width=0)(cast(), keyed_rng(1))
+    mixed = make_policy("mix", real=bare, fields=FIELDS, kind="polar", width=0)(
+        cast(), keyed_rng(1)
+    )
     assert (mixed.label == CAR).sum() > 500 and mixed.boxes is None
 
 
@@ -286,7 +335,9 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
     scan.boxes = Boxes(scan.boxes.values, ("Car", "Van"), instance=scan.boxes.instance)
     bank = ObjectBank.from_scans([scan])
     host = replace(cast([car(20, 0)]), boxes=None)
-    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False)(host, keyed_rng(0))
+    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False)(
+        host, keyed_rng(0)
+    )
     assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
     assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
     clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(host, keyed_rng(0))
@@ -296,24 +347,41 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
 
 def refusals() -> list[tuple[str, dict[str, Any], str]]:
     """Policies that these sources cannot serve, and what the error says."""
-    bare, labelled = [replace(cast(), label=None, boxes=None)], [replace(cast(), boxes=None, instance=None)]
+    bare = [replace(cast(), label=None, boxes=None)]
+    labelled = [replace(cast(), boxes=None, instance=None)]
     plain = frozenset({"reflectance"})
     return [
-        ("generated", {"fields": plain}, "labels='generated', but .* the synthetic scans only have.*Use labels='none'"),
+        (
+            "generated",
+            {"fields": plain},
+            "labels='generated', but .* the synthetic scans only have.*Use labels='none'",
+        ),
         ("generated", {"fields": frozenset({"label"}), "threshold": 0.5}, "without confidence"),
         ("generated", {"threshold": 1.5}, "threshold 1.5; expected a number from 0 to 1"),
-        ("condition", {"fields": plain}, "labels='condition', but .* the synthetic scans only have"),
+        (
+            "condition",
+            {"fields": plain},
+            "labels='condition', but .* the synthetic scans only have",
+        ),
         ("pseudo", {}, "teacher=None; expected a function"),
         ("pseudo", {"teacher": teacher, "threshold": -1}, "threshold -1"),
         ("none", {"threshold": 0.5}, "labels='none'.*'threshold'; expected no options"),
         ("generated", {"treshold": 0.5}, "'treshold'; expected options"),
         ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
-        ("mix", {"kind": "cut"}, "kind='cut'; expected one of 'objects', 'polar', 'laser', 'exchange'"),
+        (
+            "mix",
+            {"kind": "cut"},
+            "kind='cut'; expected one of 'objects', 'polar', 'laser', 'exchange'",
+        ),
         ("mix", {}, "no box with 5 points in 0 scans"),
         ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
         ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),
         ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
-        ("mix", {"real": [cast([car(8, 2)])], "fields": plain}, "neither labels nor boxes.*clear=False"),
+        (
+            "mix",
+            {"real": [cast([car(8, 2)])], "fields": plain},
+            "neither labels nor boxes.*clear=False",
+        ),
         ("mix", {"real": bare, "kind": "polar"}, "kind='polar', with scans without labels"),
         ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
         ("mix", {"kind": "laser"}, "kind='laser', with none"),
@@ -323,8 +391,12 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
     ]
 
 
-@pytest.mark.parametrize(("name", "options", "message"), refusals(), ids=lambda v: v if isinstance(v, str) else "")
-def test_policies_that_the_sources_cannot_support_are_refused(name: str, options: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "options", "message"), refusals(), ids=lambda v: v if isinstance(v, str) else ""
+)
+def test_policies_that_the_sources_cannot_support_are_refused(
+    name: str, options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         make_policy(name, **({"fields": FIELDS} | options))
 
@@ -351,7 +423,10 @@ def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_mixed_scans_lose_their_times(kind: str, synthetic: Scan, real: list[Scan]) -> None:
     """PandaSet's scans have times; those of two scans count from different moments."""
-    timed = [replace(scan, time=np.linspace(0, 0.1, len(scan), dtype=np.float32)) for scan in (synthetic, *real)]
+    timed = [
+        replace(scan, time=np.linspace(0, 0.1, len(scan), dtype=np.float32))
+        for scan in (synthetic, *real)
+    ]
     policy = make_policy("mix", real=timed[1:], fields=FIELDS | {"time"}, kind=kind)
     mixed = policy(timed[0], keyed_rng(4, 1))
     assert mixed.time is None and len(mixed) != len(synthetic)
@@ -363,22 +438,32 @@ def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic:
     source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")
     if kind == "objects":
         source = KITTIObject(real_scans / "kitti_object")
-    options = {"clear": False} if kind == "objects" else {}  # else the scan's own objects leave holes, which are filled
+    options = (
+        {"clear": False} if kind == "objects" else {}
+    )  # else the scan's own objects leave holes, which are filled
     policy = make_policy("mix", real=source, fields=FIELDS, kind=kind, **options)
     for seed in range(3):
         mixed = policy(synthetic, keyed_rng(seed))
-        assert mixed.domain == SYNTHETIC and mixed.label is not None and mixed.confidence is not None
+        assert (
+            mixed.domain == SYNTHETIC and mixed.label is not None and mixed.confidence is not None
+        )
         own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
         assert (~own).sum() > (50 if kind == "objects" else 5000) and own.sum() > 5000
         assert (mixed.confidence[~own & (mixed.label != IGNORE)] == 1).all()
         cells = locate(mixed.points, mixed.sensor).cell
-        assert (np.bincount(cells[cells >= 0]) <= 1).all()  # as the model's own scans: one return per cell
+        assert (
+            np.bincount(cells[cells >= 0]) <= 1
+        ).all()  # as the model's own scans: one return per cell
         assert (mixed.boxes is not None) == (kind == "objects")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_real_scans_that_cannot_serve(kind: str, real_scans: Path) -> None:
-    source = KITTI360(real_scans / "kitti360") if kind == "objects" else KITTIObject(real_scans / "kitti_object")
+    source = (
+        KITTI360(real_scans / "kitti360")
+        if kind == "objects"
+        else KITTIObject(real_scans / "kitti_object")
+    )
     named = "polar" if kind == "exchange" else kind  # an exchange is one of both
     with pytest.raises(ConfigError, match=f"kind='{named}'"):
         make_policy("mix", real=source, fields=FIELDS, kind=kind)

@@ -1,4 +1,5 @@
-"""Layouts: their image on a sensor's rays against slow independent casting, their files, and their errors."""
+"""Layouts: their image on a sensor's rays against slow independent casting, their files, and their
+errors."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -21,19 +22,35 @@ from lidar_synth.lab.evaluate.layouts import layout_agreement, rays_of_boxes
 from lidar_synth.labels.boxes import turned, widened
 
 SMALL = Sensor("small", 64, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
-LASERS = Sensor("lasers", 64, 1.45, 80.0, elevations=tuple(np.linspace(2, -24, 16)), heights=(0.2,) * 16)
-NAMES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "Motorcyclist")
+LASERS = Sensor(
+    "lasers", 64, 1.45, 80.0, elevations=tuple(np.linspace(2, -24, 16)), heights=(0.2,) * 16
+)
+NAMES = (
+    "Car",
+    "Van",
+    "Truck",
+    "Pedestrian",
+    "Person_sitting",
+    "Cyclist",
+    "Tram",
+    "Misc",
+    "Motorcyclist",
+)
 
 
 def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
     """Boxes that stand apart on sloping ground, and walls around them."""
-    rng, rows = np.random.default_rng(seed), np.zeros((0, 7), np.float32)
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((0, 7), np.float32)
     while len(rows) < count:
-        azimuth, distance = rng.uniform(-np.pi, np.pi), rng.uniform(4, 30)
+        azimuth = rng.uniform(-np.pi, np.pi)
+        distance = rng.uniform(4, 30)
         size = rng.uniform((0.5, 0.5, 1.0), (8, 2.5, 3))
         height = -1.7 + size[2] / 2 + rng.uniform(-0.1, 0.3)
         place = (distance * np.cos(azimuth), distance * np.sin(azimuth), height)
-        more = np.concatenate([rows, [(*place, *size, rng.uniform(-np.pi, np.pi))]]).astype(np.float32)
+        more = np.concatenate([rows, [(*place, *size, rng.uniform(-np.pi, np.pi))]]).astype(
+            np.float32
+        )
         boxes = Boxes(more, ("Car",) * len(more))
         if (
             not overlaps(boxes, 0.0)
@@ -41,19 +58,27 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         ):
             rows = more
     outlines = [
-        Outline("building", np.float32([(-40, 18), (5, 20), (40, 15)]), -1.9, np.float32([6, 4, 9])),
+        Outline(
+            "building", np.float32([(-40, 18), (5, 20), (40, 15)]), -1.9, np.float32([6, 4, 9])
+        ),
         Outline("vegetation", np.float32([(10, -12), (14, -9), (20, -12)]), 0.3, 4.0),
         Outline("fence", np.float32([(-15, -20), (-15, 5)]), -2.0, -0.7),
-        Outline("fence", np.float32([(-30, 10), (30, 11)]), -2.0, -1.2),  # lower than the building behind it
+        Outline(
+            "fence", np.float32([(-30, 10), (30, 11)]), -2.0, -1.2
+        ),  # lower than the building behind it
     ]
     names = tuple(rng.choice(NAMES, count).tolist())
     return Layout(Boxes(rows, names), (-1.7, 0.01, -0.02), outlines if walls else (), reach=60.0)
 
 
-def marched(layout: Layout, sensor: Sensor, step: float = 0.02) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Class and distance by walking along each ray: slow, and without the mathematics of the raster."""
+def marched(
+    layout: Layout, sensor: Sensor, step: float = 0.02
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Class and distance by walking along each ray: slow, and without the mathematics of the
+    raster."""
     rows, columns = sensor.shape
-    code, depth = np.zeros(sensor.shape, np.uint8), np.zeros(sensor.shape, np.float32)
+    code = np.zeros(sensor.shape, np.uint8)
+    depth = np.zeros(sensor.shape, np.float32)
     at = np.arange(step, sensor.range_max, step)
     plane = np.array([*layout.ground[1:], -1])
     for i in range(rows):
@@ -67,7 +92,9 @@ def marched(layout: Layout, sensor: Sensor, step: float = 0.02) -> tuple[NDArray
                 hit.append((at[inside[k].argmax()], layout.codes()[k]))
             for wall in layout.outlines:
                 hit += [(x, CODES[wall.kind]) for x in crossings(points, at, wall)]
-            buried = (points @ plane + layout.ground[0] > 0) & (np.hypot(*points[:, :2].T) <= layout.reach)
+            buried = (points @ plane + layout.ground[0] > 0) & (
+                np.hypot(*points[:, :2].T) <= layout.reach
+            )
             if buried.any() and not inside.any():
                 hit.append((at[buried.argmax()], CODES["ground"]))
             if hit and (nearest := min(hit))[0] >= sensor.range_min:
@@ -81,11 +108,13 @@ def crossings(points: NDArray[Any], at: NDArray[Any], wall: Outline) -> list[flo
     edges = zip(np.asarray(wall.low), np.asarray(wall.high), strict=True)
     corners = [(*corner, *edge) for corner, edge in zip(wall.line, edges, strict=True)]
     for (x1, y1, low1, high1), (x2, y2, low2, high2) in pairwise(corners):
-        along, normal = np.array([x2 - x1, y2 - y1]), np.array([y1 - y2, x2 - x1])
+        along = np.array([x2 - x1, y2 - y1])
+        normal = np.array([y1 - y2, x2 - x1])
         side = (points[:, :2] - (x1, y1)) @ normal > 0
         for k in np.flatnonzero(side[1:] != side[:-1]):
             share = (points[k, :2] - (x1, y1)) @ along / (along @ along)
-            low, high = low1 + share * (low2 - low1), high1 + share * (high2 - high1)
+            low = low1 + share * (low2 - low1)
+            high = high1 + share * (high2 - high1)
             if 0 <= share <= 1 and low <= points[k, 2] <= high:
                 found.append(float(at[k]))
     return found
@@ -101,11 +130,14 @@ def test_the_image_is_that_of_walking_along_the_rays(seed: int, sensor: Sensor) 
     assert same.mean() > 0.985
     assert len(np.unique(code)) > 6
     steps = np.abs(depth_of(image) - depth)[same]
-    assert np.quantile(steps, 0.99) < 0.06  # the walk stops after the surface, and grazes the ground later
+    assert (
+        np.quantile(steps, 0.99) < 0.06
+    )  # the walk stops after the surface, and grazes the ground later
 
 
 def test_the_ground_hides_no_box() -> None:
-    layout, sensor = some_layout(1, walls=False), load_sensor("hdl64e_lasers")
+    layout = some_layout(1, walls=False)
+    sensor = load_sensor("hdl64e_lasers")
     boxed = [layout_image(replace(layout, ground=(z, 0.0, 0.0)), sensor)[0] for z in (-2.5, -1.2)]
     assert (boxed[0] >= CODES["Car"]).sum() > 5000
     assert np.array_equal(boxed[0] >= CODES["Car"], boxed[1] >= CODES["Car"])
@@ -113,15 +145,20 @@ def test_the_ground_hides_no_box() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_cells_of_a_box_look_at_points_of_its_surface(seed: int) -> None:
-    layout, sensor = some_layout(seed), load_sensor("hdl64e_lasers")
+    layout = some_layout(seed)
+    sensor = load_sensor("hdl64e_lasers")
     image = layout_image(layout, sensor)
     depth = depth_of(image).astype(np.float64)
     points = depth[..., None] * sensor.ray_directions()
     points[..., 2] += sensor.starts[:, None]
     seen = image[0] >= CODES["Car"]
     assert seen.sum() > 5000
-    larger = replace(layout.boxes, values=layout.boxes.values + np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0]))
-    smaller = replace(layout.boxes, values=layout.boxes.values - np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0]))
+    larger = replace(
+        layout.boxes, values=layout.boxes.values + np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0])
+    )
+    smaller = replace(
+        layout.boxes, values=layout.boxes.values - np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0])
+    )
     around, within = (b.contain(points[seen].astype(np.float32)) for b in (larger, smaller))
     assert around.any(0).all() and not within.any()
     # The class is that of the box, and the way along the ray ends inside it.
@@ -130,16 +167,22 @@ def test_the_cells_of_a_box_look_at_points_of_its_surface(seed: int) -> None:
     assert (layout.codes()[first] == image[0][seen])[single].all()
     deeper = points[seen] + sensor.ray_directions()[seen] * (image[3][seen, None] * 0.1 / 2)
     assert (
-        larger.contain(deeper.astype(np.float32))[first, np.arange(len(first))] | (image[3][seen] == 0)
+        larger.contain(deeper.astype(np.float32))[first, np.arange(len(first))]
+        | (image[3][seen] == 0)
     ).mean() > 0.999
     x, y, _, length, *_, yaw = layout.boxes.values[first].T
-    along = ((points[seen][:, 0] - x) * np.cos(yaw) + (points[seen][:, 1] - y) * np.sin(yaw)) / length + 0.5
+    along = (
+        (points[seen][:, 0] - x) * np.cos(yaw) + (points[seen][:, 1] - y) * np.sin(yaw)
+    ) / length + 0.5
     assert np.abs(image[4][seen] / 255 - along)[single].max() < 0.02
 
 
 def test_nothing_is_known_beyond_the_depths_of_an_image() -> None:
     """Two bytes end at 131 m; the front of the farther truck would be there instead of at 154 m."""
-    trucks = Boxes(np.array([(160, 0, 0, 12, 6, 6, 0), (0, 126, 0, 12, 6, 6, 0)], np.float32), ("Truck", "Truck"))
+    trucks = Boxes(
+        np.array([(160, 0, 0, 12, 6, 6, 0), (0, 126, 0, 12, 6, 6, 0)], np.float32),
+        ("Truck", "Truck"),
+    )
     sensor = load_sensor("vls128")
     image = layout_image(Layout(trucks), sensor)
     seen = image[0] == CODES["Truck"]
@@ -152,8 +195,12 @@ def test_turning_rolls_and_mirroring_flips() -> None:
     layout = replace(some_layout(5, walls=False), ground=(-1.7, 0.0, 0.0))
     image = layout_image(layout, sensor)
     columns = 300
-    rolled = layout_image(replace(layout, boxes=turned(layout.boxes, 2 * np.pi * columns / 2048)), sensor)
-    assert (np.roll(rolled, columns, -1) == image).all(0).mean() > 0.99  # turned to the left, back to the right
+    rolled = layout_image(
+        replace(layout, boxes=turned(layout.boxes, 2 * np.pi * columns / 2048)), sensor
+    )
+    assert (np.roll(rolled, columns, -1) == image).all(
+        0
+    ).mean() > 0.99  # turned to the left, back to the right
     mirrored = layout.boxes.values * np.float32([1, -1, 1, 1, 1, 1, -1])
     flipped = layout_image(replace(layout, boxes=replace(layout.boxes, values=mirrored)), sensor)
     assert (flipped[..., ::-1] == image).all(0).mean() > 0.999
@@ -168,7 +215,8 @@ def test_the_layout_of_a_scan_shows_what_the_scan_does(town: Any) -> None:
     from lidar_synth.datasets.classes import TRAIN_ID
     from lidar_synth.geometry.projection import project
 
-    layout, seen = layout_of(town), project(town, town.sensor, ["label"])
+    layout = layout_of(town)
+    seen = project(town, town.sensor, ["label"])
     image = layout_image(layout, town.sensor)
     assert set(layout.boxes.names) == set(town.boxes.names) and abs(layout.ground[0] + 1.73) < 0.3
     for name, classes, least in (
@@ -189,20 +237,28 @@ def test_the_layout_of_a_scan_has_the_boxes_within_the_range(town: Any) -> None:
     assert layout_of(town).boxes.names == inside.names
     values = inside.values.copy()
     values[0, :2] = 80.5, 0  # its nearer half is within 80 m
-    assert layout_of(replace(town, boxes=replace(inside, values=values))).boxes.names == inside.names[1:]
+    assert (
+        layout_of(replace(town, boxes=replace(inside, values=values))).boxes.names
+        == inside.names[1:]
+    )
 
 
 def test_only_boxes_that_overlap_a_kept_one_are_dropped(town: Any) -> None:
     """The second of three in a row overlaps both others, which stand apart."""
-    row = Boxes(np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32), ("Car",) * 3)
+    row = Boxes(
+        np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32), ("Car",) * 3
+    )
     assert known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [10, 16]
 
 
 def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
     bare = replace(town, label=None, raw_label=None)
-    layout, known = layout_of(bare), layout_of(town)
+    layout = layout_of(bare)
+    known = layout_of(town)
     assert abs(layout.ground[0] - known.ground[0]) < 0.15
-    assert {outline.kind for outline in layout.outlines} <= {"building", "vegetation"} and len(layout.outlines) > 20
+    assert {outline.kind for outline in layout.outlines} <= {"building", "vegetation"} and len(
+        layout.outlines
+    ) > 20
     with pytest.raises(DataError, match="has no boxes"):
         layout_of(replace(town, boxes=None))
     with pytest.raises(DataError, match="returns of the ground"):
@@ -220,7 +276,9 @@ def test_a_scan_agrees_with_its_own_layout_and_not_with_another(town: Any) -> No
     with pytest.raises(DataError, match="has no labels"):
         layout_agreement([replace(town, label=None)], [layout], [town])
     image = layout_image(layout, town.sensor)
-    assert abs(rays_of_boxes(layout, town.sensor).sum() / (image[0] >= CODES["Car"]).sum() - 1) < 0.05
+    assert (
+        abs(rays_of_boxes(layout, town.sensor).sum() / (image[0] >= CODES["Car"]).sum() - 1) < 0.05
+    )
 
 
 GOOD = """
@@ -241,23 +299,44 @@ def test_a_file_is_the_layout_that_it_describes(tmp_path: Path) -> None:
     path.write_text(GOOD)
     layout = load_layout(path)
     assert layout.boxes.names == ("Van", "Cyclist", "Misc") and layout.id == "behind"
-    assert np.allclose(layout.boxes.values[1], (16.5, 0.4, -1.7 + 0.85, 1.8, 0.6, 1.7, -np.pi), atol=1e-4)
-    assert np.allclose(layout.boxes.values[2], (-20, 8, -1.6 + 3.05 / 2, 11.8, 2.55, 3.05, 0), atol=1e-4)
+    assert np.allclose(
+        layout.boxes.values[1], (16.5, 0.4, -1.7 + 0.85, 1.8, 0.6, 1.7, -np.pi), atol=1e-4
+    )
+    assert np.allclose(
+        layout.boxes.values[2], (-20, 8, -1.6 + 3.05 / 2, 11.8, 2.55, 3.05, 0), atol=1e-4
+    )
     assert layout.outlines[1].low[0] == np.float32(0.3) and layout.reach == 20  # type: ignore[index]
     image = layout_image(layout, load_sensor("hdl64e_lasers"))
-    assert {0, *(CODES[n] for n in ("ground", "building", "vegetation", "Van", "Misc"))} == set(np.unique(image[0]))
+    assert {0, *(CODES[n] for n in ("ground", "building", "vegetation", "Van", "Misc"))} == set(
+        np.unique(image[0])
+    )
 
 
 BAD = {
-    "objects: [{class: Dragon, at: [9, 0]}]": (ConfigError, "class 'Dragon'; expected one of Car, Van"),
+    "objects: [{class: Dragon, at: [9, 0]}]": (
+        ConfigError,
+        "class 'Dragon'; expected one of Car, Van",
+    ),
     "objects: [{class: Car}]": (ConfigError, r"objects\.0\.at: Field required"),
     "objects: [{class: Car, at: [9, .nan]}]": (ConfigError, r"objects\.0\.at\.1"),
-    "objects: [{class: Car, at: [9, 0], colour: red}]": (ConfigError, r"objects\.0\.colour: Extra inputs"),
+    "objects: [{class: Car, at: [9, 0], colour: red}]": (
+        ConfigError,
+        r"objects\.0\.colour: Extra inputs",
+    ),
     "objects: [{class: Car, at: [9, 0], size: [4, 0, 1]}]": (ConfigError, r"objects\.0\.size\.1"),
-    "outlines: [{kind: sea, line: [[1, 2], [2, 3]], height: 3}]": (ConfigError, r"outlines\.0\.kind"),
+    "outlines: [{kind: sea, line: [[1, 2], [2, 3]], height: 3}]": (
+        ConfigError,
+        r"outlines\.0\.kind",
+    ),
     "outlines: [{kind: fence, line: [[1, 2]], height: 3}]": (ConfigError, "at least 2"),
-    "outlines: [{kind: fence, line: [[1, 2], [2, 3]], from: 4, height: 3}]": (DataError, "low < high"),
-    "objects: [{class: Car, at: [9, 0]}, {class: Van, at: [10, 0.5]}]": (DataError, r"boxes 0 and 1 \(Car and Van\)"),
+    "outlines: [{kind: fence, line: [[1, 2], [2, 3]], from: 4, height: 3}]": (
+        DataError,
+        "low < high",
+    ),
+    "objects: [{class: Car, at: [9, 0]}, {class: Van, at: [10, 0.5]}]": (
+        DataError,
+        r"boxes 0 and 1 \(Car and Van\)",
+    ),
     "objects: [{class: Car, at: [0.5, 0]}]": (DataError, "around the sensor"),
     "ground: 1": (DataError, r"ground .*expected -10 to -0\.2 m"),
     "[1, 2]": (ConfigError, "its top level"),
@@ -284,7 +363,9 @@ def test_the_classes_with_boxes_are_those_of_the_boxes_of_detectors() -> None:
 
 
 def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:
-    rows = np.float32([[9, 0, -1, 4, 2, 1.5, 0.3], [9, 2.0, -1, 4, 2, 1.5, 0.3], [9, 0, 3, 4, 2, 1.5, 0]])
+    rows = np.float32(
+        [[9, 0, -1, 4, 2, 1.5, 0.3], [9, 2.0, -1, 4, 2, 1.5, 0.3], [9, 0, 3, 4, 2, 1.5, 0]]
+    )
     assert overlaps(Boxes(rows, ("Car",) * 3)) == []
     rows[1, 1] = 1.2
     assert overlaps(Boxes(rows, ("Car",) * 3)) == [(0, 1)]

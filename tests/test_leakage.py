@@ -17,7 +17,14 @@ from lidar_synth.formats import WRITERS, layout_of, open_scans
 from lidar_synth.formats.convert import convert
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.lab.evaluate.leakage import content_of, contents, measured, overlap, recordings_of, seen_by_model_of
+from lidar_synth.lab.evaluate.leakage import (
+    content_of,
+    contents,
+    measured,
+    overlap,
+    recordings_of,
+    seen_by_model_of,
+)
 from lidar_synth.lab.town.export import SETTINGS
 
 MADE = {"made_by": "model", "model": "small", "checkpoint": "c" * 64, "seed": 1}
@@ -37,10 +44,16 @@ def test_a_scan_is_known_by_its_hash_in_every_layout(tmp_path: Path, to: str) ->
         assert bool(overlap(seen, reference)) == found
 
 
-def test_scans_are_not_read_for_a_model_without_hashes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scans_are_not_read_for_a_model_without_hashes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_all("semantic_kitti", tmp_path, some(2))
-    monkeypatch.setattr("lidar_synth.lab.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed"))
-    measured(open_scans(tmp_path), "semantic_kitti", tmp_path, None, whole("KITTI-360", ["a drive"]))
+    monkeypatch.setattr(
+        "lidar_synth.lab.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed")
+    )
+    measured(
+        open_scans(tmp_path), "semantic_kitti", tmp_path, None, whole("KITTI-360", ["a drive"])
+    )
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "5", '{"seen": 3}', "[" * 100_000, "null"])
@@ -71,23 +84,37 @@ def test_scans_of_an_unknown_model_are_compared_with_a_note(tmp_path: Path) -> N
         assert result.exception is None, result.output
         assert "does not record its model's training data" in result.stderr
     write_all("npz", tmp_path / "others", some(3, seed=5))
-    assert "does not record" not in CliRunner().invoke(app, [*call, str(tmp_path / "others")]).stderr
+    assert (
+        "does not record" not in CliRunner().invoke(app, [*call, str(tmp_path / "others")]).stderr
+    )
 
 
 @pytest.mark.parametrize("first", ["sampled", "baked"])
 def test_converted_scans_keep_what_their_model_has_seen(tmp_path: Path, first: str) -> None:
     known = {"data": "?", "seen": contents([content_of(some(1)[0])]).to_list()}
     if first == "sampled":
-        start = generated(tmp_path / "0", "npz", {"trained_on": "?", "seed": 3, "seen": known["seen"]})
+        start = generated(
+            tmp_path / "0", "npz", {"trained_on": "?", "seed": 3, "seen": known["seen"]}
+        )
     else:
-        start = write_bank(tmp_path / "0", [some_image(i) for i in range(3)], provenance=known)[0].parent
+        start = write_bank(tmp_path / "0", [some_image(i) for i in range(3)], provenance=known)[
+            0
+        ].parent
     for number, to in enumerate(["kitti", "webdataset", "semantic_kitti"]):
-        convert(open_scans(tmp_path / str(number)), WRITERS[to](tmp_path / str(number + 1)), progress=False)
+        convert(
+            open_scans(tmp_path / str(number)),
+            WRITERS[to](tmp_path / str(number + 1)),
+            progress=False,
+        )
     assert seen_by_model_of(tmp_path / "3") == seen_by_model_of(start)
     assert seen_by_model_of(start)
     write_all("semantic_kitti", tmp_path / "real", some(3))
-    result = CliRunner().invoke(app, ["evaluate", str(tmp_path / "real"), str(tmp_path / "3"), "--protocol", "town"])
-    assert isinstance(result.exception, ConfigError) and "was trained on content" in str(result.exception)
+    result = CliRunner().invoke(
+        app, ["evaluate", str(tmp_path / "real"), str(tmp_path / "3"), "--protocol", "town"]
+    )
+    assert isinstance(result.exception, ConfigError) and "was trained on content" in str(
+        result.exception
+    )
     (tmp_path / "3" / MODELS).write_text('{"models": [5]}')
     with pytest.raises(DataError, match=MODELS):
         seen_by_model_of(tmp_path / "3")

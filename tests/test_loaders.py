@@ -1,4 +1,5 @@
-"""The epoch that is set or resumed is loaded, whatever loads it; its length is the same under every schedule."""
+"""The epoch that is set or resumed is loaded, whatever loads it; its length is the same under every
+schedule."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -22,7 +23,9 @@ STARTS = {"fresh": (0, 0), "from epoch 5": (5, 0), "resumed": (6, 8)}
 WORKERS = [
     pytest.param({"num_workers": 0}, id="0 workers"),
     pytest.param({"num_workers": 2}, id="2 workers", marks=pytest.mark.slow),
-    pytest.param({"num_workers": 2, "persistent_workers": True}, id="2 that persist", marks=pytest.mark.slow),
+    pytest.param(
+        {"num_workers": 2, "persistent_workers": True}, id="2 that persist", marks=pytest.mark.slow
+    ),
 ]
 SCHEDULED = pytest.mark.parametrize("schedule", SCHEDULES)
 STARTED = pytest.mark.parametrize("start", STARTS)
@@ -64,7 +67,9 @@ def begin(train: MixedScans, loader: DataLoader[Any], start: str) -> None:
     """As a training script does: it sets the first epoch or loads a state."""
     epoch, position = STARTS[start]
     if position:
-        order: Any = loader.dataset if isinstance(loader.dataset, MixedStream) else loader.batch_sampler
+        order: Any = (
+            loader.dataset if isinstance(loader.dataset, MixedStream) else loader.batch_sampler
+        )
         order.load_state_dict(make_state(train.mixture, epoch, position))
     elif epoch:
         train.set_epoch(epoch)
@@ -167,7 +172,9 @@ def accelerator() -> Iterator[Any]:
 @STARTED
 @FORMS
 @WORKED
-def test_accelerate(accelerator: Any, workers: dict[str, Any], form: str, start: str, schedule: str) -> None:
+def test_accelerate(
+    accelerator: Any, workers: dict[str, Any], form: str, start: str, schedule: str
+) -> None:
     from lidar_synth.integrations.accelerate import prepare
 
     train = mixed(schedule)
@@ -180,7 +187,9 @@ def test_accelerate(accelerator: Any, workers: dict[str, Any], form: str, start:
 @STARTED
 @FORMS
 @WORKED
-def test_a_stateful_data_loader(workers: dict[str, Any], form: str, start: str, schedule: str) -> None:
+def test_a_stateful_data_loader(
+    workers: dict[str, Any], form: str, start: str, schedule: str
+) -> None:
     """Of torchdata, whose state within an epoch another loader takes."""
     kind = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
     train = mixed(schedule)
@@ -200,7 +209,8 @@ def test_a_stateful_data_loader(workers: dict[str, Any], form: str, start: str, 
 
 @pytest.fixture
 def fit(tmp_path: Path) -> Any:
-    """Trains for three epochs by Lightning, with the options of ``Trainer.fit``; a ``KeyError`` writes a checkpoint."""
+    """Trains for three epochs by Lightning, with the options of ``Trainer.fit``; a ``KeyError``
+    writes a checkpoint."""
     lightning = pytest.importorskip("lightning")
 
     def train(model: Any, data: Any, **options: Any) -> None:
@@ -252,7 +262,9 @@ def make_model(stop: tuple[int, int] = (9, 9), begin: Callable[[int], None] = pr
 @SCHEDULED
 @STARTED
 @WORKED
-def test_lightning(fit: Any, workers: dict[str, Any], start: str, schedule: str, tmp_path: Path) -> None:
+def test_lightning(
+    fit: Any, workers: dict[str, Any], start: str, schedule: str, tmp_path: Path
+) -> None:
     """A run from epoch 5 on that stops in its second epoch and resumes, or that does not stop."""
     from lidar_synth.integrations.lightning import MixedData
 
@@ -279,7 +291,9 @@ def test_lightning(fit: Any, workers: dict[str, Any], start: str, schedule: str,
 @SCHEDULED
 @STARTED_WHOLE
 @WORKED
-def test_lightning_with_a_stream(fit: Any, workers: dict[str, Any], start: str, schedule: str) -> None:
+def test_lightning_with_a_stream(
+    fit: Any, workers: dict[str, Any], start: str, schedule: str
+) -> None:
     """A loader of a stream whose epoch the user's module sets; ``MixedData`` asks for its scans."""
     from lidar_synth.integrations.lightning import MixedData
 

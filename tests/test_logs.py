@@ -1,4 +1,5 @@
-"""PCD logs as the vendors' drivers write them reach a fitted sensor, a picture and a mixture by one command each."""
+"""PCD logs as the vendors' drivers write them reach a fitted sensor, a picture and a mixture by one
+command each."""
 
 from pathlib import Path
 
@@ -21,7 +22,9 @@ def town_of(name: str) -> list[Scan]:
 
 @pytest.mark.parametrize("name", LOGS)
 def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(name: str, tmp_path: Path) -> None:
-    folder, fitted, scans = tmp_path / "logs", tmp_path / "mine.yaml", town_of(name)
+    folder = tmp_path / "logs"
+    fitted = tmp_path / "mine.yaml"
+    scans = town_of(name)
     folder.mkdir()
     for number, scan in enumerate(scans):
         write_log(folder / f"{number}.pcd", LOGS[name].columns(scan))
@@ -31,11 +34,15 @@ def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(name: str, tmp_path: Pat
     mixed = MixedScans(real, Town(1, load_sensor(fitted), 2), ratio=0.5, labels="none")
     assert len(mixed) and {mixed.domain(i) for i in range(len(mixed))} == {0, 1}
 
-    sensor, read, own = load_sensor(fitted), real[0], scans[0]
+    sensor = load_sensor(fitted)
+    read = real[0]
+    own = scans[0]
     there = np.ones(len(own), bool) if name != "ouster" else LOGS[name].columns(own)["range"] > 0
     beams = np.degrees(own.sensor.row_elevations())
     assert np.abs(np.array(sensor.elevations) - beams).max() < 0.02
-    assert np.array_equal(read.points, own.points[there]) and np.array_equal(read.ring, own.ring[there])
+    assert np.array_equal(read.points, own.points[there]) and np.array_equal(
+        read.ring, own.ring[there]
+    )
     assert np.allclose(read.reflectance, own.reflectance[there], atol=0.5 / 255 + 1e-6)
     since = turn_time(own)[there] - turn_time(own)[there].min()
     assert read.time is not None and np.allclose(read.time - read.time.min(), since, atol=1e-6)
@@ -53,7 +60,9 @@ def test_channels_and_files_without_a_sensor_are_read(tmp_path: Path) -> None:
     assert load_sensor(tmp_path / "b.yaml").shape[0] == 16
 
 
-def test_plain_files_are_fitted_with_the_options_of_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plain_files_are_fitted_with_the_options_of_convert(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scan = town_of("velodyne")[0]
     values = np.c_[scan.points, 1999 * scan.reflectance, scan.ring].astype("<f4")
     values.tofile(tmp_path / "a.bin")

@@ -1,4 +1,5 @@
-"""Samples that mean something else than a trainer's own are named; those of other streets and sensors are accepted."""
+"""Samples that mean something else than a trainer's own are named; those of other streets and
+sensors are accepted."""
 
 import logging
 from collections.abc import Callable
@@ -35,36 +36,67 @@ def streets(seed: int) -> list[Scan]:
 
 def arrays_of(scan: Scan) -> Arrays:
     assert scan.label is not None
-    return np.column_stack([scan.points, scan.reflectance]).astype(np.float32), scan.label.astype(np.int64)
+    return np.column_stack([scan.points, scan.reflectance]).astype(np.float32), scan.label.astype(
+        np.int64
+    )
 
 
 def pointcept(points: np.ndarray, label: np.ndarray) -> Any:
-    return {"coord": points[:, :3], "strength": points[:, 3:], "segment": label.astype(np.int32), "name": "x"}
+    return {
+        "coord": points[:, :3],
+        "strength": points[:, 3:],
+        "segment": label.astype(np.int32),
+        "name": "x",
+    }
 
 
 def collected(points: np.ndarray, label: np.ndarray) -> Any:
     """Pointcept's after its transforms: a grid, tensors and joined features."""
     _, first = np.unique(np.floor(points[:, :3] / 0.3), axis=0, return_index=True)
     part = torch.from_numpy(points[first])
-    return {"coord": part[:, :3], "feat": part, "segment": torch.from_numpy(label[first]), "offset": len(part)}
+    return {
+        "coord": part[:, :3],
+        "feat": part,
+        "segment": torch.from_numpy(label[first]),
+        "offset": len(part),
+    }
 
 
 FORMS: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
     "pointcept": pointcept,
     "pointcept, collected": collected,
-    "open3d-ml": lambda p, s: {"point": p[:, :3], "feat": p[:, 3:], "label": (s + 1).astype(np.int32) % 256},
-    "waffleiron": lambda p, s: (np.vstack([p[:, 3], np.linalg.norm(p[:, :3], axis=1), p.T[:3]]), s, np.arange(len(p))),
+    "open3d-ml": lambda p, s: {
+        "point": p[:, :3],
+        "feat": p[:, 3:],
+        "label": (s + 1).astype(np.int32) % 256,
+    },
+    "waffleiron": lambda p, s: (
+        np.vstack([p[:, 3], np.linalg.norm(p[:, :3], axis=1), p.T[:3]]),
+        s,
+        np.arange(len(p)),
+    ),
     "cylinder3d": lambda p, s: (p[:, :3], s[:, None].astype(np.uint8), p[:, 3]),
-    "openpcdet": lambda p, s: {"points": p, "gt_boxes": np.zeros((3, 8), np.float32), "frame_id": "0"},
+    "openpcdet": lambda p, s: {
+        "points": p,
+        "gt_boxes": np.zeros((3, 8), np.float32),
+        "frame_id": "0",
+    },
     "mmdetection3d": lambda p, s: {
         "inputs": {"points": torch.from_numpy(p)},
-        "data_samples": SimpleNamespace(gt_pts_seg=SimpleNamespace(pts_semantic_mask=torch.from_numpy(s))),
+        "data_samples": SimpleNamespace(
+            gt_pts_seg=SimpleNamespace(pts_semantic_mask=torch.from_numpy(s))
+        ),
     },
     "tuple": lambda p, s: (p, s),
-}  # fmt: skip
+}
 
 
-def wrapped(form: str, wrong: Callable[[np.ndarray, np.ndarray], Arrays], real: list[Scan], synth: list[Scan]) -> Any:
+def wrapped(
+    form: str,
+    wrong: Callable[[np.ndarray, np.ndarray], Arrays],
+    real: list[Scan],
+    synth: list[Scan],
+) -> Any:
     """A mixture in a trainer's form whose synthetic samples have a mistake."""
 
     def to_sample(scan: Scan, rng: np.random.Generator) -> Any:
@@ -82,7 +114,9 @@ def scaled(*factors: float) -> Callable[[np.ndarray, np.ndarray], Arrays]:
     return lambda points, label: (points * np.array(factors, np.float32), label)
 
 
-def numbered(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray, np.ndarray], Arrays]:
+def numbered(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[np.ndarray, np.ndarray], Arrays]:
     """Other numbers of the classes; "ignore" stays."""
     return lambda points, label: (points, np.where(label == IGNORE, IGNORE, change(label)))
 
@@ -95,15 +129,24 @@ def raw_ids(label: np.ndarray) -> np.ndarray:
 
 MISTAKES: dict[str, tuple[Callable[[np.ndarray, np.ndarray], Arrays], str]] = {
     "classes too high": (numbered(lambda k: k + 1), "class 9 looks like your 8.*off by one"),
-    "classes too low": (numbered(lambda k: np.maximum(k - 1, 0)), "class 7 looks like your 8.*off by one"),
+    "classes too low": (
+        numbered(lambda k: np.maximum(k - 1, 0)),
+        "class 7 looks like your 8.*off by one",
+    ),
     "raw ids": (numbered(raw_ids), "class 40 looks like your 8.*ids in files"),
     "reflectance x 255": (scaled(1, 1, 1, 255), "another scale"),
     "reflectance 0": (scaled(1, 1, 1, 0), "is always 0"),
-    "z + 1.73": (lambda p, s: (p + np.float32([0, 0, 1.73, 0]), s), "the origin is at another height"),
-    "nuScenes' axes": (lambda p, s: (p[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1]), s), "roads run along y"),
+    "z + 1.73": (
+        lambda p, s: (p + np.float32([0, 0, 1.73, 0]), s),
+        "the origin is at another height",
+    ),
+    "nuScenes' axes": (
+        lambda p, s: (p[:, [1, 0, 2, 3]] * np.float32([-1, 1, 1, 1]), s),
+        "roads run along y",
+    ),
     "z inverted": (scaled(1, 1, -1, 1), "z points down"),
     "centimetres": (scaled(100, 100, 100, 1), "another (unit|scale)"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -114,7 +157,9 @@ def test_a_mistake_is_named(mistake: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_scans_of_another_street_are_accepted_in_every_trainers_form(form: str, caplog: Any) -> None:
+def test_scans_of_another_street_are_accepted_in_every_trainers_form(
+    form: str, caplog: Any
+) -> None:
     wrapped(form, unchanged, streets(1), streets(2))
     assert "unlike" not in caplog.text
 
@@ -147,31 +192,56 @@ def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
     write_folder(streets(1), tmp_path / "real")
     settings = tmp_path / "mix.yaml"
     arguments = ["check-mix", str(settings), str(tmp_path / "real"), "--count", "4"]
-    settings.write_text(f"synthetic: {write_folder(streets(2), tmp_path / 'synthetic')}\nratio: 0.1\n")
+    settings.write_text(
+        f"synthetic: {write_folder(streets(2), tmp_path / 'synthetic')}\nratio: 0.1\n"
+    )
     done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "mix.png")])
     assert done.exception is None and (tmp_path / "mix.png").stat().st_size > 10_000
-    for line in ("points of a scan", "rows in use", "ground, m", "reflectance: 1, 50, 99 %", "8 road"):
+    for line in (
+        "points of a scan",
+        "rows in use",
+        "ground, m",
+        "reflectance: 1, 50, 99 %",
+        "8 road",
+    ):
         assert line in done.output
-    upside_down = [replace(scan, points=scan.points * np.float32([1, 1, -1])) for scan in streets(2)]
+    upside_down = [
+        replace(scan, points=scan.points * np.float32([1, 1, -1])) for scan in streets(2)
+    ]
     settings.write_text(f"synthetic: {write_folder(upside_down, tmp_path / 'wrong')}\n")
     done = CliRunner().invoke(app, arguments)
     assert isinstance(done.exception, ConfigError) and "z points down" in str(done.exception)
 
 
 def real_sources(real: Path, labelled: Path) -> dict[str, Any]:
-    roots = {name: real / name for name in ("kitti360", "semantic_kitti", "kitti_object", "nuscenes")}
-    roots |= {"raw": real / "kitti_raw" / "2011_09_26", "street": labelled / "semantic_kitti_consecutive"}
+    roots = {
+        name: real / name for name in ("kitti360", "semantic_kitti", "kitti_object", "nuscenes")
+    }
+    roots |= {
+        "raw": real / "kitti_raw" / "2011_09_26",
+        "street": labelled / "semantic_kitti_consecutive",
+    }
     return {name: open_scans(root) for name, root in roots.items()}
 
 
-def test_no_real_dataset_is_refused_beside_another_or_the_town(real_scans: Path, labelled_scans: Path) -> None:
+def test_no_real_dataset_is_refused_beside_another_or_the_town(
+    real_scans: Path, labelled_scans: Path
+) -> None:
     sources = real_sources(real_scans, labelled_scans)
-    scans = {name: [source[i] for i in range(min(len(source), 4))] for name, source in sources.items()}
+    scans = {
+        name: [source[i] for i in range(min(len(source), 4))] for name, source in sources.items()
+    }
     scans["town"] = streets(2)
-    measured = {name: measure_tables([table_of(scan) for scan in some], [IGNORE]) for name, some in scans.items()}
+    measured = {
+        name: measure_tables([table_of(scan) for scan in some], [IGNORE])
+        for name, some in scans.items()
+    }
     for name, ours in measured.items():
         for other, theirs in measured.items():
-            assert not [each for each in contradictions(ours, theirs) if each.certain], (name, other)
+            assert not [each for each in contradictions(ours, theirs) if each.certain], (
+                name,
+                other,
+            )
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

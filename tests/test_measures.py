@@ -1,4 +1,5 @@
-"""Measures of classes, ranges, sequences, detections and conditions, by hand and against independent code."""
+"""Measures of classes, ranges, sequences, detections and conditions, by hand and against
+independent code."""
 
 from dataclasses import replace
 
@@ -28,7 +29,8 @@ def scan_of(points: np.ndarray, **fields: object) -> Scan:
     return Scan(np.asarray(points, np.float32), np.zeros(len(points), np.float32), SENSOR, **fields)  # type: ignore[arg-type]
 
 
-# --- classes ------------------------------------------------------------------------------------------------------
+# --- classes
+# ------------------------------------------------------------------------------------------------------
 
 
 def by_numpy(scan: Scan) -> np.ndarray:
@@ -49,7 +51,9 @@ def test_class_histograms_are_numpys() -> None:
 
 
 def test_the_distances_by_class_are_those_of_float64_definitions() -> None:
-    scans = [[random_scan(SENSOR, 2000, seed) for seed in seeds] for seeds in (range(5), range(5, 8))]
+    scans = [
+        [random_scan(SENSOR, 2000, seed) for seed in seeds] for seeds in (range(5), range(5, 8))
+    ]
     dense = [np.stack([by_numpy(s).ravel() for s in side]) for side in scans]
     described = [[class_histogram(s) for s in side] for side in scans]
     jsd, mmd = (KINDS[name].compare(*described, {}).value for name in ("class_jsd", "class_mmd"))
@@ -57,19 +61,25 @@ def test_the_distances_by_class_are_those_of_float64_definitions() -> None:
     p, q = (h / h.sum(1, keepdims=True) for h in dense)
     kernel = lambda a, b: np.exp(-2 * ((a[:, None] - b) ** 2).sum(-1)).mean()  # noqa: E731
     assert mmd == pytest.approx(kernel(p, p) + kernel(q, q) - 2 * kernel(p, q), abs=1e-6)
-    assert KINDS["class_jsd"].compare(described[0], described[0], {}).value == pytest.approx(0, abs=1e-7)
+    assert KINDS["class_jsd"].compare(described[0], described[0], {}).value == pytest.approx(
+        0, abs=1e-7
+    )
 
 
 def test_other_labels_on_the_same_points_are_another_scene() -> None:
     scans = [random_scan(SENSOR, 2000, seed) for seed in range(3)]
-    swapped = [replace(s, label=np.where(s.label == 8, 12, s.label).astype(np.uint8)) for s in scans]
+    swapped = [
+        replace(s, label=np.where(s.label == 8, 12, s.label).astype(np.uint8)) for s in scans
+    ]
     both = [[class_histogram(s) for s in side] for side in (scans, swapped)]
     assert KINDS["class_jsd"].compare(*both, {}).value > 0.1
 
 
 def test_class_shares_sum_to_one_in_each_ring_that_has_labels() -> None:
     points = [(2, 0, 0), (2, 1, 0), (0, 50, 0), (0, 51, 0)]
-    shares = class_shares(scan_of(points, label=np.array([8, 12, 8, IGNORE], np.uint8))).reshape(16, 19)
+    shares = class_shares(scan_of(points, label=np.array([8, 12, 8, IGNORE], np.uint8))).reshape(
+        16, 19
+    )
     assert shares[0, 8] == shares[0, 12] == 0.5 and shares[14, 8] == 1 and shares.sum() == 2
 
 
@@ -84,7 +94,8 @@ def test_a_scan_of_ignored_points_is_refused() -> None:
         class_histogram(scan_of([(9, 0, 0)], label=np.array([IGNORE], np.uint8)))
 
 
-# --- ranges -------------------------------------------------------------------------------------------------------
+# --- ranges
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_ranges_and_steps_by_hand() -> None:
@@ -102,7 +113,8 @@ def test_ranges_and_steps_by_hand() -> None:
             measure(unproject(RangeImage(np.zeros((3, 8), np.float32), SMALL)))
 
 
-# --- sequences ----------------------------------------------------------------------------------------------------
+# --- sequences
+# ----------------------------------------------------------------------------------------------------
 
 
 def drive(count: int = 5, step: float = 0.4) -> list[Scan]:
@@ -110,7 +122,8 @@ def drive(count: int = 5, step: float = 0.4) -> list[Scan]:
     street = np.random.default_rng(0).uniform((-30, -15, -2), (30, 15, 3), (4000, 3))
     scans = []
     for i in range(count):
-        pose, turn = np.eye(4), 0.01 * i
+        pose = np.eye(4)
+        turn = 0.01 * i
         pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
         pose[0, 3] = step * i
         scans.append(scan_of((street - pose[:3, 3]) @ pose[:3, :3], pose=pose, id=f"frame {i}"))
@@ -126,18 +139,28 @@ def test_a_sequence_that_moves_as_its_poses_say_has_no_error() -> None:
 def test_a_sequence_that_moves_otherwise_has_an_error() -> None:
     scans = drive()
     standing = [replace(s, pose=np.eye(4)) for s in scans]
-    assert registration_error(standing, 1) == pytest.approx(0.4 / 3, abs=5e-3)  # of three coordinates, one is wrong
+    assert registration_error(standing, 1) == pytest.approx(
+        0.4 / 3, abs=5e-3
+    )  # of three coordinates, one is wrong
     near, far = (chamfer_error(standing, n) for n in (1, 4))
     assert 0 < near < far
-    jumping = [scan_of(s.points + np.float32([0.3 * (i % 2), 0, 0]), pose=s.pose) for i, s in enumerate(scans)]
+    jumping = [
+        scan_of(s.points + np.float32([0.3 * (i % 2), 0, 0]), pose=s.pose)
+        for i, s in enumerate(scans)
+    ]
     assert registration_error(jumping, 1) > 0.09 and registration_error(jumping, 2) < 0.01
 
 
 def test_registration_finds_a_turn() -> None:
-    street, turn = drive(1)[0].points.astype(np.float64), np.radians(3)
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    street = drive(1)[0].points.astype(np.float64)
+    turn = np.radians(3)
+    rotation = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
     found = register(street, street @ rotation.T + (0.2, -0.1, 0.05))
-    assert np.allclose(found[:3, :3], rotation, atol=1e-4) and np.allclose(found[:3, 3], (0.2, -0.1, 0.05), atol=1e-3)
+    assert np.allclose(found[:3, :3], rotation, atol=1e-4) and np.allclose(
+        found[:3, 3], (0.2, -0.1, 0.05), atol=1e-3
+    )
 
 
 def test_sequences_refuse_what_they_cannot_compare() -> None:
@@ -152,7 +175,8 @@ def test_sequences_refuse_what_they_cannot_compare() -> None:
         register(scans[0].points.astype(np.float64), scans[0].points + 500.0)
 
 
-# --- detections ---------------------------------------------------------------------------------------------------
+# --- detections
+# ---------------------------------------------------------------------------------------------------
 
 
 def boxes(*places: tuple[float, float], name: str = "Car") -> Boxes:
@@ -161,12 +185,18 @@ def boxes(*places: tuple[float, float], name: str = "Car") -> Boxes:
 
 
 def test_detections_by_hand() -> None:
-    """Confidences 0.9 (hit), 0.8 (none near), 0.7 (hit): precision 1, then 2/3, at recalls 1/2 and 1."""
+    """Confidences 0.9 (hit), 0.8 (none near), 0.7 (hit): precision 1, then 2/3, at recalls 1/2 and
+    1."""
     scan = scan_of([(9, 0, 0)], boxes=boxes((10, 0), (20, 0)))
     found = boxes((10.2, 0), (40, 0), (20, 0.3)), np.array([0.9, 0.8, 0.7])
     result = detect(lambda s: found, [scan], distances=(0.5,))
-    assert result.precision == {"Car": pytest.approx((1 + 2 / 3) / 2)} and result.boxes == {"Car": 2}
-    assert result.confidence == {"Car": pytest.approx(0.8)} and result.mean_precision == result.precision["Car"]
+    assert result.precision == {"Car": pytest.approx((1 + 2 / 3) / 2)} and result.boxes == {
+        "Car": 2
+    }
+    assert (
+        result.confidence == {"Car": pytest.approx(0.8)}
+        and result.mean_precision == result.precision["Car"]
+    )
     strict = detect(lambda s: found, [scan], distances=(0.1,))
     assert strict.precision == {"Car": 0.0}
 
@@ -187,14 +217,16 @@ def test_detections_refuse_what_they_cannot_score() -> None:
         detect(lambda s: (boxes(), np.zeros(0)), [scan_of([(9, 0, 0)])])
     for confidence in (np.zeros(2), np.array([1.5]), np.array([np.nan])):
         with pytest.raises(
-            DataError, match=r"scan 'one': 1 boxes with confidences .* one confidence in \[0, 1\] per box"
+            DataError,
+            match=r"scan 'one': 1 boxes with confidences .* one confidence in \[0, 1\] per box",
         ):
             detect(lambda s, c=confidence: (boxes((1, 1)), c), [scan])
     with pytest.raises(ConfigError, match="positive metres"):
         detect(lambda s: (boxes(), np.zeros(0)), [scan], distances=())
 
 
-# --- conditions ---------------------------------------------------------------------------------------------------
+# --- conditions
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_agreement_with_the_own_condition_is_greater_than_with_another() -> None:
@@ -205,10 +237,23 @@ def test_agreement_with_the_own_condition_is_greater_than_with_another() -> None
     name, agreement = AGREEMENTS["camera"]
     assert agreement(scans, scans, judge) == 1 and "camera" in name
     assert 0 <= AGREEMENTS["semantic"][1](scans, scans, judge) <= 1
-    with pytest.raises(DataError, match="3 generated and 2 real scans; expected one real scan per generated one"):
+    with pytest.raises(
+        DataError, match="3 generated and 2 real scans; expected one real scan per generated one"
+    ):
         sight_agreement(scans, scans[:2])
 
 
 def test_obstacles_are_ahead_and_above_the_ground() -> None:
-    seen = obstacles(scan_of([(10.5, 2.5, 0), (10.5, 2.7, 1), (10.5, -3.5, -1.7), (-10, 0, 0), (1, 20, 0), (50, 0, 0)]))
+    seen = obstacles(
+        scan_of(
+            [
+                (10.5, 2.5, 0),
+                (10.5, 2.7, 1),
+                (10.5, -3.5, -1.7),
+                (-10, 0, 0),
+                (1, 20, 0),
+                (50, 0, 0),
+            ]
+        )
+    )
     assert [tuple(i) for i in np.argwhere(seen)] == [(10, 42)]

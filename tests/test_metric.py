@@ -1,4 +1,5 @@
-"""Metrics in a training loop, over processes and from a cache; protocols and published figures as data."""
+"""Metrics in a training loop, over processes and from a cache; protocols and published figures as
+data."""
 
 import multiprocessing
 from collections.abc import Sequence
@@ -31,7 +32,8 @@ def moments(scans: Sequence[Scan]) -> np.ndarray:
     return np.stack([np.r_[s.points.mean(0), s.points.std(0)] for s in scans])
 
 
-# --- update, compute, reset ---------------------------------------------------------------------------------------
+# --- update, compute, reset
+# ---------------------------------------------------------------------------------------
 
 
 def test_scans_in_parts_are_scans_at_once() -> None:
@@ -66,11 +68,15 @@ def test_merged_metrics_are_one() -> None:
         metric.update(real, real=True)
         metric.update(fake, real=False)
     parts[0].merge(parts[1])
-    assert parts[0].compute() == {s.metric: s.value for s in evaluate(REAL, FAKE, "town", progress=False)}
+    assert parts[0].compute() == {
+        s.metric: s.value for s in evaluate(REAL, FAKE, "town", progress=False)
+    }
 
 
 def of_a_rank(rank: int, store: str, out: str) -> None:
-    torch.distributed.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{store}", rank=rank, world_size=2
+    )
     metric = Metric("town", {"moments": moments})
     metric.update(REAL[rank::2], real=True)
     metric.update(FAKE[rank::2], real=False)
@@ -83,7 +89,10 @@ def of_a_rank(rank: int, store: str, out: str) -> None:
 @pytest.mark.slow
 def test_processes_compute_one_value_together(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
-    ranks = [context.Process(target=of_a_rank, args=(r, str(tmp_path / "store"), str(tmp_path))) for r in range(2)]
+    ranks = [
+        context.Process(target=of_a_rank, args=(r, str(tmp_path / "store"), str(tmp_path)))
+        for r in range(2)
+    ]
     for process in ranks:
         process.start()
     for process in ranks:
@@ -91,29 +100,54 @@ def test_processes_compute_one_value_together(tmp_path: Path) -> None:
     assert [p.exitcode for p in ranks] == [0, 0]
     one, other = ((tmp_path / str(r)).read_text() for r in range(2))
     assert one == other
-    alone = evaluate(REAL[0::2] + REAL[1::2], FAKE[0::2] + FAKE[1::2], "town", {"moments": moments}, progress=False)
+    alone = evaluate(
+        REAL[0::2] + REAL[1::2],
+        FAKE[0::2] + FAKE[1::2],
+        "town",
+        {"moments": moments},
+        progress=False,
+    )
     for (name, value), score in zip(eval(one), sorted(alone, key=lambda s: s.metric), strict=True):
         assert name == score.metric and value == pytest.approx(score.value, rel=1e-9)
 
 
 def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> None:
     many = [[random_scan(SENSOR, 300, first + i) for i in range(30)] for first in (0, 50)]
-    scores = evaluate(*many, "town", {"moments": moments}, progress=False, replicates=40, extended=True)
+    scores = evaluate(
+        *many, "town", {"moments": moments}, progress=False, replicates=40, extended=True
+    )
     by_name = {s.metric: s for s in scores}
-    assert all(s.low is not None and s.low <= s.high for s in scores if "infinitely" not in s.metric)
+    assert all(
+        s.low is not None and s.low <= s.high for s in scores if "infinitely" not in s.metric
+    )
     assert 0 <= by_name["precision of moments"].value <= 1
-    same = evaluate(many[0], many[0][1:], "town", {"moments": moments}, progress=False, replicates=40, extended=True)
+    same = evaluate(
+        many[0],
+        many[0][1:],
+        "town",
+        {"moments": moments},
+        progress=False,
+        replicates=40,
+        extended=True,
+    )
     shares = [s for s in same if s.metric.startswith(("precision", "recall", "coverage"))]
     assert len(shares) == 3 and all(s.high is not None and s.high <= 1 for s in shares)
     assert {"recall of moments", "density of moments", "coverage of moments"} <= by_name.keys()
-    frechet, unbiased = (by_name[f"Frechet distance of moments{end}"] for end in ("", ", infinitely many samples"))
+    frechet, unbiased = (
+        by_name[f"Frechet distance of moments{end}"] for end in ("", ", infinitely many samples")
+    )
     assert unbiased.value < frechet.value
-    few = evaluate(REAL, FAKE, "town", {"moments": moments}, progress=False, replicates=40, extended=True)
-    assert next(s for s in few if s.metric == "Frechet distance of moments").low is None  # 4 scans, 6 features
+    few = evaluate(
+        REAL, FAKE, "town", {"moments": moments}, progress=False, replicates=40, extended=True
+    )
+    assert (
+        next(s for s in few if s.metric == "Frechet distance of moments").low is None
+    )  # 4 scans, 6 features
     assert "[" in str(by_name["BEV Jensen-Shannon distance"])
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------
+# --- bad input
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_features_that_are_not_finite_name_their_scan() -> None:
@@ -128,14 +162,17 @@ def test_one_scan_has_no_frechet_distance() -> None:
     assert evaluate(REAL[:1], FAKE[:1], "town", progress=False)  # histograms can be compared
     with pytest.raises(DataError, match="features of 1 and 4 scans; expected at least two of each"):
         evaluate(REAL[:1], FAKE, "town", {"moments": moments}, progress=False)
-    with pytest.raises(DataError, match="1 real and 4 generated samples; expected at least two of each"):
+    with pytest.raises(
+        DataError, match="1 real and 4 generated samples; expected at least two of each"
+    ):
         evaluate(REAL[:1], FAKE, "town", progress=False, replicates=20)
 
 
 def test_scans_of_another_sensor_are_refused() -> None:
     other = random_scan(presets()["hdl32e_nuscenes"], 1500)
     with pytest.raises(
-        DataError, match=r"generated scan .*hdl32e_nuscenes \(32 rows.*expected that of scan 'random-0', town"
+        DataError,
+        match=r"generated scan .*hdl32e_nuscenes \(32 rows.*expected that of scan 'random-0', town",
     ):
         evaluate(REAL, [other], "town", progress=False)
     with pytest.raises(DataError, match="real scan .* of sensor hdl32e_nuscenes .*"):
@@ -150,14 +187,18 @@ def test_measures_of_classes_are_left_out_without_labels() -> None:
     bare = [replace(s, label=None) for s in REAL]
     left_out: dict[str, str] = {}
     scores = evaluate(bare, FAKE, "general", progress=False, left_out=left_out)
-    assert left_out == {"s_jsd": "scans without labels", "s_mmd": "scans without labels"} and len(scores) == 2
+    assert (
+        left_out == {"s_jsd": "scans without labels", "s_mmd": "scans without labels"}
+        and len(scores) == 2
+    )
     with pytest.raises(DataError, match="no figure of spiral: .*scans without labels"):
         evaluate(bare, FAKE, "spiral", progress=False)
     with pytest.raises(DataError, match="only some scans have labels"):
         evaluate([*bare, REAL[0]], FAKE, "general", progress=False)
 
 
-# --- the cache ----------------------------------------------------------------------------------------------------
+# --- the cache
+# ----------------------------------------------------------------------------------------------------
 
 
 class Counting:
@@ -175,8 +216,12 @@ def test_features_are_made_once_per_scan_and_weights(tmp_path: Path) -> None:
     first = cached(REAL[:3])
     again = cached([REAL[2], REAL[3], REAL[0]])
     assert count.seen == [s.id for s in REAL[:4]]
-    assert np.array_equal(first, moments(REAL[:3])) and np.array_equal(again, moments([REAL[2], REAL[3], REAL[0]]))
-    assert np.array_equal(cached(REAL[:1], True), moments(REAL[:1]) + 1)  # prepared as a generated scan
+    assert np.array_equal(first, moments(REAL[:3])) and np.array_equal(
+        again, moments([REAL[2], REAL[3], REAL[0]])
+    )
+    assert np.array_equal(
+        cached(REAL[:1], True), moments(REAL[:1]) + 1
+    )  # prepared as a generated scan
     Cached(count, tmp_path, "weights 2")(REAL[:1])
     assert count.seen[4:] == [REAL[0].id] * 2
 
@@ -184,9 +229,11 @@ def test_features_are_made_once_per_scan_and_weights(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", ["points", "reflectance", "label", "sensor"])
 def test_a_scan_that_changes_has_another_hash(change: str) -> None:
     scan = REAL[0]
-    other = replace(scan, sensor=presets()["hdl64e_kitti"]) if change == "sensor" else replace(
-        scan, **{change: np.roll(getattr(scan, change), 1, 0)}
-    )  # fmt: skip
+    other = (
+        replace(scan, sensor=presets()["hdl64e_kitti"])
+        if change == "sensor"
+        else replace(scan, **{change: np.roll(getattr(scan, change), 1, 0)})
+    )
     assert scan_hash(other) != scan_hash(scan) == scan_hash(replace(scan, id="renamed"))
 
 
@@ -223,7 +270,9 @@ def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
         evaluate(REAL, FAKE, "town", progress=False, processes=2)
 
 
-def test_published_weights_are_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_published_weights_are_measured_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "extractors"))
     from random_archives import write
 
@@ -231,7 +280,12 @@ def test_published_weights_are_measured_and_kept(tmp_path: Path, monkeypatch: py
     options = {"weights": tmp_path / "weights", "cache": tmp_path / "cache", "progress": False}
     left_out: dict[str, str] = {}
     first = evaluate(REAL[:2], FAKE[:2], "r2flow", left_out=left_out, **options)
-    assert [s.table for s in first] == ["JSD", "MMD", "FPD"] and set(left_out) == {"frd", "frid", "fsvd", "fpvd"}
+    assert [s.table for s in first] == ["JSD", "MMD", "FPD"] and set(left_out) == {
+        "frd",
+        "frid",
+        "fsvd",
+        "fpvd",
+    }
     files = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")}
     assert len(files) == 4
     assert evaluate(REAL[:2], FAKE[:2], "r2flow", **options) == first
@@ -239,7 +293,8 @@ def test_published_weights_are_measured_and_kept(tmp_path: Path, monkeypatch: py
     assert first[-1].value > 0
 
 
-# --- protocols and published figures as data ----------------------------------------------------------------------
+# --- protocols and published figures as data
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -266,7 +321,9 @@ def test_every_extractor_of_a_protocol_exists(name: str) -> None:
 
 def test_the_grid_of_lidm_is_that_of_its_protocol() -> None:
     grid = PROTOCOLS["lidm"].prepare.grid
-    assert grid is not None and replace(grid, name="lidm") == lidm.SENSOR == replace(lidm.SENSOR, name="lidm")
+    assert grid is not None and replace(grid, name="lidm") == lidm.SENSOR == replace(
+        lidm.SENSOR, name="lidm"
+    )
 
 
 @pytest.mark.parametrize(
@@ -291,12 +348,24 @@ def test_published_figures_name_their_protocol_and_source() -> None:
         assert table.source in sources and table.rows
         for row in table.rows:
             figures = row.keys() - {"method", "steps"}
-            assert figures and figures <= names and all(isinstance(row[f], int | float) for f in figures)
+            assert (
+                figures
+                and figures <= names
+                and all(isinstance(row[f], int | float) for f in figures)
+            )
 
 
 def test_own_figures_stand_in_the_scale_of_the_table() -> None:
-    scores = [Score("BEV minimum matching distance", 8.72e-5, "r3dpa", 1000, 2000, "MMD", 1e5, 8e-5, 9e-5)]
+    scores = [
+        Score("BEV minimum matching distance", 8.72e-5, "r3dpa", 1000, 2000, "MMD", 1e5, 8e-5, 9e-5)
+    ]
     shown = beside(scores)
-    assert shown.splitlines()[-1] == "| **these scans** (1000 real, 2000 generated) | |  |  |  |  |  | 8.72 [8, 9] |"
-    assert "| R3DPA |  | 8.46 | 6.34 | 9.83 | 11.0 | 5.67 | 8.72 |" in shown and "LiDAR-Flow" not in shown
+    assert (
+        shown.splitlines()[-1]
+        == "| **these scans** (1000 real, 2000 generated) | |  |  |  |  |  | 8.72 [8, 9] |"
+    )
+    assert (
+        "| R3DPA |  | 8.46 | 6.34 | 9.83 | 11.0 | 5.67 | 8.72 |" in shown
+        and "LiDAR-Flow" not in shown
+    )
     assert "No published figures" in beside([Score("x", 1.0, "town", 2, 2)])

@@ -50,7 +50,9 @@ def scans(count: int, seed: int, scale: float = 1.0) -> list[Scan]:
     label = np.random.default_rng(9).integers(0, 19, 3000).astype(np.uint8)
     made = []
     for i in range(count):
-        points = (street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)).astype(np.float32)
+        points = (street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)).astype(
+            np.float32
+        )
         made.append(Scan(points, np.zeros(3000, np.float32), SENSOR, label, id=f"{seed}-{i}"))
     return made
 
@@ -59,8 +61,13 @@ def compared(protocol: str, name: str, real: list, fake: list) -> float:
     """The value of a protocol's measure on clouds (N, 3)."""
     measure = PROTOCOLS[protocol].measures[name]
     kind = KINDS[measure.kind]
-    sides = [[kind.describe(Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options) for c in side]
-             for side in (real, fake)]  # fmt: skip
+    sides = [
+        [
+            kind.describe(Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options)
+            for c in side
+        ]
+        for side in (real, fake)
+    ]
     return kind.compare(*sides, measure.options).value
 
 
@@ -73,29 +80,46 @@ def test_r2flow_histogram(vectors: Vectors) -> None:
 @pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
 def test_r2flow_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
     both = clouds(vectors, real), clouds(vectors, fake)
-    assert compared("r2flow", "jsd", *both) == pytest.approx(vectors[f"r2flow/jsd{suffix}"][0], rel=1e-6)
-    assert compared("r2flow", "mmd", *both) == pytest.approx(vectors[f"r2flow/mmd{suffix}"][0], abs=1e-6)
+    assert compared("r2flow", "jsd", *both) == pytest.approx(
+        vectors[f"r2flow/jsd{suffix}"][0], rel=1e-6
+    )
+    assert compared("r2flow", "mmd", *both) == pytest.approx(
+        vectors[f"r2flow/mmd{suffix}"][0], abs=1e-6
+    )
 
 
 def test_lidm_cells(vectors: Vectors) -> None:
-    counts = sum(np.bincount(lidm.occupied(c, lidm.FINE), minlength=2000**2) for c in clouds(vectors, "real"))
+    counts = sum(
+        np.bincount(lidm.occupied(c, lidm.FINE), minlength=2000**2) for c in clouds(vectors, "real")
+    )
     assert np.array_equal(np.argwhere(counts.reshape(2000, 2000)), vectors["lidm/bev_sum_nonzero"])
     assert np.array_equal(counts[counts > 0], vectors["lidm/bev_sum_values"])
-    coarse = np.stack(np.divmod(lidm.occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1) / 200
-    assert {tuple(c) for c in coarse.astype(np.float32)} == {tuple(c) for c in vectors["lidm/bev_bin_real0"]}
+    coarse = (
+        np.stack(np.divmod(lidm.occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1) / 200
+    )
+    assert {tuple(c) for c in coarse.astype(np.float32)} == {
+        tuple(c) for c in vectors["lidm/bev_bin_real0"]
+    }
 
 
 @pytest.mark.parametrize(("real", "fake", "suffix"), PAIRS)
 def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> None:
     both = clouds(vectors, real), clouds(vectors, fake)
-    assert compared("lidm", "jsd", *both) == pytest.approx(vectors[f"lidm/jsd{suffix}"][0], rel=1e-5)
-    assert compared("lidm", "mmd", *both) == pytest.approx(vectors[f"lidm/mmd{suffix}"][0], rel=1e-4)
-    assert compared("r3dpa", "jsd", *both) == compared("lidm", "jsd", *both)  # R3DPA keeps LiDM's code for it
+    assert compared("lidm", "jsd", *both) == pytest.approx(
+        vectors[f"lidm/jsd{suffix}"][0], rel=1e-5
+    )
+    assert compared("lidm", "mmd", *both) == pytest.approx(
+        vectors[f"lidm/mmd{suffix}"][0], rel=1e-4
+    )
+    assert compared("r3dpa", "jsd", *both) == compared(
+        "lidm", "jsd", *both
+    )  # R3DPA keeps LiDM's code for it
 
 
 @pytest.mark.slow
 def test_figures_of_features(vectors: Vectors) -> None:
-    a, b = vectors["features_a"], vectors["features_b"]
+    a = vectors["features_a"]
+    b = vectors["features_b"]
     assert frechet_distance(a, b) == pytest.approx(vectors["r2flow/frechet"][0], rel=1e-9)
     assert frechet_distance(b, a) == pytest.approx(vectors["lidm/frechet"][0], rel=1e-9)
     rng = np.random.RandomState(6003)
@@ -106,12 +130,17 @@ def test_figures_of_features(vectors: Vectors) -> None:
 
 
 def test_squared_mmd_by_hand() -> None:
-    """Kernel (x y + 1)^3. No sample is compared with itself: the unbiased estimator, which can fall below 0."""
-    a, b = np.array([[0.0], [1.0]]), np.array([[1.0], [2.0]])
-    within, across = (1 + 1) / 2 + (27 + 27) / 2, (1 + 1 + 8 + 27) / 4
+    """Kernel (x y + 1)^3. No sample is compared with itself: the unbiased estimator, which can fall
+    below 0."""
+    a = np.array([[0.0], [1.0]])
+    b = np.array([[1.0], [2.0]])
+    within = (1 + 1) / 2 + (27 + 27) / 2
+    across = (1 + 1 + 8 + 27) / 4
     assert squared_mmd(a, b, subsets=3) == pytest.approx(within - 2 * across)
     assert squared_mmd(a, a, subsets=3) == pytest.approx((1 + 1) - 2 * (1 + 1 + 1 + 8) / 4)  # -3.5
-    everything = np.arange(6.0)[:, None] / 3  # all pairs of disjoint halves of one set: 0 on average
+    everything = (
+        np.arange(6.0)[:, None] / 3
+    )  # all pairs of disjoint halves of one set: 0 on average
     halves = [list(chosen) for chosen in combinations(range(6), 3)]
     pairs = [(h, [i for i in range(6) if i not in h]) for h in halves]
     three = [squared_mmd(everything[h], everything[rest], subsets=1) for h, rest in pairs]
@@ -120,7 +149,8 @@ def test_squared_mmd_by_hand() -> None:
 
 def test_frechet_distance_by_hand() -> None:
     rng = np.random.default_rng(0)
-    a, b = rng.normal(size=(50, 6)), rng.normal(1, 2, (40, 6)) @ rng.normal(size=(6, 6))
+    a = rng.normal(size=(50, 6))
+    b = rng.normal(1, 2, (40, 6)) @ rng.normal(size=(6, 6))
     root = sqrtm(np.cov(a.T) @ np.cov(b.T)).real
     expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(np.cov(a.T) + np.cov(b.T) - 2 * root)
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
@@ -129,13 +159,16 @@ def test_frechet_distance_by_hand() -> None:
     few = a[:3]  # covariances of rank 2 in 6 dimensions
     assert frechet_distance(few, few + 1) == pytest.approx(6, abs=1e-6)
     assert frechet_distance(few, few.astype(np.float32)) == pytest.approx(0, abs=1e-6)
-    assert all(frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60)))  # never below, by rounding
+    assert all(
+        frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60))
+    )  # never below, by rounding
 
 
 @given(data=st.data(), bins=st.integers(1, 20))
 def test_jensen_shannon_distance_is_scipys(data: st.DataObject, bins: int) -> None:
     weights = st.lists(st.integers(0, 9), min_size=bins, max_size=bins).filter(any)
-    p, q = np.array(data.draw(weights)), np.array(data.draw(weights))
+    p = np.array(data.draw(weights))
+    q = np.array(data.draw(weights))
     assert jensen_shannon_distance(p, q) == pytest.approx(jensenshannon(p, q), abs=1e-7)
     assert jensen_shannon_distance(p, 3 * p) == pytest.approx(0, abs=1e-7)
 
@@ -157,7 +190,10 @@ def test_minimum_matching_distance_by_nearest_neighbours(
     monkeypatch.setattr(lidm, "_BLOCK", 2)
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
     side = lidm.cells_along(cell)
-    grids = [[np.stack(np.divmod(lidm.occupied(p, cell), side), 1) / side for p in points] for points in (real, fake)]
+    grids = [
+        [np.stack(np.divmod(lidm.occupied(p, cell), side), 1) / side for p in points]
+        for points in (real, fake)
+    ]
 
     def chamfer(a: np.ndarray, b: np.ndarray) -> float:
         return ((cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()) / 2
@@ -169,7 +205,10 @@ def test_minimum_matching_distance_by_nearest_neighbours(
 def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(statistics, "_NUMBERS", 0)  # blocks of 16
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((40, 1), (18, 2)))
-    p, q = (np.array([r2flow.bev_histogram(c).ravel() for c in side], np.float64) for side in (real, fake))
+    p, q = (
+        np.array([r2flow.bev_histogram(c).ravel() for c in side], np.float64)
+        for side in (real, fake)
+    )
     p, q = (h / h.sum(1, keepdims=True) for h in (p, q))
     kernel = lambda a, b: np.exp(-2 * cdist(a, b, "sqeuclidean")).mean()  # noqa: E731
     expected = kernel(p, p) + kernel(q, q) - 2 * kernel(p, q)
@@ -180,10 +219,14 @@ def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_each_protocol_tells_near_from_far(name: str) -> None:
     real = scans(8, 0)
-    same, near, far = (evaluate(real, s, name, progress=False) for s in (real, scans(6, 1), scans(6, 2, 0.8)))
+    same, near, far = (
+        evaluate(real, s, name, progress=False) for s in (real, scans(6, 1), scans(6, 2, 0.8))
+    )
     assert len(same) == sum(m.kind != FEATURES for m in PROTOCOLS[name].measures.values())
     for zero, small, large in zip(same, near, far, strict=True):
-        apart = PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated  # the two sets are made differently
+        apart = (
+            PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated
+        )  # the two sets are made differently
         assert zero.value == pytest.approx(0, abs=1e-6) or apart
         assert small.value < large.value
         assert (small.protocol, small.real, small.generated) == (name, 8, 6)
@@ -194,20 +237,33 @@ def test_the_clouds_of_the_protocols() -> None:
     scan = random_scan(SENSOR, 5000)
     own = {tuple(p) for p in scan.points}
     real, fake = (PROTOCOLS["r2flow"].cloud(scan, generated) for generated in (False, True))
-    assert len(real) == len(fake) and {tuple(p) for p in real} <= own and not {tuple(p) for p in fake} & own
-    assert np.allclose(np.sort(np.linalg.norm(real, axis=1)), np.sort(np.linalg.norm(fake, axis=1)), rtol=1e-5)
-    assert np.linalg.norm(real, axis=1).min() >= 1.45 and 60 < np.linalg.norm(real, axis=1).max() < 63
+    assert (
+        len(real) == len(fake)
+        and {tuple(p) for p in real} <= own
+        and not {tuple(p) for p in fake} & own
+    )
+    assert np.allclose(
+        np.sort(np.linalg.norm(real, axis=1)), np.sort(np.linalg.norm(fake, axis=1)), rtol=1e-5
+    )
+    assert (
+        np.linalg.norm(real, axis=1).min() >= 1.45 and 60 < np.linalg.norm(real, axis=1).max() < 63
+    )
     corners = SENSOR.column_azimuths("corner")
     for name in ("lidm", "r3dpa"):
         both = [PROTOCOLS[name].cloud(scan, generated) for generated in (False, True)]
         assert np.array_equal(*both)
-        assert np.linalg.norm(both[0], axis=1).min() > 1 and 53 < np.linalg.norm(both[0], axis=1).max() < 56.0001
+        assert (
+            np.linalg.norm(both[0], axis=1).min() > 1
+            and 53 < np.linalg.norm(both[0], axis=1).max() < 56.0001
+        )
         for points in (fake, both[0]):  # every azimuth is that of a corner
             azimuth = -np.arctan2(points[:, 1], points[:, 0])
             assert np.abs(np.sin(azimuth[:, None] - corners)).min(1).max() < 1e-5
     small = Sensor("small", 64, 1.0, 90.0, rows=8, fov_up=5.0, fov_down=-20.0)
     assert len(PROTOCOLS["town"].cloud(random_scan(small), False)) <= 64 * 8
-    edge = Scan(np.array([(1, 0, 0), (56, 0, 0), (2, 0, 0)], np.float32), np.zeros(3, np.float32), SENSOR)
+    edge = Scan(
+        np.array([(1, 0, 0), (56, 0, 0), (2, 0, 0)], np.float32), np.zeros(3, np.float32), SENSOR
+    )
     assert len(PROTOCOLS["lidm"].cloud(edge, False)) == 1  # both limits are exclusive
 
 
@@ -218,17 +274,21 @@ def test_extractors_add_frechet_distances_over_all_batches() -> None:
         seen.append(len(some))
         return np.stack([np.r_[s.points.mean(0), s.points.std(0)] for s in some])
 
-    real, fake = scans(5, 0), scans(4, 1)
+    real = scans(5, 0)
+    fake = scans(4, 1)
     scores = evaluate(real, fake, "town", {"moments": mean_and_spread}, batch=3, progress=False)
     assert seen == [3, 2, 3, 1]
     by_name = {s.metric: s.value for s in scores}
-    a, b = mean_and_spread(real), mean_and_spread(fake)
+    a = mean_and_spread(real)
+    b = mean_and_spread(fake)
     assert by_name["Frechet distance of moments"] == frechet_distance(a, b)
     assert by_name["squared maximum mean discrepancy of moments"] == squared_mmd(a, b)
 
 
 def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
-    measures = {k: m.model_copy(update={"real": 3}) for k, m in PROTOCOLS["r2flow"].measures.items()}
+    measures = {
+        k: m.model_copy(update={"real": 3}) for k, m in PROTOCOLS["r2flow"].measures.items()
+    }
     limited = PROTOCOLS["r2flow"].model_copy(update={"measures": measures})
     asked = []
 
@@ -237,29 +297,40 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
             asked.append(index)
             return super().__getitem__(index)
 
-    real, fake = scans(6, 0), scans(4, 1)
+    real = scans(6, 0)
+    fake = scans(4, 1)
     score = evaluate(Recorded(real), fake, limited, progress=False)[0]
     assert asked == [4, 2, 1]  # random.Random(0).shuffle of 6 numbers, the first 3
     assert (score.real, score.generated) == (3, 4)
-    everything = evaluate(real, fake, limited, {"moments": lambda some: np.ones((len(some), 2))}, progress=False)
-    assert everything[0] == score and everything[-1].real == 6  # features are of all scans, as R2Flow takes them
+    everything = evaluate(
+        real, fake, limited, {"moments": lambda some: np.ones((len(some), 2))}, progress=False
+    )
+    assert (
+        everything[0] == score and everything[-1].real == 6
+    )  # features are of all scans, as R2Flow takes them
 
 
 def test_bad_input() -> None:
     good = scans(2, 0)
-    with pytest.raises(ConfigError, match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town"):
+    with pytest.raises(
+        ConfigError, match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town"
+    ):
         evaluate(good, good, "jsd")
     with pytest.raises(DataError, match="no generated scans; expected at least one"):
         evaluate(good, [], "lidm", progress=False)
     empty = Scan(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), SENSOR, id="blank")
     for name, area in (("r2flow", "3 m to 70 m"), ("lidm", r"\+-50 m"), ("town", "3 m to 70 m")):
-        with pytest.raises(DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"):
+        with pytest.raises(
+            DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"
+        ):
             evaluate(good, [good[0], empty], name, progress=False)
     features = np.ones((3, 4))
     with pytest.raises(DataError, match="features of 3 and 1 scans; expected at least two of each"):
         frechet_distance(features, features[:1])
     for a, b in ((features, features[:, :3]), (features[0], features)):
-        with pytest.raises(DataError, match=r"features of shape .*; expected \(N, D\) and \(M, D\)"):
+        with pytest.raises(
+            DataError, match=r"features of shape .*; expected \(N, D\) and \(M, D\)"
+        ):
             frechet_distance(a, b)
     with pytest.raises(DataError, match="features that are not finite"):
         squared_mmd(features, np.full((3, 4), np.nan))
@@ -270,4 +341,7 @@ def test_bad_input() -> None:
 
 def test_a_score_reads_well() -> None:
     score = Score("BEV Jensen-Shannon distance", 0.0251234, "r2flow", 10000, 10000)
-    assert str(score) == "BEV Jensen-Shannon distance = 0.0251234 (r2flow protocol, 10000 real, 10000 generated)"
+    assert (
+        str(score)
+        == "BEV Jensen-Shannon distance = 0.0251234 (r2flow protocol, 10000 real, 10000 generated)"
+    )

@@ -1,4 +1,5 @@
-"""``MixedScans``: the same samples whatever the workers and ranks, real ones bit for bit, and clear refusals."""
+"""``MixedScans``: the same samples whatever the workers and ranks, real ones bit for bit, and clear
+refusals."""
 
 import os
 import warnings
@@ -41,7 +42,9 @@ def test_the_items_of_an_epoch() -> None:
         assert item["domain"] == train.domain(i) == (item["id"][0] == "s")
         if item["domain"] == 0:
             scan = real[item["id"]]
-            assert item["points"].numpy().tobytes() == np.c_[scan.points, scan.reflectance].tobytes()
+            assert (
+                item["points"].numpy().tobytes() == np.c_[scan.points, scan.reflectance].tobytes()
+            )
             assert np.array_equal(item["label"], scan.label)
             assert np.array_equal(item["confidence"], scan.label != IGNORE)
     assert train[-1]["id"] == items[-1]["id"]
@@ -53,7 +56,13 @@ def test_the_items_of_an_epoch() -> None:
 
 def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> None:
     drawn: list[float] = []
-    train = MixedScans(Scans("r", 3), Endless(), 0.5, seed=5, to_sample=lambda scan, rng: drawn.append(rng.random()))
+    train = MixedScans(
+        Scans("r", 3),
+        Endless(),
+        0.5,
+        seed=5,
+        to_sample=lambda scan, rng: drawn.append(rng.random()),
+    )
     train.set_epoch(2)
     [train[i] for i in (4, 0)]
     assert drawn == [keyed_rng(5, 2, 4).random(), keyed_rng(5, 2, 0).random()]
@@ -63,18 +72,22 @@ def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> 
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", WORKERS)
 def test_the_number_of_workers_does_not_change_batches(workers: int, persistent: bool) -> None:
-    train, alone = mixed(), mixed()
+    train = mixed()
+    alone = mixed()
     load = loader(train, workers, batch_size=4, persistent_workers=persistent and workers > 0)
     for epoch in (0, 1, 5):
         train.set_epoch(epoch)
         alone.set_epoch(epoch)
-        expected = [alone.collate([alone[i] for i in range(s, min(s + 4, 15))]) for s in range(0, 15, 4)]
+        expected = [
+            alone.collate([alone[i] for i in range(s, min(s + 4, 15))]) for s in range(0, 15, 4)
+        ]
         assert [plain(batch) for batch in load] == [plain(batch) for batch in expected]
 
 
 @pytest.mark.slow
 def test_persistent_workers_that_were_spawned_see_the_epoch() -> None:
-    train, alone = mixed(), mixed()
+    train = mixed()
+    alone = mixed()
     load = loader(train, 1, batch_size=15, persistent_workers=True, multiprocessing_context="spawn")
     for epoch in (0, 3):
         train.set_epoch(epoch)
@@ -110,7 +123,9 @@ def _apart(batch: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ranks", "method"), [(2, "fork"), (3, "spawn")])
-def test_ranks_divide_an_epoch_without_duplicates_or_loss(ranks: int, method: str, free_port: int) -> None:
+def test_ranks_divide_an_epoch_without_duplicates_or_loss(
+    ranks: int, method: str, free_port: int
+) -> None:
     mp.start_processes(gathered, (ranks, free_port), nprocs=ranks, start_method=method)
 
 
@@ -126,11 +141,14 @@ def free_port() -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2, 3])
 @pytest.mark.parametrize("done", range(5))
-def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(ranks: int, done: int) -> None:
+def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(
+    ranks: int, done: int
+) -> None:
     train = mixed(13)  # 22 samples
     train.set_epoch(1)
     every = ids(train)
-    seen, state = [], {}
+    seen = []
+    state = {}
     for rank in range(ranks):
         sampler = train.batches(2, rank=rank, world_size=ranks)
         if len(sampler) < done:
@@ -183,7 +201,8 @@ def test_balanced_batches() -> None:
 @pytest.mark.parametrize("by", ["to_sample", "augment", "labels"])
 def test_a_sample_that_is_changed_in_place_changes_no_scan(by: str) -> None:
     """Of sources that keep their scans in memory."""
-    real, kept = Scans("r", 4), Scans("s", 4, domain=SYNTHETIC)
+    real = Scans("r", 4)
+    kept = Scans("s", 4, domain=SYNTHETIC)
     before = [(scan.points.tobytes(), scan.label.tobytes()) for scan in (*real, *kept)]  # type: ignore[union-attr]
 
     def flip(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -205,7 +224,10 @@ def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
     theirs = Theirs()
     train = MixedScans.wrap(theirs, Endless(), 0.5, to_sample=to_sample, seed=3)
     samples = [train[i] for i in range(len(train))]
-    assert sorted(s["name"] for s in samples) == [*(f"s{i}" for i in range(5)), *(f"theirs{i}" for i in range(5))]
+    assert sorted(s["name"] for s in samples) == [
+        *(f"s{i}" for i in range(5)),
+        *(f"theirs{i}" for i in range(5)),
+    ]
     for i, sample in enumerate(samples):
         if not train.domain(i):
             assert plain(sample) == plain(theirs[int(sample["name"][-1])])
@@ -233,7 +255,9 @@ def test_several_sources() -> None:
     synth = Sources(Endless(name="x"), Scans("held", 3), weights=[2, 1])
     train = MixedScans(real, synth, 0.5, epoch_size=24)
     names = ids(train)
-    assert sorted(n for n in names if n[0] in "ab") == sorted(s.id for s in [*Scans("a", 4), *Scans("b", 8)])
+    assert sorted(n for n in names if n[0] in "ab") == sorted(
+        s.id for s in [*Scans("a", 4), *Scans("b", 8)]
+    )
     assert sorted(n for n in names if n[0] == "x") == [f"x{i}" for i in range(8)]
     assert sorted(n for n in names if n[0] == "h") == ["held0", "held0", "held1", "held2"]
     assert all(train.domain(i) == train[i]["domain"] == (n[0] in "xh") for i, n in enumerate(names))

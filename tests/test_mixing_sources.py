@@ -34,7 +34,9 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
 
 
 def test_exchanged_arguments_are_named(generator: Generator) -> None:
-    with pytest.raises(ConfigError, match=r"real=Generator, which has no length; expected real scans first"):
+    with pytest.raises(
+        ConfigError, match=r"real=Generator, which has no length; expected real scans first"
+    ):
         MixedScans(generator, Scans("r", 4, GENERATED_SENSOR), 0.5)
 
 
@@ -44,7 +46,11 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
     train = MixedScans(real, generator, 0.5, seed=11)
     expected = {f"tiny/11/{i}": scan for i, scan in enumerate(generator.scans(11, range(4)))}
     for workers in (0, 2):
-        items = [item for batch in DataLoader(train, 2, num_workers=workers, collate_fn=list) for item in batch]
+        items = [
+            item
+            for batch in DataLoader(train, 2, num_workers=workers, collate_fn=list)
+            for item in batch
+        ]
         made = [item for item in items if item["domain"]]
         assert sorted(item["id"] for item in made) == sorted(expected)
         for item in made:
@@ -56,17 +62,29 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
 
 def test_generators_that_differ_have_different_plans() -> None:
     same = [load_generator("town-dense", **options) for options in ({}, {"columns": 2048})]
-    others = [load_generator("town-dense", **options) for options in ({"columns": 1024}, {"dtype": torch.bfloat16})]
+    others = [
+        load_generator("town-dense", **options)
+        for options in ({"columns": 1024}, {"dtype": torch.bfloat16})
+    ]
     assert len({Generated(generator).identity for generator in same}) == 1
     assert len({Generated(generator).identity for generator in (*same, *others)}) == 3
 
 
 def test_sources_that_differ_have_different_plans() -> None:
     """A state of one mixture cannot be loaded into the other."""
-    towns = [Town(0, scans=50), Town(1, scans=50), Town(0, scans=50, interval=2.0), Town(0, scans=49)]
+    towns = [
+        Town(0, scans=50),
+        Town(1, scans=50),
+        Town(0, scans=50, interval=2.0),
+        Town(0, scans=49),
+    ]
     transfers = [Transfer(load_sensor("vlp16")), Transfer(load_sensor("vlp16"), Mount(0.5))]
-    seen = [SeenAs(towns[0], transfers[0]), SeenAs(towns[1], transfers[0]), SeenAs(towns[0], transfers[1]),
-            SeenAs(towns[0], transfers[0], seed=1)]  # fmt: skip
+    seen = [
+        SeenAs(towns[0], transfers[0]),
+        SeenAs(towns[1], transfers[0]),
+        SeenAs(towns[0], transfers[1]),
+        SeenAs(towns[0], transfers[0], seed=1),
+    ]
     assert len({identity_of(source) for source in (*towns, *seen)}) == 8
     assert identity_of(Town(0, scans=50)) == identity_of(towns[0])
     assert identity_of(SeenAs(Town(0, scans=50), transfers[0])) == identity_of(seen[0])
@@ -81,7 +99,9 @@ def test_sources_that_differ_have_different_plans() -> None:
 def test_a_cache_keeps_the_latest(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
     scans = Generator.scans
-    monkeypatch.setattr(Generator, "scans", lambda self, seed, n, *a, **k: made.extend(n) or scans(self, seed, n))
+    monkeypatch.setattr(
+        Generator, "scans", lambda self, seed, n, *a, **k: made.extend(n) or scans(self, seed, n)
+    )
     source = Generated(generator, cache=2)
     assert source[0] is source[0]
     [source[i] for i in (1, 0, 2, 0, 1)]
@@ -96,21 +116,32 @@ def test_a_conditional_model_takes_its_conditions_in_turn(
     with pytest.raises(ConfigError, match="conditions for 'tiny'; expected none"):
         Generated(generator, condition=["a map"])
     monkeypatch.setattr(Generator, "condition", "semantic")
-    with pytest.raises(ConfigError, match=r"no conditions for 'tiny'; expected .*\(semantic\).*condition=real"):
+    with pytest.raises(
+        ConfigError, match=r"no conditions for 'tiny'; expected .*\(semantic\).*condition=real"
+    ):
         MixedScans(Scans("r", 2, GENERATED_SENSOR), generator)
     calls: list[Any] = []
-    monkeypatch.setattr(Generator, "scans", lambda self, *given, **options: calls.append((given, options)) or [None])
+    monkeypatch.setattr(
+        Generator, "scans", lambda self, *given, **options: calls.append((given, options)) or [None]
+    )
     source = Generated(generator, 3, condition=["a", "b"], steps=2)
     [source[n] for n in (0, 3)]
     assert calls == [((3, [0], ["a"]), {"steps": 2}), ((3, [3], ["b"]), {"steps": 2})]
-    others = [Generated(generator, 3, condition=["a", "b"]), Generated(generator, 3, condition=["a"], steps=2)]
+    others = [
+        Generated(generator, 3, condition=["a", "b"]),
+        Generated(generator, 3, condition=["a"], steps=2),
+    ]
     assert len({source.identity, *(other.identity for other in others)}) == 3
 
 
-def test_a_gpu_in_a_worker_is_refused(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_in_a_worker_is_refused(
+    generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     train = MixedScans(Scans("r", 2, GENERATED_SENSOR), generator, 0.5)
     monkeypatch.setattr(Generator, "device", torch.device("cuda"))
-    with pytest.raises(ConfigError, match=r"inside a DataLoader worker.*\(A\) bake .*\(B\) .*\(C\) mix in"):
+    with pytest.raises(
+        ConfigError, match=r"inside a DataLoader worker.*\(A\) bake .*\(B\) .*\(C\) mix in"
+    ):
         list(loader(train, 1, batch_size=4))
 
 
@@ -149,7 +180,9 @@ def test_the_plan_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "lidar_synth"):
         train.set_epoch(2)
         [train[i] for i in range(4)]
-    assert caplog.messages == [f"epoch 2: 15 samples, 6 of them synthetic, plan {train.plan().hash[:16]}"]
+    assert caplog.messages == [
+        f"epoch 2: 15 samples, 6 of them synthetic, plan {train.plan().hash[:16]}"
+    ]
 
 
 def test_real_scans_are_untouched(real_scans: Path) -> None:
@@ -162,7 +195,10 @@ def test_real_scans_are_untouched(real_scans: Path) -> None:
         for item in batch:
             if item["domain"] == 0:
                 scan = expected[item["id"]]
-                assert item["points"].numpy().tobytes() == np.c_[scan.points, scan.reflectance].tobytes()
+                assert (
+                    item["points"].numpy().tobytes()
+                    == np.c_[scan.points, scan.reflectance].tobytes()
+                )
                 assert item["label"].numpy().astype(np.uint8).tobytes() == scan.label.tobytes()
                 seen.add(item["id"])
     assert seen == set(expected)
@@ -188,7 +224,11 @@ def wrong_labels() -> Any:
     ("make", "error", "message"),
     [
         (lambda: mixed(ratio=1.01), ConfigError, r"ratio 1.01"),
-        (lambda: mixed(ratio=[0.5]).set_epoch(1), ConfigError, r"epoch 1 of a ratio schedule for 1 epochs"),
+        (
+            lambda: mixed(ratio=[0.5]).set_epoch(1),
+            ConfigError,
+            r"epoch 1 of a ratio schedule for 1 epochs",
+        ),
         (lambda: mixed(real=0), DataError, r"a source without scans \(Scans:0:"),
         (lambda: mixed(labels="gessed"), ConfigError, r"labels='gessed'; expected one of"),
         (lambda: mixed(collate="voxels"), ConfigError, r"form='voxels' of batches"),
@@ -198,30 +238,65 @@ def wrong_labels() -> Any:
         (lambda: mixed().batches(2, rank=2, world_size=2), ConfigError, r"rank 2 of 2"),
         (lambda: mixed().batches(2, rank=1), ConfigError, r"rank 1 of None"),
         (lambda: mixed().batches(2).state_dict(9), ConfigError, r"9 batches done of 8"),
-        (lambda: mixed().batches(2).load_state_dict({"epoch": 1}), ConfigError, r"seed, epoch and position"),
-        (lambda: mixed().batches(2).load_state_dict({"seed": 1, "epoch": 0, "position": 0}), ConfigError,
-         r"seed 1 for a mixture of seed 0"),
-        (lambda: MixedScans(Scans("r", 2), Endless(("reflectance",))), ConfigError,
-         r"only have \['reflectance'\].*'ignore'"),
-        (lambda: MixedScans(Scans("r", 2, load_sensor("os1_128")), Endless()), ConfigError,
-         r"'os1_128' \(128 x 1024.*'small' \(8 x 32.*sensor=generator.sensor"),
-        (lambda: MixedScans(Sources(Scans("r", 2), other_classes()), Endless()), ConfigError,
-         r"labels mean \('road', 'car'\).*Taxonomy.decode"),
-        (lambda: MixedScans(Theirs(), Endless()), ConfigError, r"of the type dict.*MixedScans.wrap"),
-        (lambda: MixedScans(Scans("r", 2), "town"), ConfigError, r"str as a source of synthetic scans.*load_generator"),
-        (lambda: MixedScans(Scans("r", 2), label_options={"threshold": 2}), ConfigError, r"without a synthetic source"),
+        (
+            lambda: mixed().batches(2).load_state_dict({"epoch": 1}),
+            ConfigError,
+            r"seed, epoch and position",
+        ),
+        (
+            lambda: mixed().batches(2).load_state_dict({"seed": 1, "epoch": 0, "position": 0}),
+            ConfigError,
+            r"seed 1 for a mixture of seed 0",
+        ),
+        (
+            lambda: MixedScans(Scans("r", 2), Endless(("reflectance",))),
+            ConfigError,
+            r"only have \['reflectance'\].*'ignore'",
+        ),
+        (
+            lambda: MixedScans(Scans("r", 2, load_sensor("os1_128")), Endless()),
+            ConfigError,
+            r"'os1_128' \(128 x 1024.*'small' \(8 x 32.*sensor=generator.sensor",
+        ),
+        (
+            lambda: MixedScans(Sources(Scans("r", 2), other_classes()), Endless()),
+            ConfigError,
+            r"labels mean \('road', 'car'\).*Taxonomy.decode",
+        ),
+        (
+            lambda: MixedScans(Theirs(), Endless()),
+            ConfigError,
+            r"of the type dict.*MixedScans.wrap",
+        ),
+        (
+            lambda: MixedScans(Scans("r", 2), "town"),
+            ConfigError,
+            r"str as a source of synthetic scans.*load_generator",
+        ),
+        (
+            lambda: MixedScans(Scans("r", 2), label_options={"threshold": 2}),
+            ConfigError,
+            r"without a synthetic source",
+        ),
         (lambda: Sources(), ConfigError, r"0 sources"),
-        (lambda: Sources(Scans("r", 1), weights=[1, 2]), ConfigError, r"1 sources with weights \[1, 2\]"),
+        (
+            lambda: Sources(Scans("r", 1), weights=[1, 2]),
+            ConfigError,
+            r"1 sources with weights \[1, 2\]",
+        ),
         (wrong_labels, DataError, r"labels \[40\]; expected train ids 0..18, or 255"),
     ],
-)  # fmt: skip
-def test_invalid_mixtures_are_refused(make: Callable[[], object], error: type[Exception], message: str) -> None:
+)
+def test_invalid_mixtures_are_refused(
+    make: Callable[[], object], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         make()
 
 
 def test_sensors_with_the_same_directions_can_be_mixed() -> None:
-    kitti, far = load_sensor("hdl64e_semantic_kitti"), load_sensor("town")
+    kitti = load_sensor("hdl64e_semantic_kitti")
+    far = load_sensor("town")
     assert len(MixedScans(Scans("r", 3, kitti), Scans("s", 2, far), 0.25)) == 4
     other = Sensor("other", 32, 1.45, 80.0, rows=8, fov_up=2.0, fov_down=-25.0)
     with pytest.raises(ConfigError, match=r"'small' .* and 'other'"):

@@ -1,4 +1,5 @@
-"""Models of several stages: the published plans, a tiny model end to end, kill and resumption, errors."""
+"""Models of several stages: the published plans, a tiny model end to end, kill and resumption,
+errors."""
 
 import os
 import shutil
@@ -34,7 +35,10 @@ from lidar_synth.lab.train.staged import DONE, StagedRuns
 
 MODELS = {one.name: one for one in published_models()}
 RECIPES = {one.name: one for one in published()}
-HDIT = {"architecture": "hdit", "arguments": {"width": 16, "depths": [1], "heads": [2], "patch": [1, 1]}}
+HDIT = {
+    "architecture": "hdit",
+    "arguments": {"width": 16, "depths": [1], "heads": [2], "patch": [1, 1]},
+}
 SURFACES = {
     "architecture": "surfaces",
     "arguments": {"encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
@@ -44,7 +48,8 @@ CODEC = "codec: {recipe: codec.yaml, minutes: 1}\n"
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
-    settings, plan = load_model(find_model_file(name) or Path()), plan_model(name)
+    settings = load_model(find_model_file(name) or Path())
+    plan = plan_model(name)
     assert list(plan.stages) == list(settings.stages), "every stage is needed for the last one"
     assert plan.out == Path("runs", name, f"{name}.safetensors")
     made: set[Path] = set()
@@ -53,7 +58,9 @@ def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
         alone = load_config(type(planned.config), planned.recipe)
         changed = {"output", "recipe", *settings.stages[stage].needs}
         assert planned.config.model_dump(exclude=changed) == alone.model_dump(exclude=changed)
-        assert all(start in made or key in planned.of_others for key, start in planned.starts.items())
+        assert all(
+            start in made or key in planned.of_others for key, start in planned.starts.items()
+        )
         made.add(plan.runs.checkpoint(stage))
     assert sum(plan.runs.budgets(plan.minutes).values()) == pytest.approx(plan.minutes)
     assert call("train", name, "--dry-run").startswith(f"{name} -> ")
@@ -63,7 +70,9 @@ def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
 def test_the_listed_size_is_that_of_its_parts(name: str) -> None:
     """Models from another one's teacher have that one's autoencoder."""
     plan = plan_model(name)
-    [(model, _, _)] = [s.partition("/") for s in plan.stages["teacher"].of_others.values()] or [(name, "", "")]
+    [(model, _, _)] = [s.partition("/") for s in plan.stages["teacher"].of_others.values()] or [
+        (name, "", "")
+    ]
     recipes = (plan_model(model).stages["codec"].recipe, plan.stages["student"].recipe)
     assert MODELS[name].size == f"{sum(float(RECIPES[r].size.split()[0]) for r in recipes):.1f} M"
 
@@ -77,7 +86,10 @@ def test_a_shipped_model_has_stages_and_says_how_it_was_made(name: str) -> None:
 def test_models_are_listed_and_printed_as_recipes_are() -> None:
     listed = call("recipes")
     assert all(f"{name} " in listed for name in [*MODELS, *RECIPES])
-    assert yaml.safe_load(call("recipes", "town-dense"))["stages"]["codec"]["recipe"] == "town_dense_codec"
+    assert (
+        yaml.safe_load(call("recipes", "town-dense"))["stages"]["codec"]["recipe"]
+        == "town_dense_codec"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,22 +97,40 @@ def tiny(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa
     """The file of a tiny model of five stages, beside their recipes."""
     folder = tmp_path_factory.mktemp("tiny")
     recipe = {"iterations": 5, "warmup": 1, "schedule": "trapezoid"}
-    start = {"teacher": "none.safetensors", "weaker": "none.safetensors", "codec": "none.safetensors"}
+    start = {
+        "teacher": "none.safetensors",
+        "weaker": "none.safetensors",
+        "codec": "none.safetensors",
+    }
     recipes: dict[str, dict[str, Any]] = {
         "codec": {"network": SURFACES},
         "teacher": {"network": HDIT, "codec": start["codec"]},
         "weaker": {"network": HDIT, "codec": start["codec"]},
-        "student": {"teacher": start["teacher"], "guidance": 2.0, "strategy": "uniform_piecewise", "steps": 2},
+        "student": {
+            "teacher": start["teacher"],
+            "guidance": 2.0,
+            "strategy": "uniform_piecewise",
+            "steps": 2,
+        },
         "decoder": {"decoder": True, "init": "none.safetensors"},
     }
     for name, values in recipes.items():
         path = write_config(scans, folder, name, **values, recipe=recipe)
         if name == "decoder":  # its checkpoint says what these are
             kept = yaml.safe_load(path.read_text())
-            path.write_text(yaml.safe_dump({k: v for k, v in kept.items() if k not in ("sensor", "channels")}))
-    needs = {"teacher": {"codec": "codec"}, "weaker": {"codec": "codec"},
-             "student": {"teacher": "teacher", "weaker": "weaker"}, "decoder": {"init": "student"}}  # fmt: skip
-    stages = {name: {"recipe": f"{name}.yaml", "minutes": 1, "needs": needs.get(name, {})} for name in recipes}
+            path.write_text(
+                yaml.safe_dump({k: v for k, v in kept.items() if k not in ("sensor", "channels")})
+            )
+    needs = {
+        "teacher": {"codec": "codec"},
+        "weaker": {"codec": "codec"},
+        "student": {"teacher": "teacher", "weaker": "weaker"},
+        "decoder": {"init": "student"},
+    }
+    stages = {
+        name: {"recipe": f"{name}.yaml", "minutes": 1, "needs": needs.get(name, {})}
+        for name in recipes
+    }
     (folder / "tiny.yaml").write_text(yaml.safe_dump({"stages": stages}, sort_keys=False))
     return folder / "tiny.yaml"
 
@@ -116,23 +146,35 @@ def made(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_model_is_made_by_all_its_stages_each_with_its_state(made: Path) -> None:
     generator = load_generator(made / "tiny.safetensors")
-    assert len(generator.scans(0, [0])[0]) and generator.header.time_grid == (1.0, 0.75, 0.5, 0.25, 0.0)
+    assert len(generator.scans(0, [0])[0]) and generator.header.time_grid == (
+        1.0,
+        0.75,
+        0.5,
+        0.25,
+        0.0,
+    )
     names = ("codec", "teacher", "weaker", "student", "decoder")
-    assert all((made / name / "state.safetensors").is_file() and (made / name / DONE).is_file() for name in names)
+    assert all(
+        (made / name / "state.safetensors").is_file() and (made / name / DONE).is_file()
+        for name in names
+    )
     facts = generator.header.provenance
     assert facts["model"] == "tiny" and list(facts["stages"]) == sorted(names)
-    assert {Path(stage["recipe"]).stem: stage["iterations"] for stage in facts["stages"].values()} == dict.fromkeys(
-        names, 5
-    )
+    assert {
+        Path(stage["recipe"]).stem: stage["iterations"] for stage in facts["stages"].values()
+    } == dict.fromkeys(names, 5)
     hashes = {name: load_checkpoint(made / name / f"{name}.safetensors") for name in names}
     assert facts["init"] == hashes["student"].hash
     assert hashes["student"].header.provenance["weaker"] == hashes["weaker"].hash
     assert hashes["teacher"].header.provenance["codec"] == hashes["codec"].hash
 
 
-def test_large_weights_are_stored_in_half_precision(made: Path, monkeypatch: pytest.MonkeyPatch, tiny: Path) -> None:
+def test_large_weights_are_stored_in_half_precision(
+    made: Path, monkeypatch: pytest.MonkeyPatch, tiny: Path
+) -> None:
     path = made / "tiny.safetensors"
-    full, size = load_checkpoint(path), path.stat().st_size
+    full = load_checkpoint(path)
+    size = path.stat().st_size
     monkeypatch.setattr(models, "LARGE", 1.0)
     plan = plan_model(tiny, [f"output={made}", "recipe.iterations=5"])
     train_model(plan)
@@ -147,35 +189,64 @@ def test_large_weights_are_stored_in_half_precision(made: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_a_killed_model_is_resumed_by_the_same_command(tiny: Path, made: Path, tmp_path: Path) -> None:
-    """Killed after its first stage, it keeps that one and goes on as a model that was never stopped."""
-    words = ["train", str(tiny), f"output={tmp_path / 'tiny'}", "recipe.iterations=5", "--until", "teacher"]
+def test_a_killed_model_is_resumed_by_the_same_command(
+    tiny: Path, made: Path, tmp_path: Path
+) -> None:
+    """Killed after its first stage, it keeps that one and goes on as a model that was never
+    stopped."""
+    words = [
+        "train",
+        str(tiny),
+        f"output={tmp_path / 'tiny'}",
+        "recipe.iterations=5",
+        "--until",
+        "teacher",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "lidar_synth", *words],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )
     while not (tmp_path / "tiny" / "codec" / DONE).exists():
         assert process.poll() is None, "it ended by itself"
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    codec, teacher = (tmp_path / "tiny" / name / f"{name}.safetensors" for name in ("codec", "teacher"))
+    codec, teacher = (
+        tmp_path / "tiny" / name / f"{name}.safetensors" for name in ("codec", "teacher")
+    )
     assert not (teacher.parent / DONE).exists(), "it was killed too late"
     before = codec.stat().st_mtime_ns
     assert call(*words).strip().endswith(str(teacher))
     assert codec.stat().st_mtime_ns == before
-    assert load_checkpoint(teacher).hash == load_checkpoint(made / "teacher" / "teacher.safetensors").hash
+    assert (
+        load_checkpoint(teacher).hash
+        == load_checkpoint(made / "teacher" / "teacher.safetensors").hash
+    )
 
 
 def test_a_stage_with_a_limit_of_time_lets_its_rate_fall(tiny: Path, tmp_path: Path) -> None:
-    """The iterations follow from the steps at the constant rate; a stage that was stopped as it fell keeps them."""
-    words = ("train", tiny, f"output={tmp_path / 'tiny'}", "--minutes", 5 * LEAST, "--until", "codec")
+    """The iterations follow from the steps at the constant rate; a stage that was stopped as it
+    fell keeps them."""
+    words = (
+        "train",
+        tiny,
+        f"output={tmp_path / 'tiny'}",
+        "--minutes",
+        5 * LEAST,
+        "--until",
+        "codec",
+    )
     words = tuple(map(str, words))
     call(*words)
     folder = tmp_path / "tiny" / "codec"
     ended = yaml.safe_load((folder / "config.yaml").read_text())["recipe"]["iterations"]
     header, first = read_header(folder / "codec.safetensors")
-    assert header.provenance["iterations"] == ended > 1 and header.provenance["recipe"]["recipe"]["warmup"] == 1
+    assert (
+        header.provenance["iterations"] == ended > 1
+        and header.provenance["recipe"]["recipe"]["warmup"] == 1
+    )
     steps = int(PLATEAU * ended)
     assert ended in {-(-steps // PLATEAU), -(-(steps + 1) // PLATEAU)}
     (folder / DONE).unlink()  # killed before it was noted
@@ -190,35 +261,57 @@ def test_open_stages_share_what_done_ones_have_left(made: Path, tmp_path: Path) 
     runs = StagedRuns(tmp_path, {"codec": 2.0, "teacher": 3.0, "student": 1.0})
     spent = runs.spent("codec")
     assert spent > 0 and runs.spent("teacher") == 0
-    assert runs.budgets(10.0) == pytest.approx({"teacher": (10 - spent) * 0.75, "student": (10 - spent) * 0.25})
+    assert runs.budgets(10.0) == pytest.approx(
+        {"teacher": (10 - spent) * 0.75, "student": (10 - spent) * 0.25}
+    )
 
 
 def test_a_given_checkpoint_replaces_the_stages_that_made_it(tiny: Path) -> None:
     plan = plan_model(tiny, ["teacher.init=mine.safetensors", "teacher.codec=null"])
-    assert list(plan.stages) == ["codec", "teacher", "weaker", "student", "decoder"], "the weaker teacher needs it"
-    plan = plan_model(tiny, ["student.weaker=null", "teacher.init=mine.safetensors", "teacher.codec=null"])
+    assert list(plan.stages) == ["codec", "teacher", "weaker", "student", "decoder"], (
+        "the weaker teacher needs it"
+    )
+    plan = plan_model(
+        tiny, ["student.weaker=null", "teacher.init=mine.safetensors", "teacher.codec=null"]
+    )
     assert list(plan.stages) == ["teacher", "student", "decoder"]
     assert list(plan_model(tiny, until="teacher").stages) == ["codec", "teacher"]
-    with pytest.raises(ConfigError, match=r"^teacher.init=mine.safetensors, which does not exist; expected a checkp"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^teacher.init=mine.safetensors, which does not exist; expected a checkp",
+    ):
         train_model(plan)
 
 
 def test_overrides_reach_one_stage_or_all() -> None:
     plan = plan_model(
-        "town-dense", ["seed=7", "teacher.recipe.batch=16", "teacher.seed=8", "student.recipe.iterations=9"]
+        "town-dense",
+        ["seed=7", "teacher.recipe.batch=16", "teacher.seed=8", "student.recipe.iterations=9"],
     )
     assert {name: stage.config.seed for name, stage in plan.stages.items()} == {
-        "codec": 7, "teacher": 8, "student": 7, "decoder": 7
-    }  # fmt: skip
+        "codec": 7,
+        "teacher": 8,
+        "student": 7,
+        "decoder": 7,
+    }
     batches = {name: stage.config.recipe.batch for name, stage in plan.stages.items()}
-    assert batches["teacher"] == 16 and batches["codec"] == load_config(TrainConfig, "town_dense_codec").recipe.batch
+    assert (
+        batches["teacher"] == 16
+        and batches["codec"] == load_config(TrainConfig, "town_dense_codec").recipe.batch
+    )
     assert list(plan.runs.shares) == ["codec", "teacher", "decoder"]
     assert isinstance(plan.stages["student"].config, DistillConfig)
 
 
 ERRORS: dict[str, tuple[list[str], str]] = {
-    "a model": (["town-sparse", "--dry-run"], r"--dry-run for the recipe town-sparse; expected a model of several"),
-    "a recipe": (["town_codec", "--until", "codec"], r"--until codec for the recipe town_codec; expected a model"),
+    "a model": (
+        ["town-sparse", "--dry-run"],
+        r"--dry-run for the recipe town-sparse; expected a model of several",
+    ),
+    "a recipe": (
+        ["town_codec", "--until", "codec"],
+        r"--until codec for the recipe town_codec; expected a model",
+    ),
     "a stage": (
         ["town-dense", "--until", "weaker"],
         r"--until 'weaker'; expected a stage of town-dense: codec, teacher, student, decoder",
@@ -228,9 +321,15 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         r"override 'techer.recipe.batch=4'; expected STAGE.KEY=VALUE for a stage of town-dense \(codec, teacher, "
         r"student, decoder\), output=FOLDER, or a key of all its recipes \(licence, data, .*Such as codec.recipe.batch",
     ),
-    "a key": (["town-dense", "teacher.recipe.batches=4"], r"unknown key 'recipe.batches'; known there: iterations"),
+    "a key": (
+        ["town-dense", "teacher.recipe.batches=4"],
+        r"unknown key 'recipe.batches'; known there: iterations",
+    ),
     "no value": (["town-dense", "teacher.recipe"], r"override 'recipe'; expected key=value"),
-    "the folder of a stage": (["town-dense", "codec.output=here"], r"override 'codec.output=here'; expected STAGE.KEY"),
+    "the folder of a stage": (
+        ["town-dense", "codec.output=here"],
+        r"override 'codec.output=here'; expected STAGE.KEY",
+    ),
     "too few minutes": (
         ["town-dense", "--minutes", "0.01"],
         r"--minutes 0.01 for the stages codec, teacher, student, decoder of town-dense; expected at least 0.12. "
@@ -246,8 +345,11 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         r"of the stage teacher of town-dense. Type `lidar-synth train town-dense --until teacher "
         r"output=elsewhere/town-dense` first, or give teacher.init=FILE.safetensors",
     ),
-    "a start in runs": (["town-camera"], r"Type `lidar-synth train town-dense --until teacher` first, or give teacher"),
-}  # fmt: skip
+    "a start in runs": (
+        ["town-camera"],
+        r"Type `lidar-synth train town-dense --until teacher` first, or give teacher",
+    ),
+}
 
 
 @pytest.mark.parametrize(("words", "message"), ERRORS.values(), ids=list(ERRORS))
@@ -273,7 +375,10 @@ FILES: dict[str, tuple[str, str]] = {
         f"stages:\n  {CODEC}  teacher: {{recipe: a, minutes: 1, needs: {{data: codec}}}}",
         r"teacher.needs with 'data'; expected keys among teacher, weaker, init, codec",
     ),
-    "the name of a key": ("stages: {data: {recipe: a, minutes: 1}}", r"stage 'data'; expected a name .* no key"),
+    "the name of a key": (
+        "stages: {data: {recipe: a, minutes: 1}}",
+        r"stage 'data'; expected a name .* no key",
+    ),
     "an unknown recipe": (
         "stages: {codec: {recipe: town_codecs, minutes: 1}}",
         r"recipe or model 'town_codecs'; expected",
@@ -292,7 +397,8 @@ def test_a_missing_file_and_a_recipe_are_no_models(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="nowhere.yaml"):
         call("train", tmp_path / "nowhere.yaml")
     with pytest.raises(
-        ConfigError, match=r"model 'town_codec'; expected a YAML file .* one of town, town-camera, town-d"
+        ConfigError,
+        match=r"model 'town_codec'; expected a YAML file .* one of town, town-camera, town-d",
     ):
         plan_model("town_codec")
 
@@ -302,16 +408,33 @@ def _of_the_codec(folder: Path) -> None:
 
 
 CHANGES: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
-    "settings": (["teacher.recipe.rate=2e-3"], lambda folder: None, r"teacher with recipe.rate=0.002"),
-    "the start": ([], _of_the_codec, r"teacher, which was made from another codec than .*codec.safetensors is now; "
-                                     r"expected the same one. Remove .*teacher to run the stage again"),
-    "more iterations": (["codec.recipe.iterations=6"], lambda folder: None, r"teacher, which was made from another"),
-}  # fmt: skip
+    "settings": (
+        ["teacher.recipe.rate=2e-3"],
+        lambda folder: None,
+        r"teacher with recipe.rate=0.002",
+    ),
+    "the start": (
+        [],
+        _of_the_codec,
+        r"teacher, which was made from another codec than .*codec.safetensors is now; "
+        r"expected the same one. Remove .*teacher to run the stage again",
+    ),
+    "more iterations": (
+        ["codec.recipe.iterations=6"],
+        lambda folder: None,
+        r"teacher, which was made from another",
+    ),
+}
 
 
 @pytest.mark.parametrize(("overrides", "change", "message"), CHANGES.values(), ids=list(CHANGES))
 def test_done_stages_of_another_making_are_refused(
-    overrides: list[str], change: Callable[[Path], object], message: str, tiny: Path, made: Path, tmp_path: Path
+    overrides: list[str],
+    change: Callable[[Path], object],
+    message: str,
+    tiny: Path,
+    made: Path,
+    tmp_path: Path,
 ) -> None:
     shutil.copytree(made, tmp_path / "tiny")
     change(tmp_path / "tiny")
@@ -325,5 +448,8 @@ def test_done_stages_of_another_making_are_refused(
 
 def test_a_time_without_its_warm_up_is_refused(tiny: Path, tmp_path: Path) -> None:
     overrides = [f"output={tmp_path / 'tiny'}", "codec.recipe.warmup=1000000"]
-    with pytest.raises(ConfigError, match=r"steps before the learning rate falls; expected enough for its 1000000 ste"):
+    with pytest.raises(
+        ConfigError,
+        match=r"steps before the learning rate falls; expected enough for its 1000000 ste",
+    ):
         train_model(plan_model(tiny, overrides, minutes=5 * LEAST))

@@ -12,7 +12,8 @@ def some_poses(count: int = 6, seed: int = 0, angle: float = 0.3) -> tuple[np.nd
     """(P,) times at uneven distances and (P, 4, 4) poses that turn about any axis."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_rotvec(rng.normal(size=(count, 3)) * angle)
-    poses, rotation = np.tile(np.eye(4), (count, 1, 1)), Rotation.identity()
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    rotation = Rotation.identity()
     for pose, turn in zip(poses, turns, strict=True):
         rotation = rotation * turn
         pose[:3, :3] = rotation.as_matrix()
@@ -25,7 +26,9 @@ def test_poses_between_are_those_of_scipy() -> None:
     at = np.random.default_rng(1).uniform(times[0], times[-1], 500)
     found = interpolate_poses(times, poses, at)
     expected = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
-    assert np.abs(found[:, :3, :3] - expected).max() < 1e-6  # the times have seven digits after the point
+    assert (
+        np.abs(found[:, :3, :3] - expected).max() < 1e-6
+    )  # the times have seven digits after the point
     for axis in range(3):
         assert np.allclose(found[:, axis, 3], np.interp(at, times, poses[:, axis, 3]), atol=1e-9)
     assert (found[:, 3] == (0, 0, 0, 1)).all()
@@ -50,9 +53,14 @@ def test_motion_continues_before_and_after() -> None:
 def test_points_are_in_the_frame_of_their_pose() -> None:
     _, poses = some_poses(400)
     local = np.random.default_rng(2).normal(size=(400, 3)) * 30
-    world = np.array([pose[:3, :3] @ point + pose[:3, 3] for pose, point in zip(poses, local, strict=True)])
+    world = np.array(
+        [pose[:3, :3] @ point + pose[:3, 3] for pose, point in zip(poses, local, strict=True)]
+    )
     assert np.allclose(from_world(world, poses), local)
-    assert np.allclose(from_world(world, poses[7]), (np.linalg.inv(poses[7]) @ np.c_[world, np.ones(400)].T).T[:, :3])
+    assert np.allclose(
+        from_world(world, poses[7]),
+        (np.linalg.inv(poses[7]) @ np.c_[world, np.ones(400)].T).T[:, :3],
+    )
 
 
 def test_what_cannot_be_interpolated_is_refused() -> None:

@@ -6,12 +6,16 @@ import pytest
 from lidar_synth.labels.nearest import VOXEL, NearestLabels, index_cloud
 
 SIZE = 4.0
-LOW, HIGH = np.zeros(3), np.full(3, SIZE)
+LOW = np.zeros(3)
+HIGH = np.full(3, SIZE)
 
 
-def cloud(count: int, seed: int = 0, chunks: int = 1, *, low: float = 0.0, high: float = SIZE) -> NearestLabels:
+def cloud(
+    count: int, seed: int = 0, chunks: int = 1, *, low: float = 0.0, high: float = SIZE
+) -> NearestLabels:
     rng = np.random.default_rng(seed)
-    points, values = rng.uniform(low, high, (count, 3)), rng.integers(1, 5, count).astype(np.uint32)
+    points = rng.uniform(low, high, (count, 3))
+    values = rng.integers(1, 5, count).astype(np.uint32)
     confidence = rng.uniform(0.2, 1, count).astype(np.float32)
     cuts = np.array_split(np.arange(count), chunks)
     return index_cloud([(points[c], values[c], confidence[c]) for c in cuts], LOW, HIGH)
@@ -30,18 +34,26 @@ def test_the_vote_is_that_of_a_search_through_all_points(radius: float) -> None:
             assert vote.value[i] == 0 and vote.share[i] == 0 and np.isinf(vote.distance[i])
             continue
         weights = 1 / (distance[near] + 0.02)
-        trust = {v: (weights * index.confidence[near])[index.values[near] == v].sum() for v in index.values[near]}
+        trust = {
+            v: (weights * index.confidence[near])[index.values[near] == v].sum()
+            for v in index.values[near]
+        }
         best = max(trust, key=lambda v: trust[v])
         assert vote.value[i] == best
         own = index.values[near] == best
         assert vote.share[i] == pytest.approx(trust[best] / sum(trust.values()), rel=1e-3)
         assert vote.trust[i] == pytest.approx(trust[best] / weights[own].sum(), rel=1e-3)
-        assert vote.distance[i] == pytest.approx(distance[near][index.values[near] == best].min(), rel=1e-3)
+        assert vote.distance[i] == pytest.approx(
+            distance[near][index.values[near] == best].min(), rel=1e-3
+        )
 
 
 def test_a_cloud_in_parts_gives_the_same_index() -> None:
-    whole, parts = cloud(3000), cloud(3000, chunks=7)
-    assert all(np.array_equal(getattr(whole, n), getattr(parts, n)) for n in ("starts", "points", "values"))
+    whole = cloud(3000)
+    parts = cloud(3000, chunks=7)
+    assert all(
+        np.array_equal(getattr(whole, n), getattr(parts, n)) for n in ("starts", "points", "values")
+    )
 
 
 def test_points_of_one_class_in_one_cube_become_one_and_other_classes_stay() -> None:

@@ -31,7 +31,8 @@ KNOWN = [  # kat_vectors of Random123: counter, key and output of philox4x32-10;
 
 def philox_by_integers(counter: tuple[int, ...], seed: int) -> list[int]:
     """The published algorithm with Python integers, which do not overflow."""
-    c, k = list(counter), [seed % 2**32, seed >> 32]
+    c = list(counter)
+    k = [seed % 2**32, seed >> 32]
     for _ in range(10):
         high0, low0 = divmod(0xD2511F53 * c[0], 2**32)
         high1, low1 = divmod(0xCD9E8D57 * c[2], 2**32)
@@ -55,14 +56,18 @@ def test_philox_on_tensors_equals_philox_on_integers(counter: tuple[int, ...], s
 
 
 def test_numbers_follow_the_documented_counter_layout() -> None:
-    seed, index = 2**63 + 5, 2**40 + 7
+    seed = 2**63 + 5
+    index = 2**40 + 7
     words = [philox_by_integers((block, index % 2**32, index >> 32, 0), seed) for block in range(3)]
     expected = []
     for w in words:
         for a, b in (w[:2], w[2:]):
-            radius, angle = math.sqrt(-2 * math.log((a + 0.5) / 2**32)), 2 * math.pi * b / 2**32
+            radius = math.sqrt(-2 * math.log((a + 0.5) / 2**32))
+            angle = 2 * math.pi * b / 2**32
             expected += [radius * math.cos(angle), radius * math.sin(angle)]
-    assert gaussian(seed, [index], (2, 5)).flatten().tolist() == pytest.approx(expected[:10], rel=1e-6)
+    assert gaussian(seed, [index], (2, 5)).flatten().tolist() == pytest.approx(
+        expected[:10], rel=1e-6
+    )
     words = philox_by_integers((0, index % 2**32, index >> 32, 1), seed)
     assert uniform(seed, [index]).item() == ((words[0] >> 9) + 0.5) / 2**23
 
@@ -78,7 +83,9 @@ def test_gaussian_numbers_never_change() -> None:
     indices=st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=5),
     size=st.integers(1, 40),
 )
-def test_a_sample_depends_on_neither_its_batch_nor_its_shape(seed: int, indices: list[int], size: int) -> None:
+def test_a_sample_depends_on_neither_its_batch_nor_its_shape(
+    seed: int, indices: list[int], size: int
+) -> None:
     for draw in (gaussian, uniform):
         together = draw(seed, indices, (size,))
         for row, index in zip(together, indices, strict=True):
@@ -87,14 +94,17 @@ def test_a_sample_depends_on_neither_its_batch_nor_its_shape(seed: int, indices:
 
 
 def test_all_bits_of_seed_and_index_matter() -> None:
-    draws = [gaussian(s, [i], (8,)) for s in (0, 1, 2**32, 2**63) for i in (0, 1, 2**31, 2**32, 2**62)]
+    draws = [
+        gaussian(s, [i], (8,)) for s in (0, 1, 2**32, 2**63) for i in (0, 1, 2**31, 2**32, 2**62)
+    ]
     assert len({tuple(d.flatten().tolist()) for d in draws}) == 20
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cpu_and_cuda_agree() -> None:
     for draw in (gaussian, uniform):
-        cpu, cuda = draw(9, [3, 2**40], (2, 64, 1024)), draw(9, [3, 2**40], (2, 64, 1024), "cuda")
+        cpu = draw(9, [3, 2**40], (2, 64, 1024))
+        cuda = draw(9, [3, 2**40], (2, 64, 1024), "cuda")
         assert cuda.device.type == "cuda"
         assert (cpu - cuda.cpu()).abs().max() <= 1e-6
 
@@ -110,7 +120,10 @@ def test_gaussian_numbers_are_normal_and_independent() -> None:
         "pairs of one transform": (x[:, 0::2], x[:, 1::2]),
         "indices": (x[:-1], x[1:]),
         "seeds": (x, gaussian(12, range(100), (2, 16, 64)).double().numpy().reshape(100, -1)),
-        "streams": (x, uniform(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1) - 0.5),
+        "streams": (
+            x,
+            uniform(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1) - 0.5,
+        ),
     }
     for name, (a, b) in neighbours.items():
         for power in (1, 2):
@@ -149,7 +162,9 @@ def test_arguments_out_of_range_are_refused(
         gaussian(seed, indices, shape)
 
 
-@given(st.lists(st.integers(0, 2**64 - 1), max_size=4), st.lists(st.integers(0, 2**64 - 1), max_size=4))
+@given(
+    st.lists(st.integers(0, 2**64 - 1), max_size=4), st.lists(st.integers(0, 2**64 - 1), max_size=4)
+)
 def test_keyed_generators_depend_only_on_their_key(a: list[int], b: list[int]) -> None:
     def first(key: list[int]) -> int:
         return int(keyed_rng(*key).integers(2**63))

@@ -30,7 +30,9 @@ from lidar_synth.geometry.sensor import presets
 
 @pytest.mark.parametrize("name", sorted(NORMALISATIONS))
 @given(distances=hnp.arrays(np.float32, 40, elements=st.floats(0, 100, width=32)))
-def test_decode_inverts_encode_inside_the_limits_and_drops_the_rest(name: str, distances: np.ndarray) -> None:
+def test_decode_inverts_encode_inside_the_limits_and_drops_the_rest(
+    name: str, distances: np.ndarray
+) -> None:
     scale = NORMALISATIONS[name]
     d = torch.from_numpy(distances)
     x = scale.encode(d)
@@ -45,7 +47,12 @@ def test_no_return_is_encoded_as_minus_one_and_the_farthest_return_as_one() -> N
     scale = NORMALISATIONS["r2flow"]
     x = scale.encode(torch.tensor([0.0, 79.9999, 1.45, 80.0]))
     assert x.tolist() == [-1, pytest.approx(1, abs=1e-6), -1, -1]
-    assert scale.decode(torch.tensor([-3.0, -1.0, 1.0, 3.0])).tolist() == [0, 0, 0, 0]  # 80 m is outside
+    assert scale.decode(torch.tensor([-3.0, -1.0, 1.0, 3.0])).tolist() == [
+        0,
+        0,
+        0,
+        0,
+    ]  # 80 m is outside
 
 
 def test_reflectance_is_decoded_and_clamped() -> None:
@@ -93,15 +100,22 @@ def test_a_range_image_is_unchanged_by_encoding_and_decoding(channels: tuple[str
     assert np.allclose(back.range, image.range, rtol=2e-5)
     for name in set(channels) - {"range"}:
         assert np.allclose(back.channels[name], image.channels[name], atol=1e-6), name
-    assert set(back.channels) == set(channels) - {"range"} | ({"confidence"} if "label" in channels else set())
+    assert set(back.channels) == set(channels) - {"range"} | (
+        {"confidence"} if "label" in channels else set()
+    )
     if "label" in channels:
         assert np.array_equal(back.channels["confidence"], image.mask)
 
 
 def test_a_cell_without_a_return_has_no_label_reflectance_or_confidence() -> None:
     tensors = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
-    x = tensors.encode({"range": torch.full((1, 1, 2), 9.0), "reflectance": torch.full((1, 1, 2), 0.7),
-                        "label": torch.full((1, 1, 2), 3, dtype=torch.uint8)})  # fmt: skip
+    x = tensors.encode(
+        {
+            "range": torch.full((1, 1, 2), 9.0),
+            "reflectance": torch.full((1, 1, 2), 0.7),
+            "label": torch.full((1, 1, 2), 3, dtype=torch.uint8),
+        }
+    )
     x[:, 0, 0, 1] = -0.9  # nearer than 1.45 m
     fields = tensors.decode(x)
     assert fields["label"].tolist() == [[[3, IGNORE]]]

@@ -43,7 +43,13 @@ def test_the_notebook_runs(notebook: Path, runner: ModuleType, tmp_path: Path) -
 def kinds(book: "nbformat.NotebookNode") -> list[list[str]]:
     """The kinds of output of every cell of code, such as a stream and a picture."""
     return [
-        sorted({kind for output in cell.outputs for kind in output.get("data", {output.output_type: None})})
+        sorted(
+            {
+                kind
+                for output in cell.outputs
+                for kind in output.get("data", {output.output_type: None})
+            }
+        )
         for cell in book.cells
         if cell.cell_type == "code"
     ]
@@ -73,7 +79,12 @@ def test_the_outputs_are_those_of_the_code(notebook: Path, runner: ModuleType) -
 def test_pictures_are_small(notebook: Path) -> None:
     cells = [cell for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
     data = [output.get("data", {}) for cell in cells for output in cell.outputs]
-    pictures = [base64.b64decode(text) for one in data for kind, text in one.items() if kind.startswith("image/")]
+    pictures = [
+        base64.b64decode(text)
+        for one in data
+        for kind, text in one.items()
+        if kind.startswith("image/")
+    ]
     assert pictures
     assert [len(picture) for picture in pictures if len(picture) > LARGEST] == []
 

@@ -40,14 +40,18 @@ def test_another_density_is_reported_once(caplog: pytest.LogCaptureFixture) -> N
 
 
 @pytest.mark.parametrize("collate", ["offsets", "range"])
-def test_a_like_density_or_range_images_are_not_reported(collate: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_like_density_or_range_images_are_not_reported(
+    collate: str, caplog: pytest.LogCaptureFixture
+) -> None:
     real = Dense(12) if collate == "range" else Scans("r", 12)
     assert not logged(MixedScans(real, Endless(), 0.5, collate=collate), caplog)  # type: ignore[arg-type]
 
 
 def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     MixedScans(Scans("r", 28), Scans("s", 6), 0.9)
-    assert "the 6 scans of a synthetic source" in caplog.text and "come 42 times each" in caplog.text
+    assert (
+        "the 6 scans of a synthetic source" in caplog.text and "come 42 times each" in caplog.text
+    )
     caplog.clear()
     MixedScans(Scans("r", 28), Scans("s", 6), 0.4)
     MixedScans(Scans("r", 28), Endless(), 0.9)
@@ -55,15 +59,23 @@ def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.mark.parametrize("ignored", [False, True])
-def test_unlabelled_real_scans_are_reported_once(ignored: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_unlabelled_real_scans_are_reported_once(
+    ignored: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     real = Scans("r", 12)
     for i in (3, 5):
         real[i] = replace(real[i], label=np.full(len(real[i]), 255, np.uint8) if ignored else None)
     messages = logged(MixedScans(real, Endless(), 0.5), caplog)
-    assert len(messages) == 1 and "has no labels" in messages[0] and "lidar-synth label kitti360" in messages[0]
+    assert (
+        len(messages) == 1
+        and "has no labels" in messages[0]
+        and "lidar-synth label kitti360" in messages[0]
+    )
 
 
-def test_unlabelled_real_scans_in_an_unlabelled_mixture_are_not(caplog: pytest.LogCaptureFixture) -> None:
+def test_unlabelled_real_scans_in_an_unlabelled_mixture_are_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     real = Scans("r", 12)
     real[:] = [replace(scan, label=None) for scan in real]
     assert not logged(MixedScans(real, Endless(), 0.5, labels="none"), caplog)

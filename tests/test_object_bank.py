@@ -39,7 +39,8 @@ def bank(scans: list[Scan]) -> ObjectBank:
 
 @pytest.mark.slow
 def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> None:
-    """The town's boxes are so tight that noise sticks out of them: they grow by a little, and hold nearly all of it."""
+    """The town's boxes are so tight that noise sticks out of them: they grow by a little, and hold
+    nearly all of it."""
     assert len(bank) > 20 and (bank.counts >= 8).all()
     for index in range(len(bank)):
         found = bank[index]
@@ -89,16 +90,23 @@ def test_a_bank_of_other_types_is_refused(bank: ObjectBank) -> None:
 def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
     bank.save(tmp_path / "objects.npz")
     again = ObjectBank.load(tmp_path / "objects.npz")
-    assert repr(again) == repr(bank) and again.sensor == bank.sensor and again.boxes.names == bank.boxes.names
+    assert (
+        repr(again) == repr(bank)
+        and again.sensor == bank.sensor
+        and again.boxes.names == bank.boxes.names
+    )
     for name in ("scan", "number", "ground", "start", "points", "reflectance", "label"):
-        a, b = getattr(again, name), getattr(bank, name)
+        a = getattr(again, name)
+        b = getattr(bank, name)
         assert a.dtype == b.dtype and np.array_equal(a, b)
     assert np.array_equal(again.boxes.occlusion, bank.boxes.occlusion)
     content = (tmp_path / "objects.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     np.savez(tmp_path / "other.npz", points=np.zeros(3))
     for name in ("cut", "other"):
-        with pytest.raises(DataError, match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)"):
+        with pytest.raises(
+            DataError, match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)"
+        ):
             ObjectBank.load(tmp_path / f"{name}.npz")
     with pytest.raises(FileError, match="nowhere"):
         ObjectBank.load(tmp_path / "nowhere.npz")
@@ -150,9 +158,15 @@ def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -
     if bare:
         host = replace(host, label=None, instance=None, boxes=None, raw_label=None, ring=None)
     rng = np.random.default_rng(5)
-    first = 1 if host.boxes is None else int(max(host.instance.max(), host.boxes.instance.max())) + 1
+    first = (
+        1 if host.boxes is None else int(max(host.instance.max(), host.boxes.instance.max())) + 1
+    )
     angles = rng.uniform(-np.pi, np.pi, len(bank))
-    pasted = paste(host, [bank[i].turned(a) for i, a in zip(rng.permutation(len(bank)), angles, strict=True)], count=12)
+    pasted = paste(
+        host,
+        [bank[i].turned(a) for i, a in zip(rng.permutation(len(bank)), angles, strict=True)],
+        count=12,
+    )
     assert pasted.boxes is not None and (pasted.boxes.instance >= first).sum() >= 4
     assert_nothing_shares_a_ray(pasted, first)
     new = pasted.boxes[pasted.boxes.instance >= first]
@@ -165,12 +179,16 @@ def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -
 def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
     bank = ObjectBank.from_scans(KITTIObject(real_scans / "kitti_object", "trainval"))
     assert set(bank.boxes.names) >= {"Car", "Pedestrian", "Cyclist", "Van", "Truck"}
-    assert set(bank.label.tolist()) <= {TRAIN_ID[n] for n in ("car", "truck", "person", "bicyclist")} | {IGNORE}
+    assert set(bank.label.tolist()) <= {
+        TRAIN_ID[n] for n in ("car", "truck", "person", "bicyclist")
+    } | {IGNORE}
     placed = 0
     for index in (5, 32):
         host = replace(town[index], boxes=None, instance=None, raw_label=None, ring=None)
         rng = np.random.default_rng(index)
-        pasted = paste(host, [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))])
+        pasted = paste(
+            host, [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))]
+        )
         assert pasted.boxes is not None
         assert_nothing_shares_a_ray(pasted, 1)
         placed += len(pasted.boxes)
@@ -188,16 +206,26 @@ def test_real_instances_in_town_scans(real_scans: Path, town: Town) -> None:
 def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
     rng = np.random.default_rng(seed)
     values = np.c_[
-        rng.uniform(-4, 4, (5, 2)), np.zeros(5), rng.uniform(1, 6, (5, 2)), np.ones(5), rng.uniform(-4, 4, 5)
+        rng.uniform(-4, 4, (5, 2)),
+        np.zeros(5),
+        rng.uniform(1, 6, (5, 2)),
+        np.ones(5),
+        rng.uniform(-4, 4, 5),
     ]
     values = values.astype(np.float32)
-    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1).reshape(-1, 2)
-    inside = Boxes(values, ("Car",) * 5).contain(np.c_[grid, np.zeros(len(grid))].astype(np.float32))
+    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1).reshape(
+        -1, 2
+    )
+    inside = Boxes(values, ("Car",) * 5).contain(
+        np.c_[grid, np.zeros(len(grid))].astype(np.float32)
+    )
     both = (inside[0] & inside[1:]).any(1)
     found = overlapping(values[0], values[1:])
     assert (both <= found).all()
     smaller = values[1:] - np.array([0, 0, 0, 0.4, 0.4, 0, 0], np.float32)
-    assert (overlapping(values[0], smaller) <= both).all()  # a corner may lie between the grid's points
+    assert (
+        overlapping(values[0], smaller) <= both
+    ).all()  # a corner may lie between the grid's points
 
 
 def test_boxes_grow_no_more_than_they_have_to() -> None:

@@ -12,11 +12,14 @@ from lidar_synth.lab.train import OPTIMIZERS
 def transformer() -> nn.Module:
     torch.manual_seed(0)
     small = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 4]}
-    return build_network("hdit", {"resolution": (8, 32), "channels": 3, "angles": torch.zeros(2, 8, 32)} | small)
+    return build_network(
+        "hdit", {"resolution": (8, 32), "channels": 3, "angles": torch.zeros(2, 8, 32)} | small
+    )
 
 
 def test_a_step_of_muon_turns_all_directions_alike() -> None:
-    """The update of a matrix has singular values that are about equal, whatever its gradient's are."""
+    """The update of a matrix has singular values that are about equal, whatever its gradient's
+    are."""
     network = transformer()
     muon = OPTIMIZERS["muon"](network, 0.1, (0.9, 0.99), 0.0)[0]
     weight = muon.param_groups[0]["params"][0]
@@ -34,7 +37,8 @@ def test_a_step_of_muon_turns_all_directions_alike() -> None:
 def test_muon_computes_in_float32_where_bfloat16_is_slower(
     half: bool, error: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside the polynomial of its five iterations (Jordan et al. 2024), applied to the singular values in float64."""
+    """Beside the polynomial of its five iterations (Jordan et al. 2024), applied to the singular
+    values in float64."""
     monkeypatch.setattr("lidar_synth.lab.train.optimizers.faster_in_bfloat16", lambda: half)
     muon = OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)[0]
     weight = muon.param_groups[0]["params"][0]

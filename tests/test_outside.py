@@ -69,7 +69,8 @@ def out(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", HOSTILE)
 @pytest.mark.parametrize("to", WRITERS)
 def test_nothing_lands_outside(tmp_path: Path, out: Path, to: str, name: str) -> None:
-    """The scan is refused and named, or it is written in the folder and found there again; the others go on."""
+    """The scan is refused and named, or it is written in the folder and found there again; the
+    others go on."""
     source = Named("good/0", HOSTILE[name].format(outside=tmp_path), "good/2")
     before = everything(tmp_path, out)
     report = convert(source, WRITERS[to](out), on_bad="skip", progress=False)
@@ -101,7 +102,9 @@ def test_a_bank_and_a_tar_with_names_that_lead_out(tmp_path: Path, out: Path, to
         if to == "kitti_object" and number == 0:
             continue  # a bank has no boxes
         report = convert(source, WRITERS[to](out / str(number)), on_bad="skip", progress=False)
-        assert (report.written == 0) == (to in ("kitti", "npz", "range", "pcd", "ply", "png")), report
+        assert (report.written == 0) == (to in ("kitti", "npz", "range", "pcd", "ply", "png")), (
+            report
+        )
     assert everything(tmp_path, out) == before
 
 
@@ -109,14 +112,18 @@ def test_a_bank_and_a_tar_with_names_that_lead_out(tmp_path: Path, out: Path, to
 def test_a_link_in_the_folder_that_leads_out(tmp_path: Path, out: Path, to: str) -> None:
     """Whichever folder of a layout it is, side files and images included."""
     convert(Named("good/0"), WRITERS[to](tmp_path / "model"), progress=False)
-    folders = [p.relative_to(tmp_path / "model") for p in (tmp_path / "model").rglob("*") if p.is_dir()]
+    folders = [
+        p.relative_to(tmp_path / "model") for p in (tmp_path / "model").rglob("*") if p.is_dir()
+    ]
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     for folder in folders or [Path("a")]:
         place = out / folder
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(elsewhere)
-        with pytest.raises(FileError, match=f"{place.name} is a link to .*elsewhere.*Remove the link"):
+        with pytest.raises(
+            FileError, match=f"{place.name} is a link to .*elsewhere.*Remove the link"
+        ):
             WRITERS[to](out).write(some_scan(count=60), 0, name="a/0")
         assert not list(elsewhere.iterdir())
         place.unlink()
@@ -135,7 +142,10 @@ def test_a_file_is_never_written_through_a_link(tmp_path: Path) -> None:
 
 COLLISIONS = {
     "png": [("a_b", "a/b"), ("x", "x")],
-    "semantic_kitti": [("00/000001", "2013_05_28_drive_0000_sync/0000000001"), ("other", "00/000000")],
+    "semantic_kitti": [
+        ("00/000001", "2013_05_28_drive_0000_sync/0000000001"),
+        ("other", "00/000000"),
+    ],
     "kitti360": [("00/000001", "00/1"), ("other", "00/0")],
     "kitti_object": [("training/1", "training/000001"), ("other", "training/0")],
 } | {to: [("x", "x")] for to in ("kitti", "npz", "range", "pcd", "ply", "webdataset")}
@@ -165,7 +175,11 @@ def test_names_stay_inside_and_apart(names: list[str]) -> None:
             found[name] = inside(root, name)
         except DataError:
             continue
-        assert Path(os.path.normpath(found[name])) == found[name] and found[name].is_relative_to(root) and name
+        assert (
+            Path(os.path.normpath(found[name])) == found[name]
+            and found[name].is_relative_to(root)
+            and name
+        )
     assert len(set(found.values())) == len(found)
 
 

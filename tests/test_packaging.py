@@ -31,14 +31,18 @@ def test_every_package_and_data_file_is_listed() -> None:
     for package in setuptools["package-data"].keys() - MAPPED.keys():
         patterns = setuptools["package-data"][package]
         base = ROOT / package.replace(".", "/")
-        listed |= {m.relative_to(ROOT / "lidar_synth").as_posix() for g in patterns for m in base.glob(g)}
+        listed |= {
+            m.relative_to(ROOT / "lidar_synth").as_posix() for g in patterns for m in base.glob(g)
+        }
     assert listed == data
 
 
 def test_every_recipe_is_listed() -> None:
     patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["lidar_synth.recipes"]
     listed = {path for pattern in patterns for path in (ROOT / "configs").glob(pattern)}
-    there = {p for p in (ROOT / "configs").rglob("*.*") if p.is_file() and "__pycache__" not in p.parts}
+    there = {
+        p for p in (ROOT / "configs").rglob("*.*") if p.is_file() and "__pycache__" not in p.parts
+    }
     assert there - listed == {ROOT / "configs" / "__init__.py"}
 
 
@@ -46,18 +50,25 @@ def test_every_recipe_is_listed() -> None:
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sdist, and the wheel that was built from it."""
     folder = tmp_path_factory.mktemp("built")
-    rubbish = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs", "demo_out")
+    rubbish = shutil.ignore_patterns(
+        ".*", "__pycache__", "*.egg-info", "build", "dist", "runs", "demo_out"
+    )
     shutil.copytree(ROOT, folder / "checkout", ignore=rubbish)
     shutil.copytree(ROOT / ".ci", folder / "checkout" / ".ci")
-    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "checkout"], folder)
+    run(
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "checkout"],
+        folder,
+    )
     return folder
 
 
 def environment_with(what: list[str | Path], folder: Path) -> Path:
-    """The scripts of a new environment that has the package, installed from ``what``, and what it depends on."""
+    """The scripts of a new environment that has the package, installed from ``what``, and what it
+    depends on."""
     venv.create(folder, with_pip=False)
     [site] = folder.glob("lib/python*/site-packages")
-    # Paths that a .pth file adds are not searched for further .pth files: this checkout stays out of sight.
+    # Paths that a .pth file adds are not searched for further .pth files: this checkout stays out
+    # of sight.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     pip = [sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install", "--quiet"]
     options = ["--disable-pip-version-check", "--no-deps", "--no-index", "--no-build-isolation"]
@@ -67,7 +78,9 @@ def environment_with(what: list[str | Path], folder: Path) -> Path:
 
 def run(command: list[str | Path], folder: Path) -> str:
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -76,12 +89,17 @@ def run(command: list[str | Path], folder: Path) -> str:
 def test_the_wheel_works_from_any_folder(built: Path, tmp_path: Path) -> None:
     [wheel] = built.glob("*.whl")
     bare = environment_with([wheel], built / "environment")
-    where = run([bare / "python", "-c", "import lidar_synth; print(lidar_synth.__file__)"], tmp_path)
+    where = run(
+        [bare / "python", "-c", "import lidar_synth; print(lidar_synth.__file__)"], tmp_path
+    )
     assert Path(where.strip()).is_relative_to(bare.parent)
     command = bare / "lidar-synth"
     assert "town_teacher" in run([command, "recipes"], tmp_path)
     few = ["recipe.iterations=2", "data.town=4", "samples.every=0"]
-    assert run([command, "train", "town_tiny", *few], tmp_path).strip() == "runs/town_tiny/town_tiny.safetensors"
+    assert (
+        run([command, "train", "town_tiny", *few], tmp_path).strip()
+        == "runs/town_tiny/town_tiny.safetensors"
+    )
     model = tmp_path / "runs" / "town_tiny" / "town_tiny.safetensors"
     bake = ["bake", "bank", "--config", "bake_town", "--model", model, "--count", "2"]
     assert "2 scans in 1 shards" in run([command, *bake], tmp_path)
@@ -95,9 +113,16 @@ def test_the_unpacked_sdist_runs_its_tests(built: Path, tmp_path: Path) -> None:
     with tarfile.open(archive) as file:
         file.extractall(tmp_path, filter="data")
     [root] = tmp_path.iterdir()
-    ours = {p.relative_to(ROOT) for p in (ROOT / "tests").rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+    ours = {
+        p.relative_to(ROOT)
+        for p in (ROOT / "tests").rglob("*")
+        if p.is_file() and "__pycache__" not in p.parts
+    }
     assert all((root / path).is_file() for path in ours)
-    some = [f"tests/test_{name}.py" for name in ("structure", "config", "readme", "sensor", "scan", "solvers")]
+    some = [
+        f"tests/test_{name}.py"
+        for name in ("structure", "config", "readme", "sensor", "scan", "solvers")
+    ]
     scripts = environment_with(["--editable", root], tmp_path / "environment")
     assert " passed" in run([scripts / "python", "-m", "pytest", *some], root)
 
@@ -125,7 +150,9 @@ def test_the_command_line_starts_without_the_heavy_libraries(args: list[str]) ->
         "heavy = {'torch', 'numba', 'matplotlib', 'open3d', 'embreex'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
-    run = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        [sys.executable, "-c", code, *args], capture_output=True, text=True, check=False
+    )
     assert run.returncode == 0, run.stderr
     assert "lidar-synth" in run.stdout.lower()
 
@@ -137,7 +164,9 @@ def test_every_shipped_yaml_loads_safely() -> None:
         assert isinstance(yaml.safe_load(path.read_text()), dict), path
 
 
-@pytest.mark.parametrize("script", sorted(ROOT.glob("tools/**/[a-z]*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "script", sorted(ROOT.glob("tools/**/[a-z]*.py")), ids=lambda path: path.stem
+)
 def test_what_a_script_imports_from_the_package_is_there(script: Path) -> None:
     """Scripts are run by hand and by nobody else: what they lean on moves."""
     import ast
@@ -149,4 +178,6 @@ def test_what_a_script_imports_from_the_package_is_there(script: Path) -> None:
                 continue
             module = importlib.import_module(str(node.module))
             for name in node.names:
-                assert hasattr(module, name.name), f"{script.name}: {node.module} has no {name.name}"
+                assert hasattr(module, name.name), (
+                    f"{script.name}: {node.module} has no {name.name}"
+                )

@@ -39,7 +39,8 @@ def read(path: Path, *columns: str) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_tables_of_pandas_itself_are_read(path: Path) -> None:
-    """Written by the version of pandas and in the protocol that the file's name says; README.md there has the code."""
+    """Written by the version of pandas and in the protocol that the file's name says; README.md
+    there has the code."""
     found = read(path)
     for name, values in COLUMNS.items():
         expected = values.tolist()
@@ -51,12 +52,16 @@ def test_tables_of_pandas_itself_are_read(path: Path) -> None:
 
 @pytest.mark.parametrize("protocol", range(6))
 @pytest.mark.parametrize("compressed", [False, True])
-def test_the_published_form_is_read_in_every_protocol(tmp_path: Path, protocol: int, compressed: bool) -> None:
+def test_the_published_form_is_read_in_every_protocol(
+    tmp_path: Path, protocol: int, compressed: bool
+) -> None:
     content = dump(table(COLUMNS), protocol)
     (tmp_path / "x.pkl").write_bytes(gzip.compress(content) if compressed else content)
     found = read(tmp_path / "x.pkl")
     for name, values in COLUMNS.items():
-        assert found[name].dtype == values.dtype and found[name].tolist()[:-1] == values.tolist()[:-1]
+        assert (
+            found[name].dtype == values.dtype and found[name].tolist()[:-1] == values.tolist()[:-1]
+        )
     assert read(tmp_path / "x.pkl", "yaw").keys() == {"yaw"}
     assert read_table(tmp_path / "x.pkl", ("yaw",), ("d", "missing")).keys() == {"yaw", "d"}
 
@@ -65,15 +70,23 @@ def test_the_published_form_is_read_in_every_protocol(tmp_path: Path, protocol: 
     ("change", "message"),
     [
         (lambda content: content[:-200], r"is truncated; expected a pickled pandas table"),
-        (lambda content: content[:10] + b"?" + content[11:], r"is damaged \(Error -3|is truncated|damaged pickle"),
-        (lambda content: gzip.compress(zlib.decompress(content, 31)[:-300]), "truncated or damaged pickle"),
+        (
+            lambda content: content[:10] + b"?" + content[11:],
+            r"is damaged \(Error -3|is truncated|damaged pickle",
+        ),
+        (
+            lambda content: gzip.compress(zlib.decompress(content, 31)[:-300]),
+            "truncated or damaged pickle",
+        ),
         (lambda content: b"", "truncated or damaged pickle"),
         (lambda content: b"hello", "truncated or damaged pickle|would call"),
         (lambda content: gzip.compress(dump({"a": 1})), "holds another table"),
         (lambda content: gzip.compress(dump(array(np.zeros(3)))), "holds another table"),
     ],
 )
-def test_damaged_tables_are_named(tmp_path: Path, change: Callable[[bytes], bytes], message: str) -> None:
+def test_damaged_tables_are_named(
+    tmp_path: Path, change: Callable[[bytes], bytes], message: str
+) -> None:
     path = tmp_path / "x.pkl.gz"
     path.write_bytes(change(gzip.compress(dump(table(COLUMNS)))))
     with pytest.raises(DataError, match=f"x.pkl.gz.*({message})"):
@@ -134,8 +147,12 @@ def many_blocks() -> bytes:
 
 CODE: dict[str, Callable[[], bytes]] = {
     "os.system": lambda: pickle.dumps(Exploit(os.system, f"touch ${FLAG}"), 2),
-    "builtins.eval": lambda: pickle.dumps(Exploit(eval, f"open(__import__('os').environ['{FLAG}'], 'w')")),
-    "builtins.exec": lambda: pickle.dumps(Exploit(exec, f"import os; open(os.environ['{FLAG}'], 'w')"), 0),
+    "builtins.eval": lambda: pickle.dumps(
+        Exploit(eval, f"open(__import__('os').environ['{FLAG}'], 'w')")
+    ),
+    "builtins.exec": lambda: pickle.dumps(
+        Exploit(exec, f"import os; open(os.environ['{FLAG}'], 'w')"), 0
+    ),
     "in a cell of a table": lambda: pickle.dumps(
         np.array([Exploit(os.system, f"touch ${FLAG}"), "Car"], object), protocol=4
     ),
@@ -152,7 +169,10 @@ def test_no_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
     content = CODE[name]()
     path = tmp_path / "x.pkl.gz"
     path.write_bytes(gzip.compress(content))
-    with pytest.raises(DataError, match=r"x.pkl.gz would call '[\w.]+' when loaded, and was not loaded.*release page"):
+    with pytest.raises(
+        DataError,
+        match=r"x.pkl.gz would call '[\w.]+' when loaded, and was not loaded.*release page",
+    ):
         read(path)
     assert not made.exists()
     pickle.loads(content)
@@ -222,11 +242,15 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "names in cells": lambda: frame(array(np.array([Name("numpy.ndarray"), None, "a"], object))),
     "another class as an array": lambda: frame(Call("pandas.StringDtype", ("python",))),
     "an array without a state": lambda: frame(Call("numpy.core.multiarray._reconstruct", ())),
-    "a slice of text": lambda: frame(array(np.zeros((1, 3))), placement=Call("builtins.slice", ("a",))),
+    "a slice of text": lambda: frame(
+        array(np.zeros((1, 3))), placement=Call("builtins.slice", ("a",))
+    ),
     "no slice": lambda: frame(array(np.zeros((1, 3))), placement=Call("builtins.slice", (0, 1, 0))),
     "places outside": lambda: frame(array(np.zeros((1, 3))), placement=array(np.array([7]))),
     "half a place": lambda: frame(array(np.zeros((1, 3))), placement=array(np.array([0.5]))),
-    "a million places": lambda: frame(array(np.zeros((1, 3))), placement=array(np.zeros(10**6, "i8"))),
+    "a million places": lambda: frame(
+        array(np.zeros((1, 3))), placement=array(np.zeros(10**6, "i8"))
+    ),
     "many columns": lambda: frame(array(np.zeros((1, 3))), columns=MOST_COLUMNS + 1),
 }
 """{name: content of a file that is no table}."""
@@ -261,13 +285,19 @@ def test_names_that_are_known_are_not_imported() -> None:
     """A name stays text even where its module could not be imported."""
     tree = parse_pickle(call("nowhere.at.all", 1, "a"), {"nowhere.at.all"}, "x", "y")
     assert (tree.name, tree.args, tree.state) == ("nowhere.at.all", (1, "a"), None)
-    assert all(name.split(".")[0] in ("numpy", "pandas", "builtins", "__builtin__", "_codecs", "copyreg", "copy_reg")
-               for name in KNOWN)  # fmt: skip
+    assert all(
+        name.split(".")[0]
+        in ("numpy", "pandas", "builtins", "__builtin__", "_codecs", "copyreg", "copy_reg")
+        for name in KNOWN
+    )
     assert not {"builtins.eval", "builtins.exec", "numpy.load"} & KNOWN
 
 
 def test_plain_values_are_those_of_pythons_own_reader() -> None:
-    values = {"a": [1, -2, 2**40, 2**200, 1.5, None, True, "ä", b"b", ()], "b": ({"c": []}, (1,), (1, 2), (1, 2, 3, 4))}
+    values = {
+        "a": [1, -2, 2**40, 2**200, 1.5, None, True, "ä", b"b", ()],
+        "b": ({"c": []}, (1,), (1, 2), (1, 2, 3, 4)),
+    }
     for protocol in range(3, 6):
         assert parse_pickle(pickle.dumps(values, protocol), (), "x", "y") == values
     file = io.BytesIO()

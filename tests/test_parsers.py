@@ -1,4 +1,5 @@
-"""What parses foreign files stands in ``lidar_synth/files``, or in the few modules that are listed here."""
+"""What parses foreign files stands in ``lidar_synth/files``, or in the few modules that are listed
+here."""
 
 import ast
 from pathlib import Path
@@ -12,15 +13,36 @@ from lidar_synth.files.parsing import read_picture
 PACKAGE = Path(lidar_synth.__file__).parent
 
 PARSERS = {
-    "PIL.Image.open", "Image.open", "torch.load", "np.load", "np.loadtxt", "np.genfromtxt", "np.fromstring",
-    "pickle.load", "pickle.loads", "pickle.Unpickler", "yaml.load", "yaml.safe_load", "yaml.full_load",
-    "yaml.unsafe_load", "json.load", "json.loads", "zipfile.ZipFile", "tarfile.open", "ElementTree.parse",
-    "ElementTree.iterparse", "ElementTree.fromstring", "h5py.File", "eval", "exec",
-}  # fmt: skip
+    "PIL.Image.open",
+    "Image.open",
+    "torch.load",
+    "np.load",
+    "np.loadtxt",
+    "np.genfromtxt",
+    "np.fromstring",
+    "pickle.load",
+    "pickle.loads",
+    "pickle.Unpickler",
+    "yaml.load",
+    "yaml.safe_load",
+    "yaml.full_load",
+    "yaml.unsafe_load",
+    "json.load",
+    "json.loads",
+    "zipfile.ZipFile",
+    "tarfile.open",
+    "ElementTree.parse",
+    "ElementTree.iterparse",
+    "ElementTree.fromstring",
+    "h5py.File",
+    "eval",
+    "exec",
+}
 """Calls that read a format."""
 
 OUTSIDE = {
-    # Formats with one reader, which checks sizes and turns every exception into an error of the package.
+    # Formats with one reader, which checks sizes and turns every exception into an error of the
+    # package.
     "bank/layout.py": {"h5py.File"},
     "bank/chunks.py": {"h5py.File"},  # in memory
     "bank/writer.py": {"h5py.File"},  # writes
@@ -45,8 +67,12 @@ OUTSIDE = {
 
 
 def parsers_of(path: Path) -> set[str]:
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-    return {ast.unparse(call) for call in calls if isinstance(call, ast.Name | ast.Attribute)} & PARSERS
+    calls = [
+        node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+    ]
+    return {
+        ast.unparse(call) for call in calls if isinstance(call, ast.Name | ast.Attribute)
+    } & PARSERS
 
 
 def test_no_parser_stands_outside_the_files_room() -> None:
@@ -64,7 +90,9 @@ def test_pictures_start_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(program.parent), prepend=":")
     picture = tmp_path / "000000.png"
-    picture.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n")
+    picture.write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
+    )
     with pytest.raises(DataError, match=r"000000\.png cannot be read"):
         read_picture(picture)
     assert not trace.exists()

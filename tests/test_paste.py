@@ -1,4 +1,5 @@
-"""Objects set into scans: what a sensor would have seen if they had been there, and nothing else."""
+"""Objects set into scans: what a sensor would have seen if they had been there, and nothing
+else."""
 
 from dataclasses import replace
 
@@ -25,7 +26,12 @@ places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
 def at(place: tuple[float, float, float], ground: float = -HEIGHT) -> np.ndarray:
     """A car at a distance, in a direction (degrees), with a yaw."""
     distance, direction, yaw = place
-    return car(distance * np.cos(np.radians(direction)), distance * np.sin(np.radians(direction)), yaw, ground)
+    return car(
+        distance * np.cos(np.radians(direction)),
+        distance * np.sin(np.radians(direction)),
+        yaw,
+        ground,
+    )
 
 
 def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
@@ -35,17 +41,24 @@ def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
 
 
 @settings(max_examples=25)
-@example((22.0, 0.0, 1.0), [(20.0, 1.0)])  # the foot of a wall in the cells where the car meets the ground
+@example(
+    (22.0, 0.0, 1.0), [(20.0, 1.0)]
+)  # the foot of a wall in the cells where the car meets the ground
 @given(places, st.lists(st.tuples(st.floats(4, 40), st.floats(-180, 180)), max_size=3))
 def test_a_pasted_car_looks_as_the_sensor_would_see_it(
     place: tuple[float, float, float], walls: list[tuple[float, float]]
 ) -> None:
     box = at(place)
-    around = [wall(d * np.cos(np.radians(a)), d * np.sin(np.radians(a)), np.radians(a) + 1.2) for d, a in walls]
-    empty, true = cast([], around), cast([box], around)
+    around = [
+        wall(d * np.cos(np.radians(a)), d * np.sin(np.radians(a)), np.radians(a) + 1.2)
+        for d, a in walls
+    ]
+    empty = cast([], around)
+    true = cast([box], around)
     pasted = paste(empty, [seen(box)])
     assume(pasted.boxes is not None and len(pasted.boxes) == 1)
-    expected, got = project(true), project(pasted)
+    expected = project(true)
+    got = project(pasted)
     assert len(pasted) == len(true)
     assert np.allclose(expected.range, got.range, atol=1e-4)
     for name in ("label", "instance"):
@@ -79,10 +92,16 @@ def test_a_pasted_object_stands_on_the_ground(ground: float, labelled: bool) -> 
     candidate = seen(car(22, 5, 0.4))
     pasted = paste(host, [candidate])
     assert pasted.boxes is not None and pasted.instance is not None
-    lowered = candidate.scan.points + np.array([0, 0, pasted.boxes.values[0, 2] - candidate.box[2]], np.float32)
+    lowered = candidate.scan.points + np.array(
+        [0, 0, pasted.boxes.values[0, 2] - candidate.box[2]], np.float32
+    )
     cells = np.unique(locate(lowered, SENSOR).cell)
-    assert (pasted.instance == 1).sum() == len(cells)  # the ground before it hides not even its lowest row
-    assert pasted.boxes.values[0, 2] - pasted.boxes.values[0, 5] / 2 == pytest.approx(ground, abs=0.02)
+    assert (pasted.instance == 1).sum() == len(
+        cells
+    )  # the ground before it hides not even its lowest row
+    assert pasted.boxes.values[0, 2] - pasted.boxes.values[0, 5] / 2 == pytest.approx(
+        ground, abs=0.02
+    )
     assert_nothing_shares_a_ray(pasted, 1)
 
 
@@ -130,15 +149,23 @@ def test_objects_in_front_occlude_a_pasted_object() -> None:
     assert wide.boxes is not None and not len(wide.boxes)  # hidden
     assert np.array_equal(wide.points, cast([], [wall(9, 0, np.pi / 2, 3)]).points)
     none = paste(replace(cast(), boxes=None), [])
-    assert none.boxes is not None and len(none.boxes) == 0  # a detector's sample has boxes, be there any or not
+    assert (
+        none.boxes is not None and len(none.boxes) == 0
+    )  # a detector's sample has boxes, be there any or not
 
 
 def test_gaps_between_occluding_returns_show_nothing() -> None:
-    host, alone = cast([], [wall(9, 0, np.pi / 2, 1.6)]), seen(car(15, 0, np.pi / 2))
+    host = cast([], [wall(9, 0, np.pi / 2, 1.6)])
+    alone = seen(car(15, 0, np.pi / 2))
     label = project(host).label
     assert label is not None
     rows = np.arange(64)[:, None]
-    inner = (label == WALL) & (np.roll(label, 1, 0) == WALL) & (np.roll(label, -1, 0) == WALL) & (rows % 2 == 0)
+    inner = (
+        (label == WALL)
+        & (np.roll(label, 1, 0) == WALL)
+        & (np.roll(label, -1, 0) == WALL)
+        & (rows % 2 == 0)
+    )
     perforated = host[~inner.reshape(-1)[locate(host.points, SENSOR).cell]]
     assert len(host) - len(perforated) > 200
     whole, pierced = (paste(h, [alone]).label for h in (host, perforated))
@@ -147,7 +174,9 @@ def test_gaps_between_occluding_returns_show_nothing() -> None:
 
 
 def test_occluded_objects_are_removed_with_their_boxes() -> None:
-    behind, beside, farther = car(22, 0.2), car(10, 12, 1.0), car(20, 4.0)
+    behind = car(22, 0.2)
+    beside = car(10, 12, 1.0)
+    farther = car(20, 4.0)
     host = cast([behind, beside, farther])
     host.boxes = replace(host.boxes, occlusion=np.array([0, 0, 0]))
     pasted = paste(host, [seen(car(12, 0, np.pi / 2))])
@@ -175,7 +204,9 @@ def test_pasted_objects_occlude_one_another_in_any_order() -> None:
         assert len(pasted) == len(truth)
         assert np.allclose(project(pasted).range, project(truth).range, atol=1e-4)
         assert pasted.boxes is not None
-        assert np.allclose(pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01)  # from near to far
+        assert np.allclose(
+            pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01
+        )  # from near to far
         assert_nothing_shares_a_ray(pasted, 1)
     twice = paste(cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2)
     assert twice.boxes is not None and len(twice.boxes) == 2  # the second found no place
@@ -199,7 +230,9 @@ def test_gaps_in_an_object_show_nothing_behind_it() -> None:
 
 def test_fields_of_a_scan_with_pasted_objects() -> None:
     host = cast([], [wall(20, 0)])
-    host = replace(host, ring=np.zeros(len(host), np.int16), pose=np.eye(4), domain=0, confidence=None)
+    host = replace(
+        host, ring=np.zeros(len(host), np.int16), pose=np.eye(4), domain=0, confidence=None
+    )
     candidate = seen(car(8, 5))
     camera = {"truncation": [0.2], "alpha": [1.0], "image_box": [[1, 2, 3, 4]], "occlusion": [1]}
     known = replace(candidate.scan.boxes, **{k: np.array(v) for k, v in camera.items()})
@@ -207,7 +240,9 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
     pasted = paste(host, [candidate])
     assert set(pasted.fields()) == {"reflectance", "label", "instance", "confidence", "ring"}
     new = slice(-len(candidate.scan), None)
-    assert pasted.boxes is not None and pasted.confidence is not None and pasted.instance is not None
+    assert (
+        pasted.boxes is not None and pasted.confidence is not None and pasted.instance is not None
+    )
     assert (pasted.confidence[new] == 1).all() and (pasted.instance[new] == 1).all()
     assert np.array_equal(pasted.reflectance[new], candidate.scan.reflectance)
     assert (pasted.domain, pasted.id, pasted.raw_label) == (SYNTHETIC, host.id, None)
@@ -219,7 +254,10 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
     assert (boxes.truncation[0], boxes.alpha[0]) == (np.float32(0.2), 1)
     about = paste(host, [candidate.turned(0.2)]).boxes
     assert about is not None
-    assert (about.truncation[0], about.alpha[0]) == (-1, -10)  # in another direction the camera saw nothing of it
+    assert (about.truncation[0], about.alpha[0]) == (
+        -1,
+        -10,
+    )  # in another direction the camera saw nothing of it
 
 
 @pytest.mark.parametrize("name", ["town", "hdl64e_lasers"])
@@ -230,7 +268,8 @@ def test_points_without_rings_get_those_of_their_lasers(name: str) -> None:
 
 
 def test_objects_of_another_sensor_get_rings_of_the_scans_lasers() -> None:
-    host, finer = Town(0, scans=1, motion=False)[0], Town(3, "os1_128", scans=1, motion=False)[0]
+    host = Town(0, scans=1, motion=False)[0]
+    finer = Town(3, "os1_128", scans=1, motion=False)[0]
     pasted = paste(host, objects_of(finer, 50).values())
     new = pasted[pasted.instance > host.instance.max()]
     assert len(new) > 100 and np.array_equal(new.ring, assign_beams(new).ring)
@@ -239,7 +278,8 @@ def test_objects_of_another_sensor_get_rings_of_the_scans_lasers() -> None:
 def test_objects_with_tracks_are_still_there_where_points_have_no_instance() -> None:
     """As in PandaSet and KITTI raw, whose boxes have the numbers of their tracks."""
     town = replace(Town(0, scans=1)[0], instance=None, raw_label=None)
-    before, after = objects_of(town), objects_of(merged(town, []))
+    before = objects_of(town)
+    after = objects_of(merged(town, []))
     assert len(before) >= 8 and before.keys() == after.keys()
     for number, item in before.items():
         assert np.array_equal(after[number].scan.points, item.scan.points)
@@ -248,8 +288,15 @@ def test_objects_with_tracks_are_still_there_where_points_have_no_instance() -> 
 
 @pytest.mark.slow
 def test_nothing_that_is_given_is_changed() -> None:
-    host, candidate = cast([car(20, 0)]), seen(car(8, 5))
-    for array in (host.points, *host.fields().values(), host.boxes.values, candidate.scan.points, candidate.box):
+    host = cast([car(20, 0)])
+    candidate = seen(car(8, 5))
+    for array in (
+        host.points,
+        *host.fields().values(),
+        host.boxes.values,
+        candidate.scan.points,
+        candidate.box,
+    ):
         array.setflags(write=False)
     assert len(paste(host, [candidate])) != len(host)
 

@@ -1,4 +1,5 @@
-"""Orders that are computed entry by entry: bijections of any size that follow from their keys alone."""
+"""Orders that are computed entry by entry: bijections of any size that follow from their keys
+alone."""
 
 from collections import Counter
 from itertools import pairwise
@@ -24,7 +25,8 @@ def test_an_order_is_a_bijection(size: int, seed: int, stream: int, number: int)
 @given(st.integers(1, 60), st.integers(1, 60), KEY)
 def test_entries_follow_from_themselves_alone(size: int, orders: int, seed: int) -> None:
     """One entry, or one of another order in the same call, is what it is among all."""
-    entries, numbers = np.tile(np.arange(size), orders), np.repeat(np.arange(orders), size)
+    entries = np.tile(np.arange(size), orders)
+    numbers = np.repeat(np.arange(orders), size)
     together = permute(entries, size, seed, 1, numbers).reshape(orders, size)
     for number in range(orders):
         assert together[number].tolist() == permute(np.arange(size), size, seed, 1, number).tolist()

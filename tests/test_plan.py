@@ -18,11 +18,14 @@ from lidar_synth.mixing.schedules import Schedule, share_of
 
 ENDLESS = PlannedSource(None, identity="model")
 OTHER = PlannedSource(None, identity="other")
-THREE, WEIGHED = PlannedSource(3), PlannedSource(3, 1.0)
+THREE = PlannedSource(3)
+WEIGHED = PlannedSource(3, 1.0)
 
 
 def mixture(real: int = 6, ratio: object = 0.25, **options: object) -> Mixture:
-    return Mixture((PlannedSource(real, identity="real"),), (ENDLESS,), make_schedule(ratio), **options)  # type: ignore[arg-type]
+    return Mixture(
+        (PlannedSource(real, identity="real"),), (ENDLESS,), make_schedule(ratio), **options
+    )  # type: ignore[arg-type]
 
 
 def rows(made: MixingPlan) -> list[str]:
@@ -37,7 +40,10 @@ def test_the_order_is_the_same_in_all_versions() -> None:
         ["r2", "r4", "r0", "s3", "r1", "r5", "r3", "s2"],
         ["r0", "r4", "r3", "r5", "r2", "s4", "r1", "s5"],
     ]
-    assert plan(mixture(), 2).hash == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
+    assert (
+        plan(mixture(), 2).hash
+        == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
+    )
     assert rows(plan(mixture(balanced=True), 0)) == ["s1", "r5", "r3", "r2", "s0", "r1", "r0", "r4"]
     two = Mixture(
         (PlannedSource(3), PlannedSource(2)),
@@ -47,14 +53,24 @@ def test_the_order_is_the_same_in_all_versions() -> None:
         epoch_size="replace",
     )
     made = plan(two, 1)
-    assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [(2, 2), (1, 1), (0, 2), (3, 1), (0, 1)]
+    assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [
+        (2, 2),
+        (1, 1),
+        (0, 2),
+        (3, 1),
+        (0, 1),
+    ]
 
 
 @settings(max_examples=60)
 @given(
-    real=st.integers(1, 40), hundredths=st.integers(0, 100), seed=st.integers(0, 2**64 - 1),
-    epoch=st.integers(0, 10**6), size=st.sampled_from(["add", "replace", 1, 7, 50]), balanced=st.booleans(),
-)  # fmt: skip
+    real=st.integers(1, 40),
+    hundredths=st.integers(0, 100),
+    seed=st.integers(0, 2**64 - 1),
+    epoch=st.integers(0, 10**6),
+    size=st.sampled_from(["add", "replace", 1, 7, 50]),
+    balanced=st.booleans(),
+)
 def test_counts_are_exact_over_epochs(
     real: int, hundredths: int, seed: int, epoch: int, size: str | int, balanced: bool
 ) -> None:
@@ -78,14 +94,24 @@ WEIGHTS = st.lists(st.sampled_from([None, 1, 9, 2.5, 100]), min_size=1, max_size
 
 @settings(max_examples=40)
 @given(
-    WEIGHTS, WEIGHTS, st.sampled_from([0.01, 0.1, 0.25, 1 / 3, 0.5, 0.8]), st.sampled_from(["replace", 3, 40]),
+    WEIGHTS,
+    WEIGHTS,
+    st.sampled_from([0.01, 0.1, 0.25, 1 / 3, 0.5, 0.8]),
+    st.sampled_from(["replace", 3, 40]),
     st.booleans(),
-)  # fmt: skip
+)
 def test_every_source_gets_its_share_over_epochs(
-    real: list[float | None], synthetic: list[float | None], ratio: float, size: str | int, balanced: bool
+    real: list[float | None],
+    synthetic: list[float | None],
+    ratio: float,
+    size: str | int,
+    balanced: bool,
 ) -> None:
     """After any number of epochs, to within one sample; what a plan gives is what is counted."""
-    parts = tuple(PlannedSource(3 + i, w) for i, w in enumerate(real)), tuple(PlannedSource(None, w) for w in synthetic)
+    parts = (
+        tuple(PlannedSource(3 + i, w) for i, w in enumerate(real)),
+        tuple(PlannedSource(None, w) for w in synthetic),
+    )
     mixed = Mixture(*parts, make_schedule(ratio), epoch_size=size, balanced=balanced)  # type: ignore[arg-type]
     given_so_far = np.zeros(len(real + synthetic), int)
     exact = Fraction(0)
@@ -94,7 +120,10 @@ def test_every_source_gets_its_share_over_epochs(
         assert np.bincount(made.source, minlength=len(given_so_far)).tolist() == list(made.counts)
         given_so_far += made.counts
         exact += exact_synthetic(mixed, epoch)
-        kinds = (mixed.real_weights, given_so_far[: len(real)]), (mixed.synthetic_weights, given_so_far[len(real) :])
+        kinds = (
+            (mixed.real_weights, given_so_far[: len(real)]),
+            (mixed.synthetic_weights, given_so_far[len(real) :]),
+        )
         assert abs(sum(kinds[1][1]) - exact) < 1
         for weights, counts in kinds:
             for weight, count in zip(weights, counts, strict=True):
@@ -102,7 +131,11 @@ def test_every_source_gets_its_share_over_epochs(
 
 
 def test_rare_sources_and_small_ratios_get_their_turn() -> None:
-    mixed = Mixture((PlannedSource(4),), (PlannedSource(None, 9.0), PlannedSource(None, 1.0)), make_schedule(0.5))
+    mixed = Mixture(
+        (PlannedSource(4),),
+        (PlannedSource(None, 9.0), PlannedSource(None, 1.0)),
+        make_schedule(0.5),
+    )
     assert running_counts(mixed, 50) == (200, 180, 20)
     turns = [quotas(mixture(4, 0.1, epoch_size="replace"), epoch) for epoch in range(5)]
     assert turns == [(3, 1), (4, 0), (3, 1), (4, 0), (4, 0)]
@@ -110,7 +143,9 @@ def test_rare_sources_and_small_ratios_get_their_turn() -> None:
 
 
 @pytest.mark.parametrize("size", ["add", "replace", 17])
-@pytest.mark.parametrize("ratio", [0.1, 0.25, 1 / 3, Linear(0, 0.6, 4), {0: 0.6, 5: 0.2}, lambda e: 0.5 / (e + 1)])
+@pytest.mark.parametrize(
+    "ratio", [0.1, 0.25, 1 / 3, Linear(0, 0.6, 4), {0: 0.6, 5: 0.2}, lambda e: 0.5 / (e + 1)]
+)
 def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
     """What wraps a dataset asks for its length once."""
     for real in range(1, 30):
@@ -124,23 +159,35 @@ def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
 
 
 @settings(max_examples=60)
-@given(st.lists(st.fractions("1/20", 50, max_denominator=20), min_size=1, max_size=9), st.integers(0, 10**12))
+@given(
+    st.lists(st.fractions("1/20", 50, max_denominator=20), min_size=1, max_size=9),
+    st.integers(0, 10**12),
+)
 def test_samples_are_dealt_one_by_one(weights: list[Fraction], first: int) -> None:
     counts = [np.array(split(weights, first + i)) for i in range(20)]
     sources, numbers = deal(weights, np.arange(first, first + 19))
     for i, (source, number) in enumerate(zip(sources, numbers, strict=True)):
         assert counts[i].sum() == first + i
         assert number == counts[i][source]
-        assert (counts[i + 1] - counts[i]).tolist() == [int(j == source) for j in range(len(weights))]
+        assert (counts[i + 1] - counts[i]).tolist() == [
+            int(j == source) for j in range(len(weights))
+        ]
     for i, count in enumerate(counts):
         for weight, own in zip(weights, count, strict=True):
-            assert abs(int(own) - (first + i) * weight / sum(weights)) < (1 if len(weights) <= 4 else 2)
+            assert abs(int(own) - (first + i) * weight / sum(weights)) < (
+                1 if len(weights) <= 4 else 2
+            )
 
 
 @settings(max_examples=30)
-@given(st.integers(1, 7), st.sampled_from([0.1, 0.25, 1 / 3, 0.5, 0.8]), st.sampled_from(["add", "replace", 23]))
+@given(
+    st.integers(1, 7),
+    st.sampled_from([0.1, 0.25, 1 / 3, 0.5, 0.8]),
+    st.sampled_from(["add", "replace", 23]),
+)
 def test_running_indices(real: int, ratio: float, size: str | int) -> None:
-    """Over the epochs, real scans are given equally often, up to one, and synthetic ones once each, in turn."""
+    """Over the epochs, real scans are given equally often, up to one, and synthetic ones once each,
+    in turn."""
     mixed = mixture(real, ratio, epoch_size=size)
     given_reals: Counter[int] = Counter(dict.fromkeys(range(real), 0))
     synthetic: list[int] = []
@@ -156,9 +203,13 @@ def test_running_indices(real: int, ratio: float, size: str | int) -> None:
 @pytest.mark.slow
 @settings(max_examples=40)
 @given(
-    st.integers(2, 5), st.integers(1, 30), st.sampled_from([0.1, 0.25, 1 / 3, 0.5]), WEIGHTS, st.booleans(),
+    st.integers(2, 5),
+    st.integers(1, 30),
+    st.sampled_from([0.1, 0.25, 1 / 3, 0.5]),
+    WEIGHTS,
+    st.booleans(),
     st.sampled_from([False, True]),
-)  # fmt: skip
+)
 def test_reuse_is_spread_over_epochs(
     reuse: int, real: int, ratio: float, weights: list[float | None], balanced: bool, rising: bool
 ) -> None:
@@ -169,7 +220,9 @@ def test_reuse_is_spread_over_epochs(
     counts: Counter[tuple[int, int]] = Counter()
     for epoch in range(4 * reuse):
         made = plan(mixed, epoch)
-        here = list(zip(made.source[made.domain].tolist(), made.index[made.domain].tolist(), strict=True))
+        here = list(
+            zip(made.source[made.domain].tolist(), made.index[made.domain].tolist(), strict=True)
+        )
         assert len(set(here)) == len(here)
         counts.update(here)
     assert max(counts.values(), default=0) <= reuse
@@ -198,16 +251,22 @@ def test_weights_are_kept() -> None:
     weighted = Mixture(*parts, make_schedule(0.4), epoch_size=50)
     assert running_counts(weighted, 4) == (30, 90, 20, 40, 20)
     unweighted = Mixture(
-        (PlannedSource(10), PlannedSource(30)), (ENDLESS, PlannedSource(5)), make_schedule(0.4), epoch_size=50
+        (PlannedSource(10), PlannedSource(30)),
+        (ENDLESS, PlannedSource(5)),
+        make_schedule(0.4),
+        epoch_size=50,
     )
     assert running_counts(unweighted, 4) == (30, 90, 40, 40)
 
 
 @settings(max_examples=60)
 @given(
-    st.integers(8, 200), st.fractions(0, 1, max_denominator=20), st.integers(1, 12), st.integers(0, 50),
+    st.integers(8, 200),
+    st.fractions(0, 1, max_denominator=20),
+    st.integers(1, 12),
+    st.integers(0, 50),
     st.sampled_from(["add", "replace", "number"]),
-)  # fmt: skip
+)
 def test_a_balanced_plan_is_exact_in_every_batch(
     total: int, share: Fraction, batch: int, epoch: int, size: str
 ) -> None:
@@ -222,14 +281,18 @@ def test_a_balanced_plan_is_exact_in_every_batch(
 
 @settings(max_examples=40)
 @given(st.lists(st.integers(1, 9), min_size=2, max_size=4), st.integers(1, 12), st.integers(0, 20))
-def test_a_balanced_plan_spreads_several_synthetic_sources(weights: list[int], batch: int, epoch: int) -> None:
+def test_a_balanced_plan_spreads_several_synthetic_sources(
+    weights: list[int], batch: int, epoch: int
+) -> None:
     sources = tuple(PlannedSource(None, float(w)) for w in weights)
     mixed = Mixture((PlannedSource(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
     source = plan(mixed, epoch).source
     for start in range(120 - batch + 1):
         for number, weight in enumerate(weights, 1):
             given_here = int((source[start : start + batch] == number).sum())
-            assert abs(given_here - Fraction(batch * weight, 2 * sum(weights))) < 2 + (len(weights) > 2)
+            assert abs(given_here - Fraction(batch * weight, 2 * sum(weights))) < 2 + (
+                len(weights) > 2
+            )
 
 
 def test_equal_synthetic_sources_alternate_in_every_batch() -> None:
@@ -250,13 +313,17 @@ SCHEDULES: list[tuple[object, list[float]]] = [
 @pytest.mark.parametrize(("ratio", "expected"), SCHEDULES)
 def test_schedules(ratio: object, expected: list[float]) -> None:
     schedule: Schedule = make_schedule(ratio)  # type: ignore[arg-type]
-    assert [float(share_of(schedule, epoch)) for epoch in range(5)] == pytest.approx(expected, abs=1e-6)
+    assert [float(share_of(schedule, epoch)) for epoch in range(5)] == pytest.approx(
+        expected, abs=1e-6
+    )
     mixed = mixture(7, ratio)
     before = (0, 0)
     for epoch in range(5):
         assert running_counts(mixed, epoch) == before
         before = tuple(np.add(before, quotas(mixed, epoch)).tolist())  # type: ignore[assignment]
-        assert before[1] == ceil(sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1)))
+        assert before[1] == ceil(
+            sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1))
+        )
 
 
 def test_a_late_epoch_costs_no_more_than_the_first() -> None:
@@ -281,9 +348,12 @@ def test_a_tenth_is_a_tenth() -> None:
 def test_the_hash_tells_plans_apart() -> None:
     one = plan(mixture(), 0).hash
     others = [
-        plan(mixture(), 1), plan(mixture(seed=1), 0), plan(mixture(ratio=0.5), 0), plan(mixture(balanced=True), 0),
+        plan(mixture(), 1),
+        plan(mixture(seed=1), 0),
+        plan(mixture(ratio=0.5), 0),
+        plan(mixture(balanced=True), 0),
         plan(Mixture((PlannedSource(6, identity="real"),), (OTHER,), make_schedule(0.25)), 0),
-    ]  # fmt: skip
+    ]
     assert one == plan(mixture(), 0).hash
     assert len({one, *(other.hash for other in others)}) == 6
 
@@ -315,30 +385,70 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: mixture(ratio=1.2), ConfigError, r"ratio 1.2 in epoch 0; expected the share .* from 0 to 1"),
+        (
+            lambda: mixture(ratio=1.2),
+            ConfigError,
+            r"ratio 1.2 in epoch 0; expected the share .* from 0 to 1",
+        ),
         (lambda: mixture(ratio=-0.1), ConfigError, r"ratio -0.1"),
         (lambda: mixture(ratio=float("nan")), ConfigError, r"ratio nan"),
         (lambda: mixture(ratio="a quarter"), ConfigError, r"ratio 'a quarter'"),
         (lambda: mixture(ratio=[0.5, 2]), ConfigError, r"ratio 2 in epoch 1"),
         (lambda: mixture(ratio=[]), ConfigError, r"a ratio from epoch 0 on"),
         (lambda: mixture(ratio={1: 0.5}), ConfigError, r"a ratio from epoch 0 on"),
-        (lambda: mixture(ratio=Linear(0, 0.5, 1)), ConfigError, r"over 1 epochs; expected at least 2"),
-        (lambda: plan(mixture(ratio=[0.5, 0.4]), 2), ConfigError, r"epoch 2 of a ratio schedule for 2 epochs.*longer"),
+        (
+            lambda: mixture(ratio=Linear(0, 0.5, 1)),
+            ConfigError,
+            r"over 1 epochs; expected at least 2",
+        ),
+        (
+            lambda: plan(mixture(ratio=[0.5, 0.4]), 2),
+            ConfigError,
+            r"epoch 2 of a ratio schedule for 2 epochs.*longer",
+        ),
         (lambda: plan(mixture(ratio=lambda e: e * 0.6), 2), ConfigError, r"ratio 1.2 in epoch 2"),
         (lambda: plan(mixture(), -1), ConfigError, r"epoch -1"),
-        (lambda: mixture(ratio=1.0), ConfigError, r"ratio 1 .*epoch_size='add'.*Use epoch_size='replace' or"),
-        (lambda: mixture(epoch_size="double"), ConfigError, r"epoch_size='double'; expected 'add', 'replace' or"),
+        (
+            lambda: mixture(ratio=1.0),
+            ConfigError,
+            r"ratio 1 .*epoch_size='add'.*Use epoch_size='replace' or",
+        ),
+        (
+            lambda: mixture(epoch_size="double"),
+            ConfigError,
+            r"epoch_size='double'; expected 'add', 'replace' or",
+        ),
         (lambda: mixture(epoch_size=0), ConfigError, r"epoch_size=0"),
         (lambda: mixture(reuse=0), ConfigError, r"reuse=0"),
         (lambda: mixture(seed=-1), ConfigError, r"seed -1"),
         (lambda: mixture(real=0), DataError, r"a source without scans"),
-        (lambda: Mixture((), (ENDLESS,), make_schedule(0.5), epoch_size=4), DataError, r"no real scans.*ratio=1"),
-        (lambda: Mixture((), (ENDLESS,), make_schedule(1.0)), DataError, r"no real scans.*set epoch_size"),
-        (lambda: Mixture((THREE,), (), make_schedule(0.5)), ConfigError, r"ratio 0.5 .* without a synthetic source"),
-        (lambda: Mixture((WEIGHED,), (ENDLESS,), make_schedule(0.5)), ConfigError, r"weights of real sources"),
-        (lambda: Mixture((THREE,), (PlannedSource(3, 0.0),), make_schedule(0.5)), ConfigError, r"weight 0.0"),
+        (
+            lambda: Mixture((), (ENDLESS,), make_schedule(0.5), epoch_size=4),
+            DataError,
+            r"no real scans.*ratio=1",
+        ),
+        (
+            lambda: Mixture((), (ENDLESS,), make_schedule(1.0)),
+            DataError,
+            r"no real scans.*set epoch_size",
+        ),
+        (
+            lambda: Mixture((THREE,), (), make_schedule(0.5)),
+            ConfigError,
+            r"ratio 0.5 .* without a synthetic source",
+        ),
+        (
+            lambda: Mixture((WEIGHED,), (ENDLESS,), make_schedule(0.5)),
+            ConfigError,
+            r"weights of real sources",
+        ),
+        (
+            lambda: Mixture((THREE,), (PlannedSource(3, 0.0),), make_schedule(0.5)),
+            ConfigError,
+            r"weight 0.0",
+        ),
     ],
-)  # fmt: skip
+)
 def test_invalid_plans_are_refused(make: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make()  # type: ignore[operator]
@@ -347,7 +457,9 @@ def test_invalid_plans_are_refused(make: object, error: type[Exception], message
 def test_synthetic_only_and_real_only() -> None:
     only = Mixture((), (ENDLESS,), make_schedule(1), epoch_size=5)
     assert sorted(plan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
-    assert plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
+    assert (
+        plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
+    )
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""Planes that neighbours agree on: a plane comes out exact whoever is asked, and another surface does not bend it."""
+"""Planes that neighbours agree on: a plane comes out exact whoever is asked, and another surface
+does not bend it."""
 
 import math
 
@@ -12,14 +13,18 @@ from lidar_synth.generate.models.town_codec.plane_fit import PlaneFit
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-PATCH, GRID = (2, 4), (8, 64)
-ROWS, COLUMNS = PATCH[0] * GRID[0], PATCH[1] * GRID[1]
+PATCH = (2, 4)
+GRID = (8, 64)
+ROWS = PATCH[0] * GRID[0]
+COLUMNS = PATCH[1] * GRID[1]
 ELEVATION = torch.linspace(0.05, -0.4, ROWS).tan()
 """Tangents, by row."""
 BELOW = GRID[0] // 2
-"""The first row of patches that are compared; above it they look near or over the horizon of the planes."""
+"""The first row of patches that are compared; above it they look near or over the horizon of the
+planes."""
 LEVEL = -ELEVATION.view(-1, PATCH[0]).mean(1)[BELOW - 2].item()
-"""Smallest tangent below the horizon of the patches that count in the compared ones, two rows above them."""
+"""Smallest tangent below the horizon of the patches that count in the compared ones, two rows above
+them."""
 
 
 def consensus(scale: float = 0.1, window: tuple[int, int] = (3, 9)) -> PlaneFit:
@@ -82,7 +87,8 @@ def test_what_is_far_behind_does_not_count() -> None:
 
 
 def test_columns_wrap() -> None:
-    net, x = consensus(), torch.randn(1, 5, *GRID)
+    net = consensus()
+    x = torch.randn(1, 5, *GRID)
     distance = torch.rand(1, 2, *GRID) + 2
     with torch.inference_mode():
         inverse, share = net(x, distance)

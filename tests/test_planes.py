@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from lidar_synth.generate.models.town_codec.planes import SLOPES, Planes, RangeMixture, laplace_noise
+from lidar_synth.generate.models.town_codec.planes import (
+    SLOPES,
+    Planes,
+    RangeMixture,
+    laplace_noise,
+)
 from lidar_synth.geometry.normalize import NORMALISATIONS
 
 PATCH = (2, 4)
@@ -13,7 +18,8 @@ PATCH = (2, 4)
 
 @pytest.mark.parametrize("name", NORMALISATIONS)
 def test_a_patch_on_a_wall_is_a_wall(name: str) -> None:
-    """A wall at x = 12 m: 1 / r = cos(azimuth) / 12; over four columns of a turn of 1024, linear to a millimetre."""
+    """A wall at x = 12 m: 1 / r = cos(azimuth) / 12; over four columns of a turn of 1024, linear to
+    a millimetre."""
     scale = NORMALISATIONS[name]
     net = Planes(1, PATCH, 1, scale)
     azimuth = 0.6 + torch.arange(8) * 2 * math.pi / 1024
@@ -22,8 +28,11 @@ def test_a_patch_on_a_wall_is_a_wall(name: str) -> None:
         net.planes.weight.zero_()
         for patch in range(2):  # what the network would have to say of each patch
             inverse = 1 / seen[4 * patch : 4 * patch + 4]
-            middle, slope = inverse.mean(), (inverse[3] - inverse[0]) / 3
-            net.planes.bias.copy_(torch.tensor([-math.log(middle), float(slope / middle) / SLOPES[1], 0.0, -3.0]))
+            middle = inverse.mean()
+            slope = (inverse[3] - inverse[0]) / 3
+            net.planes.bias.copy_(
+                torch.tensor([-math.log(middle), float(slope / middle) / SLOPES[1], 0.0, -3.0])
+            )
             values, spreads = net(torch.zeros(1, 1, 1, 1))
             assert values.shape == spreads.shape == (1, 1, *PATCH)
             metres = scale.decode(values)[0, 0]
@@ -64,4 +73,6 @@ def test_a_cell_sees_one_surface_never_what_lies_between() -> None:
 def test_draws_are_those_of_laplace() -> None:
     uniform_noise = (torch.arange(10_000) + 0.5) / 10_000
     drawn = laplace_noise(uniform_noise)
-    assert torch.allclose(torch.distributions.Laplace(0.0, 1.0).cdf(drawn), uniform_noise, atol=1e-6)
+    assert torch.allclose(
+        torch.distributions.Laplace(0.0, 1.0).cdf(drawn), uniform_noise, atol=1e-6
+    )

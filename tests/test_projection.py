@@ -1,4 +1,5 @@
-"""Projection and unprojection: inverses, invariants, and bit-identical results with numpy and torch."""
+"""Projection and unprojection: inverses, invariants, and bit-identical results with numpy and
+torch."""
 
 from dataclasses import replace
 
@@ -70,14 +71,19 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(sensor: Sensor) -> None:
     image = project(scan)
     back = unproject(image)
     kept = cells.point[cells.point >= 0]
-    before, after = scan.points[kept].astype(np.float64), back.points.astype(np.float64)
+    before = scan.points[kept].astype(np.float64)
+    after = back.points.astype(np.float64)
     if len(sensor.starts):  # elevations are those from the lasers
         for points in (before, after):
             points[:, 2] -= sensor.starts[np.nonzero(cells.point >= 0)[0]]
     elevation = [np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1)) for p in (before, after)]
     azimuth = [-np.arctan2(p[:, 1], p[:, 0]) for p in (before, after)]
     inside = (elevation[0] <= np.radians(sensor.up)) & (elevation[0] >= np.radians(sensor.down))
-    half = np.abs(np.diff(sensor.edges)).max() / 2 if sensor.elevations is None else np.abs(np.diff(sensor.edges)).max()
+    half = (
+        np.abs(np.diff(sensor.edges)).max() / 2
+        if sensor.elevations is None
+        else np.abs(np.diff(sensor.edges)).max()
+    )
     assert inside.sum() > 5000
     # Between two lasers that start at different heights, the edge of their rows does too.
     steps = np.abs(np.diff(sensor.starts)).max(initial=0) / np.linalg.norm(before, axis=1)
@@ -101,12 +107,15 @@ def test_projection_equals_a_brute_force_search_for_the_nearest_points(name: str
     assert np.array_equal(cells.point.reshape(-1), expected)
     image = project(scan)
     assert image.reflectance is not None
-    assert np.array_equal(image.reflectance[cells.point >= 0], scan.reflectance[cells.point[cells.point >= 0]])
+    assert np.array_equal(
+        image.reflectance[cells.point >= 0], scan.reflectance[cells.point[cells.point >= 0]]
+    )
     assert np.all(image.label[~image.mask] == IGNORE)
 
 
 def test_points_outside_the_range_limits_hide_no_other_point() -> None:
-    """A return nearer than the limit must not hide the one behind it (R2Flow masks after the projection)."""
+    """A return nearer than the limit must not hide the one behind it (R2Flow masks after the
+    projection)."""
     sensor = SMALL["linear"]
     points = np.array([[0.5, 0, 0], [20, 0, 0], [90, 0, 0], [0, 0, 0]], np.float32)
     image = project(Scan(points, np.arange(4, dtype=np.float32) / 4, sensor))
@@ -117,12 +126,15 @@ def test_points_outside_the_range_limits_hide_no_other_point() -> None:
 @pytest.mark.parametrize("kind", sorted(SMALL))
 def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
     """Both limits are inclusive in every projection; the next float32 beyond a limit is dropped."""
-    low, high = np.float32(2.5), np.float32(40)
+    low = np.float32(2.5)
+    high = np.float32(40)
     outside = np.nextafter(low, np.float32(0)), np.nextafter(high, np.float32(50))
     sensor = replace(SMALL[kind], range_min=float(low), range_max=float(high))
     points = np.zeros((4, 3), np.float32)
     for i, distance in enumerate((low, high, *outside)):
-        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]  # four different directions
+        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][
+            i
+        ]  # four different directions
     scan = Scan(points, np.zeros(4, np.float32), sensor)
     assert (locate(points, sensor).cell >= 0).tolist() == [True, True, False, False]
     assert locate(points, sensor).range[:2].tolist() == [low, high]
@@ -134,16 +146,24 @@ def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
 
 
 def test_columns_run_clockwise_from_the_rear_and_row_0_is_the_highest() -> None:
-    """Straight ahead is the edge between W/2-1 and W/2, columns run clockwise, the seam is behind, row 0 is up."""
+    """Straight ahead is the edge between W/2-1 and W/2, columns run clockwise, the seam is behind,
+    row 0 is up."""
     sensor = SMALL["linear"]
     points = np.array(
-        [[9, -0.1, 0], [9, 0.1, 0], [0.01, -9, 0], [-9, 0.1, 0], [-9, -0.1, 0], [9, -0.1, 1.5]], np.float32
+        [[9, -0.1, 0], [9, 0.1, 0], [0.01, -9, 0], [-9, 0.1, 0], [-9, -0.1, 0], [9, -0.1, 1.5]],
+        np.float32,
     )
     cell = locate(points, sensor).cell
     assert (cell % 32).tolist() == [16, 15, 23, 0, 31, 16]
     assert cell[5] // 32 < cell[0] // 32
-    for just_left_and_right_of_the_seam in ([-9, 1e-9, 0], [-9, 0, 0], [-9, -1e-9, 0]):  # +-pi in float32
-        assert locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
+    for just_left_and_right_of_the_seam in (
+        [-9, 1e-9, 0],
+        [-9, 0, 0],
+        [-9, -1e-9, 0],
+    ):  # +-pi in float32
+        assert (
+            locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
+        )
     straight_up_and_down = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
     assert (straight_up_and_down // 32).tolist() == [0, 7]
 
@@ -168,14 +188,19 @@ def devices() -> list[str]:
 
 @pytest.mark.parametrize("device", devices())
 @pytest.mark.parametrize("beams", [False, True])
-def test_batches_on_any_device_equal_single_projections(sensor: Sensor, device: str, beams: bool) -> None:
+def test_batches_on_any_device_equal_single_projections(
+    sensor: Sensor, device: str, beams: bool
+) -> None:
     sensor = sensor.by_beams() if beams else sensor
     scans = [random_scan(sensor, n, seed) for seed, n in enumerate((5000, 1, 3000))]
-    points = np.concatenate([np.c_[s.points, s.reflectance, s.label] for s in scans]).astype(np.float32)
+    points = np.concatenate([np.c_[s.points, s.reflectance, s.label] for s in scans]).astype(
+        np.float32
+    )
     offsets = torch.tensor(np.cumsum([0, *map(len, scans)]), device=device)
     batch = project_batch(torch.from_numpy(points).to(device), offsets, sensor)
     for b, scan in enumerate(scans):
-        image, cells = project(scan), locate(scan.points, sensor)
+        image = project(scan)
+        cells = locate(scan.points, sensor)
         assert np.array_equal(batch.range[b].cpu().numpy(), image.range)
         assert np.array_equal(batch.channels[b, 0].cpu().numpy(), image.reflectance)
         shown = batch.point[b].cpu().numpy()
@@ -185,14 +210,21 @@ def test_batches_on_any_device_equal_single_projections(sensor: Sensor, device: 
 
 
 def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
-    """A scan ring by ring, each counter-clockwise from straight ahead, and (N,) the row of each point."""
+    """A scan ring by ring, each counter-clockwise from straight ahead, and (N,) the row of each
+    point."""
     sensor = presets()["hdl64e_kitti360"]
-    image, points, rows = image_of(sensor.by_beams(), 5, share=share), [], []
-    image.range[image.mask] = np.maximum(image.range[image.mask], 5)  # rings of nearer points are ambiguous in crops
+    image = image_of(sensor.by_beams(), 5, share=share)
+    points = []
+    rows = []
+    image.range[image.mask] = np.maximum(
+        image.range[image.mask], 5
+    )  # rings of nearer points are ambiguous in crops
     for row in range(sensor.shape[0]):
         order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
         order = order[image.range[row, order] > 0]
-        points.append(image.range[row, order, None] * sensor.by_beams().ray_directions()[row, order])
+        points.append(
+            image.range[row, order, None] * sensor.by_beams().ray_directions()[row, order]
+        )
         rows.append(np.full(len(order), row))
     xyz = np.concatenate(points).astype(np.float32)
     return Scan(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), sensor), np.concatenate(rows)
@@ -202,7 +234,9 @@ def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> No
     full_scan, rows = scan_in_ring_order()
     for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
         image = unfold(full_scan[kept])
-        assert np.array_equal(image.range, unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range)
+        assert np.array_equal(
+            image.range, unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range
+        )
         assert np.array_equal(np.flatnonzero(image.mask.any(1)), np.unique(rows[kept]))
         assert np.array_equal(project(unproject(image)).mask, image.mask)
     with pytest.raises(DataError, match=r"rings found for the 64 lasers.*project\(\)"):
@@ -211,21 +245,26 @@ def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> No
 
 @given(first=st.integers(0, 359), width=st.integers(60, 360), share=st.sampled_from([0.3, 0.95]))
 @settings(max_examples=25)
-def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(first: int, width: int, share: float) -> None:
+def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(
+    first: int, width: int, share: float
+) -> None:
     full_scan, rows = scan_in_ring_order(share)
     azimuth = np.degrees(np.arctan2(full_scan.points[:, 1], full_scan.points[:, 0]))
     kept = (azimuth - first) % 360 < width
     known = replace(full_scan, ring=rows.astype(np.int16))[kept]
-    image, expected = unfold(full_scan[kept]), unfold(known)
+    image = unfold(full_scan[kept])
+    expected = unfold(known)
     assert np.array_equal(image.range, expected.range)
     assert np.array_equal(image.reflectance, expected.reflectance)
 
 
 @pytest.mark.parametrize("half", ["left", "right", "rear"])
 def test_rings_are_found_in_half_a_scan(half: str) -> None:
-    """R2Flow's rule looks for the step from the fourth quadrant to the first, which half a scan may not contain."""
+    """R2Flow's rule looks for the step from the fourth quadrant to the first, which half a scan may
+    not contain."""
     full_scan, rows = scan_in_ring_order()
-    x, y = full_scan.points[:, 0], full_scan.points[:, 1]
+    x = full_scan.points[:, 0]
+    y = full_scan.points[:, 1]
     kept = {"left": y > 0, "right": y < 0, "rear": x < 0}[half]
     assert np.array_equal(ring_numbers(full_scan.points[kept]), rows[kept])
 
@@ -286,21 +325,40 @@ def test_neighbours_vote_across_the_seam_but_not_beyond_the_cutoff() -> None:
     sensor = SMALL["linear"]
     image = np.full(sensor.shape, 30, np.float32)
     labels = np.full(sensor.shape, 12, np.uint8)
-    image[:, -4:], labels[:, -4:] = 20, 3
+    image[:, -4:] = 20
+    labels[:, -4:] = 3
     shown = unproject(RangeImage(image, sensor)).points
     rays = sensor.ray_directions()
-    behind_column_0 = rays[4, 0] * 50  # all neighbours differ by more than a metre: the nearest in range decides
-    at_the_seam = rays[4, -1] * 30.2  # hidden behind a cell at 20 m: its wall continues in columns 0 and 1
+    behind_column_0 = (
+        rays[4, 0] * 50
+    )  # all neighbours differ by more than a metre: the nearest in range decides
+    at_the_seam = (
+        rays[4, -1] * 30.2
+    )  # hidden behind a cell at 20 m: its wall continues in columns 0 and 1
     near_its_neighbours = rays[4, 10] * 30.9  # four of five votes are within the cutoff
-    points = np.concatenate([shown, [behind_column_0, at_the_seam, near_its_neighbours]]).astype(np.float32)
+    points = np.concatenate([shown, [behind_column_0, at_the_seam, near_its_neighbours]]).astype(
+        np.float32
+    )
     filled = fill_points(labels, image, locate(points, sensor))
     assert filled[-3:].tolist() == [12, 12, 12]
-    image[4, 10], image[3:6, 9], image[3:6, 11] = 28, 33, 33  # one near neighbour, many beyond the cutoff
+    image[4, 10], image[3:6, 9], image[3:6, 11] = (
+        28,
+        33,
+        33,
+    )  # one near neighbour, many beyond the cutoff
     labels[3:6, 9:12] = 7
-    image[2, 10], labels[2, 10] = 31, 5
+    image[2, 10] = 31
+    labels[2, 10] = 5
     points[-1] = rays[4, 10] * 31.1
     shown = unproject(RangeImage(image, sensor)).points
-    filled = fill_points(labels, image, locate(np.concatenate([shown, points[-1:]]), sensor), k=5, window=5, cutoff=0.5)
+    filled = fill_points(
+        labels,
+        image,
+        locate(np.concatenate([shown, points[-1:]]), sensor),
+        k=5,
+        window=5,
+        cutoff=0.5,
+    )
     assert filled[-1] == 5
 
 

@@ -1,4 +1,5 @@
-"""``prove`` end to end: on the town, on real scans where they are, resumed, within its minutes, and its page."""
+"""``prove`` end to end: on the town, on real scans where they are, resumed, within its minutes, and
+its page."""
 
 import json
 import re
@@ -29,7 +30,14 @@ from lidar_synth.lab.proof.pools import PoolTask, make_pool, refuse_leaks
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 SMALL = ProofSettings(
-    arms=("real", "exchange"), iterations=10, batch=2, seeds=1, columns=64, widths=(4, 8), tested=2, synthetic=3
+    arms=("real", "exchange"),
+    iterations=10,
+    batch=2,
+    seeds=1,
+    columns=64,
+    widths=(4, 8),
+    tested=2,
+    synthetic=3,
 )
 
 
@@ -41,7 +49,8 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Proof]:
-    """The output folder of a comparison on the town with every arm that needs no generator, and its result."""
+    """The output folder of a comparison on the town with every arm that needs no generator, and its
+    result."""
     out = tmp_path_factory.mktemp("proof")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pools, "SKIN_STREETS", 1)
@@ -55,7 +64,16 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
     values = result.values
     assert values["tested_places"] == ["00, place 1", "00, place 2"] and values["pairs"] == 2
     keys = [row["key"] for row in values["arms"]]
-    assert keys == ["real", "longer", "exchange", "town-50", "skin-50", "pretrain", "pretrain-skin", "paste"]
+    assert keys == [
+        "real",
+        "longer",
+        "exchange",
+        "town-50",
+        "skin-50",
+        "pretrain",
+        "pretrain-skin",
+        "paste",
+    ]
     for row in values["arms"]:
         assert 0 < row["miou"] < 100 and row["minutes"] > 0 and "5 labelled scans" in row["budget"]
         assert row["interval"] is None  # two places
@@ -70,7 +88,14 @@ def test_the_page_is_one_file_that_says_it_all(proof: tuple[Path, Proof]) -> Non
     out, result = proof
     text = (out / "index.html").read_text()
     assert not re.search(r"https?://|src=|@\w+@", text)
-    for words in ("What was not tested", "IoU by class", "Label budget", "Machine:", "Command:", "motorcyclist"):
+    for words in (
+        "What was not tested",
+        "IoU by class",
+        "Label budget",
+        "Machine:",
+        "Command:",
+        "motorcyclist",
+    ):
         assert words in text
     for row in result.values["arms"]:
         assert row["title"] in text
@@ -86,7 +111,9 @@ def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, Proof], brow
     browser.set_window_size(width, 900)
     browser.get((proof[0] / "index.html").as_uri())
     assert browser.get_log("browser") == []
-    assert browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+    assert browser.execute_script(
+        "return document.documentElement.scrollWidth <= window.innerWidth"
+    )
     circles = browser.find_elements("css selector", "svg circle")
     assert len(circles) >= 7 and all(c.size["width"] > 0 for c in circles)
 
@@ -110,7 +137,9 @@ def test_processes_give_the_results_of_one_process(tmp_path: Path) -> None:
     source = drives(2, 3)
     one = prove(source, tmp_path / "one", SMALL, jobs=1, progress=False)
     two = prove(source, tmp_path / "two", SMALL, jobs=2, progress=False)
-    assert [row["miou"] for row in one.values["arms"]] == [row["miou"] for row in two.values["arms"]]
+    assert [row["miou"] for row in one.values["arms"]] == [
+        row["miou"] for row in two.values["arms"]
+    ]
 
 
 def test_a_time_that_is_over_starts_no_training(tmp_path: Path) -> None:
@@ -119,7 +148,8 @@ def test_a_time_that_is_over_starts_no_training(tmp_path: Path) -> None:
 
 
 def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_path: Path) -> None:
-    """Iteration times are measured again by each call, so that the same minutes could give another number."""
+    """Iteration times are measured again by each call, so that the same minutes could give another
+    number."""
     source = drives(2, 3)
     asked = replace(SMALL, iterations=10**5)
     first = prove(source, tmp_path, asked, minutes=0.1, jobs=1, progress=False)
@@ -129,7 +159,8 @@ def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_
 
 
 def perfect(job: Job) -> np.ndarray:
-    """A trainer that knows the labels where its arm exchanges parts, and takes everything for road otherwise."""
+    """A trainer that knows the labels where its arm exchanges parts, and takes everything for road
+    otherwise."""
     label = np.concatenate([scan.label for scan in job.held_out if scan.label is not None])
     label = label[label != 255].astype(int)
     given = label if job.row.name == "exchange" else np.full_like(label, 8)
@@ -144,7 +175,9 @@ def test_a_trainer_of_ones_own_is_measured(tmp_path: Path) -> None:
     assert low <= exchange["difference"] <= high and low > 0
 
 
-def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(tmp_path: Path) -> None:
+def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(
+    tmp_path: Path,
+) -> None:
     saved = load_checkpoint(write_model(tmp_path / "plain.safetensors"))
     seen = frames_of("semantic_kitti", ["00/000000", "00/000001", "00/000002"])
     header = replace(saved.header, provenance={**saved.header.provenance, "seen": seen.to_list()})
@@ -156,14 +189,19 @@ def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(tm
 
 
 @pytest.mark.parametrize("condition", ["semantic", "layout"])
-def test_a_generator_with_a_condition_gets_those_of_the_towns_streets(condition: str, tmp_path: Path) -> None:
+def test_a_generator_with_a_condition_gets_those_of_the_towns_streets(
+    condition: str, tmp_path: Path
+) -> None:
     model = write_model(tmp_path / "model.safetensors", dropout=0.1, condition=condition)
 
     def scans_of(seed: int) -> list[Scan]:
-        task = PoolTask("generator", tmp_path / str(seed), SENSOR, None, 2, town_seed=seed, model=str(model))
+        task = PoolTask(
+            "generator", tmp_path / str(seed), SENSOR, None, 2, town_seed=seed, model=str(model)
+        )
         return pools.read_pool(make_pool(task))
 
-    one, other = scans_of(1), scans_of(2)
+    one = scans_of(1)
+    other = scans_of(2)
     assert len(one) == 2 and all(len(scan) for scan in one + other)
     assert not np.array_equal(one[0].points, other[0].points), "another street gives another scan"
     with pytest.raises(ConfigError, match="needs camera images"):
@@ -174,7 +212,9 @@ def test_a_generator_that_saw_the_tested_scans_in_another_folder_is_refused(tmp_
     scans = drives(3, 2)
     saved = load_checkpoint(write_model(tmp_path / "mine.safetensors"))
     provenance = {**saved.header.provenance, "seen": contents([content_of(scans[0])]).to_list()}
-    save_checkpoint(tmp_path / "mine.safetensors", replace(saved.header, provenance=provenance), saved.networks)
+    save_checkpoint(
+        tmp_path / "mine.safetensors", replace(saved.header, provenance=provenance), saved.networks
+    )
     settings = replace(SMALL, arms=("generator",), model=str(tmp_path / "mine.safetensors"))
     with pytest.raises(ConfigError, match="trained on places that are tested: content"):
         prove(scans, tmp_path / "out", settings, jobs=1, progress=False)
@@ -199,9 +239,26 @@ def test_the_shipped_generator_is_not_measured_on_its_own_town(town: Path, tmp_p
 
 def test_the_command_plans_and_proves(town: Path, tmp_path: Path) -> None:
     runner = CliRunner()
-    arms = ["--arm", "exchange", "--iterations", "10", "--batch", "2", "--seeds", "1", "--jobs", "1"]
-    planned = runner.invoke(app, ["prove", str(town), *arms, "--dry-run", "--out", str(tmp_path / "none")])
-    assert planned.exit_code == 0 and "4 trainings; about" in planned.output and not (tmp_path / "none").exists()
+    arms = [
+        "--arm",
+        "exchange",
+        "--iterations",
+        "10",
+        "--batch",
+        "2",
+        "--seeds",
+        "1",
+        "--jobs",
+        "1",
+    ]
+    planned = runner.invoke(
+        app, ["prove", str(town), *arms, "--dry-run", "--out", str(tmp_path / "none")]
+    )
+    assert (
+        planned.exit_code == 0
+        and "4 trainings; about" in planned.output
+        and not (tmp_path / "none").exists()
+    )
     done = runner.invoke(app, ["prove", str(town), *arms, "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
     assert "| real scans only |" in done.output and (tmp_path / "index.html").is_file()
@@ -223,7 +280,13 @@ def pandaset_frame(path: Path) -> Scan:
     """A frame of PandaSet in the frame of its sensor, with PandaSet's own class ids as labels."""
     with np.load(path) as file:
         reflectance = file["reflectance"].astype(np.float32) / 255
-        return Scan(file["points"], reflectance, load_sensor("pandar64"), label=file["label"], id=f"002/{path.stem}")
+        return Scan(
+            file["points"],
+            reflectance,
+            load_sensor("pandar64"),
+            label=file["label"],
+            id=f"002/{path.stem}",
+        )
 
 
 def test_labels_of_pandaset_need_its_table(labelled_scans: Path, tmp_path: Path) -> None:
@@ -232,6 +295,10 @@ def test_labels_of_pandaset_need_its_table(labelled_scans: Path, tmp_path: Path)
     settings = replace(SMALL, places="stretch:2", arms=("real",), classes="pandaset")
     with pytest.raises(DataError, match=r"with labels \[.*of another table"):
         prove(source, tmp_path, settings, jobs=1, progress=False)
-    mapped = [replace(scan, label=PANDASET.decode(scan.label)) for scan in source if scan.label is not None]
+    mapped = [
+        replace(scan, label=PANDASET.decode(scan.label))
+        for scan in source
+        if scan.label is not None
+    ]
     values = prove(mapped, tmp_path, settings, jobs=1, progress=False).values
     assert len(values["tested_places"]) == 2 and "vehicle" in values["classes"]

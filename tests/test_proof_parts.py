@@ -1,4 +1,5 @@
-"""The parts of ``prove``: places, arms, scores and intervals, the plan, a trainer as a command, the page."""
+"""The parts of ``prove``: places, arms, scores and intervals, the plan, a trainer as a command, the
+page."""
 
 import shlex
 import sys
@@ -62,7 +63,11 @@ SOURCES = {
 def test_a_split_has_places_without_a_scan_in_common(by: str) -> None:
     places = find_places(SOURCES[by], by)
     members = [i for part in places.values() for i in part]
-    assert len(places) == 3 and len(set(members)) == len(members) and set(members) <= set(range(len(SOURCES[by])))
+    assert (
+        len(places) == 3
+        and len(set(members)) == len(members)
+        and set(members) <= set(range(len(SOURCES[by])))
+    )
 
 
 def test_places_by_pose_are_apart_from_each_other() -> None:
@@ -86,7 +91,9 @@ def test_auto_takes_drives_and_else_poses() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, None])
-def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(count: int | None) -> None:
+def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
+    count: int | None,
+) -> None:
     places = find_places(drives(4, 5))
     picked = choose(places, "01", count, np.random.default_rng(0))
     per_place = Counter(next(name for name, part in places.items() if i in part) for i in picked)
@@ -110,13 +117,20 @@ def test_an_arm_trains_for_its_iterations_with_its_shares(name: str, tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["pretrain", "paste"])
-def test_the_reference_trainer_learns_and_repeats_itself(name: str, tmp_path: Path, one_thread: None) -> None:
+def test_the_reference_trainer_learns_and_repeats_itself(
+    name: str, tmp_path: Path, one_thread: None
+) -> None:
     task = job(name, tmp_path, iterations=20)
-    first, second = reference(task), reference(task)
+    first = reference(task)
+    second = reference(task)
     assert np.array_equal(first.table, second.table)
     assert first.losses[-1] < first.losses[0]
     steps = [step for step, _ in first.curve]
-    assert steps == sorted(set(steps)) and steps[-1] == 20 and np.array_equal(first.curve[-1][1], first.table)
+    assert (
+        steps == sorted(set(steps))
+        and steps[-1] == 20
+        and np.array_equal(first.curve[-1][1], first.table)
+    )
 
 
 def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) -> None:
@@ -128,7 +142,9 @@ def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) 
     assert np.array_equal(reference(whole).table, shared.table)
     assert [step for step, _ in shared.curve] == [15, 18, 20]
     pretrain(other, tmp_path / "other.safetensors")  # the labelled scans do not matter
-    assert equal(load_file(tmp_path / "other.safetensors"), load_file(tmp_path / "start.safetensors"))
+    assert equal(
+        load_file(tmp_path / "other.safetensors"), load_file(tmp_path / "start.safetensors")
+    )
 
 
 def equal(some: dict[str, torch.Tensor], others: dict[str, torch.Tensor]) -> bool:
@@ -152,7 +168,8 @@ def test_groups_name_classes_once(classes: str) -> None:
 def test_iou_of_single_classes_is_that_of_the_table() -> None:
     table = np.random.default_rng(0).integers(0, 50, (19, 19))
     table[3] = 0
-    ours, theirs = group_ious(table, GROUPS["semantic_kitti"]), class_ious(table)
+    ours = group_ious(table, GROUPS["semantic_kitti"])
+    theirs = class_ious(table)
     assert np.isnan(ours[3]) and np.allclose(np.delete(ours, 3), np.delete(theirs, 3))
 
 
@@ -171,9 +188,15 @@ def test_the_quantile_of_t_is_that_of_scipy(degrees: int) -> None:
     assert t_quantile(0.975, degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-3)
 
 
-@pytest.mark.parametrize(("places", "seeds", "between", "within"), [(6, 1, 1, 1), (7, 2, 1, 1), (7, 2, 1, 0.1)])
-def test_intervals_hold_the_truth_as_often_as_they_say(places: int, seeds: int, between: float, within: float) -> None:
-    rng, held, count = np.random.default_rng(0), 0, 400
+@pytest.mark.parametrize(
+    ("places", "seeds", "between", "within"), [(6, 1, 1, 1), (7, 2, 1, 1), (7, 2, 1, 0.1)]
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(
+    places: int, seeds: int, between: float, within: float
+) -> None:
+    rng = np.random.default_rng(0)
+    held = 0
+    count = 400
     for trial in range(count):
         d = 2 + rng.normal(0, between, (places, 1)) + rng.normal(0, within, (places, seeds))
         low, high = interval(d, seed=trial, draws=800)  # type: ignore[misc]
@@ -193,15 +216,23 @@ def test_ticks_are_round_and_few() -> None:
     assert ticks(-3.2, 7.9) == [-2.0, 0.0, 2.0, 4.0, 6.0] and 3 <= len(ticks(0, 533)) <= 8
 
 
-SMALL = ProofSettings(arms=("real", "town"), iterations=10, batch=2, seeds=2, columns=64, widths=(4, 8), tested=2)
+SMALL = ProofSettings(
+    arms=("real", "town"), iterations=10, batch=2, seeds=2, columns=64, widths=(4, 8), tested=2
+)
 
 
 def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
     source = drives(4, 5)
     plan, scans = make_plan(source, SMALL, None, 1)
-    assert len(plan.pairs) == plan.wanted == 8 and [row.key for row in plan.rows] == ["real", "town-50"]
+    assert len(plan.pairs) == plan.wanted == 8 and [row.key for row in plan.rows] == [
+        "real",
+        "town-50",
+    ]
     for (place, _), indices in plan.labelled.items():
-        assert not set(indices) & set(plan.places[place]) and {*indices, *plan.tested[place]} <= set(scans)
+        assert not set(indices) & set(plan.places[place]) and {
+            *indices,
+            *plan.tested[place],
+        } <= set(scans)
         assert not set(plan.skin_scans(place)) & set(plan.places[place])
     assert all(scan.sensor.columns == 64 for scan in scans.values())
 
@@ -231,23 +262,41 @@ def scans_with(**changes: object) -> Scans:
 
 BAD = {
     "one place": (Scans([f"00/{i}" for i in range(6)]), {}, "6 scans of one place"),
-    "one cluster of poses": (Scans([f"00/{i}" for i in range(4)], [0, 1, 2, 3]), {}, "--places stretch"),
+    "one cluster of poses": (
+        Scans([f"00/{i}" for i in range(4)], [0, 1, 2, 3]),
+        {},
+        "--places stretch",
+    ),
     "no poses": (drives(), {"places": "pose"}, "without a pose"),
-    "an unknown split": (drives(), {"places": "street"}, "places by 'street'; expected one of auto, drive"),
+    "an unknown split": (
+        drives(),
+        {"places": "street"},
+        "places by 'street'; expected one of auto, drive",
+    ),
     "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
     "fewer scans than a batch": (drives(2, 3), {"batch": 4}, "3 labelled scans for batches of 4"),
     "fewer labelled than a batch": (drives(), {"labelled": 1}, "1 labelled scans for batches of 2"),
-    "more labelled than there are": (drives(), {"labelled": 9}, "9 labelled scans; expected 1 to 8"),
+    "more labelled than there are": (
+        drives(),
+        {"labelled": 9},
+        "9 labelled scans; expected 1 to 8",
+    ),
     "an unknown class": (drives(), {"only": ("tram",)}, "class 'tram' of semantic_kitti"),
-    "a class that is nowhere": (drives(), {"only": ("road", "bicyclist")}, "class bicyclist, which no label"),
+    "a class that is nowhere": (
+        drives(),
+        {"only": ("road", "bicyclist")},
+        "class bicyclist, which no label",
+    ),
     "unknown pooled classes": (drives(), {"classes": "waymo"}, "classes 'waymo'; expected one of"),
     "an unknown arm": (drives(), {"arms": ("real", "magic")}, "arm 'magic'; expected some of real"),
     "a share of everything": (drives(), {"ratios": (1.0,)}, "ratio 1.0"),
     "no labels": (scans_with(label=None, raw_label=None), {}, "without labels"),
     "labels of another table": (
-        scans_with(label=np.full(len(drives()[5]), 41, np.uint8), raw_label=None), {}, r"with labels \[41\]",
+        scans_with(label=np.full(len(drives()[5]), 41, np.uint8), raw_label=None),
+        {},
+        r"with labels \[41\]",
     ),
-}  # fmt: skip
+}
 """{what is wrong: source, settings, message}."""
 
 
@@ -297,18 +346,25 @@ def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) 
     table = CommandTrainer(f"{sys.executable} {tmp_path / 'mine.py'} {{job}}")(task)
     label = np.concatenate([scan.label for scan in task.held_out])
     road = TRAIN_ID["road"]
-    assert table.sum() == (label != 255).sum() == table[:, road].sum() and table[road, road] == (label == road).sum()
+    assert (
+        table.sum() == (label != 255).sum() == table[:, road].sum()
+        and table[road, road] == (label == road).sum()
+    )
 
 
 def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
     task = job("paste", tmp_path)
     [stage] = describe(task)["stages"]
     assert stage["label_options"]["count"] == {"Pedestrian": 3}
-    assert ObjectBank.load(stage["label_options"]["objects"]).boxes.names == task.objects.boxes.names
+    assert (
+        ObjectBank.load(stage["label_options"]["objects"]).boxes.names == task.objects.boxes.names
+    )
 
 
 @pytest.mark.parametrize("classes", GROUPS)
-def test_returns_without_a_prediction_are_errors_in_every_pool(classes: str, tmp_path: Path) -> None:
+def test_returns_without_a_prediction_are_errors_in_every_pool(
+    classes: str, tmp_path: Path
+) -> None:
     program = (
         "import sys, yaml, pathlib, numpy as np; job = yaml.safe_load(open(sys.argv[1])); "
         "out = pathlib.Path(job['predictions']); out.mkdir(); "
@@ -324,13 +380,20 @@ def test_returns_without_a_prediction_are_errors_in_every_pool(classes: str, tmp
 
 
 FAILING = {
-    "a failure": ("import sys; print('out of memory', file=sys.stderr); sys.exit(7)", ProcessError, "status 7: out of"),
+    "a failure": (
+        "import sys; print('out of memory', file=sys.stderr); sys.exit(7)",
+        ProcessError,
+        "status 7: out of",
+    ),
     "no predictions": ("", FileError, "000000.label cannot be read"),
     "one prediction": (
-        "import sys, yaml, pathlib; p = pathlib.Path(yaml.safe_load(open(sys.argv[1]))['predictions']); p.mkdir(); "
-        "(p / '000000.label').write_bytes(bytes(4))", DataError, "with 1 predictions; expected",
+        "import sys, yaml, pathlib; p = "
+        "pathlib.Path(yaml.safe_load(open(sys.argv[1]))['predictions']); p.mkdir(); "
+        "(p / '000000.label').write_bytes(bytes(4))",
+        DataError,
+        "with 1 predictions; expected",
     ),
-}  # fmt: skip
+}
 """{what a command does: its program, the error, its message}."""
 
 
@@ -353,4 +416,6 @@ def test_a_job_is_plain_values(name: str, tmp_path: Path) -> None:
     task = job(name, tmp_path, ratio=0.25 if ARMS[name].swept else None)
     values = describe(task)
     assert yaml.safe_load(yaml.safe_dump(values)) == values
-    assert [stage["iterations"] for stage in values["stages"]] == [count for _, count in task.stages()]
+    assert [stage["iterations"] for stage in values["stages"]] == [
+        count for _, count in task.stages()
+    ]

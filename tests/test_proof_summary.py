@@ -1,4 +1,5 @@
-"""The summary of ``prove``: places without the scored classes, and the arm that is chosen on the other places."""
+"""The summary of ``prove``: places without the scored classes, and the arm that is chosen on the
+other places."""
 
 import json
 
@@ -16,7 +17,8 @@ from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.summary import summarise
 from lidar_synth.lab.proof.trial import Outcome
 
-PERSON, ROAD = TRAIN_ID["person"], TRAIN_ID["road"]
+PERSON = TRAIN_ID["person"]
+ROAD = TRAIN_ID["road"]
 FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600}
 """Persons of 1,000 that each arm finds."""
 
@@ -34,11 +36,28 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
     names = [f"p{i}" for i in range(7)]
     pairs = [(name, 0) for name in names]
     plan = ProofPlan(
-        ProofSettings(only=("person",)), {n: [i] for i, n in enumerate(names)}, tuple(names),
-        load_sensor("hdl64e_kitti"), None, arms, groups_of("semantic_kitti", ("person",)), [], pairs, 7,
-        {pair: [0] for pair in pairs}, {n: [i] for i, n in enumerate(names)}, Recordings(), False, 0.1, 1.0, 1,
-    )  # fmt: skip
-    found = {(n, 0): {arm: outcome(FOUND[arm.name], 0 if n == "p6" else 1000) for arm in arms} for n in names}
+        ProofSettings(only=("person",)),
+        {n: [i] for i, n in enumerate(names)},
+        tuple(names),
+        load_sensor("hdl64e_kitti"),
+        None,
+        arms,
+        groups_of("semantic_kitti", ("person",)),
+        [],
+        pairs,
+        7,
+        {pair: [0] for pair in pairs},
+        {n: [i] for i, n in enumerate(names)},
+        Recordings(),
+        False,
+        0.1,
+        1.0,
+        1,
+    )
+    found = {
+        (n, 0): {arm: outcome(FOUND[arm.name], 0 if n == "p6" else 1000) for arm in arms}
+        for n in names
+    }
     values = summarise(plan, found, {}, "reference").values
     by_key = {arm["key"]: arm for arm in values["arms"]}
     assert by_key["pretrain"]["better_in"] == "6 of 6 places"

@@ -26,8 +26,21 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import sha256
 
 SOURCE = Path(reader.__file__)
-STANDARD = {"bisect", "collections", "contextlib", "hashlib", "json", "multiprocessing", "os", "pathlib", "re",
-            "typing", "zipfile", "zlib", "__future__"}  # fmt: skip
+STANDARD = {
+    "bisect",
+    "collections",
+    "contextlib",
+    "hashlib",
+    "json",
+    "multiprocessing",
+    "os",
+    "pathlib",
+    "re",
+    "typing",
+    "zipfile",
+    "zlib",
+    "__future__",
+}
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +51,11 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_copy_alone_reads_every_bank_and_plan_bit_for_bit(cases: Path, tmp_path: Path) -> None:
-    """``tools/test_reader_versions.py`` runs the same with old versions of Python, numpy and h5py."""
-    assert len(list((cases / "banks").iterdir())) == len(BANKS) and len(list((cases / "plans").iterdir())) == len(
-        MIXTURES
-    )
+    """``tools/test_reader_versions.py`` runs the same with old versions of Python, numpy and
+    h5py."""
+    assert len(list((cases / "banks").iterdir())) == len(BANKS) and len(
+        list((cases / "plans").iterdir())
+    ) == len(MIXTURES)
     shutil.copy(SOURCE, tmp_path / "reader.py")
     command = [sys.executable, Path(__file__).parent / "read_alone.py", tmp_path, cases]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -51,7 +65,12 @@ def test_a_copy_alone_reads_every_bank_and_plan_bit_for_bit(cases: Path, tmp_pat
 
 def test_the_file_is_of_python_3_8_and_imports_numpy_and_h5py_alone() -> None:
     tree = ast.parse(SOURCE.read_text(), feature_version=(3, 8))
-    names = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    names = [
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    ]
     names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     assert {name.split(".")[0] for name in names} - STANDARD == {"numpy", "h5py"}
 
@@ -116,7 +135,9 @@ INVALID: dict[str, tuple[Callable[[h5py.File, Path], None], str]] = {
 @pytest.mark.parametrize("what", INVALID)
 def test_a_shard_with_other_values_is_refused(tmp_path: Path, what: str) -> None:
     change, message = INVALID[what]
-    [good], [bad] = (write_bank(tmp_path / name, [some_image(0), some_image(1)]) for name in ("good", "bad"))
+    [good], [bad] = (
+        write_bank(tmp_path / name, [some_image(0), some_image(1)]) for name in ("good", "bad")
+    )
     with h5py.File(bad, "r+", libver=("v110", "v110")) as file:
         change(file, good)
     with pytest.raises(ReaderError, match=message):
@@ -142,7 +163,9 @@ def values(scan: Any) -> list[Any]:
 @pytest.mark.slow
 def test_no_flipped_bit_gives_another_scan(tmp_path: Path) -> None:
     [path] = write_bank(tmp_path, [some_image(0), some_image(1)], fields=("reflectance", "label"))
-    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
     expected = [values(Bank(tmp_path)[number]) for number in range(2)]
     for place in rng.integers(0, len(content), 200).tolist():
         damaged = bytearray(content)
@@ -161,12 +184,15 @@ def test_no_flipped_bit_gives_another_scan(tmp_path: Path) -> None:
 def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i) for i in range(3)])
     text = (tmp_path / "index.json").read_text()
-    values = {key: value for key, value in json.loads(text).items() if key not in ("checksum", "files")}
+    values = {
+        key: value for key, value in json.loads(text).items() if key not in ("checksum", "files")
+    }
     values["shards"][0]["dropped"] = [1]
     values["scans"] -= 1
     (tmp_path / "index.json").write_text(json.dumps({**values, "checksum": _sum(values)}))
     assert len(Bank(tmp_path)) == 2
-    refused, tried = 0, [(path, wrong) for path in places(values) for wrong in WRONG]
+    refused = 0
+    tried = [(path, wrong) for path in places(values) for wrong in WRONG]
     for path, wrong in tried[::3]:
         edited = with_value(values, path, wrong)
         (tmp_path / "index.json").write_text(json.dumps({**edited, "checksum": _sum(edited)}))
@@ -189,7 +215,9 @@ def newer(root: Path) -> None:
 
 
 def edited(root: Path) -> None:
-    (root / "index.json").write_text((root / "index.json").read_text().replace('"seed": 5', '"seed": 4'))
+    (root / "index.json").write_text(
+        (root / "index.json").read_text().replace('"seed": 5', '"seed": 4')
+    )
 
 
 def blosc2(root: Path) -> None:
@@ -197,14 +225,26 @@ def blosc2(root: Path) -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no index": (remove_index, "index.json cannot be read .*No such file.*the folder of a finished bank"),
-    "no shard": (lambda root: next(root.glob("*.h5")).unlink(), "is 0 bytes long, not .*copy it again"),
-    "truncated": (lambda root: next(root.glob("*.h5")).write_bytes(b"1"), "is 1 bytes long, not .*copy it again"),
+    "no index": (
+        remove_index,
+        "index.json cannot be read .*No such file.*the folder of a finished bank",
+    ),
+    "no shard": (
+        lambda root: next(root.glob("*.h5")).unlink(),
+        "is 0 bytes long, not .*copy it again",
+    ),
+    "truncated": (
+        lambda root: next(root.glob("*.h5")).write_bytes(b"1"),
+        "is 1 bytes long, not .*copy it again",
+    ),
     "newer": (newer, "format .lidar-synth-bank/3., expected one of"),
     "blosc2": (blosc2, "compressed by 'blosc2'; bake it with --compression gzip"),
     "edited": (edited, "does not match its checksum"),
     "no JSON": (lambda root: (root / "index.json").write_text("["), "index.json cannot be read"),
-    "nested": (lambda root: (root / "index.json").write_text("[" * 10**6), "index.json cannot be read"),
+    "nested": (
+        lambda root: (root / "index.json").write_text("[" * 10**6),
+        "index.json cannot be read",
+    ),
 }
 
 
@@ -220,7 +260,9 @@ def test_a_bank_that_cannot_be_read_is_refused(tmp_path: Path, what: str) -> Non
 def planned(cases: Path, name: str, real: Any = None, **options: Any) -> MixedEpochs:
     bank, count, _ = MIXTURES[name]
     given = range(count) if real is None else real
-    return MixedEpochs(cases / "plans" / name / "plan.npz", given, Bank(cases / "banks" / bank / "bank"), **options)
+    return MixedEpochs(
+        cases / "plans" / name / "plan.npz", given, Bank(cases / "banks" / bank / "bank"), **options
+    )
 
 
 def number_of(sample: Any) -> str:
@@ -235,7 +277,9 @@ def plain(samples: list[Any]) -> list[str]:
 @pytest.mark.parametrize("workers", [0, 2])
 def test_workers_follow_the_epoch(cases: Path, workers: int) -> None:
     train = planned(cases, "generated")
-    loader = DataLoader(train, 4, collate_fn=plain, num_workers=workers, persistent_workers=workers > 0)  # type: ignore[arg-type]
+    loader = DataLoader(
+        train, 4, collate_fn=plain, num_workers=workers, persistent_workers=workers > 0
+    )  # type: ignore[arg-type]
     orders = []
     for epoch in (0, 1, 2, 0):
         train.set_epoch(epoch)
@@ -245,7 +289,12 @@ def test_workers_follow_the_epoch(cases: Path, workers: int) -> None:
 
 
 def test_real_samples_are_the_trainers_own_and_scans_get_its_form(cases: Path) -> None:
-    train = planned(cases, "generated", real=lambda number: ("real", number), to_sample=lambda scan: ("made", scan.id))
+    train = planned(
+        cases,
+        "generated",
+        real=lambda number: ("real", number),
+        to_sample=lambda scan: ("made", scan.id),
+    )
     kinds = [train[i][0] for i in range(len(train))]
     assert [kind == "made" for kind in kinds] == [bool(train.domain(i)) for i in range(len(train))]
     with pytest.raises(IndexError):
@@ -258,18 +307,42 @@ def replace_member(path: Path, name: str, value: Any) -> None:
 
 
 WRONG_PLANS: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "missing": (Path.unlink, "plan.npz cannot be read .*python -m lidar_synth.integrations.plan makes a plan"),
+    "missing": (
+        Path.unlink,
+        "plan.npz cannot be read .*python -m lidar_synth.integrations.plan makes a plan",
+    ),
     "no archive": (lambda path: path.write_text("x"), "plan.npz cannot be read"),
     "another file": (lambda path: np.savez(path, a=1), "plan.npz cannot be read"),
     "objects": (lambda path: np.savez(path, settings=np.array([{}])), "plan.npz cannot be read"),
-    "newer": (lambda path: rewrite(path, format="lidar-synth-epochs/2"), "format 'lidar-synth-epochs/2', expected"),
+    "newer": (
+        lambda path: rewrite(path, format="lidar-synth-epochs/2"),
+        "format 'lidar-synth-epochs/2', expected",
+    ),
     "another bank": (lambda path: rewrite(path, bank="x"), "made with another bank than"),
-    "other real samples": (lambda path: rewrite(path, real=12), "for 12 real samples, but there are 11"),
-    "too few scans": (lambda path: replace_member(path, "epoch-0", np.full((15, 2), (1, 5))), "do not exist"),
-    "a negative number": (lambda path: replace_member(path, "epoch-0", np.full((15, 2), (0, -1))), "do not exist"),
-    "another source": (lambda path: replace_member(path, "epoch-0", np.full((15, 2), (2, 0))), "epoch 0 cannot be"),
-    "another length": (lambda path: replace_member(path, "epoch-0", np.zeros((3, 2), np.int64)), "epoch 0 cannot be"),
-    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-200]), "plan.npz cannot be read"),
+    "other real samples": (
+        lambda path: rewrite(path, real=12),
+        "for 12 real samples, but there are 11",
+    ),
+    "too few scans": (
+        lambda path: replace_member(path, "epoch-0", np.full((15, 2), (1, 5))),
+        "do not exist",
+    ),
+    "a negative number": (
+        lambda path: replace_member(path, "epoch-0", np.full((15, 2), (0, -1))),
+        "do not exist",
+    ),
+    "another source": (
+        lambda path: replace_member(path, "epoch-0", np.full((15, 2), (2, 0))),
+        "epoch 0 cannot be",
+    ),
+    "another length": (
+        lambda path: replace_member(path, "epoch-0", np.zeros((3, 2), np.int64)),
+        "epoch 0 cannot be",
+    ),
+    "truncated": (
+        lambda path: path.write_bytes(path.read_bytes()[:-200]),
+        "plan.npz cannot be read",
+    ),
 }
 
 
@@ -292,7 +365,9 @@ def test_a_plan_that_does_not_fit_is_refused(cases: Path, tmp_path: Path, what: 
 
 
 def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
-    with pytest.raises(ReaderError, match="epoch 3 of a plan of 3 epochs; make it again with more --epochs"):
+    with pytest.raises(
+        ReaderError, match="epoch 3 of a plan of 3 epochs; make it again with more --epochs"
+    ):
         planned(cases, "generated").set_epoch(3)
 
 
@@ -312,14 +387,24 @@ def test_mixtures_that_need_the_package_in_the_trainer_are_refused(
 ) -> None:
     bank = str(cases / "banks" / "all fields" / "bank")
     with pytest.raises(ConfigError, match=message):
-        write_plan({"synthetic": bank, "ratio": 0.5, **settings}, tmp_path / "plan.npz", real=4, epochs=1)
+        write_plan(
+            {"synthetic": bank, "ratio": 0.5, **settings}, tmp_path / "plan.npz", real=4, epochs=1
+        )
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("labels", ["boxes", "generated", "condition"])
-def test_a_plan_of_boxes_says_that_the_reader_keeps_unboxed_objects(cases: Path, tmp_path: Path, labels: str) -> None:
-    settings = {"synthetic": str(cases / "banks" / "boxes" / "bank"), "ratio": 0.5, "labels": labels}
-    with pytest.raises(ConfigError, match="of a bank with boxes for a plan file; expected unboxed: keep"):
+def test_a_plan_of_boxes_says_that_the_reader_keeps_unboxed_objects(
+    cases: Path, tmp_path: Path, labels: str
+) -> None:
+    settings = {
+        "synthetic": str(cases / "banks" / "boxes" / "bank"),
+        "ratio": 0.5,
+        "labels": labels,
+    }
+    with pytest.raises(
+        ConfigError, match="of a bank with boxes for a plan file; expected unboxed: keep"
+    ):
         write_plan(settings, tmp_path / "plan.npz", real=4, epochs=1)
     write_plan(settings | {"unboxed": "keep"}, tmp_path / "plan.npz", real=4, epochs=1)
 
@@ -330,7 +415,12 @@ def test_the_command_line(
 ) -> None:
     """The documented line, and its exit status 2 on wrong settings."""
     name, real, _ = MIXTURES["generated"]
-    command = [sys.executable, "-m", "lidar_synth.integrations.plan", str(cases / "plans" / "generated" / "mix.yaml")]
+    command = [
+        sys.executable,
+        "-m",
+        "lidar_synth.integrations.plan",
+        str(cases / "plans" / "generated" / "mix.yaml"),
+    ]
     line = [*command, str(tmp_path / "plan.npz"), "--real", str(real), "--epochs", str(EPOCHS)]
     done = subprocess.run(line, capture_output=True, text=True, check=True)
     assert "3 epochs, the first with plan " in done.stdout

@@ -7,7 +7,11 @@ import pytest
 from project import ROOT
 
 README = (ROOT / "README.md").read_text()
-DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/**/*.md")), ROOT / "tests/golden/README.md"]
+DOCUMENTS = [
+    *sorted(ROOT.glob("*.md")),
+    *sorted(ROOT.glob("docs/**/*.md")),
+    ROOT / "tests/golden/README.md",
+]
 
 
 def blocks(language: str) -> list[str]:
@@ -38,5 +42,7 @@ def test_links_lead_to_existing_files_and_headings(document: Path) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_existing_files_of_the_repository(document: Path) -> None:
-    named = re.findall(r"`((?:lidar_synth|integrations|configs|tools|tests)/[\w/.]+\w/?)`", document.read_text())
+    named = re.findall(
+        r"`((?:lidar_synth|integrations|configs|tools|tests)/[\w/.]+\w/?)`", document.read_text()
+    )
     assert [name for name in named if not (ROOT / name).exists()] == []

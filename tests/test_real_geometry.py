@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.projection import fill_points, locate, project, ring_numbers, unfold, unproject
+from lidar_synth.geometry.projection import (
+    fill_points,
+    locate,
+    project,
+    ring_numbers,
+    unfold,
+    unproject,
+)
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -29,7 +36,9 @@ def scans(real_scans: Path) -> list[Scan]:
 
 
 def elevation(points: np.ndarray) -> np.ndarray:
-    return np.arcsin(points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1))
+    return np.arcsin(
+        points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1)
+    )
 
 
 @pytest.mark.slow
@@ -48,8 +57,11 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(scans: list[Scan]) -> None:
     for scan in scans:
         sensor = scan.sensor
         kept = locate(scan.points, sensor).point
-        before, after = scan.points[kept[kept >= 0]], unproject(project(scan)).points
-        seen = (elevation(before) <= np.radians(sensor.up)) & (elevation(before) >= np.radians(sensor.down))
+        before = scan.points[kept[kept >= 0]]
+        after = unproject(project(scan)).points
+        seen = (elevation(before) <= np.radians(sensor.up)) & (
+            elevation(before) >= np.radians(sensor.down)
+        )
         half = np.radians(sensor.up - sensor.down) / sensor.shape[0] / 2
         assert seen.mean() > 0.9
         assert np.abs(elevation(after) - elevation(before))[seen].max() <= half + 1e-6, scan.id
@@ -59,7 +71,8 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(scans: list[Scan]) -> None:
 
 
 def test_unfolding_finds_the_beam_of_each_ring_also_in_cropped_scans(scans: list[Scan]) -> None:
-    """The truncated scan has the upper 39 rings, and the camera-cropped one the upper 46; both start in row 0."""
+    """The truncated scan has the upper 39 rings, and the camera-cropped one the upper 46; both
+    start in row 0."""
     rows = {s.id: np.flatnonzero(unfold(s).mask.any(axis=1)) for s in scans}
     for scan_id, filled in rows.items():
         count = {"drive_0052": 39, "velodyne_reduced": 46}
@@ -90,7 +103,8 @@ def test_the_beam_table_matches_the_rings_of_real_scans(scans: list[Scan]) -> No
 
 
 def test_labels_are_transferred_back_to_points(real_scans: Path) -> None:
-    """Nearly all points of a labelled scan get their own class back from the labels of the cells."""
+    """Nearly all points of a labelled scan get their own class back from the labels of the
+    cells."""
     points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
     raw = np.fromfile(real_scans / "semantic_kitti/sequences/00/labels/000000.label", np.uint32)
     label = (raw & 0xFF).astype(np.uint8)

@@ -1,4 +1,5 @@
-"""Which frames a set of scans holds: sets of drives and frames, and the mapping between datasets."""
+"""Which frames a set of scans holds: sets of drives and frames, and the mapping between
+datasets."""
 
 from typing import Any
 
@@ -22,7 +23,9 @@ from lidar_synth.lab.importers import lidm
 
 Held = dict[str, set[int] | None]
 DRIVES = st.dictionaries(
-    st.sampled_from(["a", "b", "c"]), st.none() | st.sets(st.integers(0, 30), min_size=1), max_size=3
+    st.sampled_from(["a", "b", "c"]),
+    st.none() | st.sets(st.integers(0, 30), min_size=1),
+    max_size=3,
 )
 
 
@@ -41,16 +44,20 @@ def numbers(recordings: Recordings) -> Held:
 
 @given(DRIVES, DRIVES)
 def test_they_are_sets(some: Held, others: Held) -> None:
-    a, b = made(some), made(others)
+    a = made(some)
+    b = made(others)
     assert numbers(a) == some
     joined = {
-        d: None if None in (some.get(d, 0), others.get(d, 0)) else some.get(d, set()) | others.get(d, set())  # type: ignore[operator]
+        d: None
+        if None in (some.get(d, 0), others.get(d, 0))
+        else some.get(d, set()) | others.get(d, set())  # type: ignore[operator]
         for d in some.keys() | others.keys()
     }
     assert numbers(a | b) == joined
     shared: Held = {}
     for d in some.keys() & others.keys():
-        x, y = some[d], others[d]
+        x = some[d]
+        y = others[d]
         both = y if x is None else x if y is None else x & y
         if both is None or both:
             shared[d] = both
@@ -60,8 +67,15 @@ def test_they_are_sets(some: Held, others: Held) -> None:
 
 
 def test_splits_of_kitti360_leak_into_each_other() -> None:
-    sets = {name: whole(KITTI360, drives) for name, drives in KITTI360_SPLITS.items() if drives is not None}
-    assert [d[-9:-5] for _, d in (sets["lidm/train"] & sets["r2flow/test"]).drives] == ["0000", "0002"]
+    sets = {
+        name: whole(KITTI360, drives)
+        for name, drives in KITTI360_SPLITS.items()
+        if drives is not None
+    }
+    assert [d[-9:-5] for _, d in (sets["lidm/train"] & sets["r2flow/test"]).drives] == [
+        "0000",
+        "0002",
+    ]
     assert not sets["r2flow/train"] & sets["r2flow/test"]
     assert not sets["lidm/train"] & sets["lidm/val"]
     assert [d[-9:-5] for _, d in (sets["r2flow/train"] & sets["lidm/val"]).drives] == ["0003"]
@@ -70,18 +84,24 @@ def test_splits_of_kitti360_leak_into_each_other() -> None:
 def test_a_sequence_of_the_benchmark_is_a_part_of_a_raw_drive() -> None:
     frames = frames_of("semantic_kitti", ["08/000000", "08/000001", "08/000007"])
     assert frames.drives == {(KITTI, "2011_09_30_drive_0028"): ((1100, 1101), (1107, 1107))}
-    raw = frames_of("kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1101, 1107)])
+    raw = frames_of(
+        "kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1101, 1107)]
+    )
     assert (frames & raw).drives == {(KITTI, "2011_09_30_drive_0028"): ((1101, 1101),)}
     before = frames_of("kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1100)])
     assert not frames_of("semantic_kitti", ["08"]) & before
-    val, train = (frames_of("semantic_kitti", semantic_kitti.SPLITS[s] or ()) for s in ("val", "train"))
+    val, train = (
+        frames_of("semantic_kitti", semantic_kitti.SPLITS[s] or ()) for s in ("val", "train")
+    )
     assert val and not val & train
     assert len({drive for drive, *_ in ODOMETRY.values()}) == len(ODOMETRY) == 11
     assert frames_of("semantic_kitti", ["13"]).drives == {(KITTI, "odometry 13"): None}
 
 
 def test_frames_without_a_number_count_as_the_complete_drive() -> None:
-    assert frames_of("kitti360", ["drive/left", "drive/0000000001"]).drives == {(KITTI360, "drive"): None}
+    assert frames_of("kitti360", ["drive/left", "drive/0000000001"]).drives == {
+        (KITTI360, "drive"): None
+    }
     assert not frames_of("npz", ["drive/0000000001"])
     assert set(PLACES) == {"kitti360", "kitti_raw", "semantic_kitti", "kitti_object", "pandaset"}
 
@@ -92,7 +112,8 @@ def test_many_holes_are_kept_as_one_run() -> None:
 
 
 def test_all_of_lidms_models_know_both_datasets() -> None:
-    """Their autoencoder is trained on KITTI-360 and the odometry benchmark; validation is on drive 03, sequence 08."""
+    """Their autoencoder is trained on KITTI-360 and the odometry benchmark; validation is on drive
+    03, sequence 08."""
     val = frames_of("semantic_kitti", ["08"]) | whole(KITTI360, KITTI360_SPLITS["lidm/val"] or ())
     for data in ("KITTI-360", "SemanticKITTI", lidm.IMAGES):
         seen = lidm.seen(data, generates=True)
@@ -102,10 +123,18 @@ def test_all_of_lidms_models_know_both_datasets() -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [3, [3], [{}], [{"dataset": "x"}], *([{"dataset": "x", "drives": drives}] for drives in (
-        [1], {"a": 5}, {"a": [[1]]}, {"a": [["b", 2]]}
-    ))],
-)  # fmt: skip
+    "values",
+    [
+        3,
+        [3],
+        [{}],
+        [{"dataset": "x"}],
+        *(
+            [{"dataset": "x", "drives": drives}]
+            for drives in ([1], {"a": 5}, {"a": [[1]]}, {"a": [["b", 2]]})
+        ),
+    ],
+)
 def test_invalid_recordings_are_refused(values: Any) -> None:
     with pytest.raises(DataError, match="expected datasets, their drives and frames"):
         Recordings.from_list(values)
@@ -113,5 +142,8 @@ def test_invalid_recordings_are_refused(values: Any) -> None:
 
 def test_recordings_are_described_in_words() -> None:
     some = frames_of("kitti360", ["a/1", "a/2", "a/5", "b", "c/7"])
-    assert str(some) == "KITTI-360 a (3 frames from 1 to 5), KITTI-360 b (all frames), KITTI-360 c (frame 7)"
+    assert (
+        str(some)
+        == "KITTI-360 a (3 frames from 1 to 5), KITTI-360 b (all frames), KITTI-360 c (frame 7)"
+    )
     assert str(whole(KITTI, map(str, range(8)))).endswith("KITTI 5 (all frames) and 2 more drives")

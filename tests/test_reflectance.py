@@ -32,7 +32,9 @@ def test_chances_add_up_to_one(case: tuple[float, float, float]) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> None:
     count = 100_000
-    drawn = readings(*case, cells=count).sample(column((torch.arange(count) + 0.5) / count)).flatten()
+    drawn = (
+        readings(*case, cells=count).sample(column((torch.arange(count) + 0.5) / count)).flatten()
+    )
     predicted = readings(*case)
     nothing = torch.exp(-predicted.nll(column(torch.tensor([BLANK])))).item()
     assert (drawn == BLANK).double().mean().item() == pytest.approx(nothing, abs=1e-4)
@@ -48,16 +50,25 @@ def test_what_was_said_is_not_unexpected(case: tuple[float, float, float]) -> No
     """Draws are 0 as often as expected, and around the median."""
     count = 100_000
     predicted = readings(*case, cells=count)
-    nothing, off = predicted.residual(predicted.sample(column((torch.arange(count) + 0.5) / count))).unbind(1)
+    nothing, off = predicted.residual(
+        predicted.sample(column((torch.arange(count) + 0.5) / count))
+    ).unbind(1)
     assert nothing.mean().item() == pytest.approx(0, abs=0.002)
     assert off.median().item() == pytest.approx(0, abs=0.01)
 
 
 def test_the_unexpected_is_in_scales_and_has_an_end() -> None:
     predicted = readings(0.1, 0.15, 0.2, cells=4)
-    nothing, off = predicted.residual(column(torch.tensor([0.1, 0.25, 90.0, BLANK]))).flatten(2).squeeze(2).unbind(1)
+    nothing, off = (
+        predicted.residual(column(torch.tensor([0.1, 0.25, 90.0, BLANK])))
+        .flatten(2)
+        .squeeze(2)
+        .unbind(1)
+    )
     assert torch.allclose(off, torch.tensor([0, 0.5, 4, 0], dtype=off.dtype), atol=1e-6)
-    assert torch.allclose(nothing, torch.tensor([-0.2, -0.2, -0.2, 0.8], dtype=off.dtype), atol=1e-6)
+    assert torch.allclose(
+        nothing, torch.tensor([-0.2, -0.2, -0.2, 0.8], dtype=off.dtype), atol=1e-6
+    )
 
 
 def test_the_likeliest_is_0_or_the_median() -> None:

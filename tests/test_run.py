@@ -1,4 +1,5 @@
-"""Training runs from a configuration: what they leave, how they go on after a kill, what they refuse."""
+"""Training runs from a configuration: what they leave, how they go on after a kill, what they
+refuse."""
 
 import json
 import os
@@ -72,11 +73,18 @@ def write_config(scans: Path, folder: Path, **changes: Any) -> Path:
         values |= {
             "sensor": str(scans / "sensor.yaml"),
             "channels": ["range", "reflectance", "label"],
-            "network": {"arguments": {
-                "width": 16, "time_width": 16, "depths": [1, 1], "heads": [2, 2], "patch": [2, 2], "window": [3, 3],
-            }},
+            "network": {
+                "arguments": {
+                    "width": 16,
+                    "time_width": 16,
+                    "depths": [1, 1],
+                    "heads": [2, 2],
+                    "patch": [2, 2],
+                    "window": [3, 3],
+                }
+            },
             "steps": 5,
-        }  # fmt: skip
+        }
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(values | changes))
     return path
@@ -97,7 +105,9 @@ def state(folder: Path) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.slow
-def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(scans: Path, tmp_path: Path) -> None:
+def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(
+    scans: Path, tmp_path: Path
+) -> None:
     out = call("train", write_config(scans, tmp_path, samples={"every": 6, "count": 2}))
     run = tmp_path / "run"
     assert str(run / "run.safetensors") in out
@@ -113,7 +123,9 @@ def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(scans: 
     saved = state(tmp_path)
     checkpoint = load_checkpoint(run / "run.safetensors").networks[VELOCITY].state_dict()
     assert all(torch.equal(saved[f"average.{name}"], value) for name, value in checkpoint.items())
-    assert not all(torch.equal(saved[f"network.{name}"], value) for name, value in checkpoint.items())
+    assert not all(
+        torch.equal(saved[f"network.{name}"], value) for name, value in checkpoint.items()
+    )
 
 
 @pytest.mark.slow
@@ -122,12 +134,17 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(scans: Path, tmp_path: 
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()
         configs[name] = write_config(
-            scans, tmp_path / name, recipe={"iterations": 100, "batch": 2}, save_every=5, samples={"every": 0}
+            scans,
+            tmp_path / name,
+            recipe={"iterations": 100, "batch": 2},
+            save_every=5,
+            samples={"every": 0},
         )
     process = subprocess.Popen(
         [sys.executable, "-m", "lidar_synth", "train", configs["killed"]],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.DEVNULL,
+    )
     path = tmp_path / "killed" / "run" / "state.safetensors"
     while not path.exists():
         assert process.poll() is None, "the run ended before it was saved"
@@ -140,7 +157,8 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(scans: Path, tmp_path: 
         call("train", configs["killed"])
     call("train", configs["killed"], "--resume")
     call("train", configs["whole"])
-    resumed, whole = state(tmp_path / "killed"), state(tmp_path / "whole")
+    resumed = state(tmp_path / "killed")
+    whole = state(tmp_path / "whole")
     assert resumed.keys() == whole.keys()
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
 
@@ -151,25 +169,38 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
     call("train", write_config(scans, tmp_path / "one"))
     config = write_config(scans, tmp_path / "two")
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    torchrun = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+    ]
     done = subprocess.run(
         [*torchrun, "-m", "lidar_synth", "train", config],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
-    )  # fmt: skip
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [str(tmp_path / "two" / "run" / "run.safetensors")]
-    one, two = state(tmp_path / "one"), state(tmp_path / "two")
+    one = state(tmp_path / "one")
+    two = state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name
     assert len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1  # and not a run each
 
 
-def test_minutes_stop_a_run_and_resume_goes_on(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_minutes_stop_a_run_and_resume_goes_on(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
     path = tmp_path / "run" / "run.safetensors"
     assert read_header(path)[0].provenance["iterations"] == 1
-    seen, steps = [], module.steps
+    seen = []
+    steps = module.steps
 
     def watched(*arguments: Any) -> Iterator[Any]:
         for record in steps(*arguments):
@@ -186,15 +217,20 @@ def test_what_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = write_config(scans, tmp_path)
-    task, calls = plan_module.teacher_task(), []
+    task = plan_module.teacher_task()
+    calls = []
 
     def poisoned(batch: Any) -> Example:
         calls.append(batch)
         example = task(batch)
-        return Example(example.y, example.t, example.velocity * (torch.nan if len(calls) == 7 else 1))
+        return Example(
+            example.y, example.t, example.velocity * (torch.nan if len(calls) == 7 else 1)
+        )
 
     monkeypatch.setattr(plan_module, "teacher_task", lambda timesteps: poisoned)
-    with pytest.raises(DataError, match=r"step 7: the loss is nan.*last saved state and checkpoint are kept"):
+    with pytest.raises(
+        DataError, match=r"step 7: the loss is nan.*last saved state and checkpoint are kept"
+    ):
         call("train", config)
     assert read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"] == 4
     assert load_generator(tmp_path / "run" / "run.safetensors").scans(0, [0])
@@ -215,7 +251,9 @@ def test_fine_tuning_starts_from_a_checkpoint(scans: Path, teacher: Path, tmp_pa
     call("train", config, f"init={teacher}")
     start, end = (load_checkpoint(p) for p in (teacher, tmp_path / "run" / "run.safetensors"))
     assert end.header.provenance["init"] == start.hash
-    for a, b in zip(start.networks[VELOCITY].parameters(), end.networks[VELOCITY].parameters(), strict=True):
+    for a, b in zip(
+        start.networks[VELOCITY].parameters(), end.networks[VELOCITY].parameters(), strict=True
+    ):
         assert torch.allclose(a, b, atol=1e-6)
     short = yaml.safe_load(config.read_text())
     for key in ("sensor", "channels", "network"):
@@ -224,12 +262,15 @@ def test_fine_tuning_starts_from_a_checkpoint(scans: Path, teacher: Path, tmp_pa
     call("train", config, f"init={teacher}", f"output={tmp_path / 'short'}")
     assert read_header(tmp_path / "short" / "short.safetensors")[0].sensor == SENSOR
     for other in ("sensor=town", "channels=[range]", "network.arguments.width=32"):
-        with pytest.raises(ConfigError, match=f"expected that of {teacher}.*Or leave out {other.split('=')[0][:6]}"):
+        with pytest.raises(
+            ConfigError, match=f"expected that of {teacher}.*Or leave out {other.split('=')[0][:6]}"
+        ):
             call("train", config, f"init={teacher}", other, f"output={tmp_path / 'other'}")
 
 
 @pytest.mark.parametrize(
-    ("strategy", "grid"), [("adaptive_piecewise", None), ("uniform_piecewise", uniform_grid(4)), ("reflow", None)]
+    ("strategy", "grid"),
+    [("adaptive_piecewise", None), ("uniform_piecewise", uniform_grid(4)), ("reflow", None)],
 )
 def test_a_student_is_distilled(
     strategy: str,
@@ -241,9 +282,14 @@ def test_a_student_is_distilled(
 ) -> None:
     selection = {"candidates": 10, "trajectories": 3}
     config = write_config(
-        scans, tmp_path, teacher=str(teacher), strategy=strategy, steps=2, selection=selection,
+        scans,
+        tmp_path,
+        teacher=str(teacher),
+        strategy=strategy,
+        steps=2,
+        selection=selection,
         recipe={"metric": "pseudo_huber"},
-    )  # fmt: skip
+    )
     call("distill", config, *([f"grid={list(grid)}"] if grid else []))
     header, _ = read_header(tmp_path / "run" / "run.safetensors")
     assert header.provenance["teacher"] == load_checkpoint(teacher).hash
@@ -263,7 +309,9 @@ def test_a_student_is_distilled(
 def distilling(scans: Path, folder: Path, teacher: Path) -> Path:
     selection = {"candidates": 10, "trajectories": 3}
     recipe = {"metric": "pseudo_huber", "iterations": 4}
-    return write_config(scans, folder, teacher=str(teacher), steps=2, selection=selection, recipe=recipe)
+    return write_config(
+        scans, folder, teacher=str(teacher), steps=2, selection=selection, recipe=recipe
+    )
 
 
 def strip_settings(path: Path) -> None:
@@ -295,7 +343,9 @@ def test_a_selection_of_other_settings_is_refused(
     (run / "state.safetensors").unlink()  # stopped before the first save
     if override == "teacher":
         checkpoint = load_checkpoint(teacher)
-        header = replace(checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99})
+        header = replace(
+            checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99}
+        )
         save_checkpoint(tmp_path / "other.safetensors", header, checkpoint.networks)
         override = f"teacher={tmp_path / 'other.safetensors'}"
     if old:
@@ -306,10 +356,15 @@ def test_a_selection_of_other_settings_is_refused(
             return
     before = (run / "config.yaml").read_bytes()
     if old:
-        with pytest.warns(UserWarning, match="kept no settings"), pytest.raises(ConfigError, match=re.escape(named)):
+        with (
+            pytest.warns(UserWarning, match="kept no settings"),
+            pytest.raises(ConfigError, match=re.escape(named)),
+        ):
             call("distill", config, override)
         return
-    with pytest.raises(ConfigError, match=rf"selection.npz, which was made with .*{re.escape(named)}"):
+    with pytest.raises(
+        ConfigError, match=rf"selection.npz, which was made with .*{re.escape(named)}"
+    ):
         call("distill", config, override)
     assert (run / "config.yaml").read_bytes() == before
 
@@ -326,10 +381,14 @@ def test_a_selection_of_other_settings_is_refused(
         ("timesteps=u_shaped", r"timesteps='u_shaped' \(it began with 'uniform'\)"),
     ],
 )
-def test_a_run_is_not_resumed_with_other_settings(override: str, named: str, scans: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_other_settings(
+    override: str, named: str, scans: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
-    files = [tmp_path / "run" / name for name in ("config.yaml", "state.safetensors", "run.safetensors")]
+    files = [
+        tmp_path / "run" / name for name in ("config.yaml", "state.safetensors", "run.safetensors")
+    ]
     before = [file.read_bytes() for file in files]
     with pytest.raises(ConfigError, match=f"--resume of .*run with .*{named}"):
         call("train", config, "--resume", override)
@@ -337,7 +396,9 @@ def test_a_run_is_not_resumed_with_other_settings(override: str, named: str, sca
 
 
 @pytest.mark.slow
-def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(scans: Path, tmp_path: Path) -> None:
+def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(
+    scans: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
     harmless = ["save_every=7", "samples.every=9", "samples.count=2", "gradient_checkpointing=true"]
@@ -347,11 +408,15 @@ def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(scans:
         call("train", config, "--resume")
 
 
-def test_a_run_is_resumed_with_fewer_iterations_before_its_rate_falls(scans: Path, tmp_path: Path) -> None:
+def test_a_run_is_resumed_with_fewer_iterations_before_its_rate_falls(
+    scans: Path, tmp_path: Path
+) -> None:
     """It ends as the run that had them from its start."""
     for name in "ab":
         (tmp_path / name).mkdir()
-    short, long = (write_config(scans, tmp_path / name, recipe={"schedule": "trapezoid"}) for name in "ab")
+    short, long = (
+        write_config(scans, tmp_path / name, recipe={"schedule": "trapezoid"}) for name in "ab"
+    )
     call("train", short)
     call("train", long, "recipe.iterations=1000", "--minutes", "0")
     with pytest.raises(ConfigError, match=r"recipe.iterations=1 \(it began with 1000\)"):
@@ -363,15 +428,23 @@ def test_a_run_is_resumed_with_fewer_iterations_before_its_rate_falls(scans: Pat
         call("train", long, "--resume", "recipe.iterations=9")
 
 
-def test_a_run_is_not_resumed_with_another_teacher_of_the_same_name(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_another_teacher_of_the_same_name(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     mine = tmp_path / "teacher.safetensors"
     mine.write_bytes(teacher.read_bytes())
-    config = write_config(scans, tmp_path, teacher=str(mine), strategy="reflow", steps=2, recipe={"iterations": 4})
+    config = write_config(
+        scans, tmp_path, teacher=str(mine), strategy="reflow", steps=2, recipe={"iterations": 4}
+    )
     call("distill", config, "--minutes", "0")
     checkpoint = load_checkpoint(mine)
-    header = replace(checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99})
+    header = replace(
+        checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99}
+    )
     save_checkpoint(mine, header, checkpoint.networks)
-    with pytest.raises(ConfigError, match=r"--resume of .*run with teacher='\w+' \(it began with '\w+'\)"):
+    with pytest.raises(
+        ConfigError, match=r"--resume of .*run with teacher='\w+' \(it began with '\w+'\)"
+    ):
         call("distill", config, "--resume")
 
 

@@ -22,7 +22,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", [name for name in WRITERS if name != "kitti_object"])  # no model gives boxes
+@pytest.mark.parametrize(
+    "form", [name for name in WRITERS if name != "kitti_object"]
+)  # no model gives boxes
 def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path: Path) -> None:
     from lidar_synth.cli import app
 
@@ -35,9 +37,14 @@ def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path:
 
     assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
     assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
-    written, generator = open_scans(tmp_path / "out"), load_generator(path)
+    written = open_scans(tmp_path / "out")
+    generator = load_generator(path)
     made = {"made_by": "model", "model": "small", "checkpoint": generator.hash, "seed": 4}
-    assert written.sensor == SENSOR and written[2].provenance == made and written[2].domain == SYNTHETIC
+    assert (
+        written.sensor == SENSOR
+        and written[2].provenance == made
+        and written[2].domain == SYNTHETIC
+    )
     if form in ("npz", "semantic_kitti", "kitti", "webdataset"):
         expected = generator.scans(4, range(3))
         assert len(written) == 3
@@ -46,7 +53,9 @@ def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path:
             assert np.array_equal(a.label, b.label)
 
 
-def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(path: Path, tmp_path: Path) -> None:
+def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(
+    path: Path, tmp_path: Path
+) -> None:
     from lidar_synth.cli import app
 
     call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1"]
@@ -57,7 +66,9 @@ def test_sample_refuses_a_folder_that_holds_samples_of_another_seed(path: Path, 
     assert (tmp_path / "out" / "000000.npz").read_bytes() == before
 
 
-def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(path: Path, tmp_path: Path) -> None:
+def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(
+    path: Path, tmp_path: Path
+) -> None:
     from lidar_synth.cli import app
 
     call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1", "--to"]
@@ -75,7 +86,16 @@ def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
     guided = write(tmp_path / "guided.safetensors", ("range",), 0.1)
     real = [random_scan(SENSOR, 400, seed) for seed in range(2)]
     write_all("semantic_kitti", tmp_path / "real", real)
-    call = ["sample", str(tmp_path / "out"), "--model", str(guided), "--seed", "3", "--guidance", "2"]
+    call = [
+        "sample",
+        str(tmp_path / "out"),
+        "--model",
+        str(guided),
+        "--seed",
+        "3",
+        "--guidance",
+        "2",
+    ]
     given = [
         "--condition",
         str(tmp_path / "real"),
@@ -104,10 +124,25 @@ def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("conditional", "options", "error", "message"),
     [
-        (True, [], ConfigError, "condition None for model 'model', which takes semantic conditions; expected a data"),
-        (False, ["--condition", "real"], ConfigError, "condition real for model 'model', which takes no condition"),
+        (
+            True,
+            [],
+            ConfigError,
+            "condition None for model 'model', which takes semantic conditions; expected a data",
+        ),
+        (
+            False,
+            ["--condition", "real"],
+            ConfigError,
+            "condition real for model 'model', which takes no condition",
+        ),
         (True, ["--condition", "nowhere"], FileError, "nowhere does not exist"),
-        (False, ["--condition-split", "train"], ConfigError, "split train, but no dataset; expected --condition PATH"),
+        (
+            False,
+            ["--condition-split", "train"],
+            ConfigError,
+            "split train, but no dataset; expected --condition PATH",
+        ),
     ],
 )
 def test_sample_refuses_conditions_that_do_not_fit(

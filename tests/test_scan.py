@@ -8,7 +8,15 @@ import pytest
 from conftest import random_scan
 from hypothesis import given
 
-from lidar_synth.datasets.classes import COLOURS, IGNORE, KITTI360, NAMES, NUSCENES, SEMANTIC_KITTI, Taxonomy
+from lidar_synth.datasets.classes import (
+    COLOURS,
+    IGNORE,
+    KITTI360,
+    NAMES,
+    NUSCENES,
+    SEMANTIC_KITTI,
+    Taxonomy,
+)
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
@@ -18,7 +26,9 @@ TAXONOMIES = (SEMANTIC_KITTI, KITTI360, NUSCENES)
 
 def boxes(count: int, seed: int = 0) -> Boxes:
     rng = np.random.default_rng(seed)
-    values = np.c_[rng.uniform(-20, 20, (count, 3)), rng.uniform(0.5, 5, (count, 3)), rng.uniform(-4, 4, count)]
+    values = np.c_[
+        rng.uniform(-20, 20, (count, 3)), rng.uniform(0.5, 5, (count, 3)), rng.uniform(-4, 4, count)
+    ]
     return Boxes(values.astype(np.float32), ("Car",) * count)
 
 
@@ -35,7 +45,9 @@ def test_a_box_contains_its_corners_and_nothing_beyond(seed: int) -> None:
 
 def test_corners_follow_the_yaw_and_points_near_the_floor_can_be_excluded() -> None:
     box = Boxes(np.array([[0, 0, 0, 4, 2, 2, np.pi / 2]], np.float32), ("Car",))
-    assert np.allclose(box.corners()[0, 0], [-1, 2, -1], atol=1e-6)  # front left of a car that looks to the left
+    assert np.allclose(
+        box.corners()[0, 0], [-1, 2, -1], atol=1e-6
+    )  # front left of a car that looks to the left
     points = np.array([[0, 1.9, 0], [1.9, 0, 0], [0, 0, -0.9]], np.float32)
     assert box.contain(points).tolist() == [[True, False, True]]
     assert box.contain(points, above_floor=0.3).tolist() == [[True, False, False]]
@@ -46,11 +58,19 @@ def test_selecting_keeps_fields_together() -> None:
     scan.boxes = boxes(2)
     picked = scan[scan.label == 0]
     assert np.all(picked.label == 0) and len(picked) == (scan.label == 0).sum()
-    assert set(picked.fields()) == set(scan.fields()) == {"reflectance", "label", "raw_label", "instance"}
+    assert (
+        set(picked.fields())
+        == set(scan.fields())
+        == {"reflectance", "label", "raw_label", "instance"}
+    )
     assert picked.boxes is scan.boxes
     several = Boxes(boxes(3).values, ("Car", "Van", "Cyclist"), dont_care=np.ones((2, 4)))
     some = several[[True, False, True]]
-    assert (some.names, len(some.dont_care), some.occlusion.tolist()) == (("Car", "Cyclist"), 2, [-1, -1])
+    assert (some.names, len(some.dont_care), some.occlusion.tolist()) == (
+        ("Car", "Cyclist"),
+        2,
+        [-1, -1],
+    )
 
 
 def test_mismatched_shapes_and_invalid_boxes_are_refused() -> None:
@@ -68,11 +88,15 @@ def test_mismatched_shapes_and_invalid_boxes_are_refused() -> None:
 
 
 @pytest.mark.parametrize("taxonomy", TAXONOMIES, ids=lambda t: t.name)
-def test_every_class_of_a_dataset_is_decoded_and_unknown_ones_are_refused(taxonomy: Taxonomy) -> None:
+def test_every_class_of_a_dataset_is_decoded_and_unknown_ones_are_refused(
+    taxonomy: Taxonomy,
+) -> None:
     ids = np.array(sorted(taxonomy.to_train))
     train = taxonomy.decode(ids)
     assert train.dtype == np.uint8 and np.all((train < 19) | (train == IGNORE))
-    with pytest.raises(DataError, match=rf"here: unknown class ids \[{ids.max() + 1}\].*{taxonomy.name}"):
+    with pytest.raises(
+        DataError, match=rf"here: unknown class ids \[{ids.max() + 1}\].*{taxonomy.name}"
+    ):
         taxonomy.decode(np.array([ids.max() + 1]), "here")
     with pytest.raises(DataError, match="unknown class ids"):
         taxonomy.decode(np.array([-1]))
@@ -99,6 +123,8 @@ def test_kitti360_merges_only_motorcyclists_and_trunks() -> None:
 
 @pytest.mark.parametrize("kind", [DataError, ConfigError, FileError, LibraryError])
 def test_errors_state_input_expectation_and_hint_and_can_be_copied(kind: type) -> None:
-    error = copy.copy(kind("a.bin is cut", "whole points", "Copy it again."))  # as pickling would rebuild it
+    error = copy.copy(
+        kind("a.bin is cut", "whole points", "Copy it again.")
+    )  # as pickling would rebuild it
     assert str(error) == "a.bin is cut; expected whole points. Copy it again."
     assert isinstance(error, LidarSynthError) and isinstance(error, ValueError | OSError)

@@ -41,7 +41,9 @@ def cut(path: Path, at: int) -> None:
 @pytest.mark.parametrize("damage", [flip, cut])
 @pytest.mark.parametrize("file", ["range.npy", "cache.json"])
 @pytest.mark.parametrize("at", [5, 200, -3])
-def test_a_damaged_cache_is_made_again(tmp_path: Path, damage: Callable[[Path, int], None], file: str, at: int) -> None:
+def test_a_damaged_cache_is_made_again(
+    tmp_path: Path, damage: Callable[[Path, int], None], file: str, at: int
+) -> None:
     made = np.array(cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False).fields["range"])
     damage(tmp_path / file, at)
     with pytest.warns(UserWarning, match="made again"):
@@ -79,7 +81,9 @@ class Halves(nn.Module):
 
 @pytest.mark.parametrize("damage", [flip, cut])
 @pytest.mark.parametrize("suffix", [".npy", ".json"])
-def test_damaged_latents_are_made_again(tmp_path: Path, damage: Callable[[Path, int], None], suffix: str) -> None:
+def test_damaged_latents_are_made_again(
+    tmp_path: Path, damage: Callable[[Path, int], None], suffix: str
+) -> None:
     cache = cache_scans(SCANS[:3], SENSOR, ["range"], progress=False)
     tensors = TensorFormat(("range",), NORMALISATIONS["r2flow"])
     codec: Any = Halves()
@@ -106,7 +110,9 @@ def test_no_flipped_bit_of_a_state_is_resumed(tmp_path: Path) -> None:
     made = training()
     made.step = 3
     made.save(path)
-    content, expected, rng = path.read_bytes(), load_file(path), Random(0)
+    content = path.read_bytes()
+    expected = load_file(path)
+    rng = Random(0)
     refused = 0
     other = training()
     for _ in range(200):
@@ -119,12 +125,15 @@ def test_no_flipped_bit_of_a_state_is_resumed(tmp_path: Path) -> None:
             refused += 1
             continue
         assert other.step == 3
-        assert all(torch.equal(expected[f"network.{n}"], p) for n, p in other.network.state_dict().items())
+        assert all(
+            torch.equal(expected[f"network.{n}"], p) for n, p in other.network.state_dict().items()
+        )
     assert refused > 180
 
 
 @pytest.mark.parametrize(
-    "name", ["x", "network", "network.weight", "optimizer.a.b.c", "optimizer.0.0", "optimizer.9.0.step"]
+    "name",
+    ["x", "network", "network.weight", "optimizer.a.b.c", "optimizer.0.0", "optimizer.9.0.step"],
 )
 def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / STATE
@@ -142,7 +151,8 @@ def test_outcomes_are_sealed(tmp_path: Path) -> None:
     path.write_bytes(seal(to_values(outcome)))
     assert np.array_equal(read_outcome(path).table, outcome.table)
     assert _is_there(path, read_outcome)
-    content, rng = path.read_bytes(), Random(0)
+    content = path.read_bytes()
+    rng = Random(0)
     for _ in range(300):
         changed = bytearray(content)
         changed[rng.randrange(len(changed))] = rng.randrange(32, 127)
@@ -165,7 +175,13 @@ def test_sealed_values_are_read_back(tmp_path: Path) -> None:
 
 
 def tiny(out: Path) -> TrainConfig:
-    changes = ["recipe.iterations=2", "recipe.batch=1", "data.town=2", "samples.every=0", "save_every=1"]
+    changes = [
+        "recipe.iterations=2",
+        "recipe.batch=1",
+        "data.town=2",
+        "samples.every=0",
+        "save_every=1",
+    ]
     return load_config(TrainConfig, "town_tiny", [*changes, f"output={out}"])
 
 

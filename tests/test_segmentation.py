@@ -13,7 +13,14 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
-from lidar_synth.lab.evaluate.segmentation import Images, Judge, class_ious, confusion, load_judge, mean_iou
+from lidar_synth.lab.evaluate.segmentation import (
+    Images,
+    Judge,
+    class_ious,
+    confusion,
+    load_judge,
+    mean_iou,
+)
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.lab.train.segmentation import train_segmenter
 
@@ -29,7 +36,11 @@ def batches(count: int, seed: int = 0) -> list[Images]:
         label = torch.where(reflectance > 0.5, 8, 12).to(torch.uint8)
         label[..., ::4] = IGNORE
         made.append(
-            {"range": 5 + 20 * torch.rand(2, 16, 32, generator=draw), "reflectance": reflectance, "label": label}
+            {
+                "range": 5 + 20 * torch.rand(2, 16, 32, generator=draw),
+                "reflectance": reflectance,
+                "label": label,
+            }
         )
     return made
 
@@ -47,11 +58,16 @@ def test_the_segmenter_learns_as_its_confusion_matrix_shows() -> None:
 
 def test_ious_by_hand() -> None:
     table = np.zeros((19, 19), np.int64)
-    table[0, 0], table[0, 1], table[1, 1], table[1, 2] = 6, 2, 3, 1
+    table[0, 0] = 6
+    table[0, 1] = 2
+    table[1, 1] = 3
+    table[1, 2] = 1
     ious = class_ious(table)
     assert ious[0] == 6 / 8 and ious[1] == 3 / 6 and ious[2] == 0
     assert np.isnan(ious[3:]).all()
-    assert mean_iou(table) == (6 / 8 + 3 / 6) / 2, "a class that is said but never labelled counts by its mistakes"
+    assert mean_iou(table) == (6 / 8 + 3 / 6) / 2, (
+        "a class that is said but never labelled counts by its mistakes"
+    )
 
 
 @pytest.mark.slow
@@ -78,7 +94,9 @@ def test_a_judge_sees_a_scan_as_the_network_sees_its_image(judge: Judge) -> None
     image = project(scan)
     height = torch.from_numpy(np.sin(presets()["town"].ray_angles()[0]))
     inputs = segmenter_input(
-        torch.from_numpy(image.range)[None], torch.from_numpy(image.channels["reflectance"])[None], height
+        torch.from_numpy(image.range)[None],
+        torch.from_numpy(image.channels["reflectance"])[None],
+        height,
     )
     with torch.inference_mode():
         assert np.allclose(judge.features([scan]), judge.network.features(inputs).numpy())
@@ -99,9 +117,16 @@ def test_a_judge_is_kept_whole(judge: Judge, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b.replace(b"segmenter/1", b"segmenter/2")]
+    "damage",
+    [
+        lambda b: b[: len(b) // 2],
+        lambda b: b"",
+        lambda b: b.replace(b"segmenter/1", b"segmenter/2"),
+    ],
 )
-def test_a_damaged_judge_is_refused(judge: Judge, tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+def test_a_damaged_judge_is_refused(
+    judge: Judge, tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
     path = tmp_path / "a.safetensors"
     judge.save(path)
     path.write_bytes(damage(path.read_bytes()))

@@ -14,14 +14,20 @@ from lidar_synth.geometry.transfer.rays import rays_of
 
 DESIGN = {"hdl64e_kitti360", "hdl64e_kitti", "hdl32e_nuscenes", "os1_128", "town"}
 
-LASERS = {"vlp16": (16, 15.0, -15.0), "hdl32e": (32, 10.67, -30.67), "vls128": (128, 15.0, -25.0),
-          "pandar64": (64, 14.87, -24.909)}  # fmt: skip
+LASERS = {
+    "vlp16": (16, 15.0, -15.0),
+    "hdl32e": (32, 10.67, -30.67),
+    "vls128": (128, 15.0, -25.0),
+    "pandar64": (64, 14.87, -24.909),
+}
 """{sensor: number of lasers, highest and lowest elevation in degrees} by the manuals."""
 
 
 def test_all_required_presets_exist() -> None:
     assert set(presets()) >= DESIGN
-    values = {k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")}
+    values = {
+        k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")
+    }
     assert values == {k: presets()["hdl64e_kitti360"].to_dict()[k] for k in values}
 
 
@@ -37,7 +43,9 @@ def test_lasers_beside_each_other_point_apart() -> None:
     azimuths = presets()["vls128"].azimuths
     assert azimuths is not None
     values, counts = np.unique(azimuths, return_counts=True)
-    assert values.tolist() == [-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354] and set(counts) == {16}
+    assert values.tolist() == [-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354] and set(
+        counts
+    ) == {16}
     assert dict(zip(presets()["vls128"].elevations or (), azimuths, strict=True))[-11.742] == 6.354
 
 
@@ -58,7 +66,9 @@ def test_rays_are_unit_vectors_in_the_documented_frame(sensor: Sensor, rays: str
         assert np.allclose(np.linalg.norm(rays_xyz, axis=-1), 1, atol=1e-6)
         assert np.all(np.diff(rays_xyz[:, 0, 2]) < 0)  # row 0 is the highest
         middle = s.columns // 2
-        assert rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0  # ahead in the middle, the seam behind
+        assert (
+            rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0
+        )  # ahead in the middle, the seam behind
         assert rays_xyz[0, middle + s.columns // 4, 1] < 0  # clockwise: to the right of ahead is -y
         assert not rays_xyz.flags.writeable
 
@@ -71,26 +81,42 @@ def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
 
 
 def test_laser_elevations_are_the_beams_or_the_rows() -> None:
-    assert np.allclose(np.degrees(presets()["town"].laser_elevations[[0, -1]]), [2.53, -23.62], atol=1e-5)
+    assert np.allclose(
+        np.degrees(presets()["town"].laser_elevations[[0, -1]]), [2.53, -23.62], atol=1e-5
+    )
     linear = presets()["os1_128"]
     assert np.array_equal(linear.laser_elevations, linear.row_elevations())
     assert linear.by_beams() is linear
 
 
 def test_lasers_of_a_fitted_sensor_point_where_they_were_fitted() -> None:
-    """Beams are corrected for the height of their laser; the elevations of ``fit_sensor`` are the lasers' own."""
+    """Beams are corrected for the height of their laser; the elevations of ``fit_sensor`` are the
+    lasers' own."""
     fitted = Sensor("fitted", 8, 1.0, 90.0, elevations=(2.0, -8.0), heights=(0.05, -0.05))
     elevation, height = fitted.optics()
-    assert np.allclose(np.degrees(elevation), [2.0, -8.0], atol=1e-5) and height.tolist() == [0.05, -0.05]
+    assert np.allclose(np.degrees(elevation), [2.0, -8.0], atol=1e-5) and height.tolist() == [
+        0.05,
+        -0.05,
+    ]
     rays = rays_of(fitted)
-    assert np.allclose(rays.height + 9.0 * rays.slope, 9.0 * np.tan(np.radians([2.0, -8.0])) + height, atol=1e-6)
+    assert np.allclose(
+        rays.height + 9.0 * rays.slope, 9.0 * np.tan(np.radians([2.0, -8.0])) + height, atol=1e-6
+    )
     town = presets()["town"]
     lower = np.asarray(town.heights) > 0
     assert (town.optics()[0][lower] < town.laser_elevations[lower]).all()
     assert town.by_beams().heights is None
 
 
-GOOD = {"name": "x", "columns": 8, "range_min": 1.0, "range_max": 9.0, "rows": 4, "fov_up": 2.0, "fov_down": -2.0}
+GOOD = {
+    "name": "x",
+    "columns": 8,
+    "range_min": 1.0,
+    "range_max": 9.0,
+    "rows": 4,
+    "fov_up": 2.0,
+    "fov_down": -2.0,
+}
 
 
 @pytest.mark.parametrize(
@@ -116,10 +142,17 @@ def test_invalid_sensors_are_refused(change: dict[str, object], message: str) ->
 
 
 def test_numbers_of_numpy_become_those_of_python() -> None:
-    numbers = {"columns": np.int64(8), "rows": np.int32(4), "range_min": np.float32(1), "range_max": np.float64(9)}
+    numbers = {
+        "columns": np.int64(8),
+        "rows": np.int32(4),
+        "range_min": np.float32(1),
+        "range_max": np.float64(9),
+    }
     sensor = Sensor.from_dict({**GOOD, **numbers})
     assert sensor == Sensor.from_dict(GOOD) and sensor.to_dict() == GOOD
-    assert json.loads(json.dumps(sensor.to_dict())) == GOOD and "range_max: 9.0" in sensor_yaml(sensor)
+    assert json.loads(json.dumps(sensor.to_dict())) == GOOD and "range_max: 9.0" in sensor_yaml(
+        sensor
+    )
 
 
 def test_unknown_names_and_invalid_files_are_explained(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Generation beside the trainer: the scans that the plan says, in every order, from every process and in every way."""
+"""Generation beside the trainer: the scans that the plan says, in every order, from every process
+and in every way."""
 
 import os
 import pickle
@@ -58,7 +59,8 @@ def expected(generator: Generator, number: int) -> dict[str, np.ndarray]:
 
 
 def agree(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
-    """The contract: at least 99.99 % of the cells; of the range within a step, which points in float32 may cross."""
+    """The contract: at least 99.99 % of the cells; of the range within a step, which points in
+    float32 may cross."""
     steps = {name: abs(a[name].astype(int) - b[name].astype(int)) for name in b}
     return all((steps[name] <= (name == "range")).mean() >= 0.9999 for name in b)
 
@@ -68,7 +70,10 @@ def test_slots_notice_damage(generator: Generator) -> None:
     [image] = generator.range_images(SEED, [1])
     checksum = slots.write(1, 1, image)
     back = slots.read(1, 1, checksum)
-    assert all(np.array_equal(back[name], code) for name, code in Encoding(SENSOR, FIELDS).encode(image).items())
+    assert all(
+        np.array_equal(back[name], code)
+        for name, code in Encoding(SENSOR, FIELDS).encode(image).items()
+    )
     with pytest.raises(DataError, match="scan 2 in slot 1"):
         slots.read(1, 2, checksum)
     slots._slot(1)[100] ^= 1
@@ -95,14 +100,18 @@ def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
         assert (scan.id, scan.domain, scan.sensor) == (f"small/{SEED}/{number}", SYNTHETIC, SENSOR)
         assert agree(codes(scan), expected(generator, number))
         image = Encoding(SENSOR, FIELDS).encode(bank.image(number))
-        assert all((image[name] == values).mean() >= 0.9999 for name, values in expected(generator, number).items())
+        assert all(
+            (image[name] == values).mean() >= 0.9999
+            for name, values in expected(generator, number).items()
+        )
 
 
 class Codes(Dataset[Any]):
     """What workers of a loader read from a bank."""
 
     def __init__(self, bank: RollingBank, numbers: Sequence[int]) -> None:
-        self.bank, self.numbers = bank, numbers
+        self.bank = bank
+        self.numbers = numbers
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -115,10 +124,13 @@ class Codes(Dataset[Any]):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
-    [{}, {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True},
-     {"num_workers": 1, "multiprocessing_context": "spawn"}],
+    [
+        {},
+        {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True},
+        {"num_workers": 1, "multiprocessing_context": "spawn"},
+    ],
     ids=["main", "fork", "spawn"],
-)  # fmt: skip
+)
 def test_workers_read_it(bank: RollingBank, generator: Generator, options: dict[str, Any]) -> None:
     numbers = [3, 3, 40, 41, 42, 5, 43, 0]
     bank[7]  # so that a fork inherits an open connection
@@ -127,7 +139,9 @@ def test_workers_read_it(bank: RollingBank, generator: Generator, options: dict[
     for _ in range(2):
         given = [sample for batch in loader for sample in batch]
         assert [name for name, _ in given] == [f"small/{SEED}/{n}" for n in numbers]
-        assert all(agree(c, expected(generator, n)) for (_, c), n in zip(given, numbers, strict=True))
+        assert all(
+            agree(c, expected(generator, n)) for (_, c), n in zip(given, numbers, strict=True)
+        )
     assert bank[1].id == f"small/{SEED}/1"
 
 
@@ -150,12 +164,16 @@ def test_threads_read_it(bank: RollingBank) -> None:
 
 
 def test_announced_scans_are_made_before_they_are_requested(path: Path) -> None:
-    with RollingBank(path, seed=SEED, slots=6, threads=1, timeout=60) as bank:  # nothing else is announced to it
+    with RollingBank(
+        path, seed=SEED, slots=6, threads=1, timeout=60
+    ) as bank:  # nothing else is announced to it
         wait_until(lambda: bank.counts()["made"] == 6)  # what it made ahead by itself
         before = bank.counts()
         bank.expect([100, 102, 101])
         wait_until(lambda: bank.counts()["made"] == before["made"] + 3)
-        assert [bank[n].id for n in (102, 100, 101)] == [f"small/{SEED}/{n}" for n in (102, 100, 101)]
+        assert [bank[n].id for n in (102, 100, 101)] == [
+            f"small/{SEED}/{n}" for n in (102, 100, 101)
+        ]
         after = bank.counts()
         assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
         many = list(range(200, 20_200))
@@ -207,7 +225,9 @@ def test_a_starved_bank_serves_scans_in_memory(path: Path, generator: Generator)
         assert counts["waited"] <= 1
 
 
-def test_invalid_options_and_requests_are_refused(path: Path, bank: RollingBank, tmp_path: Path) -> None:
+def test_invalid_options_and_requests_are_refused(
+    path: Path, bank: RollingBank, tmp_path: Path
+) -> None:
     refusals: list[tuple[dict[str, Any], str]] = [
         ({"slots": 0}, "slots=0"),
         ({"timeout": 0}, "timeout=0"),
@@ -231,7 +251,9 @@ def test_invalid_options_and_requests_are_refused(path: Path, bank: RollingBank,
 
 @pytest.mark.slow
 def test_the_error_names_why_the_process_did_not_start(path: Path) -> None:
-    with pytest.raises(ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"):
+    with pytest.raises(
+        ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"
+    ):
         RollingBank(path, device="nowhere", timeout=60)
 
 
@@ -252,13 +274,23 @@ def to_codes(scan: Scan, rng: np.random.Generator) -> tuple[str, dict[str, np.nd
 
 def mixed(synth: Any) -> MixedScans:
     return MixedScans(
-        Scans("real", 12), synth, 0.5, seed=SEED, reuse=2, to_sample=to_codes, collate=list, labels="generated"
+        Scans("real", 12),
+        synth,
+        0.5,
+        seed=SEED,
+        reuse=2,
+        to_sample=to_codes,
+        collate=list,
+        labels="generated",
     )
 
 
 @pytest.mark.slow
-def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(bank: RollingBank, generator: Generator) -> None:
-    inside, rolling = mixed(generator), mixed(bank)
+def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(
+    bank: RollingBank, generator: Generator
+) -> None:
+    inside = mixed(generator)
+    rolling = mixed(bank)
     mixer = BatchMixer(mixed(generator), batch_size=5, num_workers=1)
     for epoch in (0, 2):
         for dataset in (inside, rolling, mixer.dataset):
@@ -279,7 +311,9 @@ def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(bank: Rolling
                 assert agree(other[1], first[1])
 
 
-def test_batch_mixing_takes_a_batch_sampler_and_several_sources(bank: RollingBank, generator: Generator) -> None:
+def test_batch_mixing_takes_a_batch_sampler_and_several_sources(
+    bank: RollingBank, generator: Generator
+) -> None:
     dataset = mixed(Sources(generator, bank))
     mixer = BatchMixer(dataset, batch_sampler=dataset.batches(4, rank=1, world_size=2))
     given = [sample for batch in mixer for sample in batch]
@@ -290,7 +324,9 @@ def test_batch_mixing_takes_a_batch_sampler_and_several_sources(bank: RollingBan
         assert dataset[position][0] == name
         assert agree(values, dataset[position][1])
     for options in ({}, {"batch_size": 2, "batch_sampler": dataset.batches(2)}):
-        with pytest.raises(ConfigError, match="batch_size=.* and batch_sampler=.*; expected one of them"):
+        with pytest.raises(
+            ConfigError, match="batch_size=.* and batch_sampler=.*; expected one of them"
+        ):
             BatchMixer(dataset, **options)
 
 

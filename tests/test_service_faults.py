@@ -1,4 +1,5 @@
-"""The life and death of a rolling bank: nobody waits for ever, nothing is left behind, and the error says what died."""
+"""The life and death of a rolling bank: nobody waits for ever, nothing is left behind, and the
+error says what died."""
 
 import gc
 import os
@@ -91,21 +92,28 @@ def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(bank: Rolli
     bank._client.timeout = 0.3
     start = time.monotonic()
     for _ in range(2):
-        with pytest.raises(ProcessError, match=rf"process {bank.pid}, .*has not answered \(scan 5\) within 0.3 s"):
+        with pytest.raises(
+            ProcessError, match=rf"process {bank.pid}, .*has not answered \(scan 5\) within 0.3 s"
+        ):
             bank[5]
     with pytest.raises(ProcessError, match="has not answered within 0.3 s"):
         bank.expect(range(100_000))
     assert time.monotonic() - start < 10
     os.kill(bank.pid, signal.SIGCONT)
     bank._client.timeout = 60.0
-    assert [bank[n].id for n in (7, 5)] == ["small/0/7", "small/0/5"]  # late answers are not taken for these
+    assert [bank[n].id for n in (7, 5)] == [
+        "small/0/7",
+        "small/0/5",
+    ]  # late answers are not taken for these
     os.kill(bank.pid, signal.SIGSTOP)
     bank.close()
     assert gone(bank.pid)
 
 
 def test_a_model_that_loads_for_too_long(path: Path) -> None:
-    with pytest.raises(ProcessError, match="0 scans made so far.* has not loaded the model within 0.01 s"):
+    with pytest.raises(
+        ProcessError, match="0 scans made so far.* has not loaded the model within 0.01 s"
+    ):
         RollingBank(path, timeout=0.01)
 
 
@@ -118,12 +126,16 @@ def test_the_generators_last_words_are_heard(path: Path, tmp_path: Path) -> None
     save_checkpoint(broken, checkpoint.header, checkpoint.networks)
     with RollingBank(broken, threads=1, timeout=60) as bank:
         for _ in range(2):
-            with pytest.raises(ProcessError, match=r"died \(process \d+, exit code 1; DataError: .*NaN or infinity"):
+            with pytest.raises(
+                ProcessError, match=r"died \(process \d+, exit code 1; DataError: .*NaN or infinity"
+            ):
                 bank[0]
 
 
 def test_banks_are_independent_and_end_with_their_last_reference(path: Path) -> None:
-    first, second = (RollingBank(path, seed=seed, slots=2, threads=1, timeout=60) for seed in (1, 2))
+    first, second = (
+        RollingBank(path, seed=seed, slots=2, threads=1, timeout=60) for seed in (1, 2)
+    )
     assert [bank[4].id for bank in (first, second)] == ["small/1/4", "small/2/4"]
     pid = first.pid
     del first
@@ -151,14 +163,21 @@ def main():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("how", "code"), [("raise", 1), ("vanish", 0), ("interrupt", -signal.SIGINT)])
-def test_a_trainer_that_ends_without_closing_leaves_nothing(how: str, code: int, path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("how", "code"), [("raise", 1), ("vanish", 0), ("interrupt", -signal.SIGINT)]
+)
+def test_a_trainer_that_ends_without_closing_leaves_nothing(
+    how: str, code: int, path: Path, tmp_path: Path
+) -> None:
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER + "if __name__ == '__main__':\n    main()\n")
     trainer = subprocess.Popen(
-        [sys.executable, script, path, how], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        [sys.executable, script, path, how],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
         start_new_session=True,
-    )  # fmt: skip
+    )
     assert trainer.stdout is not None
     pid, name = trainer.stdout.readline().split()
     assert name == "small/0/3"
@@ -173,9 +192,13 @@ def test_a_trainer_that_ends_without_closing_leaves_nothing(how: str, code: int,
 def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -> None:
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER + "main()\n")
-    trainer = subprocess.run([sys.executable, script, path, "return"], capture_output=True, text=True, timeout=60)
+    trainer = subprocess.run(
+        [sys.executable, script, path, "return"], capture_output=True, text=True, timeout=60
+    )
     assert trainer.returncode == 1
-    assert "A script that starts processes begins with: if __name__ == '__main__':" in trainer.stderr
+    assert (
+        "A script that starts processes begins with: if __name__ == '__main__':" in trainer.stderr
+    )
 
 
 @pytest.mark.slow

@@ -15,7 +15,11 @@ def test_sequential_prefetch_follows_the_requests() -> None:
     assert outlook.upcoming({0, 1, 3}) == (2, 2)
     outlook.answer(5)
     assert outlook.upcoming({2}) == (3, 3)
-    assert [outlook.next_use(n, 0) for n in (0, 1, 2)] == [NEVER, 1, 2]  # farther behind than the window
+    assert [outlook.next_use(n, 0) for n in (0, 1, 2)] == [
+        NEVER,
+        1,
+        2,
+    ]  # farther behind than the window
     assert outlook.next_use(2, served=1) == NEVER
     outlook.answer(70)  # training goes on at another place
     assert outlook.upcoming(()) == (70, 70)
@@ -133,4 +137,9 @@ def test_starved_requests_are_counted_and_get_the_scan_served_least() -> None:
     ledger = Ledger(4, counters, "reuse")
     assert claimed(ledger) == [0, 1]
     assert [ledger.lend(n).number for n in (0, 9, 9, 9)] == [0, 1, 0, 1]
-    assert dict(zip(COUNTERS, counters.tolist(), strict=True)) == {"made": 2, "served": 4, "waited": 0, "reused": 3}
+    assert dict(zip(COUNTERS, counters.tolist(), strict=True)) == {
+        "made": 2,
+        "served": 4,
+        "waited": 0,
+        "reused": 3,
+    }

@@ -22,7 +22,10 @@ WRONG: dict[str, tuple[str, str]] = {
     "text for reuse": ("reuse: many", "reuse='many'; expected an integer"),
     "text for an epoch": ("ratio: {'0': 0.5}", "epoch of a ratio='0'; expected an integer"),
     "options without names": ("label_options: 0.3", "label_options: 0.3; expected options by name"),
-    "text for a threshold": ("label_options: {threshold: high}", "threshold 'high'; expected a number"),
+    "text for a threshold": (
+        "label_options: {threshold: high}",
+        "threshold 'high'; expected a number",
+    ),
     "a number as a sensor": ("as_sensor: 64", "sensor 64; expected a preset's name, a file"),
     "a typing error": ("seed: [0", "is not YAML"),
     "a tag": ("seed: !!python/name:os.system", "it has the tag"),
@@ -81,4 +84,6 @@ def test_sources_say_what_they_are_in_two_lines(tmp_path: Path) -> None:
     for start, make in made.items():
         text = repr(make())
         assert text.startswith(start) and text.count("\n") == 1 and len(text) < 300
-        assert "(64 x 1024" in text or "(8 x 32" in text or "real: Scans; synthetic: Endless" in text
+        assert (
+            "(64 x 1024" in text or "(8 x 32" in text or "real: Scans; synthetic: Endless" in text
+        )

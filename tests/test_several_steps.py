@@ -1,4 +1,5 @@
-"""A student of several numbers of steps: from distillation to scans, and as the start of another run."""
+"""A student of several numbers of steps: from distillation to scans, and as the start of another
+run."""
 
 from pathlib import Path
 
@@ -13,13 +14,21 @@ from lidar_synth.generate.loading import load_generator
 __all__ = ["one_thread", "scans", "teacher"]  # fixtures
 
 
-def test_other_numbers_of_steps_have_no_times_beside_a_given_grid(scans: Path, teacher: Path, tmp_path: Path) -> None:
-    config = write_config(scans, tmp_path, teacher=str(teacher), grid=[1, 0.5, 0], also=[1], intervals=2)
-    with pytest.raises(ConfigError, match=r"also=\[1\] with grid=\[1.0, 0.5, 0.0\]; expected grid=null"):
+def test_other_numbers_of_steps_have_no_times_beside_a_given_grid(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
+    config = write_config(
+        scans, tmp_path, teacher=str(teacher), grid=[1, 0.5, 0], also=[1], intervals=2
+    )
+    with pytest.raises(
+        ConfigError, match=r"also=\[1\] with grid=\[1.0, 0.5, 0.0\]; expected grid=null"
+    ):
         call("distill", config)
 
 
-def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_a_student_of_several_numbers_of_steps_is_distilled(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     config = distilling(scans, tmp_path, teacher)
     call("distill", config, "also=[2, 1]")
     header, _ = read_header(tmp_path / "run" / "run.safetensors")
@@ -34,18 +43,29 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(scans: Path, teacher
     made = tmp_path / "run" / "run.safetensors"
     with pytest.raises(ConfigError, match="a student of several numbers of steps"):
         call("distill", config, f"teacher={made}", f"output={tmp_path / 'other'}")
-    with pytest.raises(ConfigError, match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise"):
+    with pytest.raises(
+        ConfigError, match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise"
+    ):
         call("distill", config, "also=[2]", "strategy=reflow", f"output={tmp_path / 'other'}")
     call(
-        "train", write_config(scans, tmp_path, recipe={"iterations": 1}), f"init={made}", f"output={tmp_path / 'flow'}"
+        "train",
+        write_config(scans, tmp_path, recipe={"iterations": 1}),
+        f"init={made}",
+        f"output={tmp_path / 'flow'}",
     )
-    flow = load_generator(tmp_path / "flow" / "flow.safetensors")  # it is not told where a step ends
+    flow = load_generator(
+        tmp_path / "flow" / "flow.safetensors"
+    )  # it is not told where a step ends
     assert not flow.network.ends and flow.header.other_grids == ()
 
 
-def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(teacher: Path, tmp_path: Path) -> None:
+def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(
+    teacher: Path, tmp_path: Path
+) -> None:
     given = [f"teacher={teacher}", f"output={tmp_path / 'run'}", "weaker=null", "guidance=1"]
-    with pytest.raises(ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"):
+    with pytest.raises(
+        ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"
+    ):
         call("distill", "town_pixel_student", *given)
     assert not (tmp_path / "run" / "cache").exists()
 

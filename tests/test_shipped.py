@@ -1,4 +1,5 @@
-"""The shipped weights in use: every source and label policy, mixed with the town and with real scans."""
+"""The shipped weights in use: every source and label policy, mixed with the town and with real
+scans."""
 
 import json
 import os
@@ -50,32 +51,44 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         known = image.mask & wanted.mask & (wanted.label != IGNORE)
         assert known.sum() > 0.8 * wanted.mask.sum()
         same = (image.label == wanted.label)[known].mean()
-        assert same == 1 or (columns == 1024 and same > 0.9)  # a column that stands for two has the label of one
+        assert same == 1 or (
+            columns == 1024 and same > 0.9
+        )  # a column that stands for two has the label of one
         near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
         assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
 
 
 @pytest.mark.slow
 def test_scans_follow_their_images(tmp_path: Path) -> None:
-    town, streets = Town(3, "hdl64e_lasers", 6 * STRETCH_FRAMES, motion=False), []
+    town = Town(3, "hdl64e_lasers", 6 * STRETCH_FRAMES, motion=False)
+    streets = []
     for i in range(0, len(town), STRETCH_FRAMES):
         Image.fromarray(town.image(i)).save(path := tmp_path / f"{i}.png")
         streets.append(replace(town[i], image_path=path))
     generator = load_generator("town-camera")
     made = [generator.scans(0, [0], scan, steps=2)[0] for scan in streets]  # the same noise for all
     assert made[0].sensor == streets[0].sensor
-    own, other = (sight_agreement(made, some).value for some in (streets, [*streets[1:], streets[0]]))
+    own, other = (
+        sight_agreement(made, some).value for some in (streets, [*streets[1:], streets[0]])
+    )
     assert own > other + 0.02
 
 
 @pytest.fixture(scope="module")
-def sources(generator: Generator, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+def sources(
+    generator: Generator, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[str, Any]]:
     """The same scans from every kind of source."""
     folder = tmp_path_factory.mktemp("shipped") / "bank"
     bake(folder, count=SCANS, model="town", seed=0)
     with RollingBank("town", seed=0, slots=SCANS, threads=1) as rolling:
         held = generator.scans(0, range(SCANS))
-        yield {"generator": Generated(generator, seed=0), "bank": Bank(folder), "rolling": rolling, "list": held}
+        yield {
+            "generator": Generated(generator, seed=0),
+            "bank": Bank(folder),
+            "rolling": rolling,
+            "list": held,
+        }
 
 
 @pytest.fixture(scope="module", params=["the town", "SemanticKITTI"])
@@ -103,7 +116,9 @@ def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bank", "rolling", "list"])
-def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], generator: Generator) -> None:
+def test_every_source_gives_the_same_scan(
+    kind: str, sources: dict[str, Any], generator: Generator
+) -> None:
     encoding = Encoding(generator.sensor, FIELDS)
     for number in range(SCANS):
         scan = sources[kind][number]
@@ -112,17 +127,26 @@ def test_every_source_gives_the_same_scan(kind: str, sources: dict[str, Any], ge
         given = encoding.encode(project(scan, generator.sensor, FIELDS))
         whole = encoding.encode(generator.range_images(0, [index])[0])
         for name, values in whole.items():
-            assert (abs(given[name].astype(int) - values.astype(int)) <= 1).mean() > 0.9999, (number, name)
+            assert (abs(given[name].astype(int) - values.astype(int)) <= 1).mean() > 0.9999, (
+                number,
+                name,
+            )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", [p for p in POLICIES if p != "boxes"])  # the shipped models generate no boxes
+@pytest.mark.parametrize(
+    "policy", [p for p in POLICIES if p != "boxes"]
+)  # the shipped models generate no boxes
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
 def test_every_source_and_label_policy_mixes_with_real_scans(
     kind: str, policy: str, sources: dict[str, Any], real: Source
 ) -> None:
-    options = {"teacher": sure} if policy == "pseudo" else {"kind": "laser"} if policy == "mix" else {}
-    train = MixedScans(real, sources[kind], 0.5, labels=policy, label_options=options, unlabelled="allow")
+    options = (
+        {"teacher": sure} if policy == "pseudo" else {"kind": "laser"} if policy == "mix" else {}
+    )
+    train = MixedScans(
+        real, sources[kind], 0.5, labels=policy, label_options=options, unlabelled="allow"
+    )
     seen = {0: 0, 1: 0}
     for batch in DataLoader(train, 3, collate_fn=train.collate):
         for i, domain in enumerate(batch["domain"].tolist()):
@@ -140,6 +164,8 @@ def test_every_source_and_label_policy_mixes_with_real_scans(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
-def test_no_source_has_boxes_for_detectors(kind: str, sources: dict[str, Any], real: Source) -> None:
+def test_no_source_has_boxes_for_detectors(
+    kind: str, sources: dict[str, Any], real: Source
+) -> None:
     with pytest.raises(ConfigError, match="labels='boxes'"):
         MixedScans(real, sources[kind], 0.5, labels="boxes", unlabelled="allow")

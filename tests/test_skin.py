@@ -20,7 +20,9 @@ from lidar_synth.lab.town.skin.features import features
 from lidar_synth.lab.town.skin.skin import BOXED, LONGEST, SOFT, shapes
 from lidar_synth.lab.town.skin.tables import grouped_quantiles, lookup
 
-SENSOR = Sensor("small", columns=900, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0)
+SENSOR = Sensor(
+    "small", columns=900, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0
+)
 STREETS = 5
 
 pytestmark = pytest.mark.slow
@@ -45,7 +47,8 @@ def undressed() -> list[Scan]:
 
 @pytest.fixture(scope="module")
 def altered() -> list[Scan]:
-    """Scans of a sensor that measures a third of the reflectance, with more noise of the range and two odd lasers."""
+    """Scans of a sensor that measures a third of the reflectance, with more noise of the range and
+    two odd lasers."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(returns, "_SPECKLE", returns._SPECKLE * 1.5)
         scans = cast(12, noise=Noise(range_std=0.03, gain_std=0))
@@ -54,7 +57,11 @@ def altered() -> list[Scan]:
         assert scan.ring is not None
         bright = 0.05 + 0.4 * scan.reflectance
         bright[scan.ring == 20] += 0.08
-        out.append(replace(scan, reflectance=bright.astype(np.float32), label=None, raw_label=None, boxes=None))
+        out.append(
+            replace(
+                scan, reflectance=bright.astype(np.float32), label=None, raw_label=None, boxes=None
+            )
+        )
     return out
 
 
@@ -75,7 +82,9 @@ def reflectance_quantiles(scans: list[Scan], ring: int | None = None) -> np.ndar
 
 def range_residual(scans: list[Scan]) -> float:
     """Metres, median deviation of the range from its neighbours in the ring."""
-    found = [features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual for s in scans]  # type: ignore[union-attr]
+    found = [
+        features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual for s in scans
+    ]  # type: ignore[union-attr]
     return float(np.nanmedian(np.abs(np.concatenate(found))))
 
 
@@ -116,7 +125,9 @@ def test_labels_rings_and_boxes_stay_and_points_move_along_their_rays(
         shift = np.linalg.norm(after.points - before.points, axis=1)
         assert 0.05 < shift.max() < SOFT + 1e-3
         assert shift[before.instance > 0].max() < BOXED + 1e-3
-        across = np.linalg.norm(np.cross(after.points, before.points), axis=1) / np.linalg.norm(before.points, axis=1)
+        across = np.linalg.norm(np.cross(after.points, before.points), axis=1) / np.linalg.norm(
+            before.points, axis=1
+        )
         assert across.max() < 0.05
         assert len(dressed[k]) <= len(before)
 
@@ -125,13 +136,17 @@ def test_points_stay_in_their_boxes(dressed: list[Scan]) -> None:
     for scan in dressed:
         assert scan.boxes is not None and scan.instance is not None
         grown = 2 * (0.1 + BOXED)  # 0.1 m on each side, as without a skin, and what a skin may add
-        wider = replace(scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, grown, grown, grown, 0]))
+        wider = replace(
+            scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, grown, grown, grown, 0])
+        )
         inside = wider.contain(scan.points)
         for i, instance in enumerate(scan.boxes.instance):
             assert inside[i, scan.instance == instance].all()
 
 
-def test_a_town_with_a_skin_is_a_pure_function_of_its_arguments(skin: Skin, dressed: list[Scan]) -> None:
+def test_a_town_with_a_skin_is_a_pure_function_of_its_arguments(
+    skin: Skin, dressed: list[Scan]
+) -> None:
     town = Town(13, SENSOR, STREETS * STRETCH_FRAMES, skin=skin)
     copy = pickle.loads(pickle.dumps(town))
     for k in (3, 1):
@@ -184,15 +199,21 @@ def test_what_no_skin_can_be_learnt_from(plain: list[Scan]) -> None:
 
 WRONG: dict[str, tuple[Callable[[Skin], object], type[LidarSynthError], str]] = {
     "another sensor": (lambda s: Town(skin=s), ConfigError, "same beams"),
-    "other firings": (lambda s: Town(sensor=replace(SENSOR, firings=1800), skin=s), ConfigError, "1800 firings"),
+    "other firings": (
+        lambda s: Town(sensor=replace(SENSOR, firings=1800), skin=s),
+        ConfigError,
+        "1800 firings",
+    ),
     "an unknown name": (lambda s: Town(skin="no_such"), ConfigError, "one of"),
     "a missing file": (lambda s: load_skin("no/such.skin"), FileError, "cannot be read"),
     "another suffix": (lambda s: s.save("skin.npz"), ConfigError, "ends in .skin"),
     "other arrays": (lambda s: replace(s, arrays={}), ConfigError, "arrays"),
     "not a number": (
-        lambda s: replace(s, arrays={**s.arrays, "missing": s.arrays["missing"] * np.nan}), ConfigError, "not finite"
+        lambda s: replace(s, arrays={**s.arrays, "missing": s.arrays["missing"] * np.nan}),
+        ConfigError,
+        "not finite",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -217,15 +238,19 @@ def test_the_command_line_describes_a_skin() -> None:
 
 def test_quantiles_by_group_are_those_of_numpy() -> None:
     rng = np.random.default_rng(0)
-    value, group = rng.normal(size=1000).astype(np.float32), rng.integers(0, 4, 1000) * 2
+    value = rng.normal(size=1000).astype(np.float32)
+    group = rng.integers(0, 4, 1000) * 2
     table, number = grouped_quantiles(value, group, 8, 5)
     for g in range(8):
         assert number[g] == (group == g).sum()
-        expected = np.quantile(value[group == g], np.linspace(0, 1, 5)) if number[g] else np.zeros(5)
+        expected = (
+            np.quantile(value[group == g], np.linspace(0, 1, 5)) if number[g] else np.zeros(5)
+        )
         assert np.allclose(table[g], expected, atol=1e-6)
 
 
 def test_a_map_is_monotone_and_keeps_the_distance_beyond_its_ends() -> None:
-    source, target = np.float32([[0, 0, 0.2, 0.5]]), np.float32([[0.1, 0.3, 0.4, 0.6]])
+    source = np.float32([[0, 0, 0.2, 0.5]])
+    target = np.float32([[0.1, 0.3, 0.4, 0.6]])
     grid = np.float32([-0.1, 0, 0.1, 0.2, 0.5, 0.7])
     assert np.allclose(lookup(source, target, grid), [[0.1, 0.2, 0.3, 0.4, 0.6, 0.8]])

@@ -82,7 +82,9 @@ def test_trajectory_streams_states_and_the_velocities_between_them(name: str) ->
     for here, there in pairwise(states):
         assert torch.allclose(there.y, here.y + (there.t - here.t)[:, None, None] * here.velocity)
     assert torch.equal(states[-1].y, solve(gaussian_velocity, NOISE, grid, name))
-    lazy = trajectory(lambda y, t, c: pytest.fail("evaluated before it was asked for"), NOISE, grid, name)
+    lazy = trajectory(
+        lambda y, t, c: pytest.fail("evaluated before it was asked for"), NOISE, grid, name
+    )
     assert iter(lazy) is lazy
 
 
@@ -93,7 +95,9 @@ def test_each_sample_can_have_its_own_time_grid(name: str) -> None:
     ).double()
     together = solve(gaussian_velocity, NOISE, grids.T, name)
     for i, grid in enumerate(grids):
-        assert torch.allclose(together[i : i + 1], solve(gaussian_velocity, NOISE[i : i + 1], grid, name))
+        assert torch.allclose(
+            together[i : i + 1], solve(gaussian_velocity, NOISE[i : i + 1], grid, name)
+        )
 
 
 def test_the_state_keeps_its_dtype() -> None:
@@ -104,8 +108,12 @@ def test_the_state_keeps_its_dtype() -> None:
 
 @pytest.mark.parametrize("model", ["r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier"])
 def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str) -> None:
-    """R2Flow's states follow from its velocities in our convention of time and sign; no network is involved."""
-    vectors = {k.removeprefix(f"{model}/"): v for k, v in load_file(golden / "r2flow_sampling.safetensors").items()}
+    """R2Flow's states follow from its velocities in our convention of time and sign; no network is
+    involved."""
+    vectors = {
+        k.removeprefix(f"{model}/"): v
+        for k, v in load_file(golden / "r2flow_sampling.safetensors").items()
+    }
     answers = iter(vectors["velocities"])
     times = []
 
@@ -113,14 +121,17 @@ def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str)
         times.append(1 - t[0].item())
         return -next(answers)
 
-    states = torch.stack([s.y for s in trajectory(velocity, vectors["input.x0"], 1 - vectors["input.grid"])])
+    states = torch.stack(
+        [s.y for s in trajectory(velocity, vectors["input.x0"], 1 - vectors["input.grid"])]
+    )
     assert times == pytest.approx(vectors["input.grid"][:-1].tolist(), abs=1e-7)
     assert (states - vectors["states"]).norm() / vectors["states"].norm() < 1e-6
     assert (states[-1] - vectors["output"]).norm() / vectors["output"].norm() < 1e-6
 
 
 @pytest.mark.parametrize(
-    "grid", [(1.0,), (0.0, 1.0), (1.0, 0.5, 0.5, 0.0), (1.1, 0.0), (1.0, -0.1), (1.0, float("nan"), 0.0)]
+    "grid",
+    [(1.0,), (0.0, 1.0), (1.0, 0.5, 0.5, 0.0), (1.1, 0.0), (1.0, -0.1), (1.0, float("nan"), 0.0)],
 )
 def test_grids_that_do_not_descend_within_0_and_1_are_refused(grid: tuple[float, ...]) -> None:
     with pytest.raises(ConfigError, match=r"time grid .*; expected at least two descending times"):
@@ -129,7 +140,9 @@ def test_grids_that_do_not_descend_within_0_and_1_are_refused(grid: tuple[float,
 
 def test_uniform_grids_are_evenly_spaced() -> None:
     assert uniform_grid(4) == (1.0, 0.75, 0.5, 0.25, 0.0)
-    assert uniform_grid(100)[70] == 0.3  # the nearest float, which headers and configurations display as 0.3
+    assert (
+        uniform_grid(100)[70] == 0.3
+    )  # the nearest float, which headers and configurations display as 0.3
     assert uniform_grid(2, 0.58, 0.22) == pytest.approx((0.58, 0.4, 0.22))
 
 

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from lidar_synth.errors import DataError
 from lidar_synth.lab.evaluate.extractors.pooling import mean_over_bands, mean_over_rings
-from lidar_synth.lab.evaluate.extractors.sparse import convolve, interpolate, keys, mean_in, neighbours, pyramid
+from lidar_synth.lab.evaluate.extractors.sparse import (
+    convolve,
+    interpolate,
+    keys,
+    mean_in,
+    neighbours,
+    pyramid,
+)
 from lidar_synth.lab.evaluate.extractors.voxel_networks import voxelise
 
 SIDE = 12
@@ -32,31 +39,58 @@ def at(grid: Tensor, voxels: Tensor) -> Tensor:
 
 
 def test_a_kernel_of_size_3_is_a_dense_convolution() -> None:
-    voxels, generator = random_voxels(), torch.Generator().manual_seed(0)
-    features, kernel = torch.randn(len(voxels), 5, generator=generator), torch.randn(27, 5, 7, generator=generator)
-    weight = kernel.view(3, 3, 3, 5, 7).permute(4, 3, 2, 1, 0)  # (z, y, x, in, out): x is the fastest
+    voxels = random_voxels()
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(len(voxels), 5, generator=generator)
+    kernel = torch.randn(27, 5, 7, generator=generator)
+    weight = kernel.view(3, 3, 3, 5, 7).permute(
+        4, 3, 2, 1, 0
+    )  # (z, y, x, in, out): x is the fastest
     expected = at(F.conv3d(dense(voxels, features), weight, padding=1), voxels)
-    torch.testing.assert_close(convolve(features, kernel, neighbours(voxels), len(voxels)), expected)
+    torch.testing.assert_close(
+        convolve(features, kernel, neighbours(voxels), len(voxels)), expected
+    )
 
 
 def test_a_kernel_of_size_2_and_its_transpose_are_dense_convolutions() -> None:
-    fine, generator = random_voxels(seed=1), torch.Generator().manual_seed(1)
+    fine = random_voxels(seed=1)
+    generator = torch.Generator().manual_seed(1)
     level = pyramid(fine, 2)[1]
-    features, kernel = torch.randn(len(fine), 5, generator=generator), torch.randn(8, 5, 7, generator=generator)
-    weight = kernel.view(2, 2, 2, 5, 7).permute(4, 3, 0, 1, 2)  # (x, y, z, in, out): z is the fastest
+    features = torch.randn(len(fine), 5, generator=generator)
+    kernel = torch.randn(8, 5, 7, generator=generator)
+    weight = kernel.view(2, 2, 2, 5, 7).permute(
+        4, 3, 0, 1, 2
+    )  # (x, y, z, in, out): z is the fastest
     assert level.children is not None
     coarse = convolve(features, kernel, level.children, len(level.voxels))
-    torch.testing.assert_close(coarse, at(F.conv3d(dense(fine, features), weight, stride=2), level.voxels))
+    torch.testing.assert_close(
+        coarse, at(F.conv3d(dense(fine, features), weight, stride=2), level.voxels)
+    )
     back = torch.randn(8, 7, 4, generator=generator)
     weight = back.view(2, 2, 2, 7, 4).permute(3, 4, 0, 1, 2)
-    expected = at(F.conv_transpose3d(dense(level.voxels, coarse, SIDE // 2), weight, stride=2), fine)
-    torch.testing.assert_close(convolve(coarse, back, level.children.reversed(), len(fine)), expected)
+    expected = at(
+        F.conv_transpose3d(dense(level.voxels, coarse, SIDE // 2), weight, stride=2), fine
+    )
+    torch.testing.assert_close(
+        convolve(coarse, back, level.children.reversed(), len(fine)), expected
+    )
 
 
-@pytest.mark.parametrize(("k", "offset"), [(0, (-1, -1, -1)), (2, (1, -1, -1)), (12, (-1, 0, 0)), (13, (0, 0, 0)),
-                                           (16, (0, 1, 0)), (22, (0, 0, 1)), (26, (1, 1, 1))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("k", "offset"),
+    [
+        (0, (-1, -1, -1)),
+        (2, (1, -1, -1)),
+        (12, (-1, 0, 0)),
+        (13, (0, 0, 0)),
+        (16, (0, 1, 0)),
+        (22, (0, 0, 1)),
+        (26, (1, 1, 1)),
+    ],
+)
 def test_the_offsets_of_size_3_by_hand(k: int, offset: tuple[int, int, int]) -> None:
-    """The output at a voxel takes from the voxel at ``offset`` from it with the weights of index ``k``."""
+    """The output at a voxel takes from the voxel at ``offset`` from it with the weights of index
+    ``k``."""
     here = torch.tensor((4, 4, 4))
     voxels = torch.unique(torch.stack([here, here + torch.tensor(offset)]), dim=0)
     values = torch.arange(1.0, len(voxels) + 1)[:, None]
@@ -81,7 +115,9 @@ def test_all_levels_hold_the_halved_voxels() -> None:
     levels = pyramid(random_voxels(seed=2), 4)
     for fine, coarse in pairwise(levels):
         assert torch.equal(coarse.voxels, torch.unique(fine.voxels // 2, dim=0))
-        assert coarse.parent is not None and torch.equal(coarse.voxels[coarse.parent], fine.voxels // 2)
+        assert coarse.parent is not None and torch.equal(
+            coarse.voxels[coarse.parent], fine.voxels // 2
+        )
 
 
 def test_interpolation_is_exact_on_a_full_grid_and_leaves_missing_voxels_out() -> None:
@@ -89,9 +125,13 @@ def test_interpolation_is_exact_on_a_full_grid_and_leaves_missing_voxels_out() -
     slope = torch.tensor([1.0, 2.0, 3.0])
     points = torch.from_numpy(np.random.default_rng(0).integers(0, 3 * 8, (50, 3)))
     found = interpolate((coarse * 8.0 @ slope)[:, None], coarse, points, 8)[:, 0]
-    torch.testing.assert_close(found, points.float() @ slope)  # a linear function is interpolated exactly
+    torch.testing.assert_close(
+        found, points.float() @ slope
+    )  # a linear function is interpolated exactly
     two = torch.tensor([(0, 0, 0), (1, 0, 0)])
-    found = interpolate(torch.tensor([[10.0], [20.0]]), two, torch.tensor([(2, 6, 7), (8, 0, 0)]), 8)
+    found = interpolate(
+        torch.tensor([[10.0], [20.0]]), two, torch.tensor([(2, 6, 7), (8, 0, 0)]), 8
+    )
     torch.testing.assert_close(found[:, 0], torch.tensor([12.5, 20.0]))
 
 
@@ -115,9 +155,12 @@ def test_voxels_too_far_apart_are_refused() -> None:
 def test_rings_and_bands_by_hand() -> None:
     voxels = torch.tensor([(0, 0, 0), (0, 200, 0), (0, -200, 0), (4000, 0, 0), (-4000, 0, 0)])
     features = torch.tensor([[1.0], [2.0], [4.0], [8.0], [16.0]])
-    found = mean_over_rings(features, voxels, 0.05, 56.0)  # distances 0, 10, 10, 200, 200 m from the centre
+    found = mean_over_rings(
+        features, voxels, 0.05, 56.0
+    )  # distances 0, 10, 10, 200, 200 m from the centre
     expected = torch.zeros(16)
-    expected[0], expected[int((10 - 4) / (52 / 16))] = 1, 3
+    expected[0] = 1
+    expected[int((10 - 4) / (52 / 16))] = 3
     assert torch.equal(found, expected)
     image = torch.arange(32.0)[None, :, None].expand(2, 32, 8)
     assert torch.equal(mean_over_bands(image), torch.arange(0.5, 32, 2).repeat(2))

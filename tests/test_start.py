@@ -15,9 +15,13 @@ from lidar_synth.lab.train import TrainConfig, load_config, precision, run
 from lidar_synth.lab.train.start import start_networks
 
 
-def test_a_shipped_model_is_a_start_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_shipped_model_is_a_start_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.chdir(tmp_path)
-    networks, header = start_networks(load_config(TrainConfig, "town_teacher", ["init=town", "codec=null"]))
+    networks, header = start_networks(
+        load_config(TrainConfig, "town_teacher", ["init=town", "codec=null"])
+    )
     shipped = load_checkpoint(find_model("town"))
     assert header.provenance["init"] == shipped.hash and set(networks) == set(shipped.networks)
     with pytest.raises(ConfigError, match="expected a shipped one"):
@@ -26,19 +30,29 @@ def test_a_shipped_model_is_a_start_by_its_name(monkeypatch: pytest.MonkeyPatch,
 
 def config(folder: Path, chosen: str) -> TrainConfig:
     short = ["recipe.iterations=2", "recipe.batch=1", "data.town=2", "samples.every=0"]
-    return load_config(TrainConfig, "town_tiny", [*short, f"output={folder}", f"precision={chosen}"])
+    return load_config(
+        TrainConfig, "town_tiny", [*short, f"output={folder}", f"precision={chosen}"]
+    )
 
 
 @pytest.mark.slow
 def test_rehearsed_scans_are_learnt_from_too_and_named(tmp_path: Path) -> None:
     plain = run(config(tmp_path / "plain", "no"))
     both = config(tmp_path / "both", "no").model_dump(mode="json")
-    both |= {"rehearsal": {"town": 2, "seed": 5, "licence": "MIT"}, "output": str(tmp_path / "both")}
+    both |= {
+        "rehearsal": {"town": 2, "seed": 5, "licence": "MIT"},
+        "output": str(tmp_path / "both"),
+    }
     rehearsed = run(TrainConfig.model_validate(both))
-    weights = [load_checkpoint(path).networks["velocity"].state_dict() for path in (plain, rehearsed)]
+    weights = [
+        load_checkpoint(path).networks["velocity"].state_dict() for path in (plain, rehearsed)
+    ]
     assert any(not torch.equal(weights[0][name], value) for name, value in weights[1].items())
     facts = load_checkpoint(rehearsed).header.provenance
-    assert facts["rehearsal"]["seed"] == 5 and (facts["data"]["seed"], facts["data"]["town"]) == (0, 2)
+    assert facts["rehearsal"]["seed"] == 5 and (facts["data"]["seed"], facts["data"]["town"]) == (
+        0,
+        2,
+    )
     assert overlap(seen_by(facts), town(5)) and overlap(seen_by(facts), town(0))
 
 
@@ -49,7 +63,9 @@ def faster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> b
     return request.param
 
 
-@pytest.mark.skipif(torch.cuda.is_available() or torch.backends.mps.is_available(), reason="a GPU has bfloat16")
+@pytest.mark.skipif(
+    torch.cuda.is_available() or torch.backends.mps.is_available(), reason="a GPU has bfloat16"
+)
 def test_bfloat16_is_for_processors_that_are_faster_with_it(faster: bool) -> None:
     assert precision.computed("bf16") == ("bf16" if faster else "no")
     assert precision.computed("no") == "no"
@@ -58,13 +74,17 @@ def test_bfloat16_is_for_processors_that_are_faster_with_it(faster: bool) -> Non
 @pytest.mark.slow
 def test_runs_of_one_process_may_differ_in_precision(faster: bool, tmp_path: Path) -> None:
     made = {name: load_checkpoint(run(config(tmp_path / name, name))) for name in ("bf16", "no")}
-    weights = [dict(checkpoint.networks["velocity"].named_parameters()) for checkpoint in made.values()]
+    weights = [
+        dict(checkpoint.networks["velocity"].named_parameters()) for checkpoint in made.values()
+    ]
     same = all(torch.equal(weights[0][name], value) for name, value in weights[1].items())
     assert same is not faster, "the same weights where both were trained in float32"
     AcceleratorState._reset_state()
     mine = Accelerator(mixed_precision="no")  # the caller's own stays as it is
     if faster:
-        with pytest.raises(ConfigError, match="precision=bf16, where this process has set up Accelerate with 'no'"):
+        with pytest.raises(
+            ConfigError, match="precision=bf16, where this process has set up Accelerate with 'no'"
+        ):
             run(config(tmp_path / "refused", "bf16"))
     assert run(config(tmp_path / "same", "no")).exists() and mine.mixed_precision == "no"
     AcceleratorState._reset_state()

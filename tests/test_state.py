@@ -37,7 +37,10 @@ WAYS = pytest.mark.parametrize("make", [batches, stream])
         (lambda: mixed(reuse=2), r"reuse 1, here 2"),
         (lambda: mixed(balanced=True), r"balanced False, here True"),
         (lambda: mixed(synth=Endless(name="t")), r"synthetic\[0\] identity s, here t"),
-        (lambda: mixed(synth=Sources(Endless(), Endless(name="t"))), r"synthetic .*'s'.*, here .*'t'"),
+        (
+            lambda: mixed(synth=Sources(Endless(), Endless(name="t"))),
+            r"synthetic .*'s'.*, here .*'t'",
+        ),
         (lambda: mixed(ratio=[0.5, 0.25]), r"samples before\[1\] 4, here 12"),
         (lambda: mixed(seed=1), r"the state of seed 0 for a mixture of seed 1"),
     ],
@@ -62,7 +65,8 @@ def test_a_state_survives_json_and_fits_its_mixture(make: Callable[[MixedScans],
 
 @WAYS
 def test_a_state_without_its_plan(make: Callable[[MixedScans], Any]) -> None:
-    """As earlier versions gave them: at an epoch's beginning they still load, elsewhere their order is not made."""
+    """As earlier versions gave them: at an epoch's beginning they still load, elsewhere their order
+    is not made."""
     with pytest.warns(UserWarning, match="without its plan"):
         make(mixed()).load_state_dict({"seed": 0, "epoch": 3, "position": 0})
     with pytest.raises(ConfigError, match="middle of an epoch.*position to 0.*add 1 to its epoch"):

@@ -1,4 +1,5 @@
-"""``MixedStream``: the plan's order for every number of workers, with an end or without, and going on from a state."""
+"""``MixedStream``: the plan's order for every number of workers, with an end or without, and going
+on from a state."""
 
 import copy
 from collections.abc import Iterator
@@ -29,7 +30,11 @@ def name(scan: Scan, rng: np.random.Generator) -> str:
 def mixed(real: int = 9, **options: Any) -> MixedScans:
     """15 samples an epoch."""
     return MixedScans(
-        Scans("r", real), Endless(), 0.4, to_sample=lambda scan, rng: f"{scan.id}/{rng.random()}", **options
+        Scans("r", real),
+        Endless(),
+        0.4,
+        to_sample=lambda scan, rng: f"{scan.id}/{rng.random()}",
+        **options,
     )
 
 
@@ -89,21 +94,32 @@ def test_ranks_and_workers_divide_the_stream(ranks: int, endless: bool) -> None:
     for rank in range(ranks):
         stream = MixedStream(mixed(), batch_size=2, endless=endless, rank=rank, world_size=ranks)
         # 30 samples, whole steps for 2 and 3 ranks, are two epochs
-        given += [x for batch in islice(load(stream, rank), 12 // ranks if endless else None) for x in batch]
+        given += [
+            x
+            for batch in islice(load(stream, rank), 12 // ranks if endless else None)
+            for x in batch
+        ]
     assert sorted(given) == sorted(sequence()[: 24 if endless else 15])
 
 
 def test_the_last_samples_may_be_left_out() -> None:
     given = []
     for rank in range(2):
-        stream = MixedStream(mixed(), batch_size=2, endless=False, drop_last=True, rank=rank, world_size=2)
+        stream = MixedStream(
+            mixed(), batch_size=2, endless=False, drop_last=True, rank=rank, world_size=2
+        )
         given.append(list(load(stream, 0)))
     assert [len(batches) for batches in given] == [3, 3]
-    assert sorted(x for batches in given for batch in batches for x in batch) == sorted(sequence()[:12])
+    assert sorted(x for batches in given for batch in batches for x in batch) == sorted(
+        sequence()[:12]
+    )
 
 
 def test_the_remainder_is_a_batch_of_its_own() -> None:
-    given = [MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2) for rank in range(2)]
+    given = [
+        MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2)
+        for rank in range(2)
+    ]
     assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [[7, 1], [7]]
     assert given[0].state_dict(1) == state(0, 14)
     assert given[0].state_dict(2) == state(1, 0)
@@ -112,13 +128,18 @@ def test_the_remainder_is_a_batch_of_its_own() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("done", range(5))
-@pytest.mark.parametrize(("before", "after"), [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))])
+@pytest.mark.parametrize(
+    ("before", "after"), [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))]
+)
 def test_a_state_fits_any_number_of_ranks_and_workers(
     before: tuple[int, int], after: tuple[int, int], done: int, endless: bool
 ) -> None:
-    seen, states = [], []
+    seen = []
+    states = []
     for rank in range(before[0]):
-        stream = MixedStream(mixed(), batch_size=2, endless=endless, rank=rank, world_size=before[0])
+        stream = MixedStream(
+            mixed(), batch_size=2, endless=endless, rank=rank, world_size=before[0]
+        )
         iterator = iter(load(stream, before[1]))
         batches = list(islice(iterator, done))
         if len(batches) < done:
@@ -131,7 +152,11 @@ def test_a_state_fits_any_number_of_ranks_and_workers(
     for rank in range(after[0]):
         stream = MixedStream(mixed(), batch_size=3, endless=endless, rank=rank, world_size=after[0])
         stream.load_state_dict(states[0])
-        rest += [x for batch in islice(load(stream, after[1]), 24 // 3 // after[0] if endless else None) for x in batch]
+        rest += [
+            x
+            for batch in islice(load(stream, after[1]), 24 // 3 // after[0] if endless else None)
+            for x in batch
+        ]
     length = len(seen) + 24 // (3 * after[0]) * 3 * after[0] if endless else 15
     if states[0]["epoch"] == 1 and not endless:
         assert sorted(rest) == sorted(sequence()[15:30])
@@ -169,7 +194,10 @@ def test_after_the_end_comes_the_next_epoch() -> None:
 def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
     """As ``StatefulDataLoader`` does it, which loads when it begins to iterate."""
     end = state(0, 15)
-    for make in (lambda: MixedStream(mixed(), batch_size=4, endless=False), lambda: mixed().batches(4)):
+    for make in (
+        lambda: MixedStream(mixed(), batch_size=4, endless=False),
+        lambda: mixed().batches(4),
+    ):
         resumed = make()
         resumed.load_state_dict(end)
         assert list(resumed) == []
@@ -202,9 +230,12 @@ def test_persistent_workers_hear_of_a_state() -> None:
 
 
 class Worker:
-    """A worker as ``StatefulDataLoader`` drives it: a copy of the dataset whose state is taken after each batch."""
+    """A worker as ``StatefulDataLoader`` drives it: a copy of the dataset whose state is taken
+    after each batch."""
 
-    def __init__(self, stream: MixedStream, id: int, workers: int, state: dict[str, Any] | None) -> None:
+    def __init__(
+        self, stream: MixedStream, id: int, workers: int, state: dict[str, Any] | None
+    ) -> None:
         self.info = SimpleNamespace(id=id, num_workers=workers)
         self.stream = copy.deepcopy(stream)
         with self:
@@ -241,7 +272,9 @@ def driven(workers: list[Worker], turn: int = 0) -> Iterator[list[str]]:
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("workers", [1, 2, 3])
 @pytest.mark.parametrize("done", range(6))
-def test_workers_with_a_state_each(workers: int, done: int, endless: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_with_a_state_each(
+    workers: int, done: int, endless: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """torchdata's protocol without torchdata."""
     monkeypatch.setattr(module, "get_worker_info", lambda: None)
     stream = MixedStream(mixed(), batch_size=3, endless=endless)
@@ -256,7 +289,8 @@ def test_workers_with_a_state_each(workers: int, done: int, endless: bool, monke
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("done", [0, 3])
 def test_torchdata_without_end(workers: int, done: int) -> None:
-    """Under ``StatefulDataLoader``, with what workers prefetched thrown away; with an end: test_loaders.py."""
+    """Under ``StatefulDataLoader``, with what workers prefetched thrown away; with an end:
+    test_loaders.py."""
     torchdata = pytest.importorskip("torchdata.stateful_dataloader")
 
     def make() -> Any:
@@ -270,7 +304,9 @@ def test_torchdata_without_end(workers: int, done: int) -> None:
     assert seen + list(islice(again, 10 - done)) == cut(sequence()[:40], 4)
 
 
-def test_invalid_options_and_states_of_a_stream_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_options_and_states_of_a_stream_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with pytest.raises(ConfigError, match="batch_size=0"):
         MixedStream(mixed(), batch_size=0)
     stream = MixedStream(mixed(), batch_size=4, endless=False)
@@ -300,7 +336,10 @@ class Ahead(Endless):
 def test_only_this_ranks_share_is_announced_to_a_source_that_works_ahead() -> None:
     source = Ahead()
     scans = MixedScans(Scans("r", 6), source, 0.5)
-    asked = [[int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1 for i in range(12)] for e in (0, 1)]
+    asked = [
+        [int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1 for i in range(12)]
+        for e in (0, 1)
+    ]
     stream = MixedStream(scans, batch_size=2, rank=1, world_size=2)
     source.told.clear()
     list(islice(stream, 8))

@@ -10,14 +10,16 @@ ORDER = """
 errors files datasets noise geometry generate.models generate.flow generate labels bank formats mixing bake viz cli
 lab lab.importers lab.fitting lab.kitti360 lab.town lab.evaluate lab.curate lab.train lab.proof lab.cli
 """.split()
-"""A module may import only from those before it and its own: the plugin (first line) never imports the laboratory."""
+"""A module may import only from those before it and its own: the plugin (first line) never imports
+the laboratory."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 INTEGRATIONS = PACKAGE.parent / "integrations"
 
 
 def imported(path: Path) -> set[str]:
-    """Every module of the package that a file imports, wherever in it, without the name ``lidar_synth``."""
+    """Every module of the package that a file imports, wherever in it, without the name
+    ``lidar_synth``."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -80,7 +82,10 @@ PUBLIC = {"lidar_synth.__main__"}
 
 def modules() -> dict[str, Path]:
     """Every module of the package by its name."""
-    names = {".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
+    names = {
+        ".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p
+        for p in PACKAGE.rglob("*.py")
+    }
     return {name.removesuffix(".__init__"): path for name, path in names.items()}
 
 
@@ -89,14 +94,18 @@ def imports_of(path: Path, known: dict[str, Path]) -> set[str]:
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {m if (m := f"{node.module}.{a.name}") in known else node.module for a in node.names}
+            found |= {
+                m if (m := f"{node.module}.{a.name}") in known else node.module for a in node.names
+            }
         elif isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
     return found & known.keys()
 
 
 def test_the_package_has_few_rooms() -> None:
-    there = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()}
+    there = {
+        p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()
+    }
     assert there - {"__init__", "__main__"} == {room for room in ORDER if "." not in room}
     assert len(there) <= ROOMS + 2
 
@@ -109,10 +118,14 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 def test_every_module_is_imported_by_something() -> None:
     known = modules()
-    outside = [p for folder in ("integrations", "tools") for p in (PACKAGE.parent / folder).rglob("*.py")]
+    outside = [
+        p for folder in ("integrations", "tools") for p in (PACKAGE.parent / folder).rglob("*.py")
+    ]
     used = set().union(*(imports_of(path, known) - {name} for name, path in known.items()))
     used |= set().union(*(imports_of(path, known) for path in outside))
-    used |= {name for name in known if name.startswith("lidar_synth.lab.cli.")}  # loaded by name, with the command
+    used |= {
+        name for name in known if name.startswith("lidar_synth.lab.cli.")
+    }  # loaded by name, with the command
     packages = {name for name, path in known.items() if path.name == "__init__.py"}
     assert known.keys() - used - packages == PUBLIC
 
@@ -120,15 +133,23 @@ def test_every_module_is_imported_by_something() -> None:
 def test_no_file_is_too_long_to_read() -> None:
     root = PACKAGE.parent
     folders = [root / name for name in ("lidar_synth", "integrations", "tools", "tests", "configs")]
-    long = {p.name for f in folders for p in f.rglob("*.py") if len(p.read_text().splitlines()) > LINES}
+    long = {
+        p.name for f in folders for p in f.rglob("*.py") if len(p.read_text().splitlines()) > LINES
+    }
     assert long == set()
 
 
 def test_open3d_is_imported_by_nothing_at_import_time() -> None:
     """On a bare machine its import fails; everything else has to work."""
     for path in PACKAGE.rglob("*.py"):
-        top = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.Import | ast.ImportFrom)]
-        names = [a.name for n in top for a in n.names] + [n.module or "" for n in top if isinstance(n, ast.ImportFrom)]
+        top = [
+            n
+            for n in ast.parse(path.read_text()).body
+            if isinstance(n, ast.Import | ast.ImportFrom)
+        ]
+        names = [a.name for n in top for a in n.names] + [
+            n.module or "" for n in top if isinstance(n, ast.ImportFrom)
+        ]
         assert not any(n.split(".")[0] == "open3d" for n in names), path
 
 

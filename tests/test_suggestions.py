@@ -29,7 +29,11 @@ def test_a_misspelt_name_is_answered_with_the_nearest(call: str, tmp_path: Path)
     given = call.replace("OUT", str(tmp_path / "out")).split()
     result = CliRunner().invoke(app, given)
     said = result.output if result.exception is None else f"{result.output}{result.exception}"
-    assert result.exit_code != 0 and "Did you mean" in said and CALLS[call] in said.split("Did you mean")[1]
+    assert (
+        result.exit_code != 0
+        and "Did you mean" in said
+        and CALLS[call] in said.split("Did you mean")[1]
+    )
 
 
 def test_a_name_like_none_has_no_suggestion() -> None:

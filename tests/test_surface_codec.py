@@ -37,7 +37,9 @@ from lidar_synth.lab.town import Town
 from lidar_synth.lab.train.autoencoder import Autoencoding, Losses
 from lidar_synth.noise import uniform
 
-K, LABELS, CELLS = 3, 20, PATCH[0] * PATCH[1]
+K = 3
+LABELS = 20
+CELLS = PATCH[0] * PATCH[1]
 SCALE = NORMALISATIONS["r2flow"]
 FORMAT = TensorFormat(("range", "reflectance", "label"), SCALE)
 COARSE = Sensor("coarse", 256, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
@@ -63,7 +65,12 @@ def random_surfaces(patches: int, spread: float = 1.0) -> Surfaces:
 
 
 @settings(max_examples=20, deadline=None)
-@given(batch=st.integers(1, 3), channels=st.integers(1, 4), rows=st.integers(1, 3), columns=st.integers(1, 4))
+@given(
+    batch=st.integers(1, 3),
+    channels=st.integers(1, 4),
+    rows=st.integers(1, 3),
+    columns=st.integers(1, 4),
+)
 def test_patches_have_an_inverse(batch: int, channels: int, rows: int, columns: int) -> None:
     x = torch.randn(batch, channels, rows * PATCH[0], columns * PATCH[1])
     patches = to_patches(x, PATCH)
@@ -81,30 +88,42 @@ def test_splitting_puts_the_cells_of_a_patch_beside_each_other() -> None:
 def test_the_likelihoods_of_all_that_a_cell_can_show_sum_to_one() -> None:
     """Numerically over ranges and reflectances, and over classes and lost returns."""
     surfaces = random_surfaces(1)
-    far, bright = torch.linspace(-0.9999, 1, 601), torch.linspace(-1, 9, 401)
+    far = torch.linspace(-0.9999, 1, 601)
+    bright = torch.linspace(-1, 9, 401)
     bright[0] += 1e-6  # -1 is reflectance 0, which has a probability, not a density
     grid = torch.cartesian_prod(far, bright)
     area = (far[1] - far[0]) * (bright[2] - bright[1])
     one = Surfaces(
-        surfaces.inverse[..., :1], torch.full((1, K, 1), 0.02), surfaces.returned[..., :1],
-        ZeroInflatedLogistic(*(part[..., :1] for part in surfaces.reflectance)), surfaces.classes,
+        surfaces.inverse[..., :1],
+        torch.full((1, K, 1), 0.02),
+        surfaces.returned[..., :1],
+        ZeroInflatedLogistic(*(part[..., :1] for part in surfaces.reflectance)),
+        surfaces.classes,
         surfaces.weights[..., :1],
-    )  # fmt: skip
+    )
     nothing = torch.zeros(1, 1).long()
-    total = one.log_likelihood(torch.tensor([[-1.0]]), torch.tensor([[-1.0]]), nothing, SCALE, (1.0, 1.0)).exp()
+    total = one.log_likelihood(
+        torch.tensor([[-1.0]]), torch.tensor([[-1.0]]), nothing, SCALE, (1.0, 1.0)
+    ).exp()
     for code in range(LABELS):
         codes = torch.full((1, len(grid)), code)
-        cells = one.log_likelihood(grid[None, :, 0], grid[None, :, 1], codes, SCALE, (1.0, 1.0)).exp()
-        dark = one.log_likelihood(far[None], torch.full((1, len(far)), -1.0), codes[:, : len(far)], SCALE, (1.0, 1.0))
+        cells = one.log_likelihood(
+            grid[None, :, 0], grid[None, :, 1], codes, SCALE, (1.0, 1.0)
+        ).exp()
+        dark = one.log_likelihood(
+            far[None], torch.full((1, len(far)), -1.0), codes[:, : len(far)], SCALE, (1.0, 1.0)
+        )
         total = total + cells.sum() * area + dark.exp().sum() * (far[1] - far[0])
     assert total.item() == pytest.approx(1, abs=0.01)
 
 
 def test_samples_have_the_predicted_frequencies() -> None:
     surfaces = random_surfaces(1)
-    many = Surfaces(*(_repeat(part, 4000) for part in surfaces[:3]), ZeroInflatedLogistic(
-        *(_repeat(part, 4000) for part in surfaces.reflectance)), *(_repeat(part, 4000) for part in surfaces[4:]),
-    )  # fmt: skip
+    many = Surfaces(
+        *(_repeat(part, 4000) for part in surfaces[:3]),
+        ZeroInflatedLogistic(*(_repeat(part, 4000) for part in surfaces.reflectance)),
+        *(_repeat(part, 4000) for part in surfaces[4:]),
+    )
     noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
     alike = Noise(torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.full((LABELS,), 0.5))
     relief = torch.zeros(4000, len(SPANS), CELLS)
@@ -142,19 +161,29 @@ def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
     for image in images:
         assert image.label is not None and set(np.unique(image.label)) <= {*range(19), 255}
         assert ((image.range == 0) | ((image.range >= 1.45) & (image.range <= 80))).all()
-    assert torch.equal(*(Latent(network, FORMAT).decode(z) for _ in range(2)))  # the most likely image
+    assert torch.equal(
+        *(Latent(network, FORMAT).decode(z) for _ in range(2))
+    )  # the most likely image
 
 
 def test_half_the_columns_show_the_same_street() -> None:
-    """A wider cell looks through the middle of two: on one plane, its inverse range is their mean."""
+    """A wider cell looks through the middle of two: on one plane, its inverse range is their
+    mean."""
     x = torch.zeros(5, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
-    x[:, :3] = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)) / 3 + torch.tensor([2.0, 0, 0])
+    x[:, :3] = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)) / 3 + torch.tensor(
+        [2.0, 0, 0]
+    )
     fine, coarse = (surfaces_of(x, K, LABELS, PATCH, merged).inverse[:, 0] for merged in (1, 2))
     assert torch.allclose(fine.view(5, 2, 4, 2).mean(3).flatten(1), coarse, rtol=1e-5)
     network = small().eval()
     z = torch.randn(1, *network.latent_shape)
     for width in network.widths:
-        assert network.decode(z, uniform(0, [0], (network.draws, 16, width))).shape == (1, 7, 16, width)
+        assert network.decode(z, uniform(0, [0], (network.draws, 16, width))).shape == (
+            1,
+            7,
+            16,
+            width,
+        )
     with pytest.raises(DataError, match="one of 256, 128"):
         network.decode(z, torch.rand(1, network.draws, 16, 100))
 
@@ -164,7 +193,9 @@ def layout_with_a_box() -> Tensor:
     image = torch.zeros(1, 5, 16, 256, dtype=torch.uint8)
     steps = round(12 / DEPTH_STEP)
     image[:, 0] = CODES["ground"]
-    values = torch.tensor([CODES["Car"], steps >> 8, steps & 255, round(3 / CHORD_STEP), 0], dtype=torch.uint8)
+    values = torch.tensor(
+        [CODES["Car"], steps >> 8, steps & 255, round(3 / CHORD_STEP), 0], dtype=torch.uint8
+    )
     image[..., 4:9, 30:41] = values.view(5, 1, 1)
     return image
 
@@ -177,8 +208,10 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
         kinds = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)[:, NUMBERS:]
         kinds[:cars, TRAIN_ID["car"]] += 30
         kinds[cars:, TRAIN_ID["road"]] += 30
-    z, noise = torch.randn(1, *network.latent_shape), uniform(0, [0], (network.draws, 16, width))
-    layout, sensor = layout_with_a_box(), replace(COARSE, columns=width)
+    z = torch.randn(1, *network.latent_shape)
+    noise = uniform(0, [0], (network.draws, 16, width))
+    layout = layout_with_a_box()
+    sensor = replace(COARSE, columns=width)
 
     def image_of(layout: Tensor | None) -> RangeImage:
         known = None if layout is None else {"layout": layout}
@@ -186,30 +219,44 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
         assert image.label is not None
         return image
 
-    free, bounded = image_of(None), image_of(layout)
+    free = image_of(None)
+    bounded = image_of(layout)
     inside = (layout[0, 0] == CODES["Car"]).view(16, width, -1).any(2).numpy()
     object_ = bounded.mask & (bounded.channels["label"] == TRAIN_ID["car"])
     assert (free.mask & (free.channels["label"] == TRAIN_ID["car"]))[~inside].mean() > 0.1
     assert object_[inside].any() and not object_[~inside].any()
     assert ((bounded.range[object_] > 11.99) & (bounded.range[object_] < 15.01)).all()
     # A cell without a box shows the road instead, if its patch has one.
-    assert bounded.mask[~inside].mean() == pytest.approx(free.mask[~inside].mean() if cars < 3 else 0, abs=0.1)
-    road = inside & (free.channels["label"] == TRAIN_ID["road"])  # rays through a box may miss the object
+    assert bounded.mask[~inside].mean() == pytest.approx(
+        free.mask[~inside].mean() if cars < 3 else 0, abs=0.1
+    )
+    road = inside & (
+        free.channels["label"] == TRAIN_ID["road"]
+    )  # rays through a box may miss the object
     assert np.array_equal(free.range[road], bounded.range[road])
-    assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)  # nothing is known of a blank layout
-    layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES["Cyclist"]  # what stands in a box has its class
+    assert np.array_equal(
+        free.range, image_of(torch.zeros_like(layout)).range
+    )  # nothing is known of a blank layout
+    layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES[
+        "Cyclist"
+    ]  # what stands in a box has its class
     assert np.array_equal(object_, image_of(layout).channels["label"] == TRAIN_ID["bicyclist"])
 
 
 @pytest.mark.parametrize("width", [256, 128])
 def test_returns_have_the_labels_of_a_map(width: int) -> None:
     network = small().eval()
-    z, noise = torch.randn(1, *network.latent_shape), uniform(0, [0], (network.draws, 16, width))
-    labels = torch.randint(0, 19, (1, 16, width), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    z = torch.randn(1, *network.latent_shape)
+    noise = uniform(0, [0], (network.draws, 16, width))
+    labels = torch.randint(
+        0, 19, (1, 16, width), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
     labels[..., ::3] = IGNORE
     given_map = labels.repeat_interleave(256 // width, 2)
     if width == 128:
-        given_map[..., 0::2] = IGNORE  # a column that stands for two has the label of the one that is known
+        given_map[..., 0::2] = (
+            IGNORE  # a column that stands for two has the label of the one that is known
+        )
     states = Latent(network, FORMAT)
     made, free = (
         FORMAT.to_images(states.decode(z, noise, known), replace(COARSE, columns=width))[0]
@@ -222,7 +269,8 @@ def test_returns_have_the_labels_of_a_map(width: int) -> None:
 
 
 def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_the_class() -> None:
-    count, shown = 40_000, TRAIN_ID["pole"]
+    count = 40_000
+    shown = TRAIN_ID["pole"]
     numbers = torch.zeros(1, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
     surface = numbers[:, : K * (NUMBERS + LABELS)].view(K, -1)
     surface[:, 0] = torch.tensor([1.0, 2.0, 3.0])  # far from each other
@@ -232,10 +280,15 @@ def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_t
     likely = surfaces.classes[0, :, shown].exp() / K
     drawn = surfaces_of(numbers.expand(count, -1), K, LABELS, PATCH).sample(
         torch.rand(count, DRAWS, CELLS, generator=torch.Generator().manual_seed(0)),
-        torch.zeros(count, len(SPANS), CELLS), FLAT, SCALE, codes=torch.full((count, CELLS), shown),
-    )  # fmt: skip
+        torch.zeros(count, len(SPANS), CELLS),
+        FLAT,
+        SCALE,
+        codes=torch.full((count, CELLS), shown),
+    )
     ranges = SCALE.decode(drawn[:, 0])
-    found = torch.stack([(ranges.log() - mid).abs().lt(0.3).float().mean() for mid in (1.0, 2.0, 3.0)])
+    found = torch.stack(
+        [(ranges.log() - mid).abs().lt(0.3).float().mean() for mid in (1.0, 2.0, 3.0)]
+    )
     assert torch.allclose(found, likely / likely.sum(), atol=0.01)
     assert (drawn[:, 2] == shown).all()
 
@@ -243,7 +296,8 @@ def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_t
 @pytest.mark.slow
 def test_a_decoder_of_both_widths_can_be_compiled() -> None:
     """Compiled for both at once, torch 2.13 gives infinite values."""
-    network, z = small().eval(), torch.randn(1, 8, 4, 16, generator=torch.Generator().manual_seed(0))
+    network = small().eval()
+    z = torch.randn(1, 8, 4, 16, generator=torch.Generator().manual_seed(0))
     noise = [uniform(0, [0], (network.draws, 16, width)) for width in network.widths]
     with torch.inference_mode():
         expected = [network.decode(z, some) for some in noise]
@@ -256,7 +310,9 @@ def test_training_lowers_the_likelihood_of_a_street() -> None:
     scan = Town(seed=3, sensor=COARSE, scans=1)[0]
     x = FORMAT.from_images([project(scan, COARSE, ["reflectance", "label"])])
     network = small()
-    trained = Autoencoding(network, FORMAT, COARSE, Losses(noise=0.03, rare=0.5), METRICS["l1"], {"range": 0.5})
+    trained = Autoencoding(
+        network, FORMAT, COARSE, Losses(noise=0.03, rare=0.5), METRICS["l1"], {"range": 0.5}
+    )
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
     losses = []
     for _ in range(30):
@@ -288,7 +344,9 @@ def test_the_noise_of_scans_is_measured() -> None:
     network = small().eval()
     with torch.no_grad():
         numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
-        numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])  # surfaces far apart, almost without reflectances of 0
+        numbers[:, 0] = torch.tensor(
+            [1.0, 2.3, 3.6]
+        )  # surfaces far apart, almost without reflectances of 0
         numbers[:, 3], numbers[:, 4], numbers[:, 7] = -4.5, 0.5, -6
         network.roughness.fill_(0.3)
         network.alike.fill_(0.6)
@@ -309,11 +367,16 @@ def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(merg
     fields = relief_fields(uniform(0, [0], (64, 4096 // merged)), merged)[0]
     assert fields.mean((1, 2)).abs().max() < 0.06
     for field, span in zip(fields, SPANS, strict=True):
-        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(1, abs=0.12)  # at every column
+        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(
+            1, abs=0.12
+        )  # at every column
         for lag in range(0, 2 * span + 1, 2):
             found = (field * field.roll(-lag // merged, 1)).mean()
             assert found == pytest.approx(correlation(span // merged, lag // merged), abs=0.06)
-        assert torch.equal(field[::2], field[1::2]) and (field[::2] * field[::2].roll(1, 0)).mean().abs() < 0.06
+        assert (
+            torch.equal(field[::2], field[1::2])
+            and (field[::2] * field[::2].roll(1, 0)).mean().abs() < 0.06
+        )
     assert (fields[0] * fields[1]).mean().abs() < 0.04
 
 
@@ -325,13 +388,17 @@ def test_the_relief_of_plants_is_measured() -> None:
     with torch.no_grad():
         numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
         numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])
-        numbers[:, 3], numbers[:, 4] = -4.5, 6
+        numbers[:, 3] = -4.5
+        numbers[:, 4] = 6
         for k, plant in enumerate((*PLANTS, 13)):  # 13 is a building
             numbers[k, NUMBERS + plant] = 12
         network.roughness.fill_(0.2)
         network.relief.copy_(relief)
     z = torch.randn(4, *network.latent_shape, generator=torch.Generator().manual_seed(1))
-    images = [network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape))) for i in range(4)]
+    images = [
+        network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape)))
+        for i in range(4)
+    ]
     latents = iter(network.bounded(z).split(1))
     network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
     measure_noise(network, ((x, _codes(x)) for x in images), noise=0.0)

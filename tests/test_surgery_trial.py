@@ -29,6 +29,7 @@ def test_the_town_without_cars_is_what_an_edit_should_bring_about() -> None:
     def agreement(result: Scan) -> list[float]:
         return np.nanmean(fidelity(scan, places, result, truth), 0).tolist()
 
-    before, after = agreement(scan), agreement(without(scan, [(p.mine, p.box) for p in places], None, 0))
+    before = agreement(scan)
+    after = agreement(without(scan, [(p.mine, p.box) for p in places], None, 0))
     assert agreement(truth) == [1, 1, 1]
     assert after[0] > 0.8 and after[1] > before[1] + 0.2 and after[2] > before[2] + 0.2

@@ -33,7 +33,9 @@ def by_brute_force(costs: np.ndarray, intervals: int) -> tuple[int, ...]:
 
 
 @given(data=st.data(), candidates=st.integers(1, 9), seed=st.integers(0, 2**32))
-def test_dynamic_programming_equals_brute_force(data: st.DataObject, candidates: int, seed: int) -> None:
+def test_dynamic_programming_equals_brute_force(
+    data: st.DataObject, candidates: int, seed: int
+) -> None:
     intervals = data.draw(st.integers(1, candidates))
     costs = random_costs(candidates, seed, (2, 3))
     paths = best_path(costs, intervals)
@@ -44,8 +46,12 @@ def test_dynamic_programming_equals_brute_force(data: st.DataObject, candidates:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("knots", [(1.0, 0.86, 0.58, 0.22, 0.0), (1.0, 0.42, 0.2, 0.08, 0.0), (1.0, 0.5, 0.0)])
-def test_the_knots_of_a_piecewise_linear_flow_are_found(metric: str, knots: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    "knots", [(1.0, 0.86, 0.58, 0.22, 0.0), (1.0, 0.42, 0.2, 0.08, 0.0), (1.0, 0.5, 0.0)]
+)
+def test_the_knots_of_a_piecewise_linear_flow_are_found(
+    metric: str, knots: tuple[float, ...]
+) -> None:
     velocities = gaussian(1, range(len(knots) - 1), SHAPE)
 
     def velocity(y: Tensor, t: Tensor, cond: Any) -> Tensor:
@@ -62,7 +68,9 @@ def test_costs_equal_their_definition() -> None:
     times = uniform_grid(12)
     start = gaussian(0, range(3), SHAPE, dtype=torch.float64)
     costs = cost_matrix(gaussian_velocity, start, times, METRICS["pseudo_huber"])
-    y, states, velocities = start, [start], []
+    y = start
+    states = [start]
+    velocities = []
     for t, t_next in pairwise(times):
         velocities.append(gaussian_velocity(y, torch.full((3,), t, dtype=torch.float64)))
         y = y + (t_next - t) * velocities[-1]
@@ -78,15 +86,22 @@ def test_costs_equal_their_definition() -> None:
 
 
 def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
-    """The selection minimises the mean cost; each trajectory's own optimum costs at most as much."""
-    found = select_timesteps(gaussian_velocity, SHAPE, 4, 40, 7, "squared_l2", seed=3, batch=3, progress=False)
+    """The selection minimises the mean cost; each trajectory's own optimum costs at most as
+    much."""
+    found = select_timesteps(
+        gaussian_velocity, SHAPE, 4, 40, 7, "squared_l2", seed=3, batch=3, progress=False
+    )
     noise = gaussian(3, range(7), SHAPE)
     costs = cost_matrix(gaussian_velocity, noise, uniform_grid(40), METRICS["squared_l2"])
     path = [round((1 - t) * 40) for t in found.grid]
-    assert found.costs[np.triu_indices(41, 1)] == pytest.approx(costs.mean(0)[np.triu_indices(41, 1)])
+    assert found.costs[np.triu_indices(41, 1)] == pytest.approx(
+        costs.mean(0)[np.triu_indices(41, 1)]
+    )
     assert tuple(path) == by_brute_force(costs.mean(0), 4)
     assert found.cost == pytest.approx(path_cost(costs.mean(0), np.array(path)))
-    assert found.uniform_cost == pytest.approx(path_cost(costs.mean(0), np.array([0, 10, 20, 30, 40])))
+    assert found.uniform_cost == pytest.approx(
+        path_cost(costs.mean(0), np.array([0, 10, 20, 30, 40]))
+    )
     assert found.cost < found.uniform_cost
     assert found.per_trajectory.shape == (7, 3)
     for one, times in zip(costs, found.per_trajectory, strict=True):
@@ -97,7 +112,10 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
 
 @pytest.mark.slow
 def test_the_batch_size_changes_only_rounding() -> None:
-    one, three = (select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b, progress=False) for b in (1, 3))
+    one, three = (
+        select_timesteps(gaussian_velocity, SHAPE, 3, 20, 8, batch=b, progress=False)
+        for b in (1, 3)
+    )
     assert one.grid == three.grid
     assert np.allclose(np.triu(one.costs, 1), np.triu(three.costs, 1), rtol=1e-5, atol=1e-9)
     assert np.array_equal(one.per_trajectory, three.per_trajectory)
@@ -125,14 +143,17 @@ def test_a_custom_metric_and_one_condition_per_trajectory() -> None:
         progress=False,
     )
     assert requested == [range(2), range(2, 3)]
-    # v = c t on a grid of quarters, c = 1, 11, 21: a straight step from t = 1 to 1/2 has an error of c/16.
+    # v = c t on a grid of quarters, c = 1, 11, 21: a straight step from t = 1 to 1/2 has an error
+    # of c/16.
     assert found.costs[0, 2] == pytest.approx(11 / 16, rel=1e-5)
 
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
     def live() -> int:
-        return sum(x.numel() for x in gc.get_objects() if type(x) is Tensor and x.shape[-3:] == SHAPE)
+        return sum(
+            x.numel() for x in gc.get_objects() if type(x) is Tensor and x.shape[-3:] == SHAPE
+        )
 
     def peaks(trajectories: int) -> int:
         seen = []
@@ -165,4 +186,8 @@ def test_a_teacher_with_nan_or_infinity_is_refused(bad: float) -> None:
 )
 def test_invalid_numbers_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        select_timesteps(gaussian_velocity, SHAPE, **{"candidates": 5, "trajectories": 2, "progress": False} | options)
+        select_timesteps(
+            gaussian_velocity,
+            SHAPE,
+            **{"candidates": 5, "trajectories": 2, "progress": False} | options,
+        )

@@ -1,4 +1,5 @@
-"""Weight files of strangers: every layout that ``torch.save`` writes is read as data, and nothing in it runs."""
+"""Weight files of strangers: every layout that ``torch.save`` writes is read as data, and nothing
+in it runs."""
 
 import argparse
 import io
@@ -69,7 +70,9 @@ def test_tensors_are_those_of_torch(tmp_path: Path, zipped: bool) -> None:
     for name, tensor in tensors.items():
         assert found[name].dtype == tensor.dtype, name
         assert torch.equal(found[name], tensor.detach()), name
-    assert found["turned"].untyped_storage().data_ptr() == found["plain"].untyped_storage().data_ptr()
+    assert (
+        found["turned"].untyped_storage().data_ptr() == found["plain"].untyped_storage().data_ptr()
+    )
 
 
 @pytest.fixture
@@ -90,12 +93,16 @@ def lightning(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     yield module
 
 
-def test_a_checkpoint_of_lightning_1_4_is_read(tmp_path: Path, zipped: bool, lightning: Any) -> None:
+def test_a_checkpoint_of_lightning_1_4_is_read(
+    tmp_path: Path, zipped: bool, lightning: Any
+) -> None:
     state = OrderedDict(some_tensors())
     state._metadata = {"": {"version": 1}}  # type: ignore[attr-defined]  # as nn.Module.state_dict
     content = {
         "epoch": 3,
-        "callbacks": {lightning.ModelCheckpoint: {"best_model_score": torch.tensor(0.5), "monitor": None}},
+        "callbacks": {
+            lightning.ModelCheckpoint: {"best_model_score": torch.tensor(0.5), "monitor": None}
+        },
         "hyper_parameters": lightning.AttributeDict(lr=1e-4, betas=(0.9, 0.99)),
         "namespace": argparse.Namespace(width=64, nested=argparse.Namespace(depth=2)),
         "loss": np.float64(0.25),
@@ -116,7 +123,9 @@ def test_a_checkpoint_of_lightning_1_4_is_read(tmp_path: Path, zipped: bool, lig
     assert all(torch.equal(weights[name], tensor.detach()) for name, tensor in state.items())
 
 
-@pytest.mark.parametrize("wrap", ["{}", "module.{}", "_orig_mod.{}", "module._orig_mod.{}", "_orig_mod.module.{}"])
+@pytest.mark.parametrize(
+    "wrap", ["{}", "module.{}", "_orig_mod.{}", "module._orig_mod.{}", "_orig_mod.module.{}"]
+)
 def test_names_of_wrapped_networks_are_those_of_the_network(tmp_path: Path, wrap: str) -> None:
     state = {wrap.format(name): tensor for name, tensor in nn.Linear(2, 2).state_dict().items()}
     found = load_pickle(save(tmp_path / "a.pth", state, True), "a peer")
@@ -167,13 +176,23 @@ def test_a_hostile_file_runs_nothing(tmp_path: Path, zipped: bool, place: str) -
     assert trace.exists(), "the file does nothing even in Python's own reader"
 
 
-def rebuilt(size: tuple[int, ...], stride: tuple[int, ...], offset: int = 0, count: int = 4) -> bytes:
+def rebuilt(
+    size: tuple[int, ...], stride: tuple[int, ...], offset: int = 0, count: int = 4
+) -> bytes:
     """A ZIP archive with one tensor in a storage of four float32, whatever its pickle says."""
     numbers = b"".join(b"\x8a\x08" + struct.pack("<q", n) for n in size)
     strides = b"".join(b"\x8a\x08" + struct.pack("<q", n) for n in stride)
     storage = b"(X\x07\0\0\0storagectorch\nFloatStorage\nX\1\0\0\0" + b"0X\3\0\0\0cpu"
-    body = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"\x8a\x08" + struct.pack("<q", count) + b"tQ"
-    body += b"\x8a\x08" + struct.pack("<q", offset) + b"(" + numbers + b"t(" + strides + b"t\x89}tR."
+    body = (
+        b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n("
+        + storage
+        + b"\x8a\x08"
+        + struct.pack("<q", count)
+        + b"tQ"
+    )
+    body += (
+        b"\x8a\x08" + struct.pack("<q", offset) + b"(" + numbers + b"t(" + strides + b"t\x89}tR."
+    )
     return archive(body)
 
 
@@ -211,7 +230,7 @@ DAMAGED = {
     "text": lambda: b"not a weight file",
     "nothing": lambda: b"",
     "an old tar": lambda: b"pickle\0" + bytes(2000),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", DAMAGED)
@@ -228,7 +247,9 @@ def test_deep_and_circular_values_end(tmp_path: Path, zipped: bool) -> None:
         deep = [deep]
     circle: dict[str, Any] = {}
     circle["self"] = circle
-    found = load_pickle(save(tmp_path / "a.pth", {"deep": deep, "circle": circle, "x": 1}, zipped), "a peer")
+    found = load_pickle(
+        save(tmp_path / "a.pth", {"deep": deep, "circle": circle, "x": 1}, zipped), "a peer"
+    )
     assert found["x"] == 1
     assert found["circle"] == {"self": None}
     assert len(repr(found["deep"])) < 200
@@ -236,7 +257,8 @@ def test_deep_and_circular_values_end(tmp_path: Path, zipped: bool) -> None:
 
 def test_flipped_and_cut_files_give_no_foreign_error(tmp_path: Path, zipped: bool) -> None:
     path = save(tmp_path / "a.pth", {"weights": {"a": torch.ones(3)}, "b": np.float32(1)}, zipped)
-    content, rng = path.read_bytes(), Random(0)
+    content = path.read_bytes()
+    rng = Random(0)
     refused = 0
     for _ in range(400):
         changed = bytearray(content)

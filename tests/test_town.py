@@ -1,4 +1,5 @@
-"""Scans of the town: reproducible, consistent with the ray-cast world, with labels and boxes that fit the points."""
+"""Scans of the town: reproducible, consistent with the ray-cast world, with labels and boxes that
+fit the points."""
 
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -49,7 +50,13 @@ def fingerprint(index: int) -> list[bytes]:
 
 def as_bytes(scan: Scan) -> list[bytes]:
     assert scan.raw_label is not None and scan.boxes is not None and scan.pose is not None
-    boxes = [scan.boxes.values, scan.boxes.occlusion, scan.boxes.truncation, scan.boxes.image_box, scan.boxes.instance]
+    boxes = [
+        scan.boxes.values,
+        scan.boxes.occlusion,
+        scan.boxes.truncation,
+        scan.boxes.image_box,
+        scan.boxes.instance,
+    ]
     arrays = [scan.points, scan.reflectance, scan.raw_label, scan.ring, scan.pose, *boxes]
     return [np.ascontiguousarray(a).tobytes() for a in arrays]
 
@@ -65,7 +72,9 @@ def test_a_scan_is_the_same_in_any_order_and_process(scans: dict[int, Scan]) -> 
 
 
 @pytest.mark.slow
-def test_different_seeds_and_indices_give_different_scans(town: Town, scans: dict[int, Scan]) -> None:
+def test_different_seeds_and_indices_give_different_scans(
+    town: Town, scans: dict[int, Scan]
+) -> None:
     assert as_bytes(scans[4])[0] != as_bytes(scans[5])[0]
     other = Town(seed=1, scans=5)
     assert as_bytes(other[4])[0] != as_bytes(scans[4])[0]
@@ -81,7 +90,9 @@ def test_a_town_is_an_indexable_source() -> None:
             town[index]
 
 
-@pytest.mark.parametrize("options", [{"seed": -1}, {"scans": -1}, {"interval": 0.0}, {"sensor": "hdl65"}])
+@pytest.mark.parametrize(
+    "options", [{"seed": -1}, {"scans": -1}, {"interval": 0.0}, {"sensor": "hdl65"}]
+)
 def test_invalid_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         Town(**options)  # type: ignore[arg-type]
@@ -100,7 +111,10 @@ def test_a_scan_has_every_field(scans: dict[int, Scan]) -> None:
         assert scan.domain == SYNTHETIC and scan.id == f"town-0-{index:06d}"
         assert scan.points.dtype == np.float32 and np.isfinite(scan.points).all()
         distance = np.linalg.norm(scan.points, axis=1)
-        assert distance.min() >= scan.sensor.range_min - 1e-4 and distance.max() <= scan.sensor.range_max + 1e-4
+        assert (
+            distance.min() >= scan.sensor.range_min - 1e-4
+            and distance.max() <= scan.sensor.range_max + 1e-4
+        )
 
 
 def test_label_raw_label_and_instance_agree(scans: dict[int, Scan]) -> None:
@@ -133,7 +147,9 @@ def test_classes_are_at_plausible_heights(scans: dict[int, Scan]) -> None:
         assert abs(np.median(height("road", near)) + 1.73) < 0.12
         assert np.ptp(height("road", near)) < 0.6
         if len(height("sidewalk", near)) > 50:
-            assert 0.03 < np.median(height("sidewalk", near)) - np.median(height("road", near)) < 0.35
+            assert (
+                0.03 < np.median(height("sidewalk", near)) - np.median(height("road", near)) < 0.35
+            )
         if len(height("building", near | True)) > 200:
             assert np.percentile(height("building", near | True), 90) > -0.5
 
@@ -146,7 +162,11 @@ def test_reflectance_is_quantised_and_differs_between_materials(scans: dict[int,
     near = np.concatenate([np.linalg.norm(s.points, axis=1) for s in scans.values()]) < 25
     mean = {c: reflectance[(raw == c) & near].mean() for c in (40, 60, 81, 50)}
     assert mean[40] < min(mean[60], mean[81])
-    assert MATERIALS["asphalt"].reflectance < MATERIALS["render"].reflectance < MATERIALS["plate"].reflectance
+    assert (
+        MATERIALS["asphalt"].reflectance
+        < MATERIALS["render"].reflectance
+        < MATERIALS["plate"].reflectance
+    )
 
 
 def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> None:
@@ -154,7 +174,9 @@ def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> N
     for scan in scans.values():
         boxes = scan.boxes
         assert boxes is not None and len(np.unique(boxes.instance)) == len(boxes)
-        wider = type(boxes)(boxes.values + np.array([0, 0, 0, 0.25, 0.25, 0.25, 0], np.float32), boxes.names)
+        wider = type(boxes)(
+            boxes.values + np.array([0, 0, 0, 0.25, 0.25, 0.25, 0], np.float32), boxes.names
+        )
         for i, number in enumerate(boxes.instance):
             own = scan.instance == number
             assert own.any() and wider.contain(scan.points[own])[i].all(), (scan.id, boxes.names[i])
@@ -165,8 +187,15 @@ def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> N
 
 
 def test_box_names_match_the_classes_of_their_points(scans: dict[int, Scan]) -> None:
-    class_of = {"Car": "car", "Van": "car", "Truck": "truck", "Pedestrian": "person", "Cyclist": "bicyclist",
-          "Person_sitting": "person", "Tram": "other-vehicle"}  # fmt: skip
+    class_of = {
+        "Car": "car",
+        "Van": "car",
+        "Truck": "truck",
+        "Pedestrian": "person",
+        "Cyclist": "bicyclist",
+        "Person_sitting": "person",
+        "Tram": "other-vehicle",
+    }
     for scan in scans.values():
         assert scan.boxes is not None and scan.label is not None
         for name, number in zip(scan.boxes.names, scan.boxes.instance, strict=True):
@@ -181,7 +210,9 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
         boxes = scan.boxes
         assert boxes is not None and CAMERA.image_size is not None
         known = boxes.truncation >= 0
-        assert np.array_equal(known, (boxes.image_box >= 0).all(1)) and np.array_equal(known, boxes.occlusion >= 0)
+        assert np.array_equal(known, (boxes.image_box >= 0).all(1)) and np.array_equal(
+            known, boxes.occlusion >= 0
+        )
         seen += int(known.sum())
         assert (boxes.image_box[known] <= np.array([*CAMERA.image_size] * 2) - 1).all()
         for i in np.flatnonzero(known & (boxes.truncation == 0)):
@@ -189,23 +220,31 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
             if depth.min() < 1:
                 continue
             # The image box of the object lies within the image box of its 3-D box.
-            low, high = corners.min(0) - 3, corners.max(0) + 3
+            low = corners.min(0) - 3
+            high = corners.max(0) + 3
             assert (boxes.image_box[i, :2] > low).all() and (boxes.image_box[i, 2:] < high).all()
-        ahead = (boxes.values[:, 0] > 6) & (np.abs(boxes.values[:, 1]) < 0.8 * boxes.values[:, 0] - 4)
+        ahead = (boxes.values[:, 0] > 6) & (
+            np.abs(boxes.values[:, 1]) < 0.8 * boxes.values[:, 0] - 4
+        )
         assert known[ahead].all()
     assert seen > 10
 
 
 @pytest.mark.slow
 def test_no_ray_passes_through_walls_or_cars(town: Town) -> None:
-    """A ray returns from the first surface that it hits, except for glass, wire, leaves and the relief of soil."""
+    """A ray returns from the first surface that it hits, except for glass, wire, leaves and the
+    relief of soil."""
     mover_points = 0
     still = Town(scans=500, motion=False)
     for index in INDICES:
-        world, scan = town.world(index), still[index]
+        world = town.world(index)
+        scan = still[index]
         snapshot, pose, _ = town.moment(index)
         assert scan.ring is not None and scan.instance is not None
-        start = np.zeros((len(scan), 3)) + np.array((0, 0, 1)) * scan.sensor.optics()[1][scan.ring][:, None]
+        start = (
+            np.zeros((len(scan), 3))
+            + np.array((0, 0, 1)) * scan.sensor.optics()[1][scan.ring][:, None]
+        )
         offset = scan.points - start
         measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
@@ -226,9 +265,12 @@ def test_no_ray_passes_through_walls_or_cars(town: Town) -> None:
 def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -> None:
     world = town.world(4)
     bare = replace(
-        world, triangles=np.full((1, 3, 3), 900, np.float32) * np.eye(3, dtype=np.float32), faces=world.faces[:1]
+        world,
+        triangles=np.full((1, 3, 3), 900, np.float32) * np.eye(3, dtype=np.float32),
+        faces=world.faces[:1],
     )
-    lorry, car = vehicles()["box_lorry"], vehicles()["sedan"]
+    lorry = vehicles()["box_lorry"]
+    car = vehicles()["sedan"]
     pose = np.eye(4)
 
     def place(prototype: Prototype, x: float, y: float, number: int) -> PlacedObject:
@@ -236,7 +278,9 @@ def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -
         object_pose[:3, 3] = x, y, -1.73
         return PlacedObject(prototype, object_pose, number, np.zeros(10, np.int32))
 
-    near, behind, beside = place(lorry, 14, 0, 1), place(car, 30, 0, 2), place(car, 30, 9, 3)
+    near = place(lorry, 14, 0, 1)
+    behind = place(car, 30, 0, 2)
+    beside = place(car, 30, 9, 3)
     boxes = boxes_of([near, behind, beside], pose, Snapshot(bare, [near, behind, beside]))
     assert boxes.occlusion[[0, 2]].tolist() == [0, 0] and boxes.occlusion[1] >= 2
     assert boxes.truncation.tolist() == [0, 0, 0]
@@ -252,12 +296,15 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
     def cloud(index: int, pose: np.ndarray | None = None) -> np.ndarray:
         scan = scans[index]
         assert scan.pose is not None and scan.raw_label is not None
-        still = np.isin(scan.label, [TRAIN_ID[n] for n in ("road", "sidewalk", "building", "pole", "trunk")])
+        still = np.isin(
+            scan.label, [TRAIN_ID[n] for n in ("road", "sidewalk", "building", "pole", "trunk")]
+        )
         still &= np.linalg.norm(scan.points, axis=1) < 14
         pose = scan.pose if pose is None else pose
         return scan.points[still] @ pose[:3, :3].T + pose[:3, 3]
 
-    first, second = scans[4], scans[5]
+    first = scans[4]
+    second = scans[5]
     assert first.pose is not None and second.pose is not None
     assert 1 < np.linalg.norm(second.pose[:3, 3] - first.pose[:3, 3]) < 8
     tree = cKDTree(cloud(4))
@@ -265,7 +312,8 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
     near = np.isfinite(distance_to_first)
     assert near.mean() > 0.9
     assert np.percentile(distance_to_first[near], 75) < 0.25
-    # With the pose of the other scan the same clouds do not match, so the test depends on the poses.
+    # With the pose of the other scan the same clouds do not match, so the test depends on the
+    # poses.
     without_motion = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
     heights = [np.abs(q[:, 2]).mean() for q in (cloud(4), cloud(5))]
     assert np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
@@ -288,7 +336,9 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     elevation, height = sensor.optics()
     scan = Town(scans=5, motion=False)[4]
     x, y, z = scan.points.T
-    assert np.allclose(np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5)
+    assert np.allclose(
+        np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5
+    )
     turned = np.arctan2(-y, x) - np.radians(sensor.azimuths)[scan.ring]
     firing = (turned / np.pi + 1) / 2 * sensor.firings % sensor.firings
     assert np.abs(firing - np.floor(firing) - 0.5).max() < 0.01
@@ -297,14 +347,18 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
 
 def test_the_vehicle_moves_while_the_sensor_turns() -> None:
     """What is measured later is measured from farther along the street."""
-    still, moving = Town(scans=5, motion=False)[4], Town(scans=5)[4]
+    still = Town(scans=5, motion=False)[4]
+    moving = Town(scans=5)[4]
     elevation, height = still.sensor.optics()
     for scan, largest in ((still, 1e-4), (moving, 2.0)):
         x, y, z = scan.points.T
-        start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(-elevation[scan.ring])  # of the ray, towards behind
+        start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(
+            -elevation[scan.ring]
+        )  # of the ray, towards behind
         assert abs(start[scan.ring > 20]).max() < largest
     behind = (np.arctan2(abs(y), x) > 2.9) & (scan.ring > 20)
-    left, right = np.median(start[behind & (y > 0)]), np.median(start[behind & (y < 0)])
+    left = np.median(start[behind & (y > 0)])
+    right = np.median(start[behind & (y < 0)])
     assert -0.6 < left < -0.1 < 0.1 < right < 0.6
 
 
@@ -346,15 +400,20 @@ def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan
     pixels, depth = CAMERA.pixels(scan.points)
     width, height = CAMERA.image_size or (0, 0)
     with np.errstate(invalid="ignore"):
-        inside = (depth > 1) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+        inside = (
+            (depth > 1) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+        )
     eye, rays = pixel_rays(pose, pixels[inside])
     hits = camera_hits(snapshot, eye, rays, surfaces)
     seen = SEMANTIC_KITTI.decode(surfaces.raw)[hits.surface]
     assert inside.sum() > 5000
     assert (seen == scan.label[inside]).mean() > 0.9  # type: ignore[index]
-    # With rays shifted by about two degrees the agreement drops, so the test detects a wrong calibration.
+    # With rays shifted by about two degrees the agreement drops, so the test detects a wrong
+    # calibration.
     _, aside = pixel_rays(pose, pixels[inside] + (20, 10))
-    turned = SEMANTIC_KITTI.decode(surfaces.raw)[camera_hits(snapshot, eye, aside, surfaces).surface]
+    turned = SEMANTIC_KITTI.decode(surfaces.raw)[
+        camera_hits(snapshot, eye, aside, surfaces).surface
+    ]
     assert (turned == scan.label[inside]).mean() < (seen == scan.label[inside]).mean() - 0.03  # type: ignore[index]
 
 
@@ -370,7 +429,10 @@ def test_the_camera_image_shows_a_street_with_sky(town: Town) -> None:
     hits = camera_hits(snapshot, eye, rays, town.world(4).surfaces)
     colour = image[grid[:, 1], grid[:, 0]].astype(float)
     label = SEMANTIC_KITTI.decode(town.world(4).surfaces.raw)[hits.surface]
-    assert colour[hits.surface < 0].mean() > colour[(label == TRAIN_ID["road"]) & (hits.surface >= 0)].mean() + 30
+    assert (
+        colour[hits.surface < 0].mean()
+        > colour[(label == TRAIN_ID["road"]) & (hits.surface >= 0)].mean() + 30
+    )
     red, green, _ = colour[(label == TRAIN_ID["vegetation"]) & (hits.surface >= 0)].mean(0)
     assert green > red
 
@@ -380,13 +442,17 @@ def test_no_mover_collides_with_the_ego_vehicle(town: Town) -> None:
         world = town.world(index)
         for time in town.interval * np.arange(STRETCH_FRAMES):
             s, t, turned = ego_place(world.street, time)
-            length, width = 2.3 * abs(np.cos(turned)), 2.3 * abs(np.sin(turned))
+            length = 2.3 * abs(np.cos(turned))
+            width = 2.3 * abs(np.sin(turned))
             for mover in world.movers:
                 at_s, at_t, yaw = mover.place(time)
                 low, high = mover.shape(time).mesh.bounds
                 half = (high - low)[:2] / 2
                 along, across = half if abs(np.cos(yaw)) > 0.5 else half[::-1]
-                assert abs(at_s - s) > max(0.85, length) + along or abs(at_t - t) > max(0.85, width) + across
+                assert (
+                    abs(at_s - s) > max(0.85, length) + along
+                    or abs(at_t - t) > max(0.85, width) + across
+                )
 
 
 def test_ray_casting_is_deterministic(town: Town) -> None:

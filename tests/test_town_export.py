@@ -1,4 +1,5 @@
-"""Export of the town: every layout is read back by the package's readers; an interrupted export resumes."""
+"""Export of the town: every layout is read back by the package's readers; an interrupted export
+resumes."""
 
 import json
 from pathlib import Path
@@ -32,7 +33,9 @@ def scans(town: Town) -> list[Scan]:
 
 
 @pytest.fixture(scope="module", params=sorted(LAYOUTS))
-def written(request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+def written(
+    request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, Path]:
     root = tmp_path_factory.mktemp(request.param)
     assert export_town(town, root, request.param, camera=False, progress=False) == (COUNT, 0)
     return request.param, root
@@ -48,14 +51,18 @@ def test_points_are_read_back_bit_for_bit(written: tuple[str, Path], scans: list
         assert np.array_equal(read[i].reflectance, scan.reflectance)
 
 
-def test_scans_read_from_an_exported_town_are_synthetic(written: tuple[str, Path], tmp_path: Path) -> None:
+def test_scans_read_from_an_exported_town_are_synthetic(
+    written: tuple[str, Path], tmp_path: Path
+) -> None:
     root = written[1]
     read = open_scans(root)
     assert [scan.domain for scan in read] == [SYNTHETIC] * COUNT and read[0].domain == SYNTHETIC
     one = next(path for path in sorted(root.rglob("*.bin")) if path.parent.name != "labels")
     assert open_scans(one)[0].domain == SYNTHETIC
     view(root, 0, 1, tmp_path / "page.html", None)
-    assert '"domain": 1' in (tmp_path / "page.html").read_text().replace('"domain":1', '"domain": 1')
+    assert '"domain": 1' in (tmp_path / "page.html").read_text().replace(
+        '"domain":1', '"domain": 1'
+    )
     real = MixedScans(read, ratio=0)  # a mixture counts every scan of its real source as real
     assert real[0]["domain"] == REAL
 
@@ -90,9 +97,11 @@ def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> No
         pytest.skip("SemanticKITTI has no boxes")
     tolerance = 0.02 if layout == "kitti" else 1e-3
     for i, scan in enumerate(scans):
-        read, boxes = open_scans(root)[i].boxes, scan.boxes
+        read = open_scans(root)[i].boxes
+        boxes = scan.boxes
         assert read is not None and boxes is not None
-        # label_2 lists only objects in the image; KITTI-360's reader drops boxes centred beyond the sensor's range.
+        # label_2 lists only objects in the image; KITTI-360's reader drops boxes centred beyond the
+        # sensor's range.
         near = np.linalg.norm(boxes.values[:, :2], axis=1) < scan.sensor.range_max - 1
         expected = boxes[boxes.truncation >= 0] if layout == "kitti" else boxes[near]
         assert len(read) >= len(expected) > 0
@@ -105,7 +114,9 @@ def test_boxes_are_read_back(written: tuple[str, Path], scans: list[Scan]) -> No
                 assert read.names[match] == name
 
 
-def test_kitti_labels_have_occlusion_truncation_and_image_boxes(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_kitti_labels_have_occlusion_truncation_and_image_boxes(
+    written: tuple[str, Path], scans: list[Scan]
+) -> None:
     layout, root = written
     if layout != "kitti":
         pytest.skip("only KITTI's object set")
@@ -120,7 +131,9 @@ def test_kitti_labels_have_occlusion_truncation_and_image_boxes(written: tuple[s
         assert read.truncation[match] == pytest.approx(seen.truncation[i], abs=0.006)
 
 
-def test_the_calibration_is_read_back(written: tuple[str, Path], town: Town, scans: list[Scan]) -> None:
+def test_the_calibration_is_read_back(
+    written: tuple[str, Path], town: Town, scans: list[Scan]
+) -> None:
     _, root = written
     camera = open_scans(root).calibration(0)
     assert camera is not None
@@ -140,22 +153,35 @@ def test_the_folder_has_a_readme_and_its_settings(written: tuple[str, Path]) -> 
 def test_splits_and_times_of_each_layout_are_written(written: tuple[str, Path]) -> None:
     layout, root = written
     if layout == "kitti360":
-        assert len(KITTI360(root, split="r2flow/train")) == len(KITTI360(root, split="lidm/train")) == COUNT
+        assert (
+            len(KITTI360(root, split="r2flow/train"))
+            == len(KITTI360(root, split="lidm/train"))
+            == COUNT
+        )
     if layout == "semantic_kitti":
         assert len(SemanticKITTI(root, split="train")) == COUNT
-        times = [float(line) for line in (root / "sequences" / "00" / "times.txt").read_text().split()]
+        times = [
+            float(line) for line in (root / "sequences" / "00" / "times.txt").read_text().split()
+        ]
         assert np.allclose(times, [0, 0.4, 0.8])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("layout", "scan"), {"semantic_kitti": "000001.bin", "kitti360": "0000000001.bin"}.items())
-def test_an_interrupted_or_extended_export_changes_no_byte(layout: str, scan: str, tmp_path: Path, town: Town) -> None:
+@pytest.mark.parametrize(
+    ("layout", "scan"), {"semantic_kitti": "000001.bin", "kitti360": "0000000001.bin"}.items()
+)
+def test_an_interrupted_or_extended_export_changes_no_byte(
+    layout: str, scan: str, tmp_path: Path, town: Town
+) -> None:
     assert export_town(town, tmp_path, layout, camera=False, progress=False) == (COUNT, 0)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     [lost] = tmp_path.rglob(f"velodyne*/**/{scan}")
     lost.unlink()
     for missing in (1, 0):
-        assert export_town(town, tmp_path, layout, camera=False, progress=False) == (missing, COUNT - missing)
+        assert export_town(town, tmp_path, layout, camera=False, progress=False) == (
+            missing,
+            COUNT - missing,
+        )
         assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
     longer = Town(seed=5, scans=COUNT + 1)
     assert export_town(longer, tmp_path, layout, camera=False, progress=False) == (1, COUNT)
@@ -167,7 +193,9 @@ def test_fewer_scans_than_there_are_keep_all_times(tmp_path: Path) -> None:
     times = tmp_path / "sequences" / "00" / "times.txt"
     export_town(Town(seed=5, scans=2), tmp_path, "semantic_kitti", camera=False, progress=False)
     before = times.read_text()
-    assert export_town(Town(seed=5, scans=1), tmp_path, "semantic_kitti", camera=False, progress=False) == (0, 1)
+    assert export_town(
+        Town(seed=5, scans=1), tmp_path, "semantic_kitti", camera=False, progress=False
+    ) == (0, 1)
     assert times.read_text() == before and len(before.splitlines()) == 2
 
 
@@ -179,15 +207,20 @@ def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town)
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [({"skin": "pandar64"}, "'skin': None"), ({"motion": False}, "'motion': True"),
-     ({"noise": Noise(range_std=0.03)}, "'noise'")],
-)  # fmt: skip
+    [
+        ({"skin": "pandar64"}, "'skin': None"),
+        ({"motion": False}, "'motion': True"),
+        ({"noise": Noise(range_std=0.03)}, "'noise'"),
+    ],
+)
 def test_a_folder_is_not_continued_by_a_town_whose_scans_differ(
     tmp_path: Path, options: dict[str, Any], named: str
 ) -> None:
     export_town(Town(5, "pandar64", 0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=f"was filled with .*{named}"):
-        export_town(Town(5, "pandar64", 1, **options), tmp_path, "kitti", camera=False, progress=False)
+        export_town(
+            Town(5, "pandar64", 1, **options), tmp_path, "kitti", camera=False, progress=False
+        )
 
 
 def test_scans_name_their_skin_and_its_licence() -> None:
@@ -197,7 +230,8 @@ def test_scans_name_their_skin_and_its_licence() -> None:
 
 
 @pytest.mark.parametrize(
-    ("layout", "jobs", "sequence"), [("kitti-360", 1, None), ("kitti360", 0, None), ("kitti360", 1, 100)]
+    ("layout", "jobs", "sequence"),
+    [("kitti-360", 1, None), ("kitti360", 0, None), ("kitti360", 1, 100)],
 )
 def test_invalid_arguments_are_refused(
     tmp_path: Path, town: Town, layout: str, jobs: int, sequence: int | None
@@ -218,14 +252,23 @@ def test_several_processes_write_the_same_files_as_one(tmp_path: Path, town: Tow
     for jobs in (1, 2):
         export_town(town, tmp_path / str(jobs), "kitti360", camera=False, jobs=jobs, progress=False)
     one, two = (
-        {p.relative_to(tmp_path / j): p.read_bytes() for p in (tmp_path / j).rglob("*") if p.is_file()} for j in "12"
+        {
+            p.relative_to(tmp_path / j): p.read_bytes()
+            for p in (tmp_path / j).rglob("*")
+            if p.is_file()
+        }
+        for j in "12"
     )
     assert one == two
 
 
 def test_work_is_grouped_by_stretch() -> None:
     assert _groups(list(range(3)), 1) == [[0], [1], [2]]
-    assert _groups(list(range(45)), 2) == [list(range(20)), list(range(20, 40)), list(range(40, 45))]
+    assert _groups(list(range(45)), 2) == [
+        list(range(20)),
+        list(range(20, 40)),
+        list(range(40, 45)),
+    ]
     assert _groups([3, 4, 5, 6], 2) == [[3, 4], [5, 6]]
     assert _groups([19, 20], 1) == [[19], [20]]
 
@@ -243,6 +286,8 @@ def test_the_command_writes_camera_images_and_accepts_sensors(
     with Image.open(scan.image_path) as image:
         assert image.size == (1408, 376)
         assert np.array_equal(np.asarray(image), Town(seed=5, scans=1).image(0))
-    command(tmp_path / "b", scans=1, sensor="hdl32e_nuscenes", camera=False, layout="semantic_kitti")
+    command(
+        tmp_path / "b", scans=1, sensor="hdl32e_nuscenes", camera=False, layout="semantic_kitti"
+    )
     read = SemanticKITTI(tmp_path / "b", sensor="hdl32e_nuscenes")[0]
     assert len(read) > 5000 and read.sensor == load_sensor("hdl32e_nuscenes")

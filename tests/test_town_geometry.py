@@ -29,7 +29,9 @@ def hits(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return Solid(mesh.triangles).first(origins.astype(np.float32), directions.astype(np.float32))[0]
 
 
-def rays_towards_origin(count: int, seed: int = 0, radius: float = 50.0) -> tuple[np.ndarray, np.ndarray]:
+def rays_towards_origin(
+    count: int, seed: int = 0, radius: float = 50.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions of rays from all sides towards the origin."""
     rng = np.random.default_rng(seed)
     start = rng.standard_normal((count, 3))
@@ -40,7 +42,8 @@ def rays_towards_origin(count: int, seed: int = 0, radius: float = 50.0) -> tupl
 @given(low=st.tuples(*[st.floats(-5, 5)] * 3), size=st.tuples(*[st.floats(0.1, 5)] * 3))
 @settings(max_examples=20)
 def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, ...]) -> None:
-    a, b = np.array(low), np.array(low) + np.array(size)
+    a = np.array(low)
+    b = np.array(low) + np.array(size)
     mesh = boxes([a], [b])
     assert len(mesh) == 12
     middle = (a + b) / 2
@@ -51,8 +54,14 @@ def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, 
         assert np.isclose(distances[0], 20 - size[axis] / 2, atol=1e-3)
 
 
-@pytest.mark.parametrize("mesh", [boxes([(-1, -1, -1)], [(1, 1, 1)]), ball((0, 0, 0), 1.0, rings=8, sides=12),
-                                  tube([(0, 0, -1), (0, 0, 1)], 1.0, 12)])  # fmt: skip
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        boxes([(-1, -1, -1)], [(1, 1, 1)]),
+        ball((0, 0, 0), 1.0, rings=8, sides=12),
+        tube([(0, 0, -1), (0, 0, 1)], 1.0, 12),
+    ],
+)
 def test_closed_shapes_let_no_ray_through(mesh: Mesh) -> None:
     assert np.isfinite(hits(mesh, *rays_towards_origin(2000))).all()
 
@@ -104,15 +113,24 @@ def test_vehicles_have_plausible_shapes() -> None:
         assert glass.any()
         heights = mesh.triangles[glass][..., 2]
         assert heights.min() > 0.3 * mesh.bounds[1][2]
-    # Bonnet and boot are lower than the roof, and a low ray across the middle passes between the wheels.
+    # Bonnet and boot are lower than the roof, and a low ray across the middle passes between the
+    # wheels.
     car = kinds["sedan"].mesh
-    front, roof, boot = 5 - hits(car, np.array([(x, 0.0, 5.0) for x in (1.8, 0.0, -2.1)]), np.tile((0, 0, -1), (3, 1)))
+    front, roof, boot = 5 - hits(
+        car, np.array([(x, 0.0, 5.0) for x in (1.8, 0.0, -2.1)]), np.tile((0, 0, -1), (3, 1))
+    )
     assert front < 1.0 < roof and boot < roof - 0.2
     assert np.isinf(hits(car, np.array([(0.0, -5.0, 0.1)]), np.array([(0, 1, 0)])))[0]
 
 
 def test_people_touch_the_ground_and_have_plausible_heights() -> None:
-    for prototype in [*(walker(p) for p in range(PHASES)), walker(0, True), cyclist(3), motorcyclist(), sitter()]:
+    for prototype in [
+        *(walker(p) for p in range(PHASES)),
+        walker(0, True),
+        cyclist(3),
+        motorcyclist(),
+        sitter(),
+    ]:
         low, high = prototype.mesh.bounds
         assert -0.03 < low[2] < 0.09
         assert 1.2 < high[2] < 1.95
@@ -131,7 +149,8 @@ def test_rays_enter_the_crown_of_a_plant(species: str) -> None:
         side = np.abs(directions[:, 2]) < 0.3
         distances = hits(mesh, start[side] + middle, directions[side])
         depth = 50 - distances[np.isfinite(distances)]
-        # Some rays end outside, some deep inside; with a smooth surface, all would end at the same depth.
+        # Some rays end outside, some deep inside; with a smooth surface, all would end at the same
+        # depth.
         assert len(depth) > 0.2 * side.sum() and depth.std() > 0.015 * (high - low)[:2].mean()
     assert np.isin(plant(species, 0).slot, (LEAF, CORE)).mean() > 0.5
 
@@ -152,9 +171,16 @@ def test_the_mesh_of_the_ground_matches_its_height_and_kind(stretch: int) -> Non
     world = build_world(0, stretch, 0.4)
     ground = world.scene.ground
     rng = np.random.default_rng(0)
-    s, t = rng.uniform(-40, world.street.length + 40, 3000), rng.uniform(-25, 25, 3000)
+    s = rng.uniform(-40, world.street.length + 40, 3000)
+    t = rng.uniform(-25, 25, 3000)
     kind = ground.kind(s, t)
-    paved = np.isin(kind, [NAMES.index(k) for k in ("road", "old_road", "marking", "parking", "sidewalk", "cycleway")])
+    paved = np.isin(
+        kind,
+        [
+            NAMES.index(k)
+            for k in ("road", "old_road", "marking", "parking", "sidewalk", "cycleway")
+        ],
+    )
     corners = np.zeros(len(s), bool)
     for c in ground.corners:
         corners |= (np.abs(s - c.s) < c.radius + 0.3) & (np.abs(t - c.t) < c.radius + 0.3)
@@ -185,9 +211,12 @@ def test_the_ground_has_no_holes() -> None:
 
 def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
     rng = np.random.default_rng(0)
-    road, pavement = NAMES.index("road"), NAMES.index("sidewalk")
+    road = NAMES.index("road")
+    pavement = NAMES.index("sidewalk")
     rects = [(-50.0, 50.0, -20.0, 20.0, pavement), (-50.0, 50.0, -3.0, 3.0, road)]
-    ground = Ground(Course(-50, 50, 0, rng), Relief(0.0, rng), (3, 3), (-60, 60, -60, 60), (-50, 50), rects, [])
+    ground = Ground(
+        Course(-50, 50, 0, rng), Relief(0.0, rng), (3, 3), (-60, 60, -60, 60), (-50, 50), rects, []
+    )
     step = float(ground.height(0, 3.01) - ground.height(0, 2.99))
     assert step == pytest.approx(KINDS["sidewalk"].lift, abs=1e-3)
     low = ground.points(0.0, 0.0) + UP * (step / 2 - 0.018 * 3)
@@ -204,10 +233,14 @@ def test_sampled_streets_of_a_kind_vary_and_are_valid(kind: str) -> None:
         assert street.kind == kind and street.length > 20
         assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].direction == 1
         for lane in street.lanes:
-            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.direction == (1 if lane.t < 0 else -1)
+            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.direction == (
+                1 if lane.t < 0 else -1
+            )
         assert street.ends[0] < -20 and street.ends[1] > street.length + 20
         if kind == "junction":
-            assert any(c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20 for c in street.crossings)
+            assert any(
+                c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20 for c in street.crossings
+            )
 
 
 def test_all_kinds_of_street_are_sampled() -> None:

@@ -60,12 +60,20 @@ class Convolution(nn.Module):
 
 def new_training(**recipe: Any) -> Training:
     torch.manual_seed(0)
-    return Training(Convolution(), Recipe(**{"iterations": 6, "batch": 4, "warmup": 2, "rate": 1e-2} | recipe))
+    return Training(
+        Convolution(), Recipe(**{"iterations": 6, "batch": 4, "warmup": 2, "rate": 1e-2} | recipe)
+    )
 
 
 @pytest.fixture(scope="module")
 def batches() -> Batches:
-    return Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=3, flip=True, roll=True)
+    return Batches(
+        cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False),
+        TENSORS,
+        seed=3,
+        flip=True,
+        roll=True,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +92,10 @@ def test_a_cache_holds_the_projected_scans_within_its_steps(tmp_path: Path) -> N
             image = project(scan)
             assert np.abs(fields["range"][i].numpy() - image.range).max() <= 80 / 65535 / 2 * 1.01
             assert np.array_equal(fields["range"][i].numpy() > 0, image.mask)
-            assert np.abs(fields["reflectance"][i].numpy() - image.channels["reflectance"]).max() <= 0.5 / 255 * 1.01
+            assert (
+                np.abs(fields["reflectance"][i].numpy() - image.channels["reflectance"]).max()
+                <= 0.5 / 255 * 1.01
+            )
             assert np.array_equal(fields["label"][i].numpy(), image.channels["label"])
 
 
@@ -93,7 +104,8 @@ class Counted(list[Scan]):
 
     def __init__(self, scans: list[Scan], limit: int = 10**9) -> None:
         super().__init__(scans)
-        self.reads, self.limit = 0, limit
+        self.reads = 0
+        self.limit = limit
 
     def __getitem__(self, index: Any) -> Any:
         if self.reads == self.limit:
@@ -102,7 +114,9 @@ class Counted(list[Scan]):
         return super().__getitem__(index)
 
 
-def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(tmp_path: Path) -> None:
+def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
+    tmp_path: Path,
+) -> None:
     scans = [SCANS[i % 5] for i in range(150)]
     broken = Counted(scans, limit=100)
     with pytest.raises(KeyboardInterrupt):
@@ -156,7 +170,8 @@ def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
     plain = Batches(batches.cache, TENSORS, seed=3)
     seen = set()
     for position in range(40):
-        sample, original = batches([position]).y0[0], plain([position]).y0[0]
+        sample = batches([position]).y0[0]
+        original = plain([position]).y0[0]
         found = [
             (flip, shift)
             for flip in (False, True)
@@ -171,17 +186,24 @@ def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
 
 def test_mirroring_an_image_is_mirroring_its_points() -> None:
     mirrored = Scan(SCANS[0].points * np.float32([1, -1, 1]), SCANS[0].reflectance, SENSOR)
-    assert (project(mirrored).range == project(SCANS[0]).range[:, ::-1]).mean() > 0.99  # all but points on an edge
+    assert (
+        project(mirrored).range == project(SCANS[0]).range[:, ::-1]
+    ).mean() > 0.99  # all but points on an edge
 
 
 @given(
-    step=st.integers(0, 100), size=st.integers(1, 4), accumulate=st.integers(1, 3), processes=st.integers(1, 3)
-)  # fmt: skip
+    step=st.integers(0, 100),
+    size=st.integers(1, 4),
+    accumulate=st.integers(1, 3),
+    processes=st.integers(1, 3),
+)
 def test_processes_and_micro_batches_share_the_positions_of_a_step(
     step: int, size: int, accumulate: int, processes: int
 ) -> None:
     batch = size * accumulate * processes
-    parts = [p for r in range(processes) for p in micro_batches(step, batch, accumulate, r, processes)]
+    parts = [
+        p for r in range(processes) for p in micro_batches(step, batch, accumulate, r, processes)
+    ]
     assert sorted(i for p in parts for i in p) == list(range(step * batch, (step + 1) * batch))
     assert {len(p) for p in parts} == {size}
 
@@ -205,7 +227,9 @@ def test_a_schedule_warms_up_and_ends_near_zero(name: str) -> None:
 
 def test_the_schedules_have_their_shape() -> None:
     assert SCHEDULES["cosine"](505, 10, 1000) == pytest.approx(0.5)
-    assert SCHEDULES["cosine"](257, 10, 1000) == pytest.approx((1 + math.cos(math.pi * 247 / 990)) / 2)
+    assert SCHEDULES["cosine"](257, 10, 1000) == pytest.approx(
+        (1 + math.cos(math.pi * 247 / 990)) / 2
+    )
     assert [SCHEDULES["trapezoid"](s, 10, 1000) for s in (750, 875)] == [1, 0.5]
     assert [SCHEDULES["trapezoid"](s, 10, 1000) for s in range(750)] == [
         SCHEDULES["trapezoid"](s, 10, 1200) for s in range(750)
@@ -226,7 +250,9 @@ def test_training_lowers_the_loss(batches: Batches, accelerator: Accelerator) ->
 
 
 @pytest.mark.slow
-def test_the_first_loss_is_that_of_the_metric_on_the_batch(batches: Batches, accelerator: Accelerator) -> None:
+def test_the_first_loss_is_that_of_the_metric_on_the_batch(
+    batches: Batches, accelerator: Accelerator
+) -> None:
     for metric in METRICS:
         training = new_training(metric=metric)
         batch = batches(range(4))
@@ -236,19 +262,24 @@ def test_the_first_loss_is_that_of_the_metric_on_the_batch(batches: Batches, acc
         assert record.loss == pytest.approx(expected.item(), rel=1e-5)
 
 
-def test_weights_of_channels_are_those_of_their_squared_errors(batches: Batches, accelerator: Accelerator) -> None:
+def test_weights_of_channels_are_those_of_their_squared_errors(
+    batches: Batches, accelerator: Accelerator
+) -> None:
     training = new_training(weights={"range": 4.0, "label": 0.5})
     batch = batches(range(4))
     y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(-1, 1, 1, 1) * batch.y1
     error = (training.network(y, batch.u) - (batch.y1 - batch.y0)).square().mean((0, 2, 3))
     expected = (error * torch.tensor([4, 1] + [0.5] * 5)).mean()
-    assert next(steps(training, teacher_task(), batches, accelerator)).loss == pytest.approx(expected.item(), rel=1e-5)
+    assert next(steps(training, teacher_task(), batches, accelerator)).loss == pytest.approx(
+        expected.item(), rel=1e-5
+    )
 
 
 @pytest.mark.slow
 def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accelerator) -> None:
     one, two = (
-        [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)] for n in (1, 2)
+        [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)]
+        for n in (1, 2)
     )
     assert one == pytest.approx(two, rel=1e-4)
 
@@ -258,7 +289,9 @@ def transformer() -> nn.Module:
     torch.manual_seed(0)
     arguments = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 4]}
     angles = torch.from_numpy(SENSOR.ray_angles())
-    return build_network("hdit", {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles} | arguments)
+    return build_network(
+        "hdit", {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles} | arguments
+    )
 
 
 @pytest.mark.slow
@@ -291,7 +324,11 @@ def test_every_weight_is_moved_once_at_the_rate_of_the_schedule(
     moved = [p for o in training.optimizers for group in o.param_groups for p in group["params"]]
     assert sorted(map(id, moved)) == sorted(map(id, training.network.parameters()))
     record = next(steps(training, teacher_task(), batches, accelerator))
-    assert {group["lr"] for o in training.optimizers for group in o.param_groups} == {record.rate} == {2.5e-3}
+    assert (
+        {group["lr"] for o in training.optimizers for group in o.param_groups}
+        == {record.rate}
+        == {2.5e-3}
+    )
 
 
 def test_the_average_follows_the_weights(batches: Batches, accelerator: Accelerator) -> None:
@@ -313,7 +350,9 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_the_training_as_it_was(
 ) -> None:
     def poisoned(batch: Batch) -> Example:
         example = teacher_task()(batch)
-        bad = torch.full_like(example.velocity, torch.nan) if training.step == 2 else example.velocity
+        bad = (
+            torch.full_like(example.velocity, torch.nan) if training.step == 2 else example.velocity
+        )
         return Example(example.y, example.t, bad)
 
     training = new_training(ema_every=1)
@@ -328,7 +367,9 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_the_training_as_it_was(
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_a_student_is_trained_by_every_strategy(strategy: str, batches: Batches, accelerator: Accelerator) -> None:
+def test_a_student_is_trained_by_every_strategy(
+    strategy: str, batches: Batches, accelerator: Accelerator
+) -> None:
     teacher = Convolution().eval().requires_grad_(False)
     task = student_task(strategy, teacher, uniform_grid(4), 2)
     records = list(steps(new_training(metric="pseudo_huber"), task, batches, accelerator))
@@ -361,10 +402,14 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_recipe_with_an_unknown_name_is_refused() -> None:
-    with pytest.raises(ConfigError, match="metric 'l7'; expected one of squared_l2, pseudo_huber, l1"):
+    with pytest.raises(
+        ConfigError, match="metric 'l7'; expected one of squared_l2, pseudo_huber, l1"
+    ):
         Recipe(iterations=1, metric="l7")
     with pytest.raises(ConfigError, match="at least 1"):
         Recipe(iterations=0)
     for weights in ({"colour": 1.0}, {"range": 0.0}):
-        with pytest.raises(ConfigError, match="numbers above 0 for some of range, reflectance, label"):
+        with pytest.raises(
+            ConfigError, match="numbers above 0 for some of range, reflectance, label"
+        ):
             Recipe(iterations=1, weights=weights)

@@ -1,5 +1,5 @@
-"""Runs that are disturbed: caches that two of them open, failures while saving, patience that ends before the rate
-falls, and starts that contradict the configuration."""
+"""Runs that are disturbed: caches that two of them open, failures while saving, patience that ends
+before the rate falls, and starts that contradict the configuration."""
 
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,9 @@ def test_the_rate_falls_after_a_plateau_that_patience_has_ended(
 ) -> None:
     rates: list[float] = []
     add = runs._Log.add
-    monkeypatch.setattr(runs._Log, "add", lambda self, record: rates.append(record.rate) or add(self, record))
+    monkeypatch.setattr(
+        runs._Log, "add", lambda self, record: rates.append(record.rate) or add(self, record)
+    )
     # At this rate the loss goes up and down, so that patience ends soon.
     given = config(tmp_path / "run", HELD, "recipe.rate=0.05", "recipe.schedule=trapezoid")
     train_for(given, 1.0)
@@ -87,7 +89,9 @@ def test_the_rate_falls_after_a_plateau_that_patience_has_ended(
 @pytest.mark.slow
 def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(tmp_path: Path) -> None:
     first = "condition={kind: semantic, dropout: 0.0}"
-    start = run(config(tmp_path / "start", "recipe.iterations=2", "channels=[range,reflectance]", first))
+    start = run(
+        config(tmp_path / "start", "recipe.iterations=2", "channels=[range,reflectance]", first)
+    )
     assert read_header(start)[0].conditioning == {"semantic": {}}
 
     def header(condition: str) -> Any:
@@ -96,7 +100,10 @@ def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(tmp_path
 
     assert header("{kind: semantic, dropout: 0.5}").conditioning == {"semantic": {"dropout": 0.5}}
     assert header("{kind: semantic}").conditioning == {"semantic": {}}
-    with pytest.raises(ConfigError, match=r"condition.kind 'layout' for init .*expected that of the model, 'semantic'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"condition.kind 'layout' for init .*expected that of the model, 'semantic'",
+    ):
         header("{kind: layout, dropout: 0.5}")
     with pytest.raises(ConfigError, match="condition.arguments"):
         header("{kind: semantic, arguments: {channels: 77}}")

@@ -1,4 +1,5 @@
-"""From sensor to sensor: against what the target records itself of a scene that is known exactly."""
+"""From sensor to sensor: against what the target records itself of a scene that is known
+exactly."""
 
 from dataclasses import replace
 
@@ -19,11 +20,20 @@ from lidar_synth.noise import keyed_rng
 
 HDL64E = replace(load_sensor("hdl64e_kitti360"), firings=2000, heights=None)
 UNEVEN = Sensor(
-    "uneven", 1200, 0.5, 150.0, elevations=(6, 3, 2, *np.arange(1.5, -6, -0.2), *np.arange(-6.2, -20, -1.0)),
+    "uneven",
+    1200,
+    0.5,
+    150.0,
+    elevations=(6, 3, 2, *np.arange(1.5, -6, -0.2), *np.arange(-6.2, -20, -1.0)),
     azimuths=tuple(-1.0 + 2.0 * (i % 2) for i in range(55)),
-)  # fmt: skip
-TARGETS = {"uneven": UNEVEN, "hdl32e": replace(load_sensor("hdl32e_nuscenes"), firings=1084), "hdl64e": HDL64E,
-           "os1_128": load_sensor("os1_128"), "hdl64e at heights": load_sensor("hdl64e_kitti")}  # fmt: skip
+)
+TARGETS = {
+    "uneven": UNEVEN,
+    "hdl32e": replace(load_sensor("hdl32e_nuscenes"), firings=1084),
+    "hdl64e": HDL64E,
+    "os1_128": load_sensor("os1_128"),
+    "hdl64e at heights": load_sensor("hdl64e_kitti"),
+}
 MOUNTS = {"same place": Mount(), "higher": Mount(0.4), "lower, looking down": Mount(-0.2, 3.0)}
 
 
@@ -38,9 +48,13 @@ def test_it_sees_what_the_target_itself_records(scan: Scan, target: str, mount: 
     """Ranges, occlusion and labels: also behind the car, whose shadow moves with the mount."""
     truth = record(TARGETS[target], MOUNTS[mount])
     found = Transfer(TARGETS[target], MOUNTS[mount])(scan)
-    at_truth, at_found = image(truth), image(found)
+    at_truth = image(truth)
+    at_found = image(found)
     both = (at_truth >= 0) & (at_found >= 0)
-    ranges = [np.linalg.norm(s.points, axis=1)[at[both]] for s, at in ((truth, at_truth), (found, at_found))]
+    ranges = [
+        np.linalg.norm(s.points, axis=1)[at[both]]
+        for s, at in ((truth, at_truth), (found, at_found))
+    ]
     right = np.abs(ranges[0] - ranges[1]) < 0.03 + 0.01 * ranges[0]
     assert right.mean() > 0.975
     assert (truth.label[at_truth[both]] == found.label[at_found[both]]).mean() > 0.985
@@ -51,7 +65,9 @@ def test_it_sees_what_the_target_itself_records(scan: Scan, target: str, mount: 
         & _near(truth, 50)
     )
     assert (at_found[at_truth >= 0] >= 0)[inside[at_truth[at_truth >= 0]]].mean() > 0.96
-    assert both.sum() > 0.96 * (at_found >= 0).sum()  # it returns little where the target returns nothing
+    assert (
+        both.sum() > 0.96 * (at_found >= 0).sum()
+    )  # it returns little where the target returns nothing
 
 
 def _near(scan: Scan, most: float) -> np.ndarray:
@@ -61,8 +77,10 @@ def _near(scan: Scan, most: float) -> np.ndarray:
 def test_the_nearer_surface_hides_the_farther_one(scan: Scan) -> None:
     """From further down, the car stands before the part of the wall that was seen over its roof."""
     mount = Mount(-0.9)
-    truth, found = record(HDL64E, mount), Transfer(HDL64E, mount)(scan)
-    at_truth, at_found = image(truth), image(found)
+    truth = record(HDL64E, mount)
+    found = Transfer(HDL64E, mount)(scan)
+    at_truth = image(truth)
+    at_found = image(found)
     both = (at_truth >= 0) & (at_found >= 0)
     on_car = truth.label[at_truth[both]] == CAR
     assert on_car.sum() > 1000 and (found.label[at_found[both]][on_car] == CAR).mean() > 0.97
@@ -74,7 +92,8 @@ def test_no_return_hangs_between_surfaces(scan: Scan, target: str) -> None:
     points = Transfer(TARGETS[target])(scan).points.astype(float)
     off = [np.abs(points[:, 2] - GROUND)]
     for box in (CAR_BOX, WALL):
-        c, s = np.cos(box[6]), np.sin(box[6])
+        c = np.cos(box[6])
+        s = np.sin(box[6])
         local = (points - box[:3]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
         off.append(np.linalg.norm(np.maximum(np.abs(local) - np.array(box[3:6]) / 2, 0), axis=1))
     assert (np.min(off, 0) > 0.3).mean() < 1e-3
@@ -96,20 +115,27 @@ def test_returns_lie_on_the_beams_and_firings_of_the_target(scan: Scan, target: 
     off = np.degrees(np.abs(elevation - sensor.laser_elevations[found.ring]))
     assert off.max() < 1e-3 if sensor.heights is None else np.median(off) < 0.2
     azimuths = sensor.firing_azimuths()
-    firing = (-np.arctan2(found.points[:, 1], found.points[:, 0]) - azimuths[found.ring, 0]) / np.diff(azimuths)[0, 0]
+    firing = (
+        -np.arctan2(found.points[:, 1], found.points[:, 0]) - azimuths[found.ring, 0]
+    ) / np.diff(azimuths)[0, 0]
     assert np.abs(firing - np.rint(firing)).max() < 1e-3
 
 
 def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) -> None:
     found = Transfer(HDL64E)(scan)
-    before, after = image(scan), image(found)
+    before = image(scan)
+    after = image(found)
     both = (before >= 0) & (after >= 0)
     assert both.sum() > 0.995 * max((before >= 0).sum(), (after >= 0).sum())
     off = np.linalg.norm(scan.points[before[both]] - found.points[after[both]], axis=1)
     assert np.quantile(off, 0.995) < 1e-3
     for name in ("label", "instance", "time"):
-        assert (getattr(scan, name)[before[both]] == getattr(found, name)[after[both]]).mean() > 0.999
-    np.testing.assert_allclose(scan.reflectance[before[both]], found.reflectance[after[both]], atol=0.51)
+        assert (
+            getattr(scan, name)[before[both]] == getattr(found, name)[after[both]]
+        ).mean() > 0.999
+    np.testing.assert_allclose(
+        scan.reflectance[before[both]], found.reflectance[after[both]], atol=0.51
+    )
 
 
 def test_a_real_street_of_the_town_too() -> None:
@@ -137,7 +163,9 @@ def test_boxes_and_pose_move_to_the_targets_frame(scan: Scan, mount: str) -> Non
     found = Transfer(HDL64E, MOUNTS[mount])(scan)
     np.testing.assert_allclose(found.pose, MOUNTS[mount].matrix)
     slack = 0.03 + 2 * np.sin(np.radians(MOUNTS[mount].pitch)) * CAR_BOX[3] / 2
-    grown = replace(found.boxes, values=found.boxes.values + np.float32([0, 0, 0, slack, slack, slack, 0]))
+    grown = replace(
+        found.boxes, values=found.boxes.values + np.float32([0, 0, 0, slack, slack, slack, 0])
+    )
     inside = grown.contain(found.points)[0]
     assert (inside[found.label == CAR]).mean() > 0.99 and (found.label == CAR).sum() > 500
     world = found.points.astype(float) @ found.pose[:3, :3].T + found.pose[:3, 3]
@@ -146,15 +174,19 @@ def test_boxes_and_pose_move_to_the_targets_frame(scan: Scan, mount: str) -> Non
 
 def test_porous_surfaces_keep_their_share_of_returns() -> None:
     """Leaves: returns at random depths, and rays between them that return nothing."""
-    full, rng = record(HDL64E), np.random.default_rng(0)
+    full = record(HDL64E)
+    rng = np.random.default_rng(0)
     distance = np.linalg.norm(full.points, axis=1)
     leaves = full.points * (rng.uniform(10, 14, len(full)) / distance)[:, None].astype(np.float32)
     scan = replace(full, points=leaves.astype(np.float32))
     for share in (0.3, 0.6, 1.0):
         some = scan[rng.random(len(scan)) < share]
         for target in (HDL64E, UNEVEN):
-            found, rays = Transfer(target)(some), rays_of(target)
-            rows = (np.degrees(np.arctan(rays.slope)) < 2) & (np.degrees(np.arctan(rays.slope)) > -15)
+            found = Transfer(target)(some)
+            rays = rays_of(target)
+            rows = (np.degrees(np.arctan(rays.slope)) < 2) & (
+                np.degrees(np.arctan(rays.slope)) > -15
+            )
             truth = np.bincount(record(target).ring, minlength=len(rows))[rows].sum()
             ratio = np.bincount(found.ring, minlength=len(rows))[rows].sum() / truth
             assert abs(ratio - share) < 0.1 * share + 0.03, (share, target.name)
@@ -163,7 +195,8 @@ def test_porous_surfaces_keep_their_share_of_returns() -> None:
 def test_a_narrow_pole_stays() -> None:
     pole = (12.0, -4.0, 0.0, 0.1, 0.1, 4.0, 0.0)
     for target in (HDL64E, UNEVEN):
-        found, truth = Transfer(target)(record(HDL64E, car=pole)), record(target, car=pole)
+        found = Transfer(target)(record(HDL64E, car=pole))
+        truth = record(target, car=pole)
         assert abs(np.log((found.label == CAR).sum() / (truth.label == CAR).sum())) < 0.35
 
 
@@ -178,7 +211,10 @@ def test_what_was_not_seen_returns_nothing(scan: Scan) -> None:
 
 def test_surfaces_end_where_rings_are_missing(scan: Scan) -> None:
     found = Transfer(HDL64E)(scan[(scan.ring < 25) | (scan.ring > 40)])
-    assert not ((found.ring > 25) & (found.ring < 40)).any() and ((found.ring < 25).sum(), (found.ring > 40).sum()) > (
+    assert not ((found.ring > 25) & (found.ring < 40)).any() and (
+        (found.ring < 25).sum(),
+        (found.ring > 40).sum(),
+    ) > (
         0,
         0,
     )
@@ -188,15 +224,23 @@ def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
     target = replace(UNEVEN, range_min=6.0, range_max=20.0, range_step=0.05, reflectance_levels=8)
     found = Transfer(target)(scan)
     steps = np.linalg.norm(found.points.astype(float), axis=1) / 0.05
-    assert np.abs(steps - np.rint(steps)).max() < 1e-3 and steps.min() >= 120 and 0.05 * steps.max() <= 20
+    assert (
+        np.abs(steps - np.rint(steps)).max() < 1e-3
+        and steps.min() >= 120
+        and 0.05 * steps.max() <= 20
+    )
     assert np.abs(found.reflectance * 8 % 1).max() < 1e-6 and found.reflectance.max() <= 7 / 8
 
 
 def test_noise_and_losses_are_added_and_keyed(scan: Scan) -> None:
     plain = Transfer(HDL64E)(scan)
     noisy = Transfer(HDL64E, measurement=Measurement(range_noise=0.05))
-    first, again, other = noisy(scan, keyed_rng(1)), noisy(scan, keyed_rng(1)), noisy(scan, keyed_rng(2))
-    assert np.array_equal(first.points, again.points) and not np.array_equal(first.points, other.points)
+    first = noisy(scan, keyed_rng(1))
+    again = noisy(scan, keyed_rng(1))
+    other = noisy(scan, keyed_rng(2))
+    assert np.array_equal(first.points, again.points) and not np.array_equal(
+        first.points, other.points
+    )
     off = np.linalg.norm(first.points, axis=1) - np.linalg.norm(plain.points, axis=1)
     assert abs(off.std() - 0.05) < 0.003
     fewer = Transfer(HDL64E, measurement=Measurement(loss=0.2))(scan)
@@ -211,7 +255,9 @@ def test_a_response_gives_the_targets_distribution(scan: Scan) -> None:
     recorded = replace(scan, reflectance=rng.random(len(scan), np.float32))
     target = replace(scan, reflectance=(rng.random(len(scan), np.float32) ** 2 / 3))
     response = Response.match([recorded], [target])
-    np.testing.assert_allclose(response(np.array([0.3, 0.6, 0.9])), np.array([0.3, 0.6, 0.9]) ** 2 / 3, atol=0.01)
+    np.testing.assert_allclose(
+        response(np.array([0.3, 0.6, 0.9])), np.array([0.3, 0.6, 0.9]) ** 2 / 3, atol=0.01
+    )
     found = Transfer(HDL64E, measurement=Measurement(response=response))(recorded)
     assert found.reflectance.max() < 0.34
     with pytest.raises(DataError, match="no target return between 4 and 40 m"):
@@ -221,11 +267,15 @@ def test_a_response_gives_the_targets_distribution(scan: Scan) -> None:
 
 
 def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
-    """A sweep 2 m further on, when the car stood 3 m further: its returns go back to where the scan has the car."""
+    """A sweep 2 m further on, when the car stood 3 m further: its returns go back to where the scan
+    has the car."""
     scan = record(HDL64E)
     later = record(HDL64E, car=(CAR_BOX[0] + 3, *CAR_BOX[1:]), at=2.0)
-    blind = scan[(scan.points[:, 1] < 1) | (scan.points[:, 0] < 0)]  # neither the car nor what is behind it
-    alone, filled = Transfer(HDL64E)(blind), Transfer(HDL64E).cast(blind, sweeps=[later]).scan
+    blind = scan[
+        (scan.points[:, 1] < 1) | (scan.points[:, 0] < 0)
+    ]  # neither the car nor what is behind it
+    alone = Transfer(HDL64E)(blind)
+    filled = Transfer(HDL64E).cast(blind, sweeps=[later]).scan
     assert len(filled) > 1.1 * len(alone)
     car = filled.points[filled.label == CAR]
     assert len(car) > 300
@@ -240,7 +290,9 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
 def test_the_own_vehicle_does_not_stand_in_the_way_of_another_mount(scan: Scan) -> None:
     """A bonnet 0.5 m below the sensor would hide the street from a sensor 0.4 m further down."""
     rays = rays_of(HDL64E)
-    own = np.flatnonzero((scan.ring > 50) & (np.abs(scan.points[:, 1]) < 0.5 * np.abs(scan.points[:, 0])))
+    own = np.flatnonzero(
+        (scan.ring > 50) & (np.abs(scan.points[:, 1]) < 0.5 * np.abs(scan.points[:, 0]))
+    )
     points = scan.points.copy()
     points[own] *= (-0.5 / rays.slope[scan.ring[own]] / np.hypot(*points[own, :2].T))[:, None]
     given = replace(scan, points=points)
@@ -268,11 +320,17 @@ def test_every_preset_is_a_source_and_a_target(name: str) -> None:
 BAD = {
     "empty": (lambda s: s[:0], "without a return"),
     "one beam": (lambda s: s[s.ring == 40], "one beam only"),
-    "not finite": (lambda s: replace(s, points=np.where(s.ring[:, None] == 5, np.float32(np.nan), s.points)), "NaN"),
-    "fewer beams": (lambda s: replace(_shuffled(s), sensor=load_sensor("hdl32e_nuscenes")), "on no rings"),
+    "not finite": (
+        lambda s: replace(s, points=np.where(s.ring[:, None] == 5, np.float32(np.nan), s.points)),
+        "NaN",
+    ),
+    "fewer beams": (
+        lambda s: replace(_shuffled(s), sensor=load_sensor("hdl32e_nuscenes")),
+        "on no rings",
+    ),
     "a map": (lambda s: random_scan(HDL64E, 5000), "on no rings"),
     "no overlap": (lambda s: s[s.ring < 12], "none of its surfaces lies within"),
-}  # fmt: skip
+}
 
 
 def _shuffled(scan: Scan) -> Scan:
@@ -288,8 +346,17 @@ def test_bad_scans_are_refused(scan: Scan, case: str) -> None:
 
 
 def test_a_shuffled_scan_finds_its_rings_by_elevation(scan: Scan) -> None:
-    sensor = replace(HDL64E, name="beams", elevations=HDL64E.beams, beams=None, rows=None, fov_up=None, fov_down=None)
-    given, shuffled = replace(scan, sensor=sensor), replace(_shuffled(scan), sensor=sensor)
+    sensor = replace(
+        HDL64E,
+        name="beams",
+        elevations=HDL64E.beams,
+        beams=None,
+        rows=None,
+        fov_up=None,
+        fov_down=None,
+    )
+    given = replace(scan, sensor=sensor)
+    shuffled = replace(_shuffled(scan), sensor=sensor)
     assert abs(len(Transfer(UNEVEN)(given)) - len(Transfer(UNEVEN)(shuffled))) < 50
 
 
@@ -299,7 +366,9 @@ def test_rows_whose_rays_start_above_the_origin_are_found_without_rings() -> Non
     on_rows = unproject(drawn)
     rows, on_grid = rings_of(replace(on_rows, ring=None))
     assert on_grid and np.array_equal(rows, np.nonzero(drawn.mask)[0])
-    given, without = (Transfer(load_sensor("hdl32e"))(s) for s in (on_rows, replace(on_rows, ring=None)))
+    given, without = (
+        Transfer(load_sensor("hdl32e"))(s) for s in (on_rows, replace(on_rows, ring=None))
+    )
     assert len(without) > 0.95 * len(given)
 
 
@@ -316,22 +385,33 @@ def test_impossible_measurements_are_refused(wrong: dict[str, float]) -> None:
 
 
 def porous(seed: int = 0) -> Scan:
-    """A small scan with lost returns and with leaves, so that triangles, their rims and gaps all occur."""
+    """A small scan with lost returns and with leaves, so that triangles, their rims and gaps all
+    occur."""
     rng = np.random.default_rng(seed)
     sensor = Sensor("small", 360, 1.0, 80.0, rows=24, fov_up=4.0, fov_down=-20.0)
     scan = record(sensor)
-    leaves = np.where((rng.random(len(scan)) < 0.3) & (scan.label == BUILDING), rng.uniform(0.6, 1.0, len(scan)), 1.0)
+    leaves = np.where(
+        (rng.random(len(scan)) < 0.3) & (scan.label == BUILDING),
+        rng.uniform(0.6, 1.0, len(scan)),
+        1.0,
+    )
     moved = replace(scan, points=(scan.points * leaves[:, None]).astype(np.float32))
     return moved[rng.random(len(scan)) < 0.9]
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_returns_are_those_of_the_kernels_before_they_were_made_faster(golden: Golden, mount: str) -> None:
+def test_returns_are_those_of_the_kernels_before_they_were_made_faster(
+    golden: Golden, mount: str
+) -> None:
     """The returns that version 0.1.0 gave (tests/golden/README.md)."""
     target = Sensor("other", 400, 1.0, 80.0, elevations=tuple(np.linspace(3, -16, 12)))
     found = Transfer(target, MOUNTS[mount])(porous())
     with np.load(golden / "transfer.npz") as file:
-        before = {name: file[f"{mount} {name}"] for name in ("points", "ring", "label", "reflectance")}
-    assert np.array_equal(found.ring, before["ring"]) and np.array_equal(found.label, before["label"])
+        before = {
+            name: file[f"{mount} {name}"] for name in ("points", "ring", "label", "reflectance")
+        }
+    assert np.array_equal(found.ring, before["ring"]) and np.array_equal(
+        found.label, before["label"]
+    )
     np.testing.assert_allclose(found.points, before["points"], rtol=1e-6, atol=1e-5)
     np.testing.assert_allclose(found.reflectance, before["reflectance"], atol=1e-6)

@@ -29,11 +29,17 @@ def scans() -> tuple[list[Scan], list[Scan]]:
     return real, [replace(record(OURS, at=float(i)), id=f"s{i}") for i in range(3)]
 
 
-def test_synthetic_scans_become_scans_of_the_real_sensor(scans: tuple[list[Scan], list[Scan]]) -> None:
+def test_synthetic_scans_become_scans_of_the_real_sensor(
+    scans: tuple[list[Scan], list[Scan]],
+) -> None:
     real, synthetic = scans
-    with pytest.raises(ConfigError, match=r"sources of the sensors 'theirs' .* Turn the .*as_sensor"):
+    with pytest.raises(
+        ConfigError, match=r"sources of the sensors 'theirs' .* Turn the .*as_sensor"
+    ):
         MixedScans(real, synthetic, ratio=0.5)
-    train = MixedScans(real, synthetic, ratio=0.5, as_sensor=THEIRS, to_sample=lambda scan, rng: scan)
+    train = MixedScans(
+        real, synthetic, ratio=0.5, as_sensor=THEIRS, to_sample=lambda scan, rng: scan
+    )
     for i in range(len(train)):
         sample = train[i]
         assert sample.sensor == THEIRS and sample.ring is not None
@@ -44,19 +50,27 @@ def test_synthetic_scans_become_scans_of_the_real_sensor(scans: tuple[list[Scan]
             assert np.array_equal(sample.points, real[int(sample.id[1:])].points)
 
 
-def test_the_settings_of_an_adapter_name_the_sensor(scans: tuple[list[Scan], list[Scan]], tmp_path: Path) -> None:
+def test_the_settings_of_an_adapter_name_the_sensor(
+    scans: tuple[list[Scan], list[Scan]], tmp_path: Path
+) -> None:
     values = THEIRS.to_dict()
     path = tmp_path / "theirs.yaml"
     path.write_text(yaml.safe_dump({values.pop("name"): values}))
-    mixed = mix(3, {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)}, lambda scan, rng: scan)
-    made = [sample for sample in map(mixed.__getitem__, range(len(mixed))) if isinstance(sample, Scan)]
+    mixed = mix(
+        3, {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)}, lambda scan, rng: scan
+    )
+    made = [
+        sample for sample in map(mixed.__getitem__, range(len(mixed))) if isinstance(sample, Scan)
+    ]
     assert len(made) == 3
     for scan in made:
         assert np.array_equal(scan.points, Transfer(THEIRS)(scans[1][int(scan.id[1:])]).points)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_noise_depends_on_seed_epoch_and_position_alone(scans: tuple[list[Scan], list[Scan]], workers: int) -> None:
+def test_noise_depends_on_seed_epoch_and_position_alone(
+    scans: tuple[list[Scan], list[Scan]], workers: int
+) -> None:
     def epoch(seed: int, number: int, count: int) -> dict[str, torch.Tensor]:
         train = MixedScans(*scans, ratio=0.5, seed=seed, as_sensor=NOISY, reuse=2, collate="range")
         train.set_epoch(number)
@@ -64,18 +78,27 @@ def test_noise_depends_on_seed_epoch_and_position_alone(scans: tuple[list[Scan],
         assert batch["range"].shape[1:] == THEIRS.shape
         return dict(zip(batch["id"], batch["range"], strict=True))
 
-    first, again, other = epoch(0, 1, workers), epoch(0, 1, 0), epoch(0, 0, 0)
-    assert first.keys() == again.keys() and all(torch.equal(first[name], again[name]) for name in first)
+    first = epoch(0, 1, workers)
+    again = epoch(0, 1, 0)
+    other = epoch(0, 0, 0)
+    assert first.keys() == again.keys() and all(
+        torch.equal(first[name], again[name]) for name in first
+    )
     shared = {name for name in first.keys() & other.keys() if name.startswith("s")}
     assert shared and not any(torch.equal(first[name], other[name]) for name in shared)
 
 
 def test_the_plans_hash_tells_the_transfer(scans: tuple[list[Scan], list[Scan]]) -> None:
-    hashes = {MixedScans(*scans, ratio=0.5, as_sensor=t).plan(0).hash for t in (THEIRS, NOISY, Transfer(THEIRS))}
+    hashes = {
+        MixedScans(*scans, ratio=0.5, as_sensor=t).plan(0).hash
+        for t in (THEIRS, NOISY, Transfer(THEIRS))
+    }
     assert len(hashes) == 2
 
 
-def test_a_trainers_own_dataset_with_scans_of_another_sensor(scans: tuple[list[Scan], list[Scan]]) -> None:
+def test_a_trainers_own_dataset_with_scans_of_another_sensor(
+    scans: tuple[list[Scan], list[Scan]],
+) -> None:
     yours = [torch.from_numpy(scan.points) for scan in scans[0]]
     train = MixedScans.wrap(
         yours,

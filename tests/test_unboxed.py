@@ -1,4 +1,5 @@
-"""No detector gets an object without a box: it is counted, and removed with its hole filled, or refused."""
+"""No detector gets an object without a box: it is counted, and removed with its hole filled, or
+refused."""
 
 import logging
 from dataclasses import replace
@@ -26,7 +27,11 @@ BANK = ObjectBank.from_scans([cast([car(8, 7), car(-9, 5)])])
 def with_boxes(scan: Scan, keep: list[int] | None) -> Scan:
     """The scan with some of its boxes, and without instances, as a model would generate it."""
     assert scan.boxes is not None
-    boxes = None if keep is None else Boxes(scan.boxes.values[keep], tuple(scan.boxes.names[i] for i in keep))
+    boxes = (
+        None
+        if keep is None
+        else Boxes(scan.boxes.values[keep], tuple(scan.boxes.names[i] for i in keep))
+    )
     return replace(scan, boxes=boxes, instance=None)
 
 
@@ -75,10 +80,13 @@ def test_mixtures_close_unboxed_objects_of_boxed_scans(labels: str) -> None:
     kept = mixed(with_boxes(BOTH, [0]), labels=labels, unboxed="keep")
     assert (kept["label"] == CAR).sum() == (BOTH.label == CAR).sum()  # type: ignore[attr-defined]
     with pytest.raises(
-        DataError, match="with 1 objects without a box; expected a box for every object.*unboxed='close'"
+        DataError,
+        match="with 1 objects without a box; expected a box for every object.*unboxed='close'",
     ):
         mixed(with_boxes(BOTH, [0]), labels=labels, unboxed="error")
-    with pytest.raises(ConfigError, match="unboxed='drop'; expected one of 'close', 'keep', 'error'"):
+    with pytest.raises(
+        ConfigError, match="unboxed='drop'; expected one of 'close', 'keep', 'error'"
+    ):
         mixed(with_boxes(BOTH, [0]), unboxed="drop")
 
 
@@ -87,7 +95,9 @@ def test_low_confidence_does_not_hide_an_object() -> None:
     scan.confidence = np.where(scan.label == CAR, 0.2, 1).astype(np.float32)
     own = make_policy("mix", fields=FIELDS | {"confidence"}, objects=BANK, count=1, threshold=0.5)
     assert BOTH.boxes is not None
-    assert not BOTH.boxes.contain(own(replace(scan, boxes=None), keyed_rng(0)).points, above_floor=0.4).any()
+    assert not BOTH.boxes.contain(
+        own(replace(scan, boxes=None), keyed_rng(0)).points, above_floor=0.4
+    ).any()
     item = mixed(scan, labels="generated", label_options={"threshold": 0.5})
     assert len(item["points"]) > 0  # type: ignore[arg-type]
     near = np.linalg.norm(np.asarray(item["points"])[:, :2] - (10, -5), axis=1) < 1.2  # type: ignore[call-overload]
@@ -104,14 +114,17 @@ def test_scans_without_boxes_keep_their_objects() -> None:
 def test_mix_hands_out_no_object_without_a_box(kind: str) -> None:
     options = {"objects": BANK} if kind == "objects" else {"real": [cast([car(9, 3)])], "width": 30}
     policy = make_policy("mix", fields=FIELDS, kind=kind, **options)
-    train = MixedScans.wrap([0], [with_boxes(BOTH, None)], 0.5, labels=policy, to_sample=lambda s, _: s, compare=False)
+    train = MixedScans.wrap(
+        [0], [with_boxes(BOTH, None)], 0.5, labels=policy, to_sample=lambda s, _: s, compare=False
+    )
     [scan] = [s for s in (train[i] for i in range(2)) if isinstance(s, Scan)]
     assert scan.boxes is not None and len(scan.boxes) >= 1
     assert edit.measure([scan]).objects == 0 < edit.measure([with_boxes(BOTH, None)]).objects
 
 
 def test_scans_with_boxes_and_no_labels_pass() -> None:
-    """A detector needs no labels: ``generated`` refuses such scans, ``none`` would drop their boxes."""
+    """A detector needs no labels: ``generated`` refuses such scans, ``none`` would drop their
+    boxes."""
     bare = replace(BOTH, label=None, instance=None)
     item = mixed(bare, labels="boxes")
     assert len(item["boxes"]) == 2 and len(item["points"]) == len(BOTH)  # type: ignore[arg-type]
@@ -120,21 +133,35 @@ def test_scans_with_boxes_and_no_labels_pass() -> None:
 
 
 def test_a_source_without_boxes_is_refused_for_a_detector() -> None:
-    assert "boxes" in make_synthetic([BOTH]).fields and "boxes" not in make_synthetic([with_boxes(BOTH, None)]).fields
-    with pytest.raises(ConfigError, match="labels='boxes', but .* only have .*expected scans with boxes"):
+    assert (
+        "boxes" in make_synthetic([BOTH]).fields
+        and "boxes" not in make_synthetic([with_boxes(BOTH, None)]).fields
+    )
+    with pytest.raises(
+        ConfigError, match="labels='boxes', but .* only have .*expected scans with boxes"
+    ):
         MixedScans([BOTH], [with_boxes(BOTH, None)], labels="boxes")
     with pytest.raises(ConfigError, match="labels='boxes', but .*labels='mix' pastes objects"):
         make_policy("boxes", fields=Endless().fields)
-    with pytest.raises(ConfigError, match="neither labels nor boxes.*own objects cannot be found.*clear=False"):
+    with pytest.raises(
+        ConfigError, match="neither labels nor boxes.*own objects cannot be found.*clear=False"
+    ):
         make_policy("mix", fields=frozenset({"reflectance"}), objects=BANK)
 
 
 def test_unboxed_objects_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     real = [cast([car(9, 1)])] * 3
     with caplog.at_level(logging.WARNING):
-        train = MixedScans(real, [with_boxes(BOTH, None)] * 3, 0.5, labels="mix", label_options={"objects": BANK})
+        train = MixedScans(
+            real, [with_boxes(BOTH, None)] * 3, 0.5, labels="mix", label_options={"objects": BANK}
+        )
         [train[i] for i in range(len(train))]
-        assert caplog.text.count("2.0 objects without a box a scan (100% of the points of their classes)") == 1
+        assert (
+            caplog.text.count(
+                "2.0 objects without a box a scan (100% of the points of their classes)"
+            )
+            == 1
+        )
         caplog.clear()
         train = MixedScans(real, [with_boxes(BOTH, None)] * 3, 0.5, labels="generated")
         [train[i] for i in range(len(train))]
@@ -144,5 +171,6 @@ def test_unboxed_objects_are_reported_once(caplog: pytest.LogCaptureFixture) -> 
 def test_handling_is_a_function_of_the_scan() -> None:
     scan = with_boxes(BOTH, [0])
     points = scan.points.copy()
-    first, second = HANDLING["close"](scan), HANDLING["close"](scan)
+    first = HANDLING["close"](scan)
+    second = HANDLING["close"](scan)
     assert np.array_equal(first.points, second.points) and np.array_equal(scan.points, points)

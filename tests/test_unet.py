@@ -1,4 +1,5 @@
-"""The U-Net: inputs, circular columns, the position table, and a diffusion network as a velocity."""
+"""The U-Net: inputs, circular columns, the position table, and a diffusion network as a
+velocity."""
 
 from typing import Any
 
@@ -17,9 +18,15 @@ from lidar_synth.generate.models.lidm.diffusion import DiffusionUNet, schedule_t
 from lidar_synth.generate.models.lidm.unet import UNet
 
 SMALL: dict[str, Any] = {
-    "resolution": (8, 32), "channels": 3, "width": 16, "multipliers": (1, 2), "blocks": 1, "attention": (1,),
-    "head_channels": 8, "groups": 4,
-}  # fmt: skip
+    "resolution": (8, 32),
+    "channels": 3,
+    "width": 16,
+    "multipliers": (1, 2),
+    "blocks": 1,
+    "attention": (1,),
+    "head_channels": 8,
+    "groups": 4,
+}
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -46,7 +53,9 @@ def test_a_fresh_network_returns_zero() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("arguments", [{}, {"patch": (2, 2)}, {"multipliers": (1, 2, 3), "blocks": 2}])
+@pytest.mark.parametrize(
+    "arguments", [{}, {"patch": (2, 2)}, {"multipliers": (1, 2, 3), "blocks": 2}]
+)
 def test_samples_of_a_batch_are_independent(arguments: dict[str, Any]) -> None:
     net = network(**arguments)
     together = net(state(), T)
@@ -58,47 +67,65 @@ def test_samples_of_a_batch_are_independent(arguments: dict[str, Any]) -> None:
 
 @torch.no_grad()
 def test_columns_wrap_around_and_rows_do_not() -> None:
-    net, y = network(position=False), state()
+    net = network(position=False)
+    y = state()
     out = net(y, T)
-    assert torch.allclose(net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4)  # by a multiple of the total stride
+    assert torch.allclose(
+        net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4
+    )  # by a multiple of the total stride
     assert not torch.allclose(net(y.roll(2, -2), T), out.roll(2, -2), atol=1e-2)
 
 
 @torch.no_grad()
 def test_the_position_table_distinguishes_columns() -> None:
-    net, y = network(position=True), state()
+    net = network(position=True)
+    y = state()
     assert not torch.allclose(net(y.roll(2, -1), T), net(y, T).roll(2, -1), atol=1e-2)
-    assert sum(p.numel() for p in net.parameters()) - sum(p.numel() for p in network(position=False).parameters()) == (
-        16 * 8 * 32
-    )
+    assert sum(p.numel() for p in net.parameters()) - sum(
+        p.numel() for p in network(position=False).parameters()
+    ) == (16 * 8 * 32)
 
 
-@pytest.mark.parametrize("arguments", [{}, {"context_channels": 5}, {"condition_channels": 2}, {"patch": (2, 4)}])
+@pytest.mark.parametrize(
+    "arguments", [{}, {"context_channels": 5}, {"condition_channels": 2}, {"patch": (2, 4)}]
+)
 @pytest.mark.parametrize("checkpointing", [False, True])
 def test_every_weight_gets_a_gradient(arguments: dict[str, Any], checkpointing: bool) -> None:
     net = network(**arguments)
     assert isinstance(net, UNet)
     net.gradient_checkpointing = checkpointing
-    cond = {"context_channels": torch.randn(2, 4, 5), "condition_channels": torch.randn(2, 2, 8, 32)}
+    cond = {
+        "context_channels": torch.randn(2, 4, 5),
+        "condition_channels": torch.randn(2, 2, 8, 32),
+    }
     net(state(), T, cond.get(next(iter(arguments), ""))).square().mean().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
-        assert parameter.grad.any() or "conv1.bias" in name, name  # a norm after it can cancel a bias
+        assert parameter.grad.any() or "conv1.bias" in name, (
+            name
+        )  # a norm after it can cancel a bias
 
 
 @torch.no_grad()
 def test_conditions_change_the_velocity() -> None:
-    beside, y = network(condition_channels=2), state()
-    assert not torch.allclose(beside(y, T, torch.zeros(2, 2, 8, 32)), beside(y, T, torch.ones(2, 2, 8, 32)), atol=1e-3)
-    context, tokens = network(context_channels=5), torch.randn(2, 4, 5)
+    beside = network(condition_channels=2)
+    y = state()
+    assert not torch.allclose(
+        beside(y, T, torch.zeros(2, 2, 8, 32)), beside(y, T, torch.ones(2, 2, 8, 32)), atol=1e-3
+    )
+    context = network(context_channels=5)
+    tokens = torch.randn(2, 4, 5)
     out = context(y, T, tokens)
     assert not torch.allclose(out, context(y, T, tokens * 2), atol=1e-3)
-    assert torch.allclose(out, context(y, T, tokens.flip(1)), atol=1e-5)  # the order of tokens does not matter
+    assert torch.allclose(
+        out, context(y, T, tokens.flip(1)), atol=1e-5
+    )  # the order of tokens does not matter
 
 
 @torch.no_grad()
 def test_precision_and_memory_format_change_only_rounding() -> None:
-    net, y = network(), state()
+    net = network()
+    y = state()
     out = net(y, T)
     assert torch.allclose(net.to(memory_format=torch.channels_last)(y, T), out, atol=1e-5)  # type: ignore[call-overload]
     rough = net.bfloat16()(y, T)
@@ -111,18 +138,30 @@ def test_precision_and_memory_format_change_only_rounding() -> None:
     [
         ({}, torch.zeros(2, 2, 8, 32), "none: the network takes no condition"),
         ({"condition_channels": 2}, None, r"no condition; expected \(2, 2, 8, 32\)"),
-        ({"condition_channels": 2}, torch.zeros(2, 2, 4, 32), r"a condition of shape \(2, 2, 4, 32\)"),
-        ({"context_channels": 5}, torch.zeros(2, 4, 6), r"shape \(2, 4, 6\); expected \(2, tokens, 5\)"),
+        (
+            {"condition_channels": 2},
+            torch.zeros(2, 2, 4, 32),
+            r"a condition of shape \(2, 2, 4, 32\)",
+        ),
+        (
+            {"context_channels": 5},
+            torch.zeros(2, 4, 6),
+            r"shape \(2, 4, 6\); expected \(2, tokens, 5\)",
+        ),
         ({"context_channels": 5}, None, "no condition"),
     ],
 )
-def test_conditions_of_another_shape_are_refused(arguments: dict[str, Any], cond: Tensor | None, message: str) -> None:
+def test_conditions_of_another_shape_are_refused(
+    arguments: dict[str, Any], cond: Tensor | None, message: str
+) -> None:
     with pytest.raises(DataError, match=message):
         network(**arguments)(state(), T, cond)
 
 
 def test_states_and_times_of_another_shape_are_refused() -> None:
-    with pytest.raises(DataError, match=r"a state of shape \(2, 3, 8, 16\); expected \(B, 3, 8, 32\)"):
+    with pytest.raises(
+        DataError, match=r"a state of shape \(2, 3, 8, 16\); expected \(B, 3, 8, 32\)"
+    ):
         network()(state(shape=(3, 8, 16)), T)
     with pytest.raises(DataError, match=r"times of shape \(3,\) for 2 states"):
         network()(state(), torch.zeros(3))
@@ -145,8 +184,12 @@ def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) 
 
 
 @settings(max_examples=20)
-@given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3), st.integers(1, 3))
-def test_unfold_is_the_inverse_of_fold(p: int, q: int, rows: int, columns: int, channels: int) -> None:
+@given(
+    st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3), st.integers(1, 3)
+)
+def test_unfold_is_the_inverse_of_fold(
+    p: int, q: int, rows: int, columns: int, channels: int
+) -> None:
     x = torch.randn(2, channels, p * rows, q * columns)
     folded = fold(x, (p, q))
     assert folded.shape == (2, channels * p * q, rows, columns)
@@ -163,31 +206,51 @@ def test_unfold_is_the_inverse_of_fold(p: int, q: int, rows: int, columns: int, 
         ((3, 3), (1, 1), None, (1, 3)),
     ],
 )
-def test_a_circular_convolution_equals_one_on_a_padded_image(kernel: Any, stride: Any, pad: Any, dilation: Any) -> None:
-    conv, x = WrapConv(2, 3, kernel, stride, pad, dilation=dilation), torch.randn(1, 2, 4, 8)
+def test_a_circular_convolution_equals_one_on_a_padded_image(
+    kernel: Any, stride: Any, pad: Any, dilation: Any
+) -> None:
+    conv = WrapConv(2, 3, kernel, stride, pad, dilation=dilation)
+    x = torch.randn(1, 2, 4, 8)
     rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
-    left, right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
-    padded = nn.functional.pad(nn.functional.pad(x, (left, right, 0, 0), "circular"), (0, 0, above, below))
+    left, right, above, below = pad or (
+        columns // 2,
+        columns - columns // 2,
+        rows // 2,
+        rows - rows // 2,
+    )
+    padded = nn.functional.pad(
+        nn.functional.pad(x, (left, right, 0, 0), "circular"), (0, 0, above, below)
+    )
     assert torch.allclose(
-        conv(x), nn.functional.conv2d(padded, conv.weight, conv.bias, stride, dilation=dilation), atol=1e-6
+        conv(x),
+        nn.functional.conv2d(padded, conv.weight, conv.bias, stride, dilation=dilation),
+        atol=1e-6,
     )
 
 
-# --- a denoising diffusion network as a velocity --------------------------------------------------------------------
+# --- a denoising diffusion network as a velocity
+# --------------------------------------------------------------------
 
-MEAN, SPREAD = 0.7, 0.4
+MEAN = 0.7
+SPREAD = 0.4
 TIMES = schedule_times(0.0015, 0.0195, 1000)
 
 
 class KnownNoise(DiffusionUNet):
-    """The optimal noise prediction for normal data with ``MEAN`` and ``SPREAD``: e = -s grad log p(x), at any step."""
+    """The optimal noise prediction for normal data with ``MEAN`` and ``SPREAD``: e = -s grad log
+    p(x), at any step."""
 
     def evaluate(self, y: Tensor, step: Tensor, cond: Tensor | None) -> Tensor:
         low = step.floor().clamp(max=998).long()
         ratios = torch.logit(TIMES)
-        t = torch.lerp(ratios[low], ratios[low + 1], step.double() - low).sigmoid().view(-1, 1, 1, 1)
+        t = (
+            torch.lerp(ratios[low], ratios[low + 1], step.double() - low)
+            .sigmoid()
+            .view(-1, 1, 1, 1)
+        )
         size = ((1 - t) ** 2 + t**2).sqrt()
-        a, s = (1 - t) / size, t / size
+        a = (1 - t) / size
+        s = t / size
         return (s * (y - a * MEAN) / (a**2 * SPREAD**2 + s**2)).to(y.dtype)
 
 
@@ -200,11 +263,15 @@ def known_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
 
 @pytest.fixture(scope="module")
 def known() -> Velocity:
-    return KnownNoise(resolution=(2, 2), channels=1, width=2, multipliers=(1,), blocks=1, attention=())
+    return KnownNoise(
+        resolution=(2, 2), channels=1, width=2, multipliers=(1,), blocks=1, attention=()
+    )
 
 
 def normal(count: int, seed: int = 0) -> Tensor:
-    return torch.randn(count, 1, 2, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(
+        count, 1, 2, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
 
 
 def test_steps_are_found_by_their_signal_to_noise_ratio() -> None:
@@ -212,7 +279,10 @@ def test_steps_are_found_by_their_signal_to_noise_ratio() -> None:
     assert torch.allclose(step_of(TIMES[whole], TIMES), whole.float(), atol=1e-2)
     assert step_of(torch.tensor([0.22, 0.5, 0.82]), TIMES).round().tolist() == [45, 254, 602]
     assert step_of(torch.tensor([0.0, 0.01, 0.999, 1.0]), TIMES).tolist() == [0, 0, 999, 999]
-    assert (float(TIMES[0]), float(TIMES[-1])) == (pytest.approx(0.037, abs=5e-4), pytest.approx(0.988, abs=5e-4))
+    assert (float(TIMES[0]), float(TIMES[-1])) == (
+        pytest.approx(0.037, abs=5e-4),
+        pytest.approx(0.988, abs=5e-4),
+    )
     betas = torch.linspace(0.0015**0.5, 0.0195**0.5, 1000, dtype=torch.float64) ** 2
     signal = (1 - betas).cumprod(0)  # the definition: s^2 = 1 - a^2
     assert torch.allclose(TIMES / (1 - TIMES), ((1 - signal) / signal).sqrt())
@@ -251,7 +321,8 @@ def test_an_invalid_noise_schedule_is_refused() -> None:
 def test_the_velocity_is_computed_from_the_predicted_noise() -> None:
     net = network("diffusion_unet", position=False)
     assert isinstance(net, DiffusionUNet)
-    y, t = state(1), TIMES[[300]]
+    y = state(1)
+    t = TIMES[[300]]
     x = y / ((1 - t) ** 2 + t**2).sqrt().float()
     noise = net.evaluate(x, torch.tensor([300.0]), None)
     assert torch.allclose(net(y, t), (noise - y) / (1 - t.float()), atol=1e-3)

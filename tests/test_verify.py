@@ -1,4 +1,5 @@
-"""Maintenance of banks: verify finds damage, repair regenerates it; merge, split and head keep every scan."""
+"""Maintenance of banks: verify finds damage, repair regenerates it; merge, split and head keep
+every scan."""
 
 import json
 import os
@@ -35,7 +36,10 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def baked(out: Path, model: Path, **settings: Any) -> Path:
-    bake(make_plan(out, BakeJob(**{"model": str(model), "count": 8, "shard_size": 3} | settings)), progress=False)
+    bake(
+        make_plan(out, BakeJob(**{"model": str(model), "count": 8, "shard_size": 3} | settings)),
+        progress=False,
+    )
     return out
 
 
@@ -74,14 +78,21 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "the index lists"),
     "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "the index lists"),
     "missing": (lambda path: path.unlink(), r"cannot be read \(No such file"),
-    "another": (lambda path: shutil.copyfile(path.with_name("shard-00000.h5"), path), "holds scans 0 to 2 of seed 0"),
+    "another": (
+        lambda path: shutil.copyfile(path.with_name("shard-00000.h5"), path),
+        "holds scans 0 to 2 of seed 0",
+    ),
 }
 
 
 def test_an_intact_bank_needs_no_repair(root: Path, model: Path) -> None:
     assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
     status, output = call("verify", root, "--deep", "--model", model, "--sample", 3)
-    assert status == 0 and f"{root}: intact" in output and "3 scans regenerated, at least 100.00%" in output
+    assert (
+        status == 0
+        and f"{root}: intact" in output
+        and "3 scans regenerated, at least 100.00%" in output
+    )
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
@@ -109,7 +120,8 @@ def test_every_flipped_bit_is_found(root: Path) -> None:
 
 
 def test_a_damaged_scan_is_named(root: Path) -> None:
-    """A file with the hash in the index, but with a scan that does not match its CRC: only reading it shows that."""
+    """A file with the hash in the index, but with a scan that does not match its CRC: only reading
+    it shows that."""
     path = root / "shard-00001.h5"
     with h5py.File(path, "r+") as file:
         file["label"][2, 3, 4] = 18 - file["label"][2, 3, 4] % 19
@@ -117,7 +129,10 @@ def test_a_damaged_scan_is_named(root: Path) -> None:
     entry = replace(index.shards[1], bytes=path.stat().st_size, sha256=sha256(path))
     write_bank_files(root, replace(index, shards=(index.shards[0], entry, index.shards[2])))
     [problem] = verify(root, progress=False)
-    assert problem.file == "shard-00001.h5" and "scan 2 cannot be read (its CRC does not match)" in problem.what
+    assert (
+        problem.file == "shard-00001.h5"
+        and "scan 2 cannot be read (its CRC does not match)" in problem.what
+    )
 
 
 def test_unlisted_shards_are_found(root: Path) -> None:
@@ -144,7 +159,9 @@ SIDE_DAMAGE: dict[str, Callable[[Path, np.random.Generator], object]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIDE)
 @pytest.mark.parametrize("kind", SIDE_DAMAGE)
-def test_damage_of_other_files_is_found_and_repaired(root: Path, original: Path, name: str, kind: str) -> None:
+def test_damage_of_other_files_is_found_and_repaired(
+    root: Path, original: Path, name: str, kind: str
+) -> None:
     rng = np.random.default_rng(SIDE.index(name))
     for _ in range(20 if kind in ("flip", "cut") else 1):
         SIDE_DAMAGE[kind](root / name, rng)
@@ -158,7 +175,9 @@ def test_damage_of_other_files_is_found_and_repaired(root: Path, original: Path,
 def test_repair_removes_what_a_killed_repair_left(root: Path, model: Path) -> None:
     part = root / ".shard-00000.h5.1.part"
     part.write_bytes(b"half a shard")
-    assert repair(root, str(model), progress=False) == {part.name: "removed: a killed repair left it"}
+    assert repair(root, str(model), progress=False) == {
+        part.name: "removed: a killed repair left it"
+    }
     assert not part.exists() and repair(root, str(model), progress=False) == {}
 
 
@@ -168,7 +187,10 @@ def test_verify_and_repair_report_damage_of_other_files(root: Path, model: Path)
     assert status == 1 and f"{SETTINGS}: has sha256" in output and "was damaged or edited" in output
     status, output = call("repair", root)
     assert status == 0 and f"{SETTINGS}: rewritten from the index" in output
-    assert bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False) is not None
+    assert (
+        bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
+        is not None
+    )
 
 
 def test_a_renamed_bank_is_intact(root: Path, tmp_path: Path) -> None:
@@ -179,10 +201,15 @@ def test_repair_rebuilds_a_bank_from_its_shards(root: Path, original: Path) -> N
     for name in (*SIDE, INDEX):
         (root / name).unlink()
     assert repair(root, progress=False) == {INDEX: "rebuilt from the shards"}
-    assert sides(root) == sides(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+    assert (
+        sides(root) == sides(original)
+        and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+    )
 
 
-def test_an_index_of_an_older_version_lists_no_other_files(root: Path, original: Path, model: Path) -> None:
+def test_an_index_of_an_older_version_lists_no_other_files(
+    root: Path, original: Path, model: Path
+) -> None:
     """It is the same bank; its settings file with another order of keys is kept."""
     values = json.loads((root / INDEX).read_bytes())
     assert set(values.pop("files")) == set(SIDE)
@@ -205,7 +232,10 @@ def test_deep_verification_samples_other_scans_each_time(root: Path, model: Path
     outputs = [call("verify", root, "--deep", "--model", model, "--sample", 2)[1] for _ in range(2)]
     seeds = [re.findall(r"scans selected by --seed (\d+)", output) for output in outputs]
     assert len(seeds[0]) == len(seeds[1]) == 1 and seeds[0] != seeds[1]
-    assert "selected by --seed 7" in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
+    assert (
+        "selected by --seed 7"
+        in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
+    )
     samples = [frozenset(regenerate(root, str(model), 2, progress=False)) for _ in range(8)]
     assert len(set(samples)) > 1
     again = [set(regenerate(root, str(model), 2, progress=False, seed=7)) for _ in range(2)]
@@ -216,7 +246,13 @@ def test_a_shard_may_be_open_in_plain_h5py(root: Path) -> None:
     """In this process; both can read it, in either order."""
     path = root / "shard-00001.h5"
     bank = Bank(root)
-    for options in ({}, {"locking": True}, {"locking": False}, {"libver": "latest"}, {"driver": "stdio"}):
+    for options in (
+        {},
+        {"locking": True},
+        {"locking": False},
+        {"libver": "latest"},
+        {"driver": "stdio"},
+    ):
         with h5py.File(path, "r", **options) as plain:
             assert verify(root, progress=False) == []
             assert np.array_equal(plain["range"][0], bank.shard(1).read(0)["range"])
@@ -227,7 +263,9 @@ def test_a_shard_may_be_open_in_plain_h5py(root: Path) -> None:
         assert len(bank[4].points)
 
 
-def test_deep_verification_finds_scans_that_do_not_match_their_seeds(tmp_path: Path, model: Path) -> None:
+def test_deep_verification_finds_scans_that_do_not_match_their_seeds(
+    tmp_path: Path, model: Path
+) -> None:
     honest = Bank(baked(tmp_path / "honest", model, seed=5))
     stored = {name: getattr(honest.facts, name) for name in ("settings", "checkpoint", "fields")}
     write_bank(tmp_path / "false", [some_image(i) for i in range(8)], **stored)
@@ -236,7 +274,9 @@ def test_deep_verification_finds_scans_that_do_not_match_their_seeds(tmp_path: P
     status, output = call("verify", tmp_path / "false", "--deep", "--model", model)
     assert status == 1 and "of its cells agree with the regenerated scan" in output
     other = write(tmp_path / "other.safetensors", ("range",))
-    with pytest.raises(ConfigError, match=r"other.*the checkpoint that made the bank's scans, small .*--model"):
+    with pytest.raises(
+        ConfigError, match=r"other.*the checkpoint that made the bank's scans, small .*--model"
+    ):
         regenerate(honest.root, str(other), progress=False)
     with pytest.raises(ConfigError, match="model 'small'; expected a shipped one"):
         call("verify", honest.root, "--deep")
@@ -246,7 +286,9 @@ def test_deep_verification_finds_scans_that_do_not_match_their_seeds(tmp_path: P
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_a_lost_or_damaged_index_is_rebuilt(root: Path, original: Path, model: Path, lost: bool) -> None:
+def test_a_lost_or_damaged_index_is_rebuilt(
+    root: Path, original: Path, model: Path, lost: bool
+) -> None:
     if lost:
         (root / INDEX).unlink()
     else:
@@ -256,9 +298,15 @@ def test_a_lost_or_damaged_index_is_rebuilt(root: Path, original: Path, model: P
     with pytest.raises((DataError, FileError)):
         verify(root, progress=False)
     done = repair(root, str(model), progress=False)
-    assert done == {INDEX: "rebuilt from the shards", "shard-00000.h5": "regenerated",
-                    "shard-00002.h5": "regenerated"}  # fmt: skip
-    assert shards(root) == shards(original) and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+    assert done == {
+        INDEX: "rebuilt from the shards",
+        "shard-00000.h5": "regenerated",
+        "shard-00002.h5": "regenerated",
+    }
+    assert (
+        shards(root) == shards(original)
+        and (root / INDEX).read_bytes() == (original / INDEX).read_bytes()
+    )
 
 
 def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
@@ -275,9 +323,12 @@ def test_banks_beyond_repair_are_reported(root: Path, tmp_path: Path) -> None:
         repair(tmp_path / "strange", progress=False)
 
 
-def test_a_repair_with_different_bytes_is_recorded(root: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repair_with_different_bytes_is_recorded(
+    root: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Like a repair on another machine: the scans are equal up to rounding, their bytes differ."""
-    before, write_shard = [scan.points for scan in Bank(root)], repair_module.write_shard
+    before = [scan.points for scan in Bank(root)]
+    write_shard = repair_module.write_shard
 
     class Rounding:
         def __init__(self, generator: Any) -> None:
@@ -287,12 +338,20 @@ def test_a_repair_with_different_bytes_is_recorded(root: Path, model: Path, monk
         def range_images(self, *arguments: Any, **options: Any) -> list[RangeImage]:
             images: list[RangeImage] = self.generator.range_images(*arguments, **options)
             for image in images:
-                image.range[image.mask] = np.minimum(image.range[image.mask] * np.float32(1 + 1e-4), 80)
+                image.range[image.mask] = np.minimum(
+                    image.range[image.mask] * np.float32(1 + 1e-4), 80
+                )
             return images
 
-    monkeypatch.setattr(repair_module, "write_shard", lambda generator, *rest: write_shard(Rounding(generator), *rest))
+    monkeypatch.setattr(
+        repair_module,
+        "write_shard",
+        lambda generator, *rest: write_shard(Rounding(generator), *rest),
+    )
     (root / "shard-00001.h5").unlink()
-    assert repair(root, str(model), progress=False) == {"shard-00001.h5": "regenerated, with different bytes"}
+    assert repair(root, str(model), progress=False) == {
+        "shard-00001.h5": "regenerated, with different bytes"
+    }
     assert verify(root, progress=False) == []
     assert "shard-00001.h5 was regenerated with torch" in Bank(root).index.repairs[0]
     assert "with different bytes" in (root / "README.md").read_text()
@@ -319,7 +378,11 @@ def names_and_points(*roots: Path) -> list[tuple[str, bytes]]:
 
 
 def test_split_and_merge_are_inverse(root: Path, tmp_path: Path) -> None:
-    parts = split(Bank(root), {tmp_path / "a": 0.5, tmp_path / "b": 0.25, tmp_path / "c": 0.25}, progress=False)
+    parts = split(
+        Bank(root),
+        {tmp_path / "a": 0.5, tmp_path / "b": 0.25, tmp_path / "c": 0.25},
+        progress=False,
+    )
     assert [index.scans for index in parts.values()] == [4, 2, 2]
     assert names_and_points(*parts) == names_and_points(root)
     assert all(verify(part, progress=False) == [] for part in parts)
@@ -333,17 +396,23 @@ def test_head_takes_the_first_scans(root: Path, tmp_path: Path, model: Path) -> 
     status, output = call("bank", "head", root, tmp_path / "head", "--count", 4)
     assert status == 0 and f"{tmp_path / 'head'}: 4 scans in 2 shards" in output
     assert names_and_points(tmp_path / "head") == names_and_points(root)[:4]
-    assert (tmp_path / "head" / "shard-00000.h5").read_bytes() == (root / "shard-00000.h5").read_bytes()
+    assert (tmp_path / "head" / "shard-00000.h5").read_bytes() == (
+        root / "shard-00000.h5"
+    ).read_bytes()
     before = shards(tmp_path / "head")
     (tmp_path / "head" / "shard-00001.h5").unlink()
-    assert repair(tmp_path / "head", str(model), progress=False) == {"shard-00001.h5": "regenerated"}
+    assert repair(tmp_path / "head", str(model), progress=False) == {
+        "shard-00001.h5": "regenerated"
+    }
     assert shards(tmp_path / "head") == before
     for count in (0, 9):
         with pytest.raises(ConfigError, match=f"the first {count} scans of .*; expected 1 to 8"):
             head(Bank(root), count, tmp_path / "none", progress=False)
 
 
-def test_banks_of_several_bakes_can_be_merged_and_repaired(root: Path, tmp_path: Path, model: Path) -> None:
+def test_banks_of_several_bakes_can_be_merged_and_repaired(
+    root: Path, tmp_path: Path, model: Path
+) -> None:
     other = baked(tmp_path / "other", model, first=8, count=4)
     status, _ = call("bank", "merge", tmp_path / "all", root, other)
     assert status == 0
@@ -353,10 +422,18 @@ def test_banks_of_several_bakes_can_be_merged_and_repaired(root: Path, tmp_path:
     (tmp_path / "all" / "shard-00003.h5").unlink()
     assert repair(tmp_path / "all", str(model), progress=False) == {"shard-00003.h5": "regenerated"}
     assert names_and_points(tmp_path / "all") == names_and_points(root, other)
-    with pytest.raises(ConfigError, match="both hold scan 6 of seed 0; expected every scan only once"):
-        merge([Bank(root), Bank(baked(tmp_path / "over", model, first=6, count=4))], tmp_path / "x", progress=False)
+    with pytest.raises(
+        ConfigError, match="both hold scan 6 of seed 0; expected every scan only once"
+    ):
+        merge(
+            [Bank(root), Bank(baked(tmp_path / "over", model, first=6, count=4))],
+            tmp_path / "x",
+            progress=False,
+        )
     write_bank(tmp_path / "few", [some_image()])
-    with pytest.raises(ConfigError, match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected"):
+    with pytest.raises(
+        ConfigError, match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected"
+    ):
         merge([Bank(root), Bank(tmp_path / "few")], tmp_path / "x", progress=False)
     assert not (tmp_path / "x").exists()
 
@@ -366,7 +443,11 @@ def test_invalid_edits_are_refused(root: Path, tmp_path: Path) -> None:
         head(Bank(root), 2, root, progress=False)
     for shares in ({"a": 0.5, "b": 0.6}, {"a": 1.5, "b": -0.5}, {"a": 0.99, "b": 0.01}):
         with pytest.raises(ConfigError, match="sum to 1|at least one scan"):
-            split(Bank(root), {tmp_path / name: share for name, share in shares.items()}, progress=False)
+            split(
+                Bank(root),
+                {tmp_path / name: share for name, share in shares.items()},
+                progress=False,
+            )
     for part in ("train", "train=much", "=0.5"):
         with pytest.raises(ConfigError, match=f"part '{part}'; expected FOLDER=SHARE"):
             call("bank", "split", root, part)

@@ -33,11 +33,15 @@ from lidar_synth.viz.colour import EMPTY, UNLABELLED, VALUES
 from lidar_synth.viz.render import box_segments
 
 
-def few_points(*places: tuple[float, float, float], label: list[int] | None = None, **fields: Any) -> Scan:
+def few_points(
+    *places: tuple[float, float, float], label: list[int] | None = None, **fields: Any
+) -> Scan:
     """A scan of a few points."""
     points = np.array(places, np.float32).reshape(-1, 3)
     labels = None if label is None else np.array(label, np.uint8)
-    return Scan(points, np.full(len(points), 0.5, np.float32), SMALL, label=labels, id="few", **fields)
+    return Scan(
+        points, np.full(len(points), 0.5, np.float32), SMALL, label=labels, id="few", **fields
+    )
 
 
 def wall(x: float, label: int) -> Scan:
@@ -56,7 +60,9 @@ def test_a_picture_has_the_colour_of_every_cell(sensor: Sensor) -> None:
     image = project(random_scan(sensor))
     labels = picture(image, "label")
     assert labels.shape == (*sensor.shape, 3)
-    np.testing.assert_array_equal(labels[~image.mask], np.broadcast_to(EMPTY, labels[~image.mask].shape))
+    np.testing.assert_array_equal(
+        labels[~image.mask], np.broadcast_to(EMPTY, labels[~image.mask].shape)
+    )
     assert image.label is not None
     for train, colour in [*enumerate(COLOURS), (IGNORE, UNLABELLED)]:
         cells = image.mask & (image.label == train)
@@ -74,7 +80,13 @@ def test_colours_increase_with_the_values() -> None:
     pixels = picture(RangeImage(ranges, SMALL), "range", scale)
     np.testing.assert_array_equal(pixels[0], scale.table[scale.index(ranges[0])])
     assert (np.diff(scale.index(ranges[0]).astype(int)) >= 0).all()
-    assert scale.index(np.array([-5.0, 0.0, 20.0, 80.0, 500.0])).tolist() == [0, 0, 128, 255, 255]  # gamma 1/2
+    assert scale.index(np.array([-5.0, 0.0, 20.0, 80.0, 500.0])).tolist() == [
+        0,
+        0,
+        128,
+        255,
+        255,
+    ]  # gamma 1/2
 
 
 @pytest.mark.parametrize("name", ["height", "range", "reflectance"])
@@ -94,9 +106,12 @@ def test_a_missing_or_unknown_channel_is_refused() -> None:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-@pytest.mark.parametrize("camera", [Camera((-20, 0, 0)), Camera((-20, 0, 0), field=10, parallel=True)])
+@pytest.mark.parametrize(
+    "camera", [Camera((-20, 0, 0)), Camera((-20, 0, 0), field=10, parallel=True)]
+)
 def test_the_near_point_hides_the_far_one(camera: Camera, order: int) -> None:
-    near, far = wall(5, CAR), wall(15, ROAD)
+    near = wall(5, CAR)
+    far = wall(15, ROAD)
     both = joined(near, far)[np.arange(len(near) + len(far))[::order]]
     pixels = render(both, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
     assert np.abs(pixels.astype(int) - COLOURS[CAR]).max() < 12
@@ -106,14 +121,18 @@ def test_the_near_point_hides_the_far_one(camera: Camera, order: int) -> None:
 
 def test_from_the_other_side_the_far_point_hides_the_near_one() -> None:
     both = joined(wall(5, CAR), wall(15, ROAD))
-    pixels = render(both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False)[100, 100]
+    pixels = render(both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False)[
+        100, 100
+    ]
     assert np.abs(pixels.astype(int) - COLOURS[ROAD]).max() < 12
 
 
 def test_from_above_ahead_is_up_and_left_is_left() -> None:
     scan = few_points((20, 0, 0), (0, 10, 0), label=[CAR, ROAD])
     pixels = render(scan, "label", camera=bird(25), size=(500, 500), rings=False).astype(int)
-    assert (np.abs(pixels[48:52, 248:252] - COLOURS[CAR]).max(-1) < 70).any()  # 20 m: 200 pixels up from the middle
+    assert (
+        np.abs(pixels[48:52, 248:252] - COLOURS[CAR]).max(-1) < 70
+    ).any()  # 20 m: 200 pixels up from the middle
     assert (np.abs(pixels[248:252, 148:152] - COLOURS[ROAD]).max(-1) < 70).any()  # 10 m to the left
     far = np.ones((500, 500), bool)
     far[40:60, 240:260] = far[240:260, 140:160] = False
@@ -122,9 +141,13 @@ def test_from_above_ahead_is_up_and_left_is_left() -> None:
 
 @settings(max_examples=40)
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(5, 100))
-def test_an_orbit_keeps_its_target_in_the_centre(azimuth: float, elevation: float, distance: float) -> None:
+def test_an_orbit_keeps_its_target_in_the_centre(
+    azimuth: float, elevation: float, distance: float
+) -> None:
     camera = Orbit(azimuth, elevation, distance, target=(1.0, -2.0, 0.5)).camera()
-    pixel, depth, per_metre = camera.look(np.array([(1.0, -2.0, 0.5), (1.0, -2.0, 1.5)]), (640, 480))
+    pixel, depth, per_metre = camera.look(
+        np.array([(1.0, -2.0, 0.5), (1.0, -2.0, 1.5)]), (640, 480)
+    )
     np.testing.assert_allclose(pixel[0], (320, 240), atol=0.01)
     np.testing.assert_allclose(depth[0], distance, rtol=1e-4)
     np.testing.assert_allclose(per_metre[0], 240 / np.tan(np.radians(21)) / distance, rtol=1e-3)
@@ -134,14 +157,26 @@ def test_an_orbit_keeps_its_target_in_the_centre(azimuth: float, elevation: floa
 
 def test_points_behind_the_camera_are_not_drawn() -> None:
     scan = few_points((-30, 0, 0), (-21, 0.2, 0), label=[CAR, CAR])
-    assert (render(scan, "label", camera=Camera((-20, 0, 0)), size=(64, 64), rings=False) == EMPTY).all()
+    assert (
+        render(scan, "label", camera=Camera((-20, 0, 0)), size=(64, 64), rings=False) == EMPTY
+    ).all()
 
 
 def test_eye_dome_lighting_darkens_the_background_of_an_edge() -> None:
-    """Eye-dome lighting: next to the outline of a near wall, the far wall is darker than elsewhere."""
+    """Eye-dome lighting: next to the outline of a near wall, the far wall is darker than
+    elsewhere."""
     y, z = np.meshgrid(np.linspace(-6, 6, 200), np.linspace(-6, 6, 200))
-    back = few_points(*map(tuple, np.stack([np.full(y.size, 15.0), y.ravel(), z.ravel()], -1)), label=[ROAD] * y.size)
-    pixels = render(joined(wall(5, CAR), back), "label", camera=Camera((-20, 0, 0)), size=(400, 400), rings=False)
+    back = few_points(
+        *map(tuple, np.stack([np.full(y.size, 15.0), y.ravel(), z.ravel()], -1)),
+        label=[ROAD] * y.size,
+    )
+    pixels = render(
+        joined(wall(5, CAR), back),
+        "label",
+        camera=Camera((-20, 0, 0)),
+        size=(400, 400),
+        rings=False,
+    )
     row = pixels[200].astype(int)
     is_car = np.abs(row - COLOURS[CAR]).sum(-1) < 40
     beside = np.flatnonzero(is_car)[-1] + np.arange(1, 4)
@@ -153,7 +188,12 @@ def test_boxes_are_drawn_along_their_edges_unless_switched_off() -> None:
     boxes = Boxes(np.array([(0, 0, 0, 8, 4, 2, 0)], np.float32), ("Car",))
     scan = few_points((0, 0, -2), label=[ROAD], boxes=boxes)
     pixels = render(scan, "label", camera=bird(10), size=(200, 200), rings=False)
-    for row, column in [(60, 100), (140, 90), (100, 80), (100, 120)]:  # front, back, left and right edge
+    for row, column in [
+        (60, 100),
+        (140, 90),
+        (100, 80),
+        (100, 120),
+    ]:  # front, back, left and right edge
         assert pixels[row - 2 : row + 3, column - 2 : column + 3].max() > 180
     assert pixels[80, 100].min() > 90, "the line to the front"
     assert pixels[120, 100].max() < 90, "none to the back"
@@ -162,7 +202,9 @@ def test_boxes_are_drawn_along_their_edges_unless_switched_off() -> None:
 
 
 def test_box_segments_connect_the_corners() -> None:
-    boxes = Boxes(np.array([(1, 2, 3, 4, 2, 1.5, 0.7), (9, 0, 0, 1, 1, 1, 0)], np.float32), ("Car", "Misc"))
+    boxes = Boxes(
+        np.array([(1, 2, 3, 4, 2, 1.5, 0.7), (9, 0, 0, 1, 1, 1, 0)], np.float32), ("Car", "Misc")
+    )
     segments = box_segments(boxes)
     assert segments.shape == (26, 2, 3)
     lengths = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1)
@@ -186,8 +228,10 @@ def test_points_can_be_coloured_by_every_quantity(by: str) -> None:
 
 
 def test_real_and_synthetic_differ_in_colour() -> None:
-    real, synthetic = (render(replace(wall(5, CAR), domain=d), "domain", camera=Camera((-20, 0, 0)), size=(64, 64))
-                       for d in (REAL, SYNTHETIC))  # fmt: skip
+    real, synthetic = (
+        render(replace(wall(5, CAR), domain=d), "domain", camera=Camera((-20, 0, 0)), size=(64, 64))
+        for d in (REAL, SYNTHETIC)
+    )
     assert np.abs(real[32, 32].astype(int) - synthetic[32, 32]).max() > 100
 
 
@@ -206,7 +250,9 @@ def rgb(figure: Any) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_sheet_shows_its_scan_its_views_and_its_classes() -> None:
-    scan = replace(random_scan(SMALL), boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",)))
+    scan = replace(
+        random_scan(SMALL), boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",))
+    )
     assert scan.label is not None
     figure = sheet(scan)
     assert f"{len(scan):,} points" in figure.texts[0].get_text()
@@ -251,7 +297,9 @@ def test_a_contact_sheet_shows_every_scan() -> None:
         np.testing.assert_array_equal(label, picture(image, "label"))
         np.testing.assert_array_equal((distance == EMPTY).all(-1), ~image.mask)
     bare = contact_sheet([replace(scan, label=None) for scan in scans])
-    assert sum(bool(axes.images) for axes in bare.axes) == 10, "without labels there is no label image"
+    assert sum(bool(axes.images) for axes in bare.axes) == 10, (
+        "without labels there is no label image"
+    )
     with pytest.raises(ConfigError, match="no scans"):
         contact_sheet([])
 
@@ -268,7 +316,9 @@ def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
 
 
 def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"out\.jpg; expected a file that ends in \.png or \.html"):
+    with pytest.raises(
+        ConfigError, match=r"out\.jpg; expected a file that ends in \.png or \.html"
+    ):
         write_view(tmp_path / "out.jpg", [random_scan(SMALL)])
     with pytest.raises(ConfigError, match="no scans"):
         write_view(tmp_path / "out.png", [])

@@ -27,7 +27,9 @@ def scan(seed: int, domain: int, count: int = 1500) -> Scan:
     """A random scan; a real one has boxes, a synthetic one has confidence."""
     made = replace(random_scan(SMALL, count, seed), domain=domain)
     if domain == REAL:
-        return replace(made, boxes=Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",)))
+        return replace(
+            made, boxes=Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
+        )
     return replace(made, confidence=np.random.default_rng(seed).random(count).astype(np.float32))
 
 
@@ -58,9 +60,11 @@ def page(driver: Any, folder: Path) -> Page:
 
 def behind_each_other() -> Scan:
     """Three points on one line of sight of the first camera, the nearest one second in the file."""
-    eye, target = np.array(Orbit().camera().eye), np.array(Orbit().target)
+    eye = np.array(Orbit().camera().eye)
+    target = np.array(Orbit().target)
     points = [eye + share * (target - eye) for share in (1.3, 0.7, 1.0)]
-    label, bright = np.array([2, 0, 5], np.uint8), np.array([0.1, 0.5, 0.9], np.float32)
+    label = np.array([2, 0, 5], np.uint8)
+    bright = np.array([0.1, 0.5, 0.9], np.float32)
     return Scan(np.array(points, np.float32), bright, SMALL, label=label)
 
 
@@ -70,7 +74,11 @@ def test_a_page_opens_offline_without_an_error(driver: Any, folder: Path, name: 
     assert page.errors() == []
     loaded = page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)")
     assert [address for address in loaded if not address.startswith(("data:", "blob:"))] == []
-    drawn = [view for view in range(len(page.all(".view"))) if "\n0 points" not in page.texts(".caption")[view]]
+    drawn = [
+        view
+        for view in range(len(page.all(".view")))
+        if "\n0 points" not in page.texts(".caption")[view]
+    ]
     assert drawn
     if name != "empty":
         assert all(len(np.unique(page.pixels(view).reshape(-1, 3), axis=0)) > 20 for view in drawn)
@@ -121,9 +129,14 @@ def test_dragging_turns_and_moves_and_the_wheel_zooms(page: Page) -> None:
     assert page.texts(".picked") == ["", ""], "dragging picks nothing"
 
 
-def visible(given: Scan, camera: dict[str, Any], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, depths and disc radii (in pixels) of the points in a view, by the package's own renderer."""
-    orbit = Orbit(**{key: tuple(value) if key == "target" else value for key, value in camera.items()})
+def visible(
+    given: Scan, camera: dict[str, Any], size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, depths and disc radii (in pixels) of the points in a view, by the package's own
+    renderer."""
+    orbit = Orbit(
+        **{key: tuple(value) if key == "target" else value for key, value in camera.items()}
+    )
     pixels, depth, per_metre = orbit.camera().look(given.points, size)
     gap = 0.015 + 0.003 * np.linalg.norm(given.points, axis=1)
     return pixels, depth, np.maximum(2 * gap * per_metre, 1.5) / 2
@@ -152,8 +165,12 @@ def agrees(shown: dict[str, str], given: Scan, i: int) -> bool:
         near(shown["range"], np.linalg.norm(given.points[i]), 0.008)
         and shown["label"] == label
         and near(shown["reflectance"], given.reflectance[i], 0.008)
-        and (shown["confidence"] == confidence or near(shown["confidence"], float(confidence), 0.008))
-        and np.allclose([float(v) for v in shown["x, y, z"][:-2].split(", ")], given.points[i], atol=0.008)
+        and (
+            shown["confidence"] == confidence or near(shown["confidence"], float(confidence), 0.008)
+        )
+        and np.allclose(
+            [float(v) for v in shown["x, y, z"][:-2].split(", ")], given.points[i], atol=0.008
+        )
     )
 
 
@@ -161,21 +178,33 @@ def agrees(shown: dict[str, str], given: Scan, i: int) -> bool:
 def test_a_click_shows_the_values_of_the_point_under_the_cursor(page: Page, view: int) -> None:
     given = (REALS[0], SYNTHETICS[0])[view]
     page.drag(0, 60, 30)  # a camera other than the first
-    camera, size = page.camera(), page.size(view)
+    camera = page.camera()
+    size = page.size(view)
     pixels, depth, _ = visible(given, camera, size)
     inside = ((pixels > 80) & (pixels < np.array(size) - 80)).all(1) & (depth > 1)
-    gaps = np.linalg.norm(pixels[inside][:, None] - pixels[inside][None], axis=-1) + 1e9 * np.eye(inside.sum())
+    gaps = np.linalg.norm(pixels[inside][:, None] - pixels[inside][None], axis=-1) + 1e9 * np.eye(
+        inside.sum()
+    )
     alone = np.flatnonzero(inside)[gaps.min(1) > 9]  # nothing else is near these on the screen
     assert len(alone) >= 5
     for i in alone[:5]:
         x, y = np.rint(pixels[i]).astype(int)
         shown = page.click(view, int(x), int(y))
-        assert agrees(shown, given, int(i)), (shown, i, given.points[i], np.linalg.norm(given.points[i]), pixels[i])
+        assert agrees(shown, given, int(i)), (
+            shown,
+            i,
+            given.points[i],
+            np.linalg.norm(given.points[i]),
+            pixels[i],
+        )
         mark = page.run(
-            "const m = state.views[arguments[0]].mark; return [parseFloat(m.style.left), parseFloat(m.style.top)]", view
+            "const m = state.views[arguments[0]].mark; return [parseFloat(m.style.left), "
+            "parseFloat(m.style.top)]",
+            view,
         )
         np.testing.assert_allclose(mark, pixels[i], atol=0.5)
-    rng, hits = np.random.default_rng(view), 0
+    rng = np.random.default_rng(view)
+    hits = 0
     for x, y in rng.integers((80, 80), np.array(size) - 80, (12, 2)).tolist():
         i = nearest(given, camera, size, x, y)
         shown = page.click(view, x, y)
@@ -190,7 +219,9 @@ def test_the_front_point_is_picked_where_points_overlap(driver: Any, folder: Pat
     width, height = page.size(0)
     shown = page.click(0, width // 2, height // 2)
     assert agrees(shown, behind_each_other(), 1), shown
-    next(button for button in page.all("#classes button") if "car" in button.text).click()  # hides the front point
+    next(
+        button for button in page.all("#classes button") if "car" in button.text
+    ).click()  # hides the front point
     assert page.click(0, width // 2, height // 2)["label"] == "person"
 
 
@@ -208,10 +239,22 @@ def press_shown(page: Page, shown: str) -> None:
 
 MOUSE = ("drag", "Shift drag", "wheel", "click")
 CHANGES = {
-    "1": "pressed", "2": "pressed", "3": "pressed", "4": "pressed", "5": "pressed", "←": "captions", "→": "captions",
-    "Shift ←": "captions", "Shift →": "captions", "+": "size", "−": "size", "b": "pressed", "t": "pressed",
-    "r": "camera", "Esc": "picked",
-}  # fmt: skip
+    "1": "pressed",
+    "2": "pressed",
+    "3": "pressed",
+    "4": "pressed",
+    "5": "pressed",
+    "←": "captions",
+    "→": "captions",
+    "Shift ←": "captions",
+    "Shift →": "captions",
+    "+": "size",
+    "−": "size",
+    "b": "pressed",
+    "t": "pressed",
+    "r": "camera",
+    "Esc": "picked",
+}
 """What every key of the page with two kinds of scans changes."""
 
 
@@ -265,7 +308,9 @@ def test_every_key_that_works_is_in_the_help(page: Page) -> None:
         assert page.situation() == before, f"{key!r} is not in the help"
 
 
-def test_a_page_with_one_scan_has_one_view_and_no_keys_for_others(driver: Any, folder: Path) -> None:
+def test_a_page_with_one_scan_has_one_view_and_no_keys_for_others(
+    driver: Any, folder: Path
+) -> None:
     page = Page(driver, folder / "one.html")
     assert len(page.all(".view")) == 1
     assert page.size(0)[0] == page.run("return innerWidth")
@@ -300,7 +345,9 @@ def test_a_scan_without_the_chosen_quantity_is_grey_and_says_so(page: Page) -> N
 def test_a_narrow_window_needs_no_scrolling_sideways(driver: Any, folder: Path) -> None:
     page = Page(driver, folder / "pair.html", (500, 800))
     assert page.run("return document.documentElement.scrollWidth <= innerWidth")
-    boxes = [page.run("return arguments[0].getBoundingClientRect()", view) for view in page.all(".view")]
+    boxes = [
+        page.run("return arguments[0].getBoundingClientRect()", view) for view in page.all(".view")
+    ]
     assert boxes[0]["bottom"] <= boxes[1]["top"], "the views are stacked"
     for button in page.all("#controls button"):
         box = page.run("return arguments[0].getBoundingClientRect()", button)

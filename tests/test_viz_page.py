@@ -38,22 +38,34 @@ def scans() -> list[Scan]:
         replace(random_scan(load_sensor("town"), 3000), boxes=boxes),
         replace(
             random_scan(load_sensor("os1_128"), 500, seed=1),
-            label=None, domain=SYNTHETIC, id="</script>&<b>", confidence=np.linspace(0, 1, 500, dtype=np.float32),
+            label=None,
+            domain=SYNTHETIC,
+            id="</script>&<b>",
+            confidence=np.linspace(0, 1, 500, dtype=np.float32),
         ),
-    ]  # fmt: skip
+    ]
 
 
 @pytest.fixture(scope="module")
 def page(scans: list[Scan]) -> str:
-    return html_page(scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@", panels=PANELS)
+    return html_page(
+        scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@", panels=PANELS
+    )
 
 
 def unpacked(scan: dict[str, Any]) -> list[np.ndarray]:
-    """x, y, z in metres, reflectance and label of a scan of a page, and its confidence if it has it."""
-    content, count = zlib.decompress(base64.b64decode(scan["points"])), scan["count"]
+    """x, y, z in metres, reflectance and label of a scan of a page, and its confidence if it has
+    it."""
+    content = zlib.decompress(base64.b64decode(scan["points"]))
+    count = scan["count"]
     steps = np.frombuffer(content, "<i2", 3 * count).reshape(3, count)
     bytes_ = np.frombuffer(content, np.uint8, offset=6 * count).reshape(-1, count)
-    return [*np.cumsum(steps, axis=1, dtype=np.int16) * scan["metres"], bytes_[0] / 255, bytes_[1], *bytes_[2:] / 255]
+    return [
+        *np.cumsum(steps, axis=1, dtype=np.int16) * scan["metres"],
+        bytes_[0] / 255,
+        bytes_[1],
+        *bytes_[2:] / 255,
+    ]
 
 
 @pytest.mark.slow
@@ -64,7 +76,9 @@ def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
         assert step <= np.abs(scan.points).max() / 32767 * 1.001
         np.testing.assert_allclose(np.stack([x, y, z], 1), scan.points, atol=step / 2 * 1.01)
         np.testing.assert_allclose(reflectance, scan.reflectance, atol=0.5 / 255 + 1e-6)
-        np.testing.assert_array_equal(label, np.full(len(scan), IGNORE) if scan.label is None else scan.label)
+        np.testing.assert_array_equal(
+            label, np.full(len(scan), IGNORE) if scan.label is None else scan.label
+        )
         assert len(confidence) == (scan.confidence is not None)
         if scan.confidence is not None:
             np.testing.assert_allclose(confidence[0], scan.confidence, atol=0.5 / 255 + 1e-6)
@@ -92,12 +106,15 @@ def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> Non
         channels = ["range", "reflectance"] + ["label"] * (scan.label is not None)
         assert [p["title"] for p in packed["pictures"]] == [colours[c].title for c in channels]
         for channel, shown in zip(channels, packed["pictures"], strict=True):
-            np.testing.assert_array_equal(pixels(shown["uri"]), picture(image, channel, colours[channel]))
+            np.testing.assert_array_equal(
+                pixels(shown["uri"]), picture(image, channel, colours[channel])
+            )
         assert pixels(packed["still"]).shape == (360, 640, 3)
 
 
 def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[Scan]) -> None:
-    data, colours = page_data(page), scales(scans)
+    data = page_data(page)
+    colours = scales(scans)
     table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(len(colours), 256, 3)
     assert list(data["scales"]) == list(VALUES) == list(colours)
     for name, scale in colours.items():
@@ -109,7 +126,10 @@ def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[
 
 def test_the_page_loads_nothing_from_outside(page: str) -> None:
     markup = page.replace(json.dumps(page_data(page)), "")
-    assert not re.search(r"https?:|//cdn|@import|import\s*\(|\bfetch\b|XMLHttpRequest|<link|src=[\"'](?!data:)", markup)
+    assert not re.search(
+        r"https?:|//cdn|@import|import\s*\(|\bfetch\b|XMLHttpRequest|<link|src=[\"'](?!data:)",
+        markup,
+    )
     assert not re.search(r"@(title|notes|script)@", page)
 
 
@@ -127,7 +147,9 @@ def test_an_existing_camera_image_is_shown_on_the_page(tmp_path: Path) -> None:
     assert photo.shape[1] == 1200
     assert np.abs(photo.astype(int) - (10, 200, 30)).max() < 8
     lost = replace(with_image, image_path=tmp_path / "lost.png")
-    assert "camera" not in [p["title"] for p in page_data(html_page([lost]))["scans"][0]["pictures"]]
+    assert "camera" not in [
+        p["title"] for p in page_data(html_page([lost]))["scans"][0]["pictures"]
+    ]
 
 
 def test_panels_stand_on_the_page_as_they_are(page: str) -> None:

@@ -30,7 +30,8 @@ View = Callable[..., Result]
 
 @pytest.fixture
 def view(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> View:
-    """Runs ``lidar-synth view`` on a folder of three scans, from an empty working directory and without a screen."""
+    """Runs ``lidar-synth view`` on a folder of three scans, from an empty working directory and
+    without a screen."""
     data = tmp_path / "data"
     data.mkdir()
     for i in range(3):
@@ -56,10 +57,14 @@ def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("args", "ids"), [
-    (["--index", "-1"], ["000002"]), (["--index", "-3", "--count", "2"], ["000000", "000001"]),
-    (["--count", "9"], ["000000", "000001", "000002"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "ids"),
+    [
+        (["--index", "-1"], ["000002"]),
+        (["--index", "-3", "--count", "2"], ["000000", "000001"]),
+        (["--count", "9"], ["000000", "000001", "000002"]),
+    ],
+)
 def test_view_shows_the_selected_scans(view: View, args: list[str], ids: list[str]) -> None:
     assert view(*args, "--out", "out.html").exit_code == 0
     shown = page_data(Path("out.html").read_text(encoding="utf-8"))["scans"]
@@ -76,13 +81,18 @@ def test_view_accepts_a_sensor_and_writes_a_sheet(view: View) -> None:
     assert Image.open("all.png").size[0] == 920
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    (["--index", "3"], r"--index 3: .* holds 3 scans; expected 0 \.\. 2"),
-    (["--index", "-4"], r"--index -4: .* holds 3 scans"),
-    (["--out", "scan.jpg"], r"scan\.jpg; expected a file that ends in \.png or \.html"),
-    (["--sensor", "velodyne"], r"sensor 'velodyne'; expected one of"),
-])  # fmt: skip
-def test_the_error_of_a_wrong_call_names_the_right_one(view: View, args: list[str], message: str) -> None:
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--index", "3"], r"--index 3: .* holds 3 scans; expected 0 \.\. 2"),
+        (["--index", "-4"], r"--index -4: .* holds 3 scans"),
+        (["--out", "scan.jpg"], r"scan\.jpg; expected a file that ends in \.png or \.html"),
+        (["--sensor", "velodyne"], r"sensor 'velodyne'; expected one of"),
+    ],
+)
+def test_the_error_of_a_wrong_call_names_the_right_one(
+    view: View, args: list[str], message: str
+) -> None:
     result = view(*args)
     assert isinstance(result.exception, ConfigError)
     assert re.search(message, str(result.exception))
@@ -114,7 +124,9 @@ def test_the_window_draws_points_and_boxes() -> None:
     scan = replace(random_scan(SMALL), boxes=boxes)
     cloud, lines = window.geometries(scan, scales([scan]))
     np.testing.assert_array_equal(np.asarray(cloud.points).astype(np.float32), scan.points)
-    np.testing.assert_allclose(np.asarray(cloud.colors) * 255, scales([scan])["label"](scan.label), atol=1e-4)
+    np.testing.assert_allclose(
+        np.asarray(cloud.colors) * 255, scales([scan])["label"](scan.label), atol=1e-4
+    )
     drawn = np.asarray(lines.points)[np.asarray(lines.lines)]
     np.testing.assert_allclose(drawn, box_segments(boxes), atol=1e-6)
     assert len(window.geometries(replace(scan, boxes=None), scales([scan]))) == 1

@@ -12,9 +12,16 @@ from lidar_synth.generate.models.codebook import CODEBOOKS
 from lidar_synth.generate.models.lidm.vqvae import VQVAE
 
 SMALL: dict[str, Any] = {
-    "resolution": (8, 32), "channels": 2, "latent_channels": 4, "codes": 16, "width": 8, "multipliers": (1, 2),
-    "strides": ((2, 2),), "blocks": 1, "groups": 4,
-}  # fmt: skip
+    "resolution": (8, 32),
+    "channels": 2,
+    "latent_channels": 4,
+    "codes": 16,
+    "width": 8,
+    "multipliers": (1, 2),
+    "strides": ((2, 2),),
+    "blocks": 1,
+    "groups": 4,
+}
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,7 +52,9 @@ def image(count: int = 2) -> Tensor:
         ({"strides": (), "multipliers": (1,), "attention": False}, (4, 8, 32)),
     ],
 )
-def test_latents_and_outputs_have_the_documented_shapes(arguments: dict[str, Any], shape: tuple[int, ...]) -> None:
+def test_latents_and_outputs_have_the_documented_shapes(
+    arguments: dict[str, Any], shape: tuple[int, ...]
+) -> None:
     net = network(**arguments)
     latent = net.encode(image())
     assert net.latent_shape == shape == latent.shape[1:]
@@ -60,8 +69,10 @@ def test_the_default_latent_has_the_shape_of_lidm() -> None:
 @torch.no_grad()
 @pytest.mark.parametrize("patch", [(1, 1), (2, 2)])
 def test_the_encoder_wraps_columns_but_not_rows(patch: tuple[int, int]) -> None:
-    net, x = network(patch=patch), image()
-    z, columns = net.encode(x), 2 * patch[1]
+    net = network(patch=patch)
+    x = image()
+    z = net.encode(x)
+    columns = 2 * patch[1]
     assert torch.allclose(net.encode(x.roll(columns, -1)), z.roll(1, -1), atol=1e-5)
     assert not torch.allclose(net.encode(x.roll(2 * patch[0], -2)), z.roll(1, -2), atol=1e-2)
 
@@ -147,14 +158,17 @@ def test_without_a_codebook_latents_are_bounded() -> None:
 
 @torch.no_grad()
 def test_latents_have_mean_0_and_variance_1() -> None:
-    net, x = network().train(), image(8)
+    net = network().train()
+    x = image(8)
     raw = net.encode(x)
     assert abs(float(raw.std()) - 1) > 0.2
     net(x)
     z = net.eval().encode(x)
     assert torch.allclose(z.mean((0, 2, 3)), torch.zeros(4), atol=1e-4)
     assert torch.allclose(z.std((0, 2, 3)), torch.ones(4), atol=1e-4)
-    assert torch.allclose(net.decode(z), net(x).output, atol=1e-5)  # the decoder reverts the normalisation
+    assert torch.allclose(
+        net.decode(z), net(x).output, atol=1e-5
+    )  # the decoder reverts the normalisation
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])
@@ -168,16 +182,23 @@ def test_every_weight_gets_a_gradient(checkpointing: bool) -> None:
 
 
 def test_images_and_latents_of_another_shape_are_refused() -> None:
-    with pytest.raises(DataError, match=r"a latent of shape \(1, 4, 4, 8\); expected \(B, 4, 4, 16\)"):
+    with pytest.raises(
+        DataError, match=r"a latent of shape \(1, 4, 4, 8\); expected \(B, 4, 4, 16\)"
+    ):
         network().decode(torch.zeros(1, 4, 4, 8))
-    with pytest.raises(DataError, match=r"an image of shape \(1, 1, 8, 32\); expected \(B, 2, 8, 32\)"):
+    with pytest.raises(
+        DataError, match=r"an image of shape \(1, 1, 8, 32\); expected \(B, 2, 8, 32\)"
+    ):
         network().encode(torch.zeros(1, 1, 8, 32))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"resolution": (9, 32)}, r"an image of \(9, 32\) rows and columns; expected multiples of \(2, 2\)"),
+        (
+            {"resolution": (9, 32)},
+            r"an image of \(9, 32\) rows and columns; expected multiples of \(2, 2\)",
+        ),
         ({"codebook": "guess"}, "one of gradient, ema"),
         ({"multipliers": (1, 2, 3)}, "one multiplier more than strides"),
         ({"strides": ((3, 3),)}, "strides of"),

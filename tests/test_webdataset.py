@@ -20,7 +20,8 @@ from lidar_synth.lab.evaluate.extractors.archive import Archive
 
 
 def samples(path: Path) -> dict[str, dict[str, bytes]]:
-    """As WebDataset's readers group a tar file: neighbours with the same key, which ends at the first dot."""
+    """As WebDataset's readers group a tar file: neighbours with the same key, which ends at the
+    first dot."""
     found: dict[str, dict[str, bytes]] = {}
     with tarfile.open(path) as tar:
         for member in tar:
@@ -48,8 +49,13 @@ def test_members_are_what_webdataset_decodes(tmp_path: Path) -> None:
     assert list(found) == ["000000", "000001"]
     first, second = found.values()
     assert list(first) == [
-        "json", "points.npy", "label.npy", "raw_label.npy", "instance.npy", "boxes.npy",
-    ]  # fmt: skip
+        "json",
+        "points.npy",
+        "label.npy",
+        "raw_label.npy",
+        "instance.npy",
+        "boxes.npy",
+    ]
     points = np.load(BytesIO(first["points.npy"]), allow_pickle=False)
     assert points.dtype == np.float32 and np.array_equal(points[:, :3], scans[0].points)
     assert np.array_equal(points[:, 3], scans[0].reflectance)
@@ -66,7 +72,11 @@ def test_members_are_what_webdataset_decodes(tmp_path: Path) -> None:
 
 
 def test_a_bank_goes_out_under_its_names(tmp_path: Path) -> None:
-    write_bank(tmp_path / "bank", [some_image(i) for i in range(5)], fields=("reflectance", "label", "confidence"))
+    write_bank(
+        tmp_path / "bank",
+        [some_image(i) for i in range(5)],
+        fields=("reflectance", "label", "confidence"),
+    )
     bank = open_scans(tmp_path / "bank")
     convert(bank, WebDatasetWriter(tmp_path / "out", shard_size=3), progress=False)
     assert list(samples(tmp_path / "out" / "scans-000001.tar")) == ["small/5/3", "small/5/4"]
@@ -84,7 +94,9 @@ def test_names_with_dots(tmp_path: Path) -> None:
         writer.write(some_scan(index), index, name=name)
         assert writer.complete(index, name)
     writer.finish()
-    assert list(open_scans(tmp_path).ids) == names and len(samples(tmp_path / "scans-000000.tar")) == 3
+    assert (
+        list(open_scans(tmp_path).ids) == names and len(samples(tmp_path / "scans-000000.tar")) == 3
+    )
 
 
 @pytest.mark.slow
@@ -105,7 +117,8 @@ class Interrupted:
     """Scans of which one cannot be read, for now."""
 
     def __init__(self, scans: list[Scan], stop: type[BaseException]) -> None:
-        self.scans, self.stop = scans, stop
+        self.scans = scans
+        self.stop = stop
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -120,15 +133,27 @@ def test_a_resumed_run_writes_the_same_bytes(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
     convert(scans, WebDatasetWriter(tmp_path / "once", shard_size=2), progress=False)
     with pytest.raises(KeyboardInterrupt):
-        convert(Interrupted(scans, KeyboardInterrupt), WebDatasetWriter(tmp_path / "two", shard_size=2), progress=False)
-    assert convert(scans, WebDatasetWriter(tmp_path / "two", shard_size=2), progress=False) == Report(2, 3)
+        convert(
+            Interrupted(scans, KeyboardInterrupt),
+            WebDatasetWriter(tmp_path / "two", shard_size=2),
+            progress=False,
+        )
+    assert convert(
+        scans, WebDatasetWriter(tmp_path / "two", shard_size=2), progress=False
+    ) == Report(2, 3)
     assert tars(tmp_path / "two") == tars(tmp_path / "once")
-    assert convert(scans, WebDatasetWriter(tmp_path / "two", shard_size=2), progress=False) == Report(0, 5)
-    assert {path.name for path in (tmp_path / "two").iterdir()} == {*tars(tmp_path / "two"), SETTINGS}
+    assert convert(
+        scans, WebDatasetWriter(tmp_path / "two", shard_size=2), progress=False
+    ) == Report(0, 5)
+    assert {path.name for path in (tmp_path / "two").iterdir()} == {
+        *tars(tmp_path / "two"),
+        SETTINGS,
+    }
 
 
 def test_killed_while_gathering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tar files are there, but so are the scans that they were made of: none of them comes twice."""
+    """Tar files are there, but so are the scans that they were made of: none of them comes
+    twice."""
     import lidar_synth.formats.webdataset as module
 
     scans = [some_scan(i) for i in range(3)]
@@ -142,7 +167,9 @@ def test_killed_while_gathering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_skipped_scans_are_added_by_a_later_run(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
-    report = convert(Interrupted(scans, DataError), WebDatasetWriter(tmp_path), on_bad="skip", progress=False)
+    report = convert(
+        Interrupted(scans, DataError), WebDatasetWriter(tmp_path), on_bad="skip", progress=False
+    )
     assert report.written == 4 and len(open_scans(tmp_path)) == 4
     assert convert(scans, WebDatasetWriter(tmp_path), progress=False) == Report(1, 4)
     assert open_scans(tmp_path).ids == ("000000", "000001", "000002", "000004", "000003")
@@ -152,7 +179,8 @@ def test_skipped_scans_are_added_by_a_later_run(tmp_path: Path) -> None:
 
 def test_a_scan_that_is_written_again_replaces_the_old_one(tmp_path: Path) -> None:
     """All of it: the new one may have fewer members."""
-    old, new = [some_scan(i) for i in range(3)], some_scan(7)
+    old = [some_scan(i) for i in range(3)]
+    new = some_scan(7)
     new.label = new.raw_label = new.instance = new.boxes = None
     names = ["a.b/0", "a.b/00", "c"]
     writer = WebDatasetWriter(tmp_path)
@@ -172,7 +200,9 @@ def damaged(path: Path, **members: bytes | None) -> None:
     """Write the file again with other members; None leaves one out."""
     [(key, there)] = samples(path).items()
     with tarfile.open(path, "w") as tar:
-        for kind, content in (there | {kind.replace("_", "."): content for kind, content in members.items()}).items():
+        for kind, content in (
+            there | {kind.replace("_", "."): content for kind, content in members.items()}
+        ).items():
             if content is not None:
                 info = tarfile.TarInfo(f"{key}.{kind}")
                 info.size = len(content)
@@ -189,7 +219,9 @@ def damaged(path: Path, **members: bytes | None) -> None:
         ({"label_npy": b"\x93NUMPY"}, "label.npy has no header of an .npy file"),
     ],
 )
-def test_damaged_members_are_named_and_skipped(tmp_path: Path, members: dict[str, bytes | None], message: str) -> None:
+def test_damaged_members_are_named_and_skipped(
+    tmp_path: Path, members: dict[str, bytes | None], message: str
+) -> None:
     path = write_tars(tmp_path)[1]
     damaged(path, **members)
     with pytest.raises(DataError, match=f"scan '000001' of .*scans-000001.tar: .*({message})"):
@@ -203,9 +235,13 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
     content = path.read_bytes()
     for length in (100, 700, len(content) // 2):
         path.write_bytes(content[:length])
-        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
+        with pytest.raises(
+            DataError, match="scans-000001.tar is truncated, damaged or not a tar file"
+        ):
             open_scans(tmp_path)
-        with pytest.raises(DataError, match="scans-000001.tar is truncated, damaged or not a tar file"):
+        with pytest.raises(
+            DataError, match="scans-000001.tar is truncated, damaged or not a tar file"
+        ):
             convert([some_scan()], WebDatasetWriter(tmp_path), progress=False)
     path.write_bytes(content)
     scans = open_scans(tmp_path)

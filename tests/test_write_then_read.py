@@ -63,7 +63,11 @@ def distorted(rng: np.random.Generator) -> Scan:
 
 
 def _value(scan: Scan, rng: np.random.Generator) -> Scan:
-    known = [n for n in WRONG if getattr(scan, n) is not None and getattr(scan, n).dtype.kind in "iuf" and len(scan)]
+    known = [
+        n
+        for n in WRONG
+        if getattr(scan, n) is not None and getattr(scan, n).dtype.kind in "iuf" and len(scan)
+    ]
     name = known[rng.integers(len(known))] if known else "points"
     return with_value(scan, name, WRONG[name][rng.integers(len(WRONG[name]))]) if known else scan
 
@@ -71,7 +75,11 @@ def _value(scan: Scan, rng: np.random.Generator) -> Scan:
 def _kind(scan: Scan, rng: np.random.Generator) -> Scan:
     name = list(WRONG)[rng.integers(len(WRONG))]
     values = getattr(scan, name)
-    return scan if values is None else replace(scan, **{name: values.astype(KINDS[rng.integers(len(KINDS))])})
+    return (
+        scan
+        if values is None
+        else replace(scan, **{name: values.astype(KINDS[rng.integers(len(KINDS))])})
+    )
 
 
 def _empty(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -83,7 +91,14 @@ def _out_of_view(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def _pose(scan: Scan, rng: np.random.Generator) -> Scan:
-    poses = (np.full((4, 4), np.nan), np.eye(3), 2 * np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(4) * 1j, np.eye(4)[:3])
+    poses = (
+        np.full((4, 4), np.nan),
+        np.eye(3),
+        2 * np.eye(4),
+        np.diag([1.0, 1, -1, 1]),
+        np.eye(4) * 1j,
+        np.eye(4)[:3],
+    )
     return replace(scan, pose=poses[rng.integers(len(poses))])
 
 
@@ -91,20 +106,37 @@ def _boxes(scan: Scan, rng: np.random.Generator) -> Scan:
     boxes = some_boxes(count=3)
     names = [
         "Car",
-        ("Person (sitting)", "", "a b", "DontCare", "-", "x\ny", "Bus", "Voiture é")[rng.integers(8)],
+        ("Person (sitting)", "", "a b", "DontCare", "-", "x\ny", "Bus", "Voiture é")[
+            rng.integers(8)
+        ],
         "Van",
     ]
-    instance = np.array([0, (1 << 31) - 1, -5, 26_001, 999_999][rng.integers(5)], np.int32) + np.zeros(3, np.int32)
+    instance = np.array(
+        [0, (1 << 31) - 1, -5, 26_001, 999_999][rng.integers(5)], np.int32
+    ) + np.zeros(3, np.int32)
     occlusion = np.full(3, rng.integers(-3, 6), np.int8)
     truncation = np.full(3, (-1, 0.5, 7, -9)[rng.integers(4)], np.float32)
     image_box = np.full((3, 4), (-1, 0, 1e9)[rng.integers(3)], np.float32)
-    fields = {"instance": instance, "occlusion": occlusion, "truncation": truncation, "image_box": image_box}
+    fields = {
+        "instance": instance,
+        "occlusion": occlusion,
+        "truncation": truncation,
+        "image_box": image_box,
+    }
     return replace(scan, boxes=Boxes(boxes.values, tuple(names), **fields))
 
 
 def _origin(scan: Scan, rng: np.random.Generator) -> Scan:
-    wrong: list[Any] = [{"seed": np.int64(3)}, {"seed": np.nan}, {"a": [1]}, {1: "a"}, {"a": "x" * 10**5}]
-    return replace(scan, domain=int(rng.integers(-1, 3)), provenance=wrong[rng.integers(len(wrong))])
+    wrong: list[Any] = [
+        {"seed": np.int64(3)},
+        {"seed": np.nan},
+        {"a": [1]},
+        {1: "a"},
+        {"a": "x" * 10**5},
+    ]
+    return replace(
+        scan, domain=int(rng.integers(-1, 3)), provenance=wrong[rng.integers(len(wrong))]
+    )
 
 
 FAULTS: list[Callable[[Scan, np.random.Generator], Scan]] = [
@@ -167,7 +199,9 @@ def test_what_is_written_is_read(to: str, tmp_path: Path) -> None:
     ],
     ids=["nan", "1e30 m", "label 261", "instance 2^32 + 7", "ring 70,000", "time 1e30", "empty"],
 )
-def test_no_writer_takes_what_readers_refuse(to: str, fault: Callable[[Scan], Scan], tmp_path: Path) -> None:
+def test_no_writer_takes_what_readers_refuse(
+    to: str, fault: Callable[[Scan], Scan], tmp_path: Path
+) -> None:
     writer = WRITERS[to](tmp_path)  # type: ignore[call-arg]
     with pytest.raises(DataError):
         writer.write(fault(complete()), 0)

@@ -1,4 +1,5 @@
-"""Turns of a made-up sensor between walls and boxes, with the time and the true beam and firing of every point."""
+"""Turns of a made-up sensor between walls and boxes, with the time and the true beam and firing of
+every point."""
 
 from dataclasses import dataclass
 
@@ -42,7 +43,8 @@ def turned(
         heights: metres above the origin.
         azimuths: degrees, clockwise.
         firings: per turn.
-        encoder: steps of a turn to which azimuths are rounded, while the rotation speed varies by half a per cent.
+        encoder: steps of a turn to which azimuths are rounded, while the rotation speed varies by
+            half a per cent.
         seed: of the scene.
     """
     rng = np.random.default_rng(seed)
@@ -59,7 +61,9 @@ def turned(
     height = np.asarray(heights)[ring] if heights is not None else np.zeros(len(ring))
     distance = _distances(azimuth, elevation, height, rng)
     rho = distance * np.cos(elevation)
-    points = np.stack([rho * np.cos(azimuth), -rho * np.sin(azimuth), height + distance * np.sin(elevation)], 1)
+    points = np.stack(
+        [rho * np.cos(azimuth), -rho * np.sin(azimuth), height + distance * np.sin(elevation)], 1
+    )
     kept = (distance < 100) & (rng.random(len(ring)) < 0.9)
     scan = Scan(
         points[kept].astype(np.float32),
@@ -71,8 +75,11 @@ def turned(
     return Turned(scan, ring[kept], firing[kept])
 
 
-def _distances(azimuth: np.ndarray, elevation: np.ndarray, height: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Level ground 1.7 m below the origin, and slanted walls whose distance changes every degree or so."""
+def _distances(
+    azimuth: np.ndarray, elevation: np.ndarray, height: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Level ground 1.7 m below the origin, and slanted walls whose distance changes every degree or
+    so."""
     sector = azimuth / (2 * np.pi) % 1.0 * WALLS
     number = sector.astype(int) % WALLS
     near = np.exp(rng.uniform(np.log(4), np.log(70), WALLS))
@@ -88,7 +95,8 @@ def driving(speed: float, turn_rate: float = 0.0) -> Trajectory:
     times = np.arange(-2, 3) * DURATION
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     for pose, time in zip(poses, times, strict=True):
-        c, s = np.cos(turn_rate * time), np.sin(turn_rate * time)
+        c = np.cos(turn_rate * time)
+        s = np.sin(turn_rate * time)
         pose[:2, :2], pose[0, 3] = [[c, -s], [s, c]], speed * time
     return Trajectory(times, poses)
 

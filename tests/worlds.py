@@ -12,7 +12,9 @@ from lidar_synth.geometry.sensor import Sensor, presets
 
 SENSOR = presets()["town"]
 HEIGHT = 1.73
-CAR, WALL, ROAD = TRAIN_ID["car"], TRAIN_ID["building"], TRAIN_ID["road"]
+CAR = TRAIN_ID["car"]
+WALL = TRAIN_ID["building"]
+ROAD = TRAIN_ID["road"]
 
 
 def car(x: float, y: float, yaw: float = 0.0, ground: float = -HEIGHT) -> NDArray[np.float32]:
@@ -20,19 +22,27 @@ def car(x: float, y: float, yaw: float = 0.0, ground: float = -HEIGHT) -> NDArra
     return np.array([x, y, ground + 0.8, 4.2, 1.8, 1.6, yaw], np.float32)
 
 
-def wall(x: float, y: float, yaw: float = 0.0, length: float = 10.0, height: float = 4.0) -> NDArray[np.float32]:
+def wall(
+    x: float, y: float, yaw: float = 0.0, length: float = 10.0, height: float = 4.0
+) -> NDArray[np.float32]:
     """(7,) the box of a thin wall that reaches 0.1 m into the ground."""
     return np.array([x, y, height / 2 - HEIGHT - 0.1, length, 0.3, height, yaw], np.float32)
 
 
 def distances(box: NDArray[np.float32], rays: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(...) distances in metres along unit rays (..., 3) from the origin to a box; inf where they miss it."""
-    c, s = np.cos(float(box[6])), np.sin(float(box[6]))
+    """(...) distances in metres along unit rays (..., 3) from the origin to a box; inf where they
+    miss it."""
+    c = np.cos(float(box[6]))
+    s = np.sin(float(box[6]))
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    local, eye = rays.astype(np.float64) @ turn.T, -turn @ box[:3].astype(np.float64)
+    local = rays.astype(np.float64) @ turn.T
+    eye = -turn @ box[:3].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = np.sort(np.stack([(-box[3:6] / 2 - eye) / local, (box[3:6] / 2 - eye) / local]), axis=0)
-    enter, leave = low.max(-1), high.min(-1)
+        low, high = np.sort(
+            np.stack([(-box[3:6] / 2 - eye) / local, (box[3:6] / 2 - eye) / local]), axis=0
+        )
+    enter = low.max(-1)
+    leave = high.min(-1)
     return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
 
@@ -49,7 +59,8 @@ def cast(
     with np.errstate(divide="ignore"):
         road = np.where(rays[..., 2] < 0, ground / rays[..., 2].astype(np.float64), np.inf)
     hits = np.stack([road, *(distances(b, rays) for b in (*walls, *cars))])
-    surface, distance = hits.argmin(0), hits.min(0)
+    surface = hits.argmin(0)
+    distance = hits.min(0)
     seen = (distance >= sensor.range_min) & (distance <= sensor.range_max)
     label = np.array([ROAD, *[WALL] * len(walls), *[CAR] * len(cars)], np.uint8)[surface]
     instance = np.maximum(surface - len(walls), 0)
@@ -63,6 +74,9 @@ def cast(
         },
     )
     scan = unproject(image)
-    scan.boxes = Boxes(np.array(cars, np.float32), ("Car",) * len(cars), instance=np.arange(1, len(cars) + 1))
-    scan.id, scan.domain = id, SYNTHETIC
+    scan.boxes = Boxes(
+        np.array(cars, np.float32), ("Car",) * len(cars), instance=np.arange(1, len(cars) + 1)
+    )
+    scan.id = id
+    scan.domain = SYNTHETIC
     return scan

@@ -1,15 +1,19 @@
-"""Compare distillation strategies in 4, 2 and 1 steps (the paper's Table 4), each with several seeds.
+"""Compare distillation strategies in 4, 2 and 1 steps (the paper's Table 4), each with several
+seeds.
 
-    python tools/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072] [--count 64]
+    python tools/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072]
+    [--count 64]
 
-TEACHER is the checkpoint of a latent flow, LATENTS the file ``latents-*.npy`` that its training has left in its cache.
-Parts of the teacher's trajectories are computed once, as in R2Flow, in Euler steps of 1/24. Every student starts from
-the teacher's weights and learns from as many of them in as many iterations. One student of reflow serves all numbers
-of steps. In one step, the piecewise strategies are timestep distillation, and are not trained again. The time grids of
+TEACHER is the checkpoint of a latent flow, LATENTS the file ``latents-*.npy`` that its training has
+left in its cache. Parts of the teacher's trajectories are computed once, as in R2Flow, in Euler
+steps of 1/24. Every student starts from the teacher's weights and learns from as many of them in as
+many iterations. One student of reflow serves all numbers of steps. In one step, the piecewise
+strategies are timestep distillation, and are not trained again. The time grids of
 ``adaptive_piecewise`` are selected on 64 trajectories; all others are uniform.
 
-The first table has means and standard deviations over the seeds, the second one all measures of tools/model_card.py for
-the first seed in 4 steps, with 95 % intervals. WORK keeps students and trajectories: a second call resumes.
+The first table has means and standard deviations over the seeds, the second one all measures of
+tools/model_card.py for the first seed in 4 steps, with 95 % intervals. WORK keeps students and
+trajectories: a second call resumes.
 """
 
 import argparse
@@ -42,19 +46,31 @@ from lidar_synth.lab.train.precision import faster_in_bfloat16
 STEPS = (4, 2, 1)
 EULER = 24
 """Steps of the teacher from noise to data."""
-BATCH, TRAJECTORIES, CANDIDATES, RATE, WARM_UP, DECAY = 8, 64, 50, 6e-4, 20, 0.99
+BATCH = 8
+TRAJECTORIES = 64
+CANDIDATES = 50
+RATE = 6e-4
+WARM_UP = 20
+DECAY = 0.99
 WHOLE = ("reflow", "timestep_distillation")
 """Strategies whose targets are whole trajectories."""
-SHOWN = {"bird's-eye JSD": "BEV Jensen", "Fréchet": "Frechet", "squared MMD": "squared", "mIoU, %": "mIoU"}
+SHOWN = {
+    "bird's-eye JSD": "BEV Jensen",
+    "Fréchet": "Frechet",
+    "squared MMD": "squared",
+    "mIoU, %": "mIoU",
+}
 """{column: the beginning of the measure's name}."""
 ERROR = "error, %"
-"""Squared difference of sampled latents and the teacher's of the same noise in 50 steps, over their variance."""
+"""Squared difference of sampled latents and the teacher's of the same noise in 50 steps, over their
+variance."""
 
 Grid = tuple[float, ...]
 
 
 class Student(NamedTuple):
-    """A student: its strategy, its time grid, and the grid of the parts of trajectories that it learns from."""
+    """A student: its strategy, its time grid, and the grid of the parts of trajectories that it
+    learns from."""
 
     strategy: str
     grid: Grid
@@ -66,7 +82,9 @@ def students(selected: dict[int, Grid]) -> list[Student]:
     found = []
     for strategy in STRATEGIES:
         for steps in STEPS:
-            grid = selected[steps] if strategy == "adaptive_piecewise" else tuple(uniform_grid(steps))
+            grid = (
+                selected[steps] if strategy == "adaptive_piecewise" else tuple(uniform_grid(steps))
+            )
             if strategy in WHOLE or steps > 1:
                 found.append(Student(strategy, grid, (1.0, 0.0) if strategy in WHOLE else grid))
     return found
@@ -96,31 +114,44 @@ class Ablation:
         if not path.exists():
             shape = self.latents.shape[2:]
             selection = select_timesteps(
-                velocity(self.teacher), shape, max(STEPS), CANDIDATES, TRAJECTORIES, "squared_l2", batch=2 * BATCH
+                velocity(self.teacher),
+                shape,
+                max(STEPS),
+                CANDIDATES,
+                TRAJECTORIES,
+                "squared_l2",
+                batch=2 * BATCH,
             )
             times = np.asarray(selection.candidates)
             torch.save({n: times[best_path(selection.costs, n)].tolist() for n in STEPS}, path)
         return {n: tuple(grid) for n, grid in torch.load(path, weights_only=True).items()}
 
     def parts(self, grid: Grid) -> dict[str, Tensor]:
-        """Parts of the teacher's trajectories: data ``y0``, noise ``y1``, the index of the ``interval`` that the
-        teacher integrates from the point between them, and its mean velocity there, the ``slope``."""
+        """Parts of the teacher's trajectories: data ``y0``, noise ``y1``, the index of the
+        ``interval`` that the teacher integrates from the point between them, and its mean velocity
+        there, the ``slope``."""
         path = self.work / f"parts-{'-'.join(f'{t:g}' for t in grid)}.safetensors"
         if not path.exists():
-            rng, noise, flow, found = (
-                np.random.default_rng(7),
-                torch.Generator().manual_seed(7),
-                velocity(self.teacher),
-                [],
-            )
+            rng = np.random.default_rng(7)
+            noise = torch.Generator().manual_seed(7)
+            flow = velocity(self.teacher)
+            found = []
             intervals = list(pairwise(grid))
             for part in tqdm(range(self.pairs // BATCH), desc=path.stem, unit="batch"):
                 index = part % len(intervals)
                 start, end = intervals[index]
-                y0 = torch.from_numpy(self.latents[rng.integers(2), rng.choice(self.latents.shape[1], BATCH)]).float()
+                y0 = torch.from_numpy(
+                    self.latents[rng.integers(2), rng.choice(self.latents.shape[1], BATCH)]
+                ).float()
                 y1 = torch.randn(y0.shape, generator=noise)
                 y = torch.lerp(y0, y1, start)
-                after = solve(flow, y, uniform_grid(max(2, round(EULER * (start - end))), start, end), "euler", None)
+                after = solve(
+                    flow,
+                    y,
+                    uniform_grid(max(2, round(EULER * (start - end))), start, end),
+                    "euler",
+                    None,
+                )
                 slope = (after - y) / (end - start)
                 found.append((y0.half(), y1.half(), torch.full((BATCH,), index), slope.half()))
             columns = (torch.cat(column) for column in zip(*found, strict=True))
@@ -136,16 +167,19 @@ class Ablation:
         return load_file(path)
 
     def _learn(self, student: Student, seed: int, name: str) -> dict[str, Tensor]:
-        parts, network = self.parts(student.parts), deepcopy(self.teacher.network).train().requires_grad_(True)
+        parts = self.parts(student.parts)
+        network = deepcopy(self.teacher.network).train().requires_grad_(True)
         average = {k: v.clone() for k, v in network.state_dict().items()}
-        optimizers, draws = muon(network, RATE, (0.9, 0.98), 0.01), torch.Generator().manual_seed(seed)
+        optimizers = muon(network, RATE, (0.9, 0.98), 0.01)
+        draws = torch.Generator().manual_seed(seed)
         for step in tqdm(range(self.iterations), desc=name, unit="step"):
             y, t, v = supervision(student, parts, draws)
             with torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16()):
                 predicted = network(y, t)
             (predicted.float() - v).square().mean().backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            warm, cool = (step + 1) / WARM_UP, (self.iterations - step) / (0.4 * self.iterations)
+            warm = (step + 1) / WARM_UP
+            cool = (self.iterations - step) / (0.4 * self.iterations)
             for optimizer in optimizers:
                 for group in optimizer.param_groups:
                     group["lr"] = RATE * min(1.0, warm, max(0.02, cool))
@@ -163,8 +197,12 @@ class Ablation:
 
     def end(self, generator: Generator, grid: Grid) -> Tensor:
         """(n, C, h, w) the latents that a flow makes of the same noise."""
-        noise = torch.randn(TRAJECTORIES, *self.latents.shape[2:], generator=torch.Generator().manual_seed(5))
-        return torch.cat([solve(velocity(generator), y, grid, "euler", None) for y in noise.split(BATCH)])
+        noise = torch.randn(
+            TRAJECTORIES, *self.latents.shape[2:], generator=torch.Generator().manual_seed(5)
+        )
+        return torch.cat(
+            [solve(velocity(generator), y, grid, "euler", None) for y in noise.split(BATCH)]
+        )
 
 
 def velocity(generator: Generator) -> Callable[..., Tensor]:
@@ -177,8 +215,11 @@ def velocity(generator: Generator) -> Callable[..., Tensor]:
     return flow
 
 
-def supervision(student: Student, parts: dict[str, Tensor], draws: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """States, times and velocities of a batch by the strategy; its teacher is the recorded slope."""
+def supervision(
+    student: Student, parts: dict[str, Tensor], draws: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """States, times and velocities of a batch by the strategy; its teacher is the recorded
+    slope."""
     picks = torch.randint(len(parts["y0"]), (BATCH,), generator=draws)
     y0, y1, slope = (parts[name][picks].float() for name in ("y0", "y1", "slope"))
     u = torch.rand(BATCH, generator=draws)
@@ -194,14 +235,19 @@ def supervision(student: Student, parts: dict[str, Tensor], draws: torch.Generat
 def sample(generator: Generator, grid: Grid, count: int) -> list[Scan]:
     """Scans on a time grid; all generators get the same noise."""
     known = replace(generator, header=replace(generator.header, time_grid=grid, other_grids=()))
-    made = [known.scans(SEED, [i])[0] for i in tqdm(range(count), desc=f"{len(grid) - 1} steps", unit="scan")]
+    made = [
+        known.scans(SEED, [i])[0]
+        for i in tqdm(range(count), desc=f"{len(grid) - 1} steps", unit="scan")
+    ]
     return [replace(scan, sensor=load_sensor("town")) for scan in made]
 
 
 def row(name: str, steps: int, measured: Sequence[Measured], errors: Sequence[float]) -> str:
     """Means and standard deviations over the seeds."""
-    columns = [[next(s.value for s in one.scores if s.metric.startswith(start)) for one in measured]
-               for start in SHOWN.values()]  # fmt: skip
+    columns = [
+        [next(s.value for s in one.scores if s.metric.startswith(start)) for one in measured]
+        for start in SHOWN.values()
+    ]
     columns += [[one.classes[BEND] for one in measured], list(errors)]
     cells = []
     for values in columns:
@@ -211,33 +257,48 @@ def row(name: str, steps: int, measured: Sequence[Measured], errors: Sequence[fl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("teacher", type=Path)
     parser.add_argument("latents", type=Path)
     parser.add_argument("work", type=Path, help="folder of students and trajectories")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=1000, help="of each student")
-    parser.add_argument("--pairs", type=int, default=3072, help="parts of trajectories for each time grid")
+    parser.add_argument(
+        "--pairs", type=int, default=3072, help="parts of trajectories for each time grid"
+    )
     parser.add_argument("--count", type=int, default=64, help="scans in each set")
-    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
+    parser.add_argument(
+        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+    )
     given = parser.parse_args()
 
     given.work.mkdir(parents=True, exist_ok=True)
     teacher = load_generator(str(given.teacher))
-    ablation = Ablation(teacher, np.load(given.latents, mmap_mode="r"), given.work, given.pairs, given.iterations)
+    ablation = Ablation(
+        teacher, np.load(given.latents, mmap_mode="r"), given.work, given.pairs, given.iterations
+    )
     every = students(ablation.selected())
     for seed in range(given.seeds):
         for student in every:
             ablation.train(student, seed)
-    real, judge = town(REFERENCE, given.count), load_judge()
-    plain, exact = Comparison(real, judge), Comparison(real, judge, given.intervals)
+    real = town(REFERENCE, given.count)
+    judge = load_judge()
+    plain = Comparison(real, judge)
+    exact = Comparison(real, judge, given.intervals)
     columns = (*SHOWN, BEND, ERROR)
     lines = [f"| strategy | steps | {' | '.join(columns)} |", f"|---|---:|{'---:|' * len(columns)}"]
-    kept, whole = [], ablation.end(teacher, uniform_grid(50))
+    kept = []
+    whole = ablation.end(teacher, uniform_grid(50))
 
     def add(name: str, generators: Sequence[Generator], grid: Grid) -> None:
-        steps, sets = len(grid) - 1, [sample(generator, grid, given.count) for generator in generators]
-        errors = [100 * float((ablation.end(g, grid) - whole).square().mean() / whole.var()) for g in generators]
+        steps = len(grid) - 1
+        sets = [sample(generator, grid, given.count) for generator in generators]
+        errors = [
+            100 * float((ablation.end(g, grid) - whole).square().mean() / whole.var())
+            for g in generators
+        ]
         lines.append(row(name, steps, [plain.measure(name, scans) for scans in sets], errors))
         if steps == max(STEPS):
             kept.append(exact.measure(name, sets[0]))
@@ -245,7 +306,11 @@ def main() -> None:
     for steps in (50, *STEPS):
         add("teacher", [teacher], uniform_grid(steps))
     for student in every:
-        add(student.strategy, [ablation.generator(student, seed) for seed in range(given.seeds)], student.grid)
+        add(
+            student.strategy,
+            [ablation.generator(student, seed) for seed in range(given.seeds)],
+            student.grid,
+        )
     print("\n".join(lines), f"\n\nSeed 0, {max(STEPS)} steps:\n\n{table(kept)}")
 
 

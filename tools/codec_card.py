@@ -1,11 +1,13 @@
-"""Measure what an autoencoder preserves of a scan, by class: the figures of docs/research/autoencoder.md.
+"""Measure what an autoencoder preserves of a scan, by class: the figures of
+docs/research/autoencoder.md.
 
     python tools/codec_card.py NAME=MODEL ... [--count 24]
 
     python tools/codec_card.py "as it ships=town" "mine=runs/town_codec/town_codec.safetensors"
 
-The scans are from a town that no model was trained on, each on another street. They are encoded, and decoded to the
-mode of the predicted distributions. A flow on these latents cannot be more accurate than this.
+The scans are from a town that no model was trained on, each on another street. They are encoded,
+and decoded to the mode of the predicted distributions. A flow on these latents cannot be more
+accurate than this.
 """
 
 import argparse
@@ -28,7 +30,8 @@ CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
     """Range images, encoded and decoded by the autoencoder of a checkpoint."""
-    codec, made = open_codec(model), []
+    codec = open_codec(model)
+    made = []
     for image in tqdm(images, desc=Path(model).stem, unit="scan"):
         made += reconstruct(codec, codec.tensors.from_images([image]), image.sensor)
     return made
@@ -37,7 +40,9 @@ def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
 def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
     """A line of the table, in per cent."""
     a, b = (np.stack([image.range for image in images]) for images in (real, made))
-    labels, decoded = (np.stack([image.channels["label"] for image in images]) for images in (real, made))
+    labels, decoded = (
+        np.stack([image.channels["label"] for image in images]) for images in (real, made)
+    )
     both = (a > 0) & (b > 0)
     off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
     right = [((a > 0) == (b > 0)).mean(), (labels == decoded)[both & (labels != IGNORE)].mean()]
@@ -46,7 +51,9 @@ def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL")
     parser.add_argument("--count", type=int, default=24, help="scans")
     given = parser.parse_args()
@@ -57,7 +64,10 @@ def main() -> None:
         name, model = text.split("=", 1)
         with torch.inference_mode():
             lines.append(row(name, images, there_and_back(model, images)))
-    print(f"{given.count} scans of town {SEED}; per cent: cells, labels; medians of |range / true range - 1|\n")
+    print(
+        f"{given.count} scans of town {SEED}; per cent: cells, labels; medians of |range / true "
+        "range - 1|\n"
+    )
     columns = ("returns right", "labels right", *CLASSES)
     print(f"| autoencoder | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
     print("\n".join(lines))

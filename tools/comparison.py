@@ -1,8 +1,10 @@
-"""Do synthetic scans help? The same segmenter trained on a few labelled scans, without and with synthetic ones.
+"""Do synthetic scans help? The same segmenter trained on a few labelled scans, without and with
+synthetic ones.
 
-Both trainings ("arms") have the same labelled scans, iterations, batch size, augmentation, network and seeds; they
-differ only in the share of synthetic samples. Each is measured on the same held-out scans. Every training runs on one
-thread of a process of its own, so that the figures do not depend on the number of cores.
+Both trainings ("arms") have the same labelled scans, iterations, batch size, augmentation, network
+and seeds; they differ only in the share of synthetic samples. Each is measured on the same held-out
+scans. Every training runs on one thread of a process of its own, so that the figures do not depend
+on the number of cores.
 """
 
 import os
@@ -25,7 +27,9 @@ from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels.augment import compose, flip_y, scale, yaw
 
 AUGMENT = compose([yaw, flip_y, scale])
-AUGMENTATION = "rotation about the vertical axis, mirroring and scaling, of real and synthetic scans alike"
+AUGMENTATION = (
+    "rotation about the vertical axis, mirroring and scaling, of real and synthetic scans alike"
+)
 WIDTHS = (8, 16, 32, 48)
 """Channels of the segmenter: half of its default, for a short training on a CPU."""
 
@@ -57,13 +61,16 @@ class Protocol:
         return MixedScans(self.real, self.synthetic if ratio else None, ratio, seed=seed, **options)
 
     def train(self, ratio: float, seed: int) -> NDArray[np.int64]:
-        """(19, 19) confusion matrix on the held-out scans after a training with this share of synthetic samples."""
+        """(19, 19) confusion matrix on the held-out scans after a training with this share of
+        synthetic samples."""
         torch.manual_seed(seed)
         mixed = self.mixture(ratio, seed, augment=AUGMENT, augment_real=True, collate="range")
         held_out = MixedScans(self.held_out, ratio=0, collate="range")
         height = torch.from_numpy(np.sin(mixed.collate.sensor.ray_angles()[0]))
         network = RangeSegmenter(widths=WIDTHS)
-        train_segmenter(network, endless_batches(mixed, self.batch), height, self.steps, progress=False)
+        train_segmenter(
+            network, endless_batches(mixed, self.batch), height, self.steps, progress=False
+        )
         return confusion(network, DataLoader(held_out, 1, collate_fn=held_out.collate), height)
 
 
@@ -76,14 +83,17 @@ class Result:
 
     def scores(self) -> tuple[list[float], list[float]]:
         """The mIoU of every seed, in [0, 1], without and with synthetic scans."""
-        return [mean_iou(table) for table in self.without], [mean_iou(table) for table in self.with_synthetic]
+        return [mean_iou(table) for table in self.without], [
+            mean_iou(table) for table in self.with_synthetic
+        ]
 
     def ious(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(19,) IoU of every class, mean over the seeds, without and with synthetic scans; NaN for a class that the
-        held-out scans do not have."""
+        """(19,) IoU of every class, mean over the seeds, without and with synthetic scans; NaN for
+        a class that the held-out scans do not have."""
         there = self.without[0].sum(1) > 0
         means = [
-            np.mean([np.nan_to_num(class_ious(t)) for t in tables], 0) for tables in (self.without, self.with_synthetic)
+            np.mean([np.nan_to_num(class_ious(t)) for t in tables], 0)
+            for tables in (self.without, self.with_synthetic)
         ]
         return np.where(there, means[0], np.nan), np.where(there, means[1], np.nan)
 
@@ -109,10 +119,13 @@ def compare(protocol: Protocol, jobs: int | None = None) -> Result:
         protocol: the comparison.
         jobs: number of processes; by default one for each core.
     """
-    ratios, seeds = (0.0, protocol.ratio), range(protocol.seeds)
+    ratios = (0.0, protocol.ratio)
+    seeds = range(protocol.seeds)
     runs = [(ratio, seed) for seed in seeds for ratio in ratios]
     workers = min(jobs or os.cpu_count() or 1, len(runs))
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(protocol,))
+    pool = ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=_start, initargs=(protocol,)
+    )
     with pool, tqdm(total=len(runs), desc="trainings", unit="training") as bar:
         futures = [pool.submit(_train, *run) for run in runs]
         for future in futures:

@@ -1,16 +1,20 @@
-"""Does a model follow its condition? The figures and images of conditional models in docs/research/conditions.md.
+"""Does a model follow its condition? The figures and images of conditional models in
+docs/research/conditions.md.
 
-    python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64] [--picture OUT.png]
+    python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64]
+    [--picture OUT.png]
 
-    python tools/condition_card.py "student, 4 steps=town-semantic" "teacher, 50 steps=RUN/teacher.safetensors:50"
+    python tools/condition_card.py "student, 4 steps=town-semantic" "teacher, 50
+    steps=RUN/teacher.safetensors:50"
 
-Every model gets the same noise and the conditions of the same real scans, from an unseen town or from ROOT. The first
-table measures how close the generated scans are as a set. The second one measures how well each agrees with the scan of
-its own condition, and with another scan, half the set away:
+Every model gets the same noise and the conditions of the same real scans, from an unseen town or
+from ROOT. The first table measures how close the generated scans are as a set. The second one
+measures how well each agrees with the scan of its own condition, and with another scan, half the
+set away:
 
     semantic   mIoU between the label map and the segmenter's prediction on the generated scan
-    camera     intersection over union of the occupied bird's-eye cells (1 m) in the camera's view, up to 40 m away;
-               a cell is occupied if it has a return above the ground
+    camera     intersection over union of the occupied bird's-eye cells (1 m) in the camera's view,
+               up to 40 m away; a cell is occupied if it has a return above the ground
 """
 
 import argparse
@@ -21,7 +25,17 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import REFERENCE, SEED, Comparison, Measured, needs_images, shrink, table, town, with_images
+from model_card import (
+    REFERENCE,
+    SEED,
+    Comparison,
+    Measured,
+    needs_images,
+    shrink,
+    table,
+    town,
+    with_images,
+)
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
@@ -74,9 +88,17 @@ def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> N
     grid = figure.subplots(len(made), 3, squeeze=False, width_ratios=[1.25, 1, 1])
     for axes, a, b in zip(grid, made, real, strict=True):
         assert a.sensor is not None
-        images = (seen(kind, b, a.sensor), render(a, "label", size=(900, 540)), render(b, "label", size=(900, 540)))
-        for axis, image, title in zip(axes, images, ("condition", "generated", "scan of the condition"), strict=True):
-            axis.imshow(image, aspect="equal" if kind == "camera" or title != "condition" else "auto")
+        images = (
+            seen(kind, b, a.sensor),
+            render(a, "label", size=(900, 540)),
+            render(b, "label", size=(900, 540)),
+        )
+        for axis, image, title in zip(
+            axes, images, ("condition", "generated", "scan of the condition"), strict=True
+        ):
+            axis.imshow(
+                image, aspect="equal" if kind == "camera" or title != "condition" else "auto"
+            )
             axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
             axis.set_axis_off()
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,13 +107,21 @@ def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> N
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
     parser.add_argument("--root", help="a dataset with labels or images [default: a town]")
     parser.add_argument("--split", help="split of ROOT")
     parser.add_argument("--count", type=int, default=64, help="scans in each row")
-    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
-    parser.add_argument("--picture", type=Path, help="PNG of the first model's scans; do not publish it for real data")
+    parser.add_argument(
+        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        help="PNG of the first model's scans; do not publish it for real data",
+    )
     given = parser.parse_args()
     with TemporaryDirectory() as folder:
         report(given, Path(folder))
@@ -107,7 +137,9 @@ def report(given: argparse.Namespace, folder: Path) -> None:
     else:
         real = town(REFERENCE, given.count)
         if needs_images(given.models):
-            real = with_images(real, Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0), folder)
+            real = with_images(
+                real, Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0), folder
+            )
     comparison = Comparison(real, judge, given.intervals)
     sets: list[Measured] = []
     verdicts = []
@@ -123,7 +155,10 @@ def report(given: argparse.Namespace, folder: Path) -> None:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])
     print(f"{len(real)} scans in each set\n\n{table(sets)}")
-    print("\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n" + "\n".join(verdicts))
+    print(
+        "\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n"
+        + "\n".join(verdicts)
+    )
 
 
 if __name__ == "__main__":

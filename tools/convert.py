@@ -1,4 +1,5 @@
-"""Convert scans from one format to another: ``python tools/convert.py --help``; the same as ``lidar-synth convert``."""
+"""Convert scans from one format to another: ``python tools/convert.py --help``; the same as
+``lidar-synth convert``."""
 
 import sys
 

@@ -1,10 +1,13 @@
-"""Damage a shard in many ways, one at a time; check that all damage is found and that no wrong scan is returned.
+"""Damage a shard in many ways, one at a time; check that all damage is found and that no wrong scan
+is returned.
 
     python tools/damage_bank.py [--model town] [--flips 1000] [--cuts 200]
 
-Random bits are flipped and the file is truncated at random lengths. After each damage all scans are read twice: through
-the index, and from the shard alone, without the size and hash of the index. Every scan that a reader returns has to
-equal the one that was written, and ``verify`` has to find all damage. At the end ``repair`` generates the shard again.
+Random bits are flipped and the file is truncated at random lengths. After each damage all scans are
+    read twice: through
+the index, and from the shard alone, without the size and hash of the index. Every scan that a
+reader returns has to equal the one that was written, and ``verify`` has to find all damage. At the
+end ``repair`` generates the shard again.
 """
 
 import argparse
@@ -30,13 +33,18 @@ def by_index(root: Path, number: int) -> list[bytes]:
     first = bank.index.ends[number] - bank.index.shards[number].scans
     scans = [bank[i] for i in range(first, bank.index.ends[number])]
     bank.close()
-    return [b"".join(a.tobytes() for a in (s.points, s.reflectance, s.label) if a is not None) for s in scans]
+    return [
+        b"".join(a.tobytes() for a in (s.points, s.reflectance, s.label) if a is not None)
+        for s in scans
+    ]
 
 
 def alone(path: Path) -> list[bytes]:
     """The arrays of a shard's scans, read from the shard alone."""
     with ShardReader(path, str(path)) as shard:
-        return [b"".join(a.tobytes() for a in shard.read(i).values()) for i in range(shard.entry.scans)]
+        return [
+            b"".join(a.tobytes() for a in shard.read(i).values()) for i in range(shard.entry.scans)
+        ]
 
 
 def attempt(read: Callable[[], list[bytes]], expected: list[bytes]) -> str:
@@ -48,23 +56,36 @@ def attempt(read: Callable[[], list[bytes]], expected: list[bytes]) -> str:
 
 
 def main() -> None:
-    """Prints what each check found; exits with 1 on a wrong scan or on damage that no check found."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Prints what each check found; exits with 1 on a wrong scan or on damage that no check
+    found."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--cuts", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the flipped bits and the lengths")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the flipped bits and the lengths"
+    )
     given = parser.parse_args()
     rng = np.random.default_rng(given.seed)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "bank"
-        index = bake(make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)), progress=False)
+        index = bake(
+            make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)), progress=False
+        )
         assert index is not None
-        path, facts, entry = root / index.shards[1].file, index.sources[0], index.shards[1]
-        content, whole, arrays = path.read_bytes(), by_index(root, 1), alone(path)
+        path = root / index.shards[1].file
+        facts = index.sources[0]
+        entry = index.shards[1]
+        content = path.read_bytes()
+        whole = by_index(root, 1)
+        arrays = alone(path)
         bits = rng.choice(8 * len(content), given.flips, replace=False).tolist()
         lengths = rng.choice(len(content), given.cuts, replace=False).tolist()
-        damaged = [("flip", flipped(content, bit)) for bit in bits] + [("cut", content[:length]) for length in lengths]
+        damaged = [("flip", flipped(content, bit)) for bit in bits] + [
+            ("cut", content[:length]) for length in lengths
+        ]
         counts: Counter[tuple[str, str, str]] = Counter()
         for kind, values in tqdm(damaged, unit="damage"):
             path.write_bytes(values)
@@ -74,7 +95,10 @@ def main() -> None:
             counts[kind, "verify", "found" if found else "NOT FOUND"] += 1
         done = repair(root, given.model, progress=False)
         same = path.read_bytes() == content
-    print(f"a shard of {len(content):,} bytes, {entry.scans} scans of {facts.sensor.shape}, {facts.fields}")
+    print(
+        f"a shard of {len(content):,} bytes, {entry.scans} scans of {facts.sensor.shape}, "
+        f"{facts.fields}"
+    )
     for (kind, who, what), count in counts.items():
         print(f"{kind:5} {who:24} {what:12} {count:6}")
     print(f"repair: {done}, {'the same bytes' if same else 'DIFFERENT BYTES'}")

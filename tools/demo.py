@@ -1,15 +1,19 @@
-"""The whole package in a few minutes on one machine: scans mixed with synthetic ones, a comparison, a page to look at.
+"""The whole package in a few minutes on one machine: scans mixed with synthetic ones, a comparison,
+a page to look at.
 
     python tools/demo.py demo_out --scans 24
 
-1. Writes scans of a procedural town in SemanticKITTI's layout, in place of your own labelled dataset, and scans of
-   another town, on which segmenters are measured. With SEMANTICKITTI_ROOT set, that dataset is used instead: sequence
-   08 is held out, or the last sequence if there is no 08. KITTI360_ROOT works too: its last labelled drive is held
-   out, or the end of its only one. Without labels per scan (``lidar-synth label kitti360`` makes them) its scans are
-   mixed and shown, and nothing is trained.
+1. Writes scans of a procedural town in SemanticKITTI's layout, in place of your own labelled
+   dataset, and scans of another town, on which segmenters are measured. With SEMANTICKITTI_ROOT
+   set, that dataset is used instead: sequence 08 is held out, or the last sequence if there is no
+   08. KITTI360_ROOT works too: its last labelled drive is held out, or the end of its only one.
+   Without labels per scan (``lidar-synth label kitti360`` makes them) its scans are mixed and
+   shown, and nothing is trained.
 2. Bakes a bank of scans that the shipped model generates, and verifies it.
-3. Trains a small segmenter on the labelled scans, without and with synthetic ones, with two or three seeds each.
-4. Writes a page: real and synthetic scans side by side, the mixture, and the mIoU of both trainings.
+3. Trains a small segmenter on the labelled scans, without and with synthetic ones, with two or
+  three seeds each.
+4. Writes a page: real and synthetic scans side by side, the mixture, and the mIoU of both
+    trainings.
 
 Run it again to resume after a stop.
 """
@@ -39,7 +43,8 @@ SHOWN = 4
 """Scans of each kind on the page."""
 
 _TOWN_MODEL = (
-    "The synthetic scans come from a model of a procedural town, which has not seen this dataset: they look like the "
+    "The synthetic scans come from a model of a procedural town, which has not seen this dataset: "
+    "they look like the "
     "town. For scans like yours, train a model on yours."
 )
 
@@ -81,57 +86,101 @@ def command(*words: str) -> None:
 def spread(source: Source, count: int, chosen: Sequence[int] | None = None) -> list[Scan]:
     """At most ``count`` scans, evenly spread over a source or over some of its indices."""
     indices = list(range(len(source))) if chosen is None else chosen
-    places = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    places = np.unique(
+        np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
+    )
     return [source[indices[i]] for i in places]
 
 
 def town(out: Path, scans: int, seed: int) -> Data:
     """Scans of two towns; those of the first one take the place of the user's own."""
     for name, number, more in (("town", seed, ()), ("other_town", seed + 1, ("--no-camera",))):
-        words = ("--scans", str(scans), "--seed", str(number), "--interval", "1", "--layout", "semantic_kitti", *more)
+        words = (
+            "--scans",
+            str(scans),
+            "--seed",
+            str(number),
+            "--interval",
+            "1",
+            "--layout",
+            "semantic_kitti",
+            *more,
+        )
         command("town", str(out / name), *words, "--jobs", str(os.cpu_count() or 1))
     notes = (
-        "No real sensor measured these scans: no dataset was given, so scans of a procedural town take the place of "
-        f"your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own data. The synthetic scans come from the "
+        "No real sensor measured these scans: no dataset was given, so scans of a procedural town "
+        "take the place of "
+        f"your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own data. The "
+        "synthetic scans come from the "
         'model that ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
     )
-    real, other = list(open_scans(out / "town")), list(open_scans(out / "other_town"))
+    real = list(open_scans(out / "town"))
+    other = list(open_scans(out / "other_town"))
     return Data(
-        real, other, "Scan of the town, in place of a real one", "town", notes, f"another town (seed {seed + 1})"
+        real,
+        other,
+        "Scan of the town, in place of a real one",
+        "town",
+        notes,
+        f"another town (seed {seed + 1})",
     )
 
 
 def semantic_kitti(root: str, scans: int) -> Data:
     """SemanticKITTI, with a sequence held out: 08, or the last one."""
     source = open_scans(root, layout="semantic_kitti", split="all")
-    labelled = [i for i, name in enumerate(source.ids) if int(name[:2]) < 11]  # the test set has no labels
+    labelled = [
+        i for i, name in enumerate(source.ids) if int(name[:2]) < 11
+    ]  # the test set has no labels
     sequences = {key: list(found) for key, found in groupby(labelled, lambda i: source.ids[i][:2])}
     held_out = "08" if "08" in sequences else max(sequences)
     chosen = [i for key, found in sequences.items() if key != held_out for i in found]
     if not chosen:
-        sys.exit(f"SEMANTICKITTI_ROOT={root} has one labelled sequence; expected two or more, to hold one out")
-    notes = f"Real scans: SemanticKITTI, sequences {', '.join(k for k in sequences if k != held_out)}. {_TOWN_MODEL}"
-    real, other = spread(source, scans, chosen), spread(source, scans, sequences[held_out])
+        sys.exit(
+            f"SEMANTICKITTI_ROOT={root} has one labelled sequence; expected two or more, to hold "
+            "one out"
+        )
+    notes = (
+        "Real scans: SemanticKITTI, sequences "
+        f"{', '.join(k for k in sequences if k != held_out)}. {_TOWN_MODEL}"
+    )
+    real = spread(source, scans, chosen)
+    other = spread(source, scans, sequences[held_out])
     place = f"sequence {held_out}, on which nothing was trained"
     return Data(real, other, "Real scan (SemanticKITTI)", "real", notes, place)
 
 
 def kitti360(root: str, scans: int) -> Data:
-    """KITTI-360, with labels per scan if they were made; the last drive, or the end of the only one, is held out."""
+    """KITTI-360, with labels per scan if they were made; the last drive, or the end of the only
+    one, is held out."""
     name = "Real scan (KITTI-360)"
     try:
         source = KITTI360(root, "r2flow/train", labels=root)
     except DataError:
         real = spread(KITTI360(root, "r2flow/train"), scans)
-        notes = f"Real scans: KITTI-360, without labels, so nothing was trained. Make them: {_LABEL.format(root=root)}"
+        notes = (
+            "Real scans: KITTI-360, without labels, so nothing was trained. Make them: "
+            f"{_LABEL.format(root=root)}"
+        )
         return Data(real, [], name, "real", notes)
-    drives = {key: list(found) for key, found in groupby(range(len(source)), lambda i: source.ids[i].split("/")[0])}
+    drives = {
+        key: list(found)
+        for key, found in groupby(range(len(source)), lambda i: source.ids[i].split("/")[0])
+    }
     *others, last = drives.values()
     chosen = [i for indices in others for i in indices] or last[: max(1, 3 * len(last) // 4)]
     held_out = [i for i in last if i not in set(chosen)]
-    notes = f"Real scans: KITTI-360, {len(drives)} drives, with labels from its accumulated clouds. {_TOWN_MODEL}"
-    place = f"{'the last' if others else 'the end of the only'} labelled drive, on which nothing was trained"
-    return Data(spread(source, scans, chosen), spread(source, scans, held_out), name, "real", notes, place)
+    notes = (
+        f"Real scans: KITTI-360, {len(drives)} drives, with labels from its accumulated clouds. "
+        f"{_TOWN_MODEL}"
+    )
+    place = (
+        f"{'the last' if others else 'the end of the only'} labelled drive, on which nothing was "
+        "trained"
+    )
+    return Data(
+        spread(source, scans, chosen), spread(source, scans, held_out), name, "real", notes, place
+    )
 
 
 def dataset(out: Path, scans: int, seed: int) -> Data:
@@ -153,12 +202,18 @@ def shares(scans: Sequence[Scan]) -> NDArray[np.float64]:
 def protocol_notes(protocol: Protocol, place: str) -> list[str]:
     """What a reader has to know to judge the figures."""
     return [
-        f"Both trainings use the same {len(protocol.real)} labelled scans (the label budget), and the same network, "
-        f"seeds, {protocol.steps} iterations of {protocol.batch} scans, and augmentation: {AUGMENTATION}. They differ "
-        f"in the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Each dot is the mIoU of one seed on "
-        f"{len(protocol.held_out)} scans of {place}; the white line is the mean, ± the standard deviation.",
-        "These are short trainings of a small network, made to finish in a minute or two: they show the procedure, and "
-        "the mIoU is far below that of a full training. tools/ratio_curve.py makes longer comparisons.",
+        f"Both trainings use the same {len(protocol.real)} labelled scans (the label budget), and "
+        "the same network, "
+        f"seeds, {protocol.steps} iterations of {protocol.batch} scans, and augmentation: "
+        f"{AUGMENTATION}. They differ "
+        f"in the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Each dot is the "
+        "mIoU of one seed on "
+        f"{len(protocol.held_out)} scans of {place}; the white line is the mean, ± the standard "
+        "deviation.",
+        "These are short trainings of a small network, made to finish in a minute or two: they "
+        "show the procedure, and "
+        "the mIoU is far below that of a full training. tools/ratio_curve.py makes longer "
+        "comparisons.",
     ]
 
 
@@ -173,47 +228,88 @@ def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
         return made
     without, with_synthetic = result.scores()
     arms = {f"{data.kind} scans only": without, f"{data.kind} and synthetic scans": with_synthetic}
-    columns = {f"% of points, {kind}": shares([s for s in epoch if s.domain == d]) for d, kind in enumerate(kinds)}
-    ious = dict(zip((f"IoU %, {data.kind} only", "IoU %, with synthetic"), result.ious(), strict=True))
-    notes = [f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : not there."]
-    return [*made, scores_panel(arms, protocol_notes(protocol, data.place)), classes_panel(columns | ious, notes)]
+    columns = {
+        f"% of points, {kind}": shares([s for s in epoch if s.domain == d])
+        for d, kind in enumerate(kinds)
+    }
+    ious = dict(
+        zip((f"IoU %, {data.kind} only", "IoU %, with synthetic"), result.ious(), strict=True)
+    )
+    notes = [
+        f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : "
+        "not there."
+    ]
+    return [
+        *made,
+        scores_panel(arms, protocol_notes(protocol, data.place)),
+        classes_panel(columns | ious, notes),
+    ]
 
 
 def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
     """Write the page, with some scans of each kind."""
-    real = [replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)]  # the town stands in for real scans
+    real = [
+        replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)
+    ]  # the town stands in for real scans
     names = (data.name, "Synthetic scan, generated in 4 steps")
     shown = real + spread(bank, SHOWN)
-    text = html_page(shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made)
+    text = html_page(
+        shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made
+    )
     write_file(path, text.encode())
 
 
 def main() -> None:
     """Runs all steps."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, nargs="?", default=Path("demo_out"), help="folder to write to")
-    parser.add_argument("--scans", type=int, default=24, help="how many scans to train on, and how many to hold out")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "out", type=Path, nargs="?", default=Path("demo_out"), help="folder to write to"
+    )
+    parser.add_argument(
+        "--scans", type=int, default=24, help="how many scans to train on, and how many to hold out"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the town")
     given = parser.parse_args()
     start = time.monotonic()
     command("doctor")
     data = dataset(given.out, given.scans, given.seed)
     folder = given.out / "bank"
-    command("bake", str(folder), "--model", "town", "--count", str(given.scans), "--seed", "1", "--shard-size", "16")
+    command(
+        "bake",
+        str(folder),
+        "--model",
+        "town",
+        "--count",
+        str(given.scans),
+        "--seed",
+        "1",
+        "--shard-size",
+        "16",
+    )
     command("verify", str(folder), "--deep")
     bank = Bank(folder)
 
     few = given.scans < 12
-    protocol = Protocol(data.real, list(bank), data.held_out, steps=40 if few else 120, seeds=2 if few else 3)
+    protocol = Protocol(
+        data.real, list(bank), data.held_out, steps=40 if few else 120, seeds=2 if few else 3
+    )
     result = None
     if data.labelled:
-        print(f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, {protocol.steps} iterations each")
+        print(
+            f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, "
+            f"{protocol.steps} iterations each"
+        )
         result = compare(protocol)
     page = given.out / "index.html"
     write_page(page, data, bank, panels(protocol, data, result))
     if result is not None:
         for name, scores in zip(("without", "with"), result.scores(), strict=True):
-            print(f"mIoU {name} synthetic scans: {', '.join(f'{100 * score:.1f} %' for score in scores)}")
+            print(
+                f"mIoU {name} synthetic scans: "
+                f"{', '.join(f'{100 * score:.1f} %' for score in scores)}"
+            )
     print(f"\n{time.monotonic() - start:.0f} s. The page is {page.resolve()}")
 
 

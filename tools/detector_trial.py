@@ -1,11 +1,15 @@
-"""Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on two others.
+"""Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on
+two others.
 
-    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations 1600]
-                                        [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
+    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations
+                                        1600] [--layout-model CHECKPOINT] [--minutes M] [--out
+                                        TABLE.md]
 
-All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half of each batch of an
-arm with synthetic scans is synthetic, unless its row says otherwise. Each seed has its own 30 scans of the town, the
-same in every arm. Scans and finished trainings are kept in WORK: the same command resumes. docs/research/detectors.md
+All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half
+of each batch of an arm with synthetic scans is synthetic, unless its row says otherwise. Each seed
+has its own 30 scans of the town, the
+same in every arm. Scans and finished trainings are kept in WORK: the same command resumes.
+    docs/research/detectors.md
 has the protocol.
 """
 
@@ -34,14 +38,18 @@ from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
 from lidar_synth.mixing import Sources
 
-LABELLED, TRAIN_TOWN = 30, 7
-TESTED, TEST_TOWNS = 40, (8, 9)
+LABELLED = 30
+TRAIN_TOWN = 7
+TESTED = 40
+TEST_TOWNS = (8, 9)
 """Tested scans of each town."""
 LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town-dense"
-BATCH, RATE = 2, 3e-3
+BATCH = 2
+RATE = 3e-3
 PHASES = 4
-"""Epochs of a training, of which an arm with synthetic scans first has them alone in all but the last."""
+"""Epochs of a training, of which an arm with synthetic scans first has them alone in all but the
+last."""
 SETTLING = 24
 """Batches of labelled scans for the statistics of the batch normalisation."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
@@ -74,20 +82,35 @@ class Arm:
 
 
 _MODEL = "the generator's: 6,000 scans of the town of seed 0 with point labels"
-_LAYOUT = "the generator's: 6,000 scans of the town of seed 0 with point labels and boxes; layouts of other towns"
+_LAYOUT = (
+    "the generator's: 6,000 scans of the town of seed 0 with point labels and boxes; layouts of "
+    "other towns"
+)
 _TOWN = "boxes of the town scans"
 ARMS = {
     "real": Arm("labelled scans only", "none"),
     "gt_sampling": Arm("GT sampling", "none", pasted=True),
-    "unboxed": Arm("unconditional scans with unboxed objects, objects pasted", _MODEL, "unboxed", "mix"),
-    "closed": Arm("unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"),
+    "unboxed": Arm(
+        "unconditional scans with unboxed objects, objects pasted", _MODEL, "unboxed", "mix"
+    ),
+    "closed": Arm(
+        "unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"
+    ),
     "layout": Arm("layout scans", _LAYOUT, "layout"),
     "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
-    "layout_quarter": Arm("layout scans in a quarter, GT sampling", _LAYOUT, "layout", pasted=True, share=0.25),
-    "layout_first": Arm("layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True),
+    "layout_quarter": Arm(
+        "layout scans in a quarter, GT sampling", _LAYOUT, "layout", pasted=True, share=0.25
+    ),
+    "layout_first": Arm(
+        "layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True
+    ),
     "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
-    "town_gt": Arm("town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True),
-    "town_first": Arm("these first, GT sampling (upper bound)", _TOWN, "town", pasted=True, first=True),
+    "town_gt": Arm(
+        "town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True
+    ),
+    "town_first": Arm(
+        "these first, GT sampling (upper bound)", _TOWN, "town", pasted=True, first=True
+    ),
 }
 
 
@@ -102,7 +125,10 @@ class Work:
     """
 
     def __init__(self, folder: Path, iterations: int, count: int, model: str | None) -> None:
-        self.folder, self.iterations, self.count, self.model = folder, iterations, count, model
+        self.folder = folder
+        self.iterations = iterations
+        self.count = count
+        self.model = model
         self.pool = cache(self._pool)
 
     @property
@@ -114,11 +140,16 @@ class Work:
 
     def labelled(self, seed: int) -> Source:
         """The labelled scans of a seed."""
-        return pools.streets(self.folder / "pools" / f"labelled-{seed}", TRAIN_TOWN, LABELLED * seed, LABELLED)
+        return pools.streets(
+            self.folder / "pools" / f"labelled-{seed}", TRAIN_TOWN, LABELLED * seed, LABELLED
+        )
 
     def tested(self) -> list[Source]:
         """The tested scans of each town."""
-        return [pools.streets(self.folder / "pools" / f"test-{t}", t, 0, TESTED, every_box=True) for t in TEST_TOWNS]
+        return [
+            pools.streets(self.folder / "pools" / f"test-{t}", t, 0, TESTED, every_box=True)
+            for t in TEST_TOWNS
+        ]
 
     def _pool(self, name: str) -> Source:
         folder = self.folder / "pools" / f"{name}-{self.count}"
@@ -128,9 +159,14 @@ class Work:
             return pools.without_unboxed(folder, self.pool("unboxed"))
         if name == "layout":
             model = str(self.model)
-            return pools.laid_out(folder.with_name(f"{name}-{self.tag}-{self.count}"), model, self.pool("town"))
+            return pools.laid_out(
+                folder.with_name(f"{name}-{self.tag}-{self.count}"), model, self.pool("town")
+            )
         towns = [folder.with_name(f"town-{t}-{self.count}") for t in LAYOUT_TOWNS]
-        parts = [pools.streets(f, t, 0, self.count // 2) for f, t in zip(towns, LAYOUT_TOWNS, strict=True)]
+        parts = [
+            pools.streets(f, t, 0, self.count // 2)
+            for f, t in zip(towns, LAYOUT_TOWNS, strict=True)
+        ]
         return Sources(*parts)
 
     def result(self, arm: str, seed: int) -> Path:
@@ -149,17 +185,29 @@ def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: i
         steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
     share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
-        labelled, pool, share if pool is not None else 0, arm.labels,
-        label_options=options if arm.labels == "mix" else None, seed=seed, balanced=True,
+        labelled,
+        pool,
+        share if pool is not None else 0,
+        arm.labels,
+        label_options=options if arm.labels == "mix" else None,
+        seed=seed,
+        balanced=True,
         epoch_size=count // PHASES if arm.first else count,
-        augment=compose(steps), augment_real=True, to_sample=sample, collate=collate,
-        unboxed="keep",  # the pools are baked without unboxed objects, except the one that shows their harm
-    )  # fmt: skip
+        augment=compose(steps),
+        augment_real=True,
+        to_sample=sample,
+        collate=collate,
+        # the pools are baked without unboxed objects, except the one that shows their harm
+        unboxed="keep",
+    )
 
 
-def run(work: Work, name: str, seed: int, test: Callable[[Detector], list[float]]) -> dict[str, Any]:
+def run(
+    work: Work, name: str, seed: int, test: Callable[[Detector], list[float]]
+) -> dict[str, Any]:
     """Train and test one detector."""
-    arm, labelled = ARMS[name], work.labelled(seed)
+    arm = ARMS[name]
+    labelled = work.labelled(seed)
     pool = work.pool(arm.pool) if arm.pool else None
     start = time.process_time()
     torch.manual_seed(seed)
@@ -183,10 +231,15 @@ def make_test(work: Work) -> Callable[[Detector], list[float]]:
     scans = [source[i] for source in work.tested() for i in range(len(source))]
     truths = [Truth.of(scan) for scan in tqdm(scans, "tested boxes", unit="scan")]
     counts = [sum(int(t.wanted[t.classes == c].sum()) for t in truths) for c in range(len(CLASSES))]
-    print(f"{len(scans)} tested scans; boxes: {dict(zip(CLASSES, counts, strict=True))}", flush=True)
+    print(
+        f"{len(scans)} tested scans; boxes: {dict(zip(CLASSES, counts, strict=True))}", flush=True
+    )
 
     def test(network: Detector) -> list[float]:
-        return precisions(detect(network, lambda i: view(scans[i].points, scans[i].reflectance), len(scans)), truths)
+        return precisions(
+            detect(network, lambda i: view(scans[i].points, scans[i].reflectance), len(scans)),
+            truths,
+        )
 
     return test
 
@@ -194,7 +247,10 @@ def make_test(work: Work) -> Callable[[Detector], list[float]]:
 def report(results: Mapping[str, Mapping[int, list[float]]]) -> str:
     """A Markdown table of the finished trainings: {arm: {seed: AP of every class}}."""
     names = [*CLASSES, "mean"]
-    lines = [f"| half of each batch, besides the 30 scans | {' | '.join(names)} | mean - GT sampling | seeds |"]
+    lines = [
+        f"| half of each batch, besides the 30 scans | {' | '.join(names)} | mean - GT sampling | "
+        "seeds |"
+    ]
     lines.append("|---|" + "---:|" * (len(names) + 2))
     base = {seed: np.mean(ap) for seed, ap in results.get(BASE, {}).items()}
     for name, found in results.items():
@@ -204,7 +260,9 @@ def report(results: Mapping[str, Mapping[int, list[float]]]) -> str:
         difference = _spread(paired, "+") if name != BASE and paired else "-"
         lines.append(f"| {ARMS[name].title} | {' | '.join(cells)} | {difference} | {len(found)} |")
     lines += ["", "| | labels used besides those of the 30 scans |", "|---|---|"]
-    return "\n".join([*lines, *(f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results)])
+    return "\n".join(
+        [*lines, *(f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results)]
+    )
 
 
 def _spread(values: Any, sign: str = "") -> str:
@@ -214,23 +272,35 @@ def _spread(values: Any, sign: str = "") -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path, help="folder for scans and results")
-    parser.add_argument("--arm", action="append", choices=ARMS, help="by default all; layout arms only with a model")
+    parser.add_argument(
+        "--arm", action="append", choices=ARMS, help="by default all; layout arms only with a model"
+    )
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=1600)
     parser.add_argument("--pool", type=int, default=200, help="synthetic scans of each kind")
     parser.add_argument("--layout-model", metavar="CHECKPOINT")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="no training begins after these")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="no training begins after these"
+    )
     parser.add_argument("--out", type=Path, help="file for the table")
     given = parser.parse_args()
     torch.set_num_threads(1)
     start = time.monotonic()
     work = Work(given.work, given.iterations, given.pool, given.layout_model)
-    arms = [n for n in ARMS if (n in given.arm if given.arm else given.layout_model or ARMS[n].pool != "layout")]
+    arms = [
+        n
+        for n in ARMS
+        if (n in given.arm if given.arm else given.layout_model or ARMS[n].pool != "layout")
+    ]
     test: Callable[[Detector], list[float]] | None = None
     for seed, name in ((seed, name) for seed in range(given.seeds) for name in arms):
-        if (path := work.result(name, seed)).exists() or time.monotonic() - start > 60 * given.minutes:
+        if (
+            path := work.result(name, seed)
+        ).exists() or time.monotonic() - start > 60 * given.minutes:
             continue
         test = test or make_test(work)
         found = run(work, name, seed, test)
@@ -239,9 +309,16 @@ def main() -> None:
     results = {}
     for name in arms:
         paths = {seed: work.result(name, seed) for seed in range(given.seeds)}
-        kept = {seed: json.loads(path.read_text())["ap"] for seed, path in paths.items() if path.exists()}
+        kept = {
+            seed: json.loads(path.read_text())["ap"]
+            for seed, path in paths.items()
+            if path.exists()
+        }
         results |= {name: kept} if kept else {}
-    text = f"{report(results)}\n\n{given.iterations} iterations of {BATCH}; {machine()}; {time.strftime('%Y-%m-%d')}"
+    text = (
+        f"{report(results)}\n\n{given.iterations} iterations of {BATCH}; {machine()}; "
+        f"{time.strftime('%Y-%m-%d')}"
+    )
     print(text)
     if given.out:
         given.out.write_text(text + "\n", encoding="utf-8")

@@ -1,7 +1,8 @@
 """Do edited scans keep their boxes true, and can objects be moved and put back?
 
-On scans of the town for three sensors, or on real scans with boxes (--folder): objects are set to random places, moved
-away by 5 % of their distance, and removed and put back; scans are turned into those of other sensors.
+On scans of the town for three sensors, or on real scans with boxes (--folder): objects are set to
+random places, moved away by 5 % of their distance, and removed and put back; scans are turned into
+those of other sensors.
 
     python tools/edit_trial.py --inserts 500 --scans 8
 """
@@ -33,7 +34,8 @@ FAR = 2.0
 
 
 def grown_by(scans: Sequence[Scan], count: int) -> NDArray[np.float64]:
-    """(count, 3) metres by which the sides of objects' boxes grow when the objects are set to random places."""
+    """(count, 3) metres by which the sides of objects' boxes grow when the objects are set to
+    random places."""
     rng = keyed_rng(40)
     items = [
         (item, scan.boxes.values[number])
@@ -46,7 +48,8 @@ def grown_by(scans: Sequence[Scan], count: int) -> NDArray[np.float64]:
         return np.zeros((0, 3))
     for _ in range(40 * count):
         item, box = items[rng.integers(len(items))]
-        distance, angle = np.hypot(*box[:2]) * rng.uniform(0.6, 1.8), rng.uniform(-np.pi, np.pi)
+        distance = np.hypot(*box[:2]) * rng.uniform(0.6, 1.8)
+        angle = rng.uniform(-np.pi, np.pi)
         try:
             pose = distance * np.cos(angle), distance * np.sin(angle)
             result = edit.insert(scans[rng.integers(len(scans))], item, pose)
@@ -60,7 +63,8 @@ def grown_by(scans: Sequence[Scan], count: int) -> NDArray[np.float64]:
 
 
 def outside_share(scans: Sequence[Scan], targets: Sequence[str]) -> float:
-    """Share of the vehicles' points that lie far from every box after scans were turned into other sensors'."""
+    """Share of the vehicles' points that lie far from every box after scans were turned into other
+    sensors'."""
     total = outside = 0
     for scan in scans:
         for name in targets:
@@ -74,7 +78,8 @@ def outside_share(scans: Sequence[Scan], targets: Sequence[str]) -> float:
 
 
 def tried(scans: Sequence[Scan], factor: float) -> tuple[Counter[str], Counter[str], Counter[str]]:
-    """Numbers of objects, by class: all, and those that were moved by a factor; and reasons of the others.
+    """Numbers of objects, by class: all, and those that were moved by a factor; and reasons of the
+    others.
 
     With the factor 1 an object is removed and put back.
     """
@@ -99,10 +104,14 @@ def tried(scans: Sequence[Scan], factor: float) -> tuple[Counter[str], Counter[s
 
 def main() -> None:
     """Print the figures of each sensor."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--inserts", type=int, default=500, help="inserts of all sensors together")
     parser.add_argument("--scans", type=int, default=8, help="scans of each sensor")
-    parser.add_argument("--folder", nargs="*", default=[], help="folders of scans with boxes, in place of the town")
+    parser.add_argument(
+        "--folder", nargs="*", default=[], help="folders of scans with boxes, in place of the town"
+    )
     arguments = parser.parse_args()
     sources: dict[str, Source] = {root: open_scans(root) for root in arguments.folder}
     if not sources:
@@ -112,14 +121,22 @@ def main() -> None:
         growth = grown_by(scans, -(-arguments.inserts // len(sources)))
         worst = np.abs(growth).max(1, initial=0)
         shares = [(worst > limit).mean() for limit in (0.2, 0.5, 2.0)]
-        print(f"{name}: {len(growth)} inserts; a side changed by over 0.2, 0.5, 2 m: "
-              + "{:.1%}, {:.1%}, {:.1%}".format(*shares) + f"; at most {worst.max(initial=0):.2f} m")  # fmt: skip
+        print(
+            f"{name}: {len(growth)} inserts; a side changed by over 0.2, 0.5, 2 m: "
+            + "{:.1%}, {:.1%}, {:.1%}".format(*shares)
+            + f"; at most {worst.max(initial=0):.2f} m"
+        )
         if all(scan.label is not None for scan in scans):
-            print(f"  vehicles' points over 2 m from a box after a transfer: {outside_share(scans, SENSORS):.2%}")
+            print(
+                "  vehicles' points over 2 m from a box after a transfer: "
+                f"{outside_share(scans, SENSORS):.2%}"
+            )
         for text, factor in (("moved", AWAY), ("put back", 1.0)):
             all_of, done, why = tried(scans, factor)
-            print(f"  {text}: {done.total()} of {all_of.total()}; people "
-                  f"{done['Pedestrian']} of {all_of['Pedestrian']}; else {dict(why.most_common(5))}")  # fmt: skip
+            print(
+                f"  {text}: {done.total()} of {all_of.total()}; people "
+                f"{done['Pedestrian']} of {all_of['Pedestrian']}; else {dict(why.most_common(5))}"
+            )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""Fuzz the readers: read thousands of mutated files, each under a limit of memory and time, and print a table.
+"""Fuzz the readers: read thousands of mutated files, each under a limit of memory and time, and
+print a table.
 
     python tools/fuzz.py [--cases 5000] [--reader NAME ...] [--seed 0] [--jobs 2] [--keep FOLDER]
     python tools/fuzz.py --reader NAME --case NUMBER --keep FOLDER
 
-A case is a function of reader, seed and number (and of the versions of the libraries that write the valid files).
-Reading it has to give a correct result or one of the package's errors. All other cases are listed below the table, and
-their files are kept. With ``--case`` one case is written to the folder and read in this process, without limits, to
-inspect its error. The exit status is 1 if any case has a flaw. Linux only. docs/research/reliability.md has the table.
+A case is a function of reader, seed and number (and of the versions of the libraries that write the
+valid files). Reading it has to give a correct result or one of the package's errors. All other
+cases are listed below the table, and their files are kept. With ``--case`` one case is written to
+the folder and read in this process, without limits, to inspect its error. The exit status is 1 if
+any case has a flaw. Linux only. docs/research/reliability.md has the table.
 """
 
 import argparse
@@ -29,24 +31,41 @@ PART = 1250
 """Cases that one process reads; readers that are fuzzed for longer are spread over several."""
 
 COLUMNS = {
-    "read equal": (EQUAL,), "read otherwise, sound": (SOUND,), "refused": (REFUSED,), "unsound": (UNSOUND,),
-    "foreign errors": (FOREIGN,), "deaths": (DIED,), "memory": (MEMORY,), "time": (SLOW,),
-}  # fmt: skip
+    "read equal": (EQUAL,),
+    "read otherwise, sound": (SOUND,),
+    "refused": (REFUSED,),
+    "unsound": (UNSOUND,),
+    "foreign errors": (FOREIGN,),
+    "deaths": (DIED,),
+    "memory": (MEMORY,),
+    "time": (SLOW,),
+}
 
 
 def main() -> None:
     """Prints the table and the flaws."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", type=int, default=5000, help="for each reader")
     parser.add_argument(
-        "--reader", action="append", choices=TARGETS, help="a reader to fuzz; repeat for several [default: all]"
+        "--reader",
+        action="append",
+        choices=TARGETS,
+        help="a reader to fuzz; repeat for several [default: all]",
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes that read at a time")
-    parser.add_argument("--memory", type=float, default=500, help="limit of memory of a case, in megabytes")
-    parser.add_argument("--seconds", type=float, default=5, help="limit of time of a case, in seconds")
+    parser.add_argument(
+        "--memory", type=float, default=500, help="limit of memory of a case, in megabytes"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=5, help="limit of time of a case, in seconds"
+    )
     parser.add_argument("--keep", type=Path, help="folder for the files of the cases with a flaw")
-    parser.add_argument("--case", type=int, help="write this case to --keep, and read it in this process")
+    parser.add_argument(
+        "--case", type=int, help="write this case to --keep, and read it in this process"
+    )
     given = parser.parse_args()
     names = given.reader or list(TARGETS)
     if given.case is not None:
@@ -65,7 +84,9 @@ def main() -> None:
         sys.exit(1)
 
 
-def run(names: list[str], cases: int, seed: int, jobs: int, limits: Limits) -> tuple[dict[str, Report], list[str]]:
+def run(
+    names: list[str], cases: int, seed: int, jobs: int, limits: Limits
+) -> tuple[dict[str, Report], list[str]]:
     """A report for each reader, and what went wrong with the harness itself."""
     failures: list[str] = []
     reports = {name: Report() for name in names}
@@ -74,7 +95,9 @@ def run(names: list[str], cases: int, seed: int, jobs: int, limits: Limits) -> t
 
         def one(name: str, numbers: range) -> tuple[str, Report]:
             try:
-                return name, fuzz(name, TARGETS[name], numbers, seed, limits, lambda _: bar.update())
+                return name, fuzz(
+                    name, TARGETS[name], numbers, seed, limits, lambda _: bar.update()
+                )
             except RuntimeError as error:
                 failures.append(f"cases {numbers.start} to {numbers.stop - 1}: {error}")
                 return name, Report()
@@ -89,7 +112,9 @@ def table(reports: dict[str, Report]) -> str:
     head = ["reader", "cases", *COLUMNS, "peak MB", "slowest s"]
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * (len(head) - 1)}"]
     for name, report in reports.items():
-        counts = [sum(report.counts[verdict] for verdict in verdicts) for verdicts in COLUMNS.values()]
+        counts = [
+            sum(report.counts[verdict] for verdict in verdicts) for verdicts in COLUMNS.values()
+        ]
         row = [name, report.cases, *counts, f"{report.peak / 1e6:.0f}", f"{report.slowest:.2f}"]
         lines.append(f"| {' | '.join(f'{v:,}' if isinstance(v, int) else v for v in row)} |")
     return "\n".join(lines)
@@ -99,7 +124,9 @@ def print_flaws(name: str, seed: int, report: Report, keep: Path | None) -> None
     """Each kind of flaw once, with its first cases."""
     kinds = Counter((flaw.verdict, flaw.detail[:90]) for flaw in report.flaws)
     for (verdict, detail), count in kinds.most_common():
-        numbers = [f.number for f in report.flaws if (f.verdict, f.detail[:90]) == (verdict, detail)][:3]
+        numbers = [
+            f.number for f in report.flaws if (f.verdict, f.detail[:90]) == (verdict, detail)
+        ][:3]
         print(f"{name} --seed {seed} --case {numbers}: {count} x {verdict}: {detail!r}")
         for number in numbers if keep is not None else ():
             Cases(name, TARGETS[name], seed, keep / name / f"{seed}-{number}").place(number)

@@ -10,7 +10,8 @@
     paste     a generated scan before and after the town's objects replaced its own
     sensors   one street as three sensors see it
 
-All scans are the first ones of their seed: none is selected. Each picture takes less than a minute on one core.
+All scans are the first ones of their seed: none is selected. Each picture takes less than a minute
+    on one core.
 """
 
 import argparse
@@ -57,14 +58,18 @@ def pairs() -> list[list[tuple[str, Picture]]]:
     """Generated scans and the town's."""
     made = load_generator("town").scans(0, range(3))
     return [
-        [(f"generated, 4 steps: town/0/{i}", near(scan)), (f"the town, street {i}", near(street(i)))]
+        [
+            (f"generated, 4 steps: town/0/{i}", near(scan)),
+            (f"the town, street {i}", near(street(i))),
+        ]
         for i, scan in enumerate(made)
     ]
 
 
 def from_map() -> list[list[tuple[str, Picture]]]:
     """The map of one scan, two scans generated from it, and the scan itself."""
-    scan, generator = street(0), load_generator("town-semantic")
+    scan = street(0)
+    generator = load_generator("town-semantic")
     labels = picture(project(scan, generator.sensor, ["label"]), "label")
     made = generator.scans(0, range(3), condition=scan)
     return [
@@ -76,39 +81,56 @@ def from_map() -> list[list[tuple[str, Picture]]]:
 
 def from_camera() -> list[list[tuple[str, Picture]]]:
     """Images of the camera, the scans generated from them, and the scans taken with them."""
-    generator, rows = load_generator("town-camera"), []
+    generator = load_generator("town-camera")
+    rows = []
     for i in range(2):
         town = Town(UNSEEN, scans=(i + 1) * STRETCH_FRAMES)
         image = town.image(i * STRETCH_FRAMES)
-        small = Image.fromarray(image).resize((320, 96), Image.Resampling.BICUBIC)  # as its encoder takes it
+        small = Image.fromarray(image).resize(
+            (320, 96), Image.Resampling.BICUBIC
+        )  # as its encoder takes it
         [made] = generator.scans(0, [i], condition=np.array(small).transpose(2, 0, 1))
         rows += [
             [("condition: a camera image", image)],
-            [("generated", near(made)), ("the town's scan taken with the image", near(town[i * STRETCH_FRAMES]))],
+            [
+                ("generated", near(made)),
+                ("the town's scan taken with the image", near(town[i * STRETCH_FRAMES])),
+            ],
         ]
     return rows
 
 
 def from_layout() -> list[list[tuple[str, Picture]]]:
     """Scans with boxes, and the scans generated from their layouts."""
-    generator, rows = load_generator("town-layout"), []
+    generator = load_generator("town-layout")
+    rows = []
     for i in range(2):
         scan = street(i, sensor="hdl64e_lasers")
         [made] = generator.scans(0, [i], condition=scan)
-        rows += [[("generated from boxes, ground and outlines", near(made, boxes=True)),
-                  ("the town's scan with this layout", near(scan, boxes=True))]]  # fmt: skip
+        rows += [
+            [
+                ("generated from boxes, ground and outlines", near(made, boxes=True)),
+                ("the town's scan with this layout", near(scan, boxes=True)),
+            ]
+        ]
     return rows
 
 
 def pasted() -> list[list[tuple[str, Picture]]]:
-    """A generated scan, and the same with objects of the town in place of its own (the label policy ``mix``)."""
+    """A generated scan, and the same with objects of the town in place of its own (the label policy
+    ``mix``)."""
     generator = load_generator("town")
     scans = Town(0, scans=5 * STRETCH_FRAMES)
     bank = ObjectBank.from_scans([scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)])
     policy = make_policy("mix", fields=generator.fields, objects=bank, count=12, clear=True)
     [scan] = generator.scans(0, [0])
     mixed = policy(scan, np.random.default_rng(0))
-    return [[("generated", near(scan)), ("its objects replaced by pasted ones, with boxes", near(mixed, boxes=True))]]
+    return [
+        [
+            ("generated", near(scan)),
+            ("its objects replaced by pasted ones, with boxes", near(mixed, boxes=True)),
+        ]
+    ]
 
 
 def sensors() -> list[list[tuple[str, Picture]]]:
@@ -131,13 +153,17 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
 def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Rows of images with their titles, all rows of the same width."""
     title = 0.36  # inches
-    heights = [12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title for row in rows]
+    heights = [
+        12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title for row in rows
+    ]
     figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
     FigureCanvasAgg(figure)
     parts = np.atleast_1d(figure.subfigures(len(rows), 1, height_ratios=heights))
     for part, row, height in zip(parts, rows, heights, strict=True):
         part.set_facecolor("#101218")
-        grid = part.subplots(1, len(row), squeeze=False, width_ratios=[i.shape[1] / i.shape[0] for _, i in row])
+        grid = part.subplots(
+            1, len(row), squeeze=False, width_ratios=[i.shape[1] / i.shape[0] for _, i in row]
+        )
         part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01)
         for axes, (name, image) in zip(grid[0], row, strict=True):
             axes.imshow(image, interpolation="lanczos")
@@ -159,7 +185,9 @@ def channels() -> Picture:
 def save(path: Path, pixels: Picture) -> None:
     """Write a PNG with few colours, small enough for a repository."""
     image = Image.fromarray(pixels)
-    image = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
+    image = image.resize(
+        (WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS
+    )
     # Few pixels are cars or poles: a palette by number of pixels would lose their colours.
     image = image.quantize(96, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -167,15 +195,21 @@ def save(path: Path, pixels: Picture) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     names = ["channels", *PICTURES]
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"pictures to make: {', '.join(names)} [all]")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"pictures to make: {', '.join(names)} [all]"
+    )
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"))
     given = parser.parse_args()
     if unknown := set(given.names) - set(names):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(names)}")
     for name in given.names or names:
-        save(given.out / f"{name}.png", channels() if name == "channels" else draw(PICTURES[name]()))
+        save(
+            given.out / f"{name}.png", channels() if name == "channels" else draw(PICTURES[name]())
+        )
         print(given.out / f"{name}.png")
 
 

@@ -1,4 +1,5 @@
-"""How often do the 95 % intervals of the measures cover the truth? The table in docs/research/measures.md.
+"""How often do the 95 % intervals of the measures cover the truth? The table in
+docs/research/measures.md.
 
     python tools/interval_coverage.py [--trials 400] [--replicates 200] [NAME ...]
 
@@ -15,9 +16,17 @@ from numpy.typing import NDArray
 from lidar_synth.lab.evaluate.distances import frechet_of_moments, jensen_shannon_distance
 from lidar_synth.lab.evaluate.intervals import bootstrap
 from lidar_synth.lab.evaluate.measures import normalised_rows
-from lidar_synth.lab.evaluate.statistics import Statistic, frechet, gaussian_mmd, histogram_distance, polynomial_mmd
+from lidar_synth.lab.evaluate.statistics import (
+    Statistic,
+    frechet,
+    gaussian_mmd,
+    histogram_distance,
+    polynomial_mmd,
+)
 
-WIDTH, BINS, LARGE = 8, 50, 4000
+WIDTH = 8
+BINS = 50
+LARGE = 4000
 
 Rng = np.random.Generator
 
@@ -67,10 +76,18 @@ SIMULATIONS = {
     "JSD, 100 scans": Simulation(jsd, 100, JSD_TRUTH),
     "MMD of histograms, 30 scans": Simulation(mmd, 30),
     "MMD of histograms, 100 scans": Simulation(mmd, 100),
-    "Frechet, 4 samples per feature": Simulation(features(1.0, frechet), 4 * WIDTH, gaussian_truth(1.0)),
-    "Frechet, 12 samples per feature": Simulation(features(1.0, frechet), 12 * WIDTH, gaussian_truth(1.0)),
-    "Frechet, small, 12 samples per feature": Simulation(features(0.3, frechet), 12 * WIDTH, gaussian_truth(0.3)),
-    "Frechet, small, 40 samples per feature": Simulation(features(0.3, frechet), 40 * WIDTH, gaussian_truth(0.3)),
+    "Frechet, 4 samples per feature": Simulation(
+        features(1.0, frechet), 4 * WIDTH, gaussian_truth(1.0)
+    ),
+    "Frechet, 12 samples per feature": Simulation(
+        features(1.0, frechet), 12 * WIDTH, gaussian_truth(1.0)
+    ),
+    "Frechet, small, 12 samples per feature": Simulation(
+        features(0.3, frechet), 12 * WIDTH, gaussian_truth(0.3)
+    ),
+    "Frechet, small, 40 samples per feature": Simulation(
+        features(0.3, frechet), 40 * WIDTH, gaussian_truth(0.3)
+    ),
     "unbiased squared MMD, 100 samples": Simulation(features(1.0, polynomial_mmd), 100),
     "unbiased squared MMD, small, 300 samples": Simulation(features(0.3, polynomial_mmd), 300),
 }
@@ -86,11 +103,15 @@ def coverage(simulation: Simulation, trials: int, replicates: int) -> tuple[floa
         statistic = simulation.draw(np.random.default_rng([1, k]), simulation.samples)
         if (interval := bootstrap(statistic, replicates, seed=k)) is not None:
             found.append(interval)
-    return float(np.mean([i.low <= truth <= i.high for i in found])), float(np.mean([i.high - i.low for i in found]))
+    return float(np.mean([i.low <= truth <= i.high for i in found])), float(
+        np.mean([i.high - i.low for i in found])
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="simulations [default: all]")
     parser.add_argument("--trials", type=int, default=400)
     parser.add_argument("--replicates", type=int, default=200)

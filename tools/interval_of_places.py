@@ -2,8 +2,8 @@
 
     python tools/interval_of_places.py [--trials 600]
 
-Differences of places are normal with one standard deviation, those of seeds within a place with another. The table is
-that of docs/research/proof.md.
+Differences of places are normal with one standard deviation, those of seeds within a place with
+another. The table is that of docs/research/proof.md.
 """
 
 import argparse
@@ -15,7 +15,8 @@ from lidar_synth.lab.proof.scores import interval
 
 def coverage(places: int, seeds: int, between: float, within: float, trials: int) -> float:
     """Share of the simulated comparisons whose 95 % interval holds the true mean."""
-    rng, held = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    held = 0
     for trial in range(trials):
         values = rng.normal(0, between, (places, 1)) + rng.normal(0, within, (places, seeds))
         ends = interval(values, seed=trial, draws=1500)
@@ -25,14 +26,23 @@ def coverage(places: int, seeds: int, between: float, within: float, trials: int
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--trials", type=int, default=600)
     trials = parser.parse_args().trials
-    spreads = {"places and seeds alike": (1, 1), "mostly places": (1, 0.2), "mostly seeds": (0.2, 1)}
+    spreads = {
+        "places and seeds alike": (1, 1),
+        "mostly places": (1, 0.2),
+        "mostly seeds": (0.2, 1),
+    }
     print(f"| places | seeds | {' | '.join(spreads)} |\n|---:|---:|{'---:|' * len(spreads)}")
     for places in (6, 7, 11):
         for seeds in (1, 2, 3):
-            cells = [f"{100 * coverage(places, seeds, *spread, trials):.1f}" for spread in spreads.values()]
+            cells = [
+                f"{100 * coverage(places, seeds, *spread, trials):.1f}"
+                for spread in spreads.values()
+            ]
             print(f"| {places} | {seeds} | {' | '.join(cells)} |", flush=True)
 
 

@@ -2,10 +2,10 @@
 
     python tools/kill_bake.py --kills 100 [--engine processes] [--model town]
 
-First a bank is baked without interruption. Then the same bake runs in its own process group, which is killed (SIGKILL)
-after a random fraction of the time of a complete run, and is started again. Whenever a bake finishes, its files are
-compared and the next bank begins. By default the model is a fast one with random weights, because the test is about
-writing.
+First a bank is baked without interruption. Then the same bake runs in its own process group, which
+is killed (SIGKILL) after a random fraction of the time of a complete run, and is started again.
+Whenever a bake finishes, its files are compared and the next bank begins. By default the model is a
+fast one with random weights, because the test is about writing.
 """
 
 import argparse
@@ -30,7 +30,9 @@ def start(plan: BakePlan, engine: str, workers: int) -> int:
     """Bake in a child process with its own process group; returns its id."""
     child = os.fork()
     if child:
-        os.setpgid(child, child)  # in the parent too: the child may be killed before it sets its group itself
+        os.setpgid(
+            child, child
+        )  # in the parent too: the child may be killed before it sets its group itself
         return child
     os.setpgid(0, 0)
     try:
@@ -57,12 +59,18 @@ def killed(child: int, seconds: float) -> bool:
 
 def files(root: Path) -> dict[str, bytes]:
     """All files of a bank, including those of an unfinished bake."""
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in root.rglob("*")
+        if path.is_file()
+    }
 
 
 def main() -> None:
     """Repeats until the number of kills is reached; exits with 1 if bytes differ."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", help="a shipped model or a checkpoint")
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--count", type=int, default=40)
@@ -79,7 +87,9 @@ def main() -> None:
         assert not killed(start(whole, "local", 1), 1e6)
         begin = time.monotonic()
         assert not killed(start(plan, given.engine, given.workers), 1e6)
-        seconds, expected, out = time.monotonic() - begin, files(whole.out), plan.out
+        seconds = time.monotonic() - begin
+        expected = files(whole.out)
+        out = plan.out
         assert files(out) == expected, "the engine writes other bytes"
         shutil.rmtree(out)
         kills = banks = 0
@@ -92,11 +102,17 @@ def main() -> None:
                 elif (out / INDEX).exists():
                     assert verify(out, progress=False) == []
                     if files(out) != expected:
-                        sys.exit(f"bank {banks} after {kills} kills has other bytes than one baked without a kill")
+                        sys.exit(
+                            f"bank {banks} after {kills} kills has other bytes than one baked "
+                            "without a kill"
+                        )
                     banks += 1
                     shutil.rmtree(out)
-        print(f"{kills} kills, {banks} banks of {given.count} scans in {len(plan.shards)} shards by {given.engine}, "
-              f"a whole run takes {seconds:.1f} s: all files have the same bytes as without a kill")  # fmt: skip
+        print(
+            f"{kills} kills, {banks} banks of {given.count} scans in {len(plan.shards)} shards by "
+            f"{given.engine}, "
+            f"a whole run takes {seconds:.1f} s: all files have the same bytes as without a kill"
+        )
 
 
 if __name__ == "__main__":

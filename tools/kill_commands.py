@@ -1,10 +1,12 @@
-"""Kill commands that write (SIGKILL) at random moments, run them again, and compare with runs without a kill.
+"""Kill commands that write (SIGKILL) at random moments, run them again, and compare with runs
+without a kill.
 
     python tools/kill_commands.py --kills 50 [--command convert ...]
 
-Every command is run twice without a kill, to see whether it gives the same bytes at all and how long it takes after its
-imports. Then it runs in a forked process that is killed after a random part of that time and started again, until it
-ends by itself. The table has the kills and the files that differ from those of the uninterrupted run.
+Every command is run twice without a kill, to see whether it gives the same bytes at all and how
+long it takes after its imports. Then it runs in a forked process that is killed after a random part
+of that time and started again, until it ends by itself. The table has the kills and the files that
+differ from those of the uninterrupted run.
 """
 
 import argparse
@@ -52,7 +54,8 @@ def run(words: list[str]) -> None:
 
 
 def run_and_kill(words: list[str], seconds: float) -> bool:
-    """Run a command in a child process and kill it after some seconds; returns whether it was still running."""
+    """Run a command in a child process and kill it after some seconds; returns whether it was still
+    running."""
     child = os.fork()
     if child == 0:
         os.setpgid(0, 0)
@@ -77,14 +80,21 @@ def run_and_kill(words: list[str], seconds: float) -> bool:
 
 def read_files(root: Path) -> dict[str, bytes]:
     """All files of a folder by their relative paths."""
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in root.rglob("*")
+        if path.is_file()
+    }
 
 
-def try_command(name: str, places: dict[str, str], out: Path, kills: int, rng: random.Random) -> tuple[int, int, str]:
+def try_command(
+    name: str, places: dict[str, str], out: Path, kills: int, rng: random.Random
+) -> tuple[int, int, str]:
     """Kill one command repeatedly.
 
     Returns:
-        The kills, the runs that were completed after kills, and what differed or failed ("" if nothing).
+        The kills, the runs that were completed after kills, and what differed or failed ("" if
+        nothing).
     """
     words = COMMANDS[name]
     for place, path in {**places, "OUT": str(out)}.items():
@@ -120,7 +130,9 @@ def try_command(name: str, places: dict[str, str], out: Path, kills: int, rng: r
 
 def main() -> None:
     """Prints the table; exits with 1 if anything differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--command", action="append", choices=COMMANDS, help="repeatable [all]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments")

@@ -1,11 +1,12 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
-    python tools/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1] [--picture OUT.png]
-                                   [--dump OUT.json] [--intervals 200]
+    python tools/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
+                                   [--picture OUT.png] [--dump OUT.json] [--intervals 200]
 
-Layouts are those of scans of a town that no model was trained on, each from another stretch of road. The first row is
-the town's own scans: boxes are larger than objects, so that some of their rays return from behind. Other models
-are compared by the distances alone, with the labels or images of the same scans as conditions.
+Layouts are those of scans of a town that no model was trained on, each from another stretch of
+road. The first row is the town's own scans: boxes are larger than objects, so that some of their
+rays return from behind. Other models are compared by the distances alone, with the labels or images
+of the same scans as conditions.
 """
 
 import argparse
@@ -31,9 +32,12 @@ SHOWN = 6
 """Examples in the picture."""
 
 
-def generate(model: str, steps: int | None, guidance: float, real: list[Scan]) -> tuple[str | None, list[Scan]]:
+def generate(
+    model: str, steps: int | None, guidance: float, real: list[Scan]
+) -> tuple[str | None, list[Scan]]:
     """The model's condition, and one scan of it for each real scan."""
-    generator, made = load_generator(model), []
+    generator = load_generator(model)
+    made = []
     for i, scan in enumerate(tqdm(real, desc=Path(model).stem, unit="scan")):
         given = scan if generator.condition else None
         strength = guidance if generator.condition == "layout" else 1.0
@@ -45,7 +49,9 @@ def line(name: str, found: LayoutAgreement | None) -> str:
     """A row of the second table."""
     if found is None:
         return f"| {name} | - | - | - | - | - | - |"
-    shares = " | ".join(f"{100 * s:.2f}" for s in (found.inside_share, found.filled_share, found.kept_share))
+    shares = " | ".join(
+        f"{100 * s:.2f}" for s in (found.inside_share, found.filled_share, found.kept_share)
+    )
     return f"| {name} | {shares} | {found.points} | {found.boxes} | {found.seen} |"
 
 
@@ -56,7 +62,9 @@ def draw(path: Path, made: list[Scan], real: list[Scan], layouts: list[Layout]) 
     grid = figure.subplots(len(made), 2, squeeze=False)
     for axes, scan, own, layout in zip(grid, made, real, layouts, strict=True):
         scan.boxes = own.boxes = layout.boxes
-        for axis, one, title in zip(axes, (scan, own), ("generated", "scan of the layout"), strict=True):
+        for axis, one, title in zip(
+            axes, (scan, own), ("generated", "scan of the layout"), strict=True
+        ):
             axis.imshow(render(one, "label", size=(1100, 660)))
             axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
             axis.set_axis_off()
@@ -66,14 +74,20 @@ def draw(path: Path, made: list[Scan], real: list[Scan], layouts: list[Layout]) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
     parser.add_argument("--count", type=int, default=64, help="number of layouts")
     parser.add_argument("--seed", type=int, default=1, help="of the unseen town")
     parser.add_argument("--guidance", type=float, default=1.0, help="of layout models")
-    parser.add_argument("--distances", action="store_true", help="compare the sets of scans, too (slow)")
+    parser.add_argument(
+        "--distances", action="store_true", help="compare the sets of scans, too (slow)"
+    )
     parser.add_argument("--picture", type=Path, help="PNG of the first model's scans")
-    parser.add_argument("--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none")
+    parser.add_argument(
+        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+    )
     parser.add_argument("--dump", type=Path, help="JSON of the counts")
     given = parser.parse_args()
     with TemporaryDirectory() as folder:
@@ -82,7 +96,9 @@ def main() -> None:
 
 def report(given: argparse.Namespace, folder: Path) -> None:
     """Print the tables; images of the town go to a folder."""
-    town = Town(given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False)
+    town = Town(
+        given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False
+    )
     real = [town[i * STRETCH_FRAMES] for i in tqdm(range(given.count), desc="town", unit="scan")]
     layouts = [layout_of(scan) for scan in real]
     real = with_images(real, town, folder) if needs_images(given.models) else real
@@ -100,13 +116,23 @@ def report(given: argparse.Namespace, folder: Path) -> None:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
             draw(given.picture, *([some[k] for k in apart] for some in (scans, real, layouts)))
     print(f"{given.count} layouts of the town of seed {given.seed}\n")
-    print("| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, %", end=" ")
+    print(
+        "| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, %",
+        end=" ",
+    )
     print("| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |")
-    print("|---|---:|---:|---:|---:|---:|---:|\n" + "\n".join(line(name, found) for name, found in counts.items()))
+    print(
+        "|---|---:|---:|---:|---:|---:|---:|\n"
+        + "\n".join(line(name, found) for name, found in counts.items())
+    )
     if comparison is not None:
         print(f"\n{table(distances)}")
     if given.dump:
-        given.dump.write_text(json.dumps({name: found and found._asdict() for name, found in counts.items()}, indent=1))
+        given.dump.write_text(
+            json.dumps(
+                {name: found and found._asdict() for name, found in counts.items()}, indent=1
+            )
+        )
 
 
 if __name__ == "__main__":

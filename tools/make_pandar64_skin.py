@@ -2,8 +2,9 @@
 
     python tools/make_pandar64_skin.py FRAMES [--measure]
 
-FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring) in the sensor's frame.
-The skin is learnt from frames 00 to 30; ``--measure`` compares the town with frames 60 and later instead of writing it.
+FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring) in
+the sensor's frame. The skin is learnt from frames 00 to 30; ``--measure`` compares the town with
+frames 60 and later instead of writing it.
 """
 
 import argparse
@@ -19,12 +20,16 @@ from lidar_synth.lab.town.returns import LEVELS, Noise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
 
 OUT = Path("lidar_synth/lab/town/skin/pandar64.skin")
-LAST_LEARNT, FIRST_MEASURED = 30, 60
+LAST_LEARNT = 30
+FIRST_MEASURED = 60
 LICENCE = (
-    "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of their names or marks "
+    "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of "
+    "their names or marks "
     "beyond attribution; no attempt to identify persons"
 )
-SOURCE = "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
+SOURCE = (
+    "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
+)
 
 
 def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:
@@ -34,14 +39,20 @@ def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:
         if first <= int(path.stem) <= last:
             a = read_arrays(path, ("points", "reflectance", "ring"))
             scans.append(
-                Scan(a["points"], a["reflectance"].astype(np.float32) / 255, sensor, ring=a["ring"].astype(np.int16),
-                     id=path.stem)
-            )  # fmt: skip
+                Scan(
+                    a["points"],
+                    a["reflectance"].astype(np.float32) / 255,
+                    sensor,
+                    ring=a["ring"].astype(np.int16),
+                    id=path.stem,
+                )
+            )
     return scans
 
 
 def distances(real: Domain, town: Domain) -> list[float]:
-    """Wasserstein distances of reflectance, its residual and the range's residual (mm), weighted by range and kind."""
+    """Wasserstein distances of reflectance, its residual and the range's residual (mm), weighted by
+    range and kind."""
     from scipy.stats import wasserstein_distance
 
     from lidar_synth.lab.town.skin.features import BAND, STRATUM_KIND
@@ -60,16 +71,20 @@ def distances(real: Domain, town: Domain) -> list[float]:
     for a, b in zip(one, other, strict=True):
         total = weight = 0.0
         for g in np.unique(group):
-            x, y = a[group == g], b[other_group == g]
-            x, y = x[~np.isnan(x)], y[~np.isnan(y)]
+            x = a[group == g]
+            y = b[other_group == g]
+            x = x[~np.isnan(x)]
+            y = y[~np.isnan(y)]
             if len(x) > 1000 and len(y) > 1000:
-                total, weight = total + len(x) * wasserstein_distance(x[::7], y[::7]), weight + len(x)
+                total = total + len(x) * wasserstein_distance(x[::7], y[::7])
+                weight = weight + len(x)
         out.append(total / weight)
     return out
 
 
 def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
-    """Prints the distances to the measured frames of the learnt frames, the physical model and the skin."""
+    """Prints the distances to the measured frames of the learnt frames, the physical model and the
+    skin."""
     rng = np.random.default_rng(0)
 
     def domain(scans: list[Scan], step: float, centred: bool) -> Domain:
@@ -80,10 +95,17 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
     skin = load_skin(OUT)
     towns = {
         "physical model": (Town(seed, sensor, count), 1 / LEVELS, False),
-        "lasers of equal gain": (Town(seed, sensor, count, noise=Noise(gain_std=0)), 1 / LEVELS, False),
+        "lasers of equal gain": (
+            Town(seed, sensor, count, noise=Noise(gain_std=0)),
+            1 / LEVELS,
+            False,
+        ),
         "skin": (Town(seed, sensor, count, skin=skin), 1 / 255, True),
     }
-    print("| frames 60 and later against | reflectance | its residual | residual of range, mm | points |")
+    print(
+        "| frames 60 and later against | reflectance | its residual | residual of range, mm | "
+        "points |"
+    )
     print("|---|---:|---:|---:|---:|")
     rows = {"frames 00 to 30": domain(frames(folder, sensor, 0, LAST_LEARNT), 1 / 255, True)}
     for name, (town, step, centred) in towns.items():
@@ -96,7 +118,9 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
 
 def main() -> None:
     """Writes the skin, or prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("frames", type=Path)
     parser.add_argument("--measure", action="store_true")
     parser.add_argument("--streets", type=int, default=12, help="of the town that is measured")

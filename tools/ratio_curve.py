@@ -1,12 +1,13 @@
 """Which ratio helps? mIoU of a segmenter over the share of synthetic scans in its training.
 
-    python tools/ratio_curve.py [ROOT] [--model town-dense] [--labelled 40] [--epochs 20] [--seeds 3] [--plot OUT.png]
+    python tools/ratio_curve.py [ROOT] [--model town-dense] [--labelled 40] [--epochs 20] [--seeds
+    3] [--plot OUT.png]
 
-Every epoch has a few labelled scans of the town (or of ROOT, SemanticKITTI for instance). Synthetic scans are added up
-to 10, 25 and 50 % of the samples, so these runs have more iterations. "real, as long" trains on the real scans alone
-for as many iterations as the longest of them. Every row is run with several seeds of the weights, the order and the
-synthetic scans. Another town (or the split val of ROOT) is held out. The table is that of
-docs/research/help-a-trainer.md.
+Every epoch has a few labelled scans of the town (or of ROOT, SemanticKITTI for instance). Synthetic
+scans are added up to 10, 25 and 50 % of the samples, so these runs have more iterations. "real, as
+long" trains on the real scans alone for as many iterations as the longest of them. Every row is run
+with several seeds of the weights, the order and the synthetic scans. Another town (or the split val
+of ROOT) is held out. The table is that of docs/research/help-a-trainer.md.
 """
 
 import argparse
@@ -27,11 +28,15 @@ from lidar_synth.noise import keyed_rng
 
 RATIOS = (0.0, 0.1, 0.25, 0.5)
 BATCH = 4
-LABELLED, HELD_OUT = 7, 1
-"""Seeds of towns that no shipped generator was trained on; these learnt from labelled scans of the town of seed 0."""
+LABELLED = 7
+HELD_OUT = 1
+"""Seeds of towns that no shipped generator was trained on; these learnt from labelled scans of the
+town of seed 0."""
 
 
-def run(real: Source, synthetic: list[Scan], ratio: float, steps: int, held_out: Source, seed: int) -> np.ndarray:
+def run(
+    real: Source, synthetic: list[Scan], ratio: float, steps: int, held_out: Source, seed: int
+) -> np.ndarray:
     """The confusion matrix of one training."""
     # Every seed gets other synthetic scans.
     apart = np.random.default_rng(seed).permutation(len(synthetic))
@@ -45,7 +50,9 @@ def generated(generator: Generator, sensor: Sensor, count: int) -> list[Scan]:
     """Generated scans, turned into scans of the real ones' sensor."""
     change = None if generator.sensor.shape == sensor.shape else Transfer(sensor)
     scans = (generator.scans(0, [i])[0] for i in tqdm(range(count), desc="synthetic", unit="scan"))
-    return [scan if change is None else change(scan, keyed_rng(0, i)) for i, scan in enumerate(scans)]
+    return [
+        scan if change is None else change(scan, keyed_rng(0, i)) for i, scan in enumerate(scans)
+    ]
 
 
 def plot(path: Path, rows: dict[str, list[float]]) -> None:
@@ -55,7 +62,9 @@ def plot(path: Path, rows: dict[str, list[float]]) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
     for place, (_, values) in enumerate(rows.items()):
-        axes.errorbar(place, 100 * np.mean(values), 100 * np.std(values), fmt="o", capsize=4, color="tab:blue")
+        axes.errorbar(
+            place, 100 * np.mean(values), 100 * np.std(values), fmt="o", capsize=4, color="tab:blue"
+        )
         axes.plot([place] * len(values), 100 * np.asarray(values), ".", color="tab:gray", alpha=0.7)
     axes.set_xticks(range(len(rows)), rows)
     axes.set_ylabel("mIoU on held-out scans, %")
@@ -64,7 +73,9 @@ def plot(path: Path, rows: dict[str, list[float]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", nargs="?", help="a labelled dataset [default: the town]")
     parser.add_argument("--model", default="town-dense")
     parser.add_argument("--labelled", type=int, default=40, help="real scans to train on")
@@ -75,27 +86,38 @@ def main() -> None:
     given = parser.parse_args()
 
     if given.root:
-        source, other = open_scans(given.root, split="train"), open_scans(given.root, split="val")
+        source = open_scans(given.root, split="train")
+        other = open_scans(given.root, split="val")
         real = [source[int(i)] for i in np.linspace(0, len(source) - 1, given.labelled)]
         held_out = [other[int(i)] for i in np.linspace(0, len(other) - 1, given.held_out)]
     else:
-        # Twenty neighbouring scans share a stretch of road: a wide interval spreads few scans over many stretches.
-        real, held_out = town(LABELLED, 10 * given.labelled)[::10], town(HELD_OUT, given.held_out)
+        # Twenty neighbouring scans share a stretch of road: a wide interval spreads few scans over
+        # many stretches.
+        real = town(LABELLED, 10 * given.labelled)[::10]
+        held_out = town(HELD_OUT, given.held_out)
     synthetic = generated(load_generator(given.model), real[0].sensor, 10 * given.labelled)
     steps = {ratio: round(given.epochs * given.labelled / (1 - ratio) / BATCH) for ratio in RATIOS}
     settings = {f"{100 * ratio:.0f} %": (ratio, steps[ratio]) for ratio in RATIOS}
     settings["real, as long"] = (0.0, steps[RATIOS[-1]])
     rows: dict[str, list[float]] = {}
-    print(f"{given.labelled} real scans, {given.epochs} epochs, batch {BATCH}, {len(held_out)} held out\n")
-    print("| share synthetic | iterations | mIoU, % | seeds | car, person, pole, % |\n|---|---:|---:|---|---|")
+    print(
+        f"{given.labelled} real scans, {given.epochs} epochs, batch {BATCH}, {len(held_out)} held "
+        "out\n"
+    )
+    print(
+        "| share synthetic | iterations | mIoU, % | seeds | car, person, pole, % "
+        "|\n|---|---:|---:|---|---|"
+    )
     for name, (ratio, count) in settings.items():
         tables = [run(real, synthetic, ratio, count, held_out, seed) for seed in range(given.seeds)]
         rows[name] = [mean_iou(table) for table in tables]
-        mean, spread = 100 * np.mean(rows[name]), 100 * np.std(rows[name])
+        mean = 100 * np.mean(rows[name])
+        spread = 100 * np.std(rows[name])
         some = 100 * np.mean([class_ious(table)[[0, 5, 17]] for table in tables], 0)
         each = ", ".join(f"{100 * v:.1f}" for v in rows[name])
         print(
-            f"| {name} | {count} | {mean:.1f} ± {spread:.1f} | {each} | {', '.join(f'{v:.0f}' for v in some)} |",
+            f"| {name} | {count} | {mean:.1f} ± {spread:.1f} | {each} | "
+            f"{', '.join(f'{v:.0f}' for v in some)} |",
             flush=True,
         )
     if given.plot:

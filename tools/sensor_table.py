@@ -1,9 +1,12 @@
-"""The table of docs/research/fitted-sensors.md: ``fit_sensor`` on real scans and on the town, beside what is known.
+"""The table of docs/research/fitted-sensors.md: ``fit_sensor`` on real scans and on the town,
+beside what is known.
 
     python tools/sensor_table.py REAL_SCANS LABELLED_SCANS
 
-The folders are laid out as LIDAR_SYNTH_REAL_SCANS and LIDAR_SYNTH_LABELLED_SCANS of the tests. "error" is the largest
-difference of an elevation from a table: Hesai's for the Pandar64, that of the casting sensor for the town; for two
+The folders are laid out as LIDAR_SYNTH_REAL_SCANS and LIDAR_SYNTH_LABELLED_SCANS of the tests.
+"error" is the largest
+difference of an elevation from a table: Hesai's for the Pandar64, that of the casting sensor for
+    the town; for two
 disjoint halves of the frames, it is the difference between both fits.
 """
 
@@ -38,7 +41,9 @@ def pandar(labelled: Path, frames: Sequence[int] = FRAMES, rings: int = 1) -> li
 def raw(files: Sequence[Path]) -> list[Scan]:
     """Scans of KITTI's order of points."""
     points = [read_points(path) for path in files]
-    return [Scan(p[:, :3], p[:, 3], SENSOR, id=path.stem) for p, path in zip(points, files, strict=True)]
+    return [
+        Scan(p[:, :3], p[:, 3], SENSOR, id=path.stem) for p, path in zip(points, files, strict=True)
+    ]
 
 
 def without_rings(scans: Sequence[Scan]) -> list[Scan]:
@@ -48,7 +53,8 @@ def without_rings(scans: Sequence[Scan]) -> list[Scan]:
 
 
 def largest_error(fit: SensorFit, table: Sequence[float]) -> float:
-    """The largest difference of a fitted beam from a table, degrees; infinite if the numbers of beams differ."""
+    """The largest difference of a fitted beam from a table, degrees; infinite if the numbers of
+    beams differ."""
     found = np.asarray(fit.sensor.elevations)
     if len(found) != len(table):
         return float("inf")
@@ -64,7 +70,8 @@ def row(name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None
     error = "" if table is None else f"{largest_error(fit, table):.4f}"
     step = f"{1000 * fit.sensor.range_step:.0f} mm" if fit.sensor.range_step else ""
     print(
-        f"| {name} | {len(scans)} | {len(fit.points)} | {error} | {fit.share:.2%} | {fit.sensor.firings} "
+        f"| {name} | {len(scans)} | {len(fit.points)} | {error} | {fit.share:.2%} | "
+        f"{fit.sensor.firings} "
         f"| {fit.azimuths.known} | {step} | {seconds:.1f} |",
         flush=True,
     )
@@ -73,17 +80,29 @@ def row(name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("real", type=Path)
     parser.add_argument("labelled", type=Path)
     given = parser.parse_args()
-    real, labelled = given.real, given.labelled
-    hesai = np.loadtxt(labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1)[:, 1].tolist()
-    print("| scans | frames | beams | error (degrees) | within 0.05 | firings | offsets by | range step | seconds |")
+    real = given.real
+    labelled = given.labelled
+    hesai = np.loadtxt(labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1)[
+        :, 1
+    ].tolist()
+    print(
+        "| scans | frames | beams | error (degrees) | within 0.05 | firings | offsets by | range "
+        "step | seconds |"
+    )
     print("|---|---:|---:|---:|---:|---:|---|---:|---:|")
     row("Pandar64 (PandaSet), sensor frame", lambda: pandar(labelled), hesai)
     row("the same without times", lambda: [replace(s, time=None) for s in pandar(labelled)], hesai)
-    row("the same, forward quarter", lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in pandar(labelled)], hesai)
+    row(
+        "the same, forward quarter",
+        lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in pandar(labelled)],
+        hesai,
+    )
     row("the same, every fourth beam", lambda: pandar(labelled, rings=4), hesai[::4])
     tables: dict[str, Sequence[float]] = {}
     for name, files in {
@@ -95,13 +114,24 @@ def main() -> None:
         table = first.sensor.elevations or ()
         tables[name] = table
         row(f"HDL-64E ({name}), odd frames", lambda files=files: raw(files[1::2]), table)  # type: ignore[misc]
-    row("HDL-64E (KITTI-360), points shuffled",
-        lambda: without_rings(raw(sorted((real / "kitti360").rglob("*.bin"))[:5])), tables["KITTI-360"])  # fmt: skip
-    row("HDL-32E (nuScenes)", lambda: list(open_scans(real / "nuscenes")), np.linspace(10.67, -30.67, 32).tolist())
+    row(
+        "HDL-64E (KITTI-360), points shuffled",
+        lambda: without_rings(raw(sorted((real / "kitti360").rglob("*.bin"))[:5])),
+        tables["KITTI-360"],
+    )
+    row(
+        "HDL-32E (nuScenes)",
+        lambda: list(open_scans(real / "nuscenes")),
+        np.linspace(10.67, -30.67, 32).tolist(),
+    )
     for preset in ("town", "os1_128", "hdl32e_nuscenes"):
         sensor = load_sensor(preset)
         elevations = np.degrees(sensor.optics()[0]).tolist()
-        row(f"town, `{preset}`", lambda p=preset: [Town(0, p, motion=False)[i] for i in range(3)], elevations)  # type: ignore[misc]
+        row(
+            f"town, `{preset}`",
+            lambda p=preset: [Town(0, p, motion=False)[i] for i in range(3)],
+            elevations,
+        )  # type: ignore[misc]
 
 
 if __name__ == "__main__":

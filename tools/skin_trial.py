@@ -1,10 +1,12 @@
 """What a skin brings before a network that learnt from real streets, part by part.
 
-    python tools/skin_trial.py SEMANTIC_KITTI --judge FOLDER [--streets 24] [--columns 1024 2048] [--places 00 01 ...]
+    python tools/skin_trial.py SEMANTIC_KITTI --judge FOLDER [--streets 24] [--columns 1024 2048]
+    [--places 00 01 ...]
 
-SEMANTIC_KITTI is a folder of real scans in that layout, FOLDER an archive of lidar-bonnetal. A skin is learnt from the
-real scans of ``--places`` (all by default), without their labels; the table compares one scan of each of some streets
-with the real scans of the other places, or with all if there are none. docs/research/skin.md has the tables.
+SEMANTIC_KITTI is a folder of real scans in that layout, FOLDER an archive of lidar-bonnetal. A skin
+is learnt from the real scans of ``--places`` (all by default), without their labels; the table
+compares one scan of each of some streets with the real scans of the other places, or with all if
+there are none. docs/research/skin.md has the tables.
 """
 
 import argparse
@@ -47,7 +49,10 @@ def towns(skin: Skin, count: int, seed: int, names: list[str]) -> dict[str, Town
     made["the skin"] = Town(seed, scans=count, skin=skin)
     for k in range(1, len(PARTS)):
         made[f"+ {PARTS[k - 1]}"] = Town(seed, scans=count, skin=only(skin, PARTS[:k]))
-    made |= {f"without {p}": Town(seed, scans=count, skin=only(skin, tuple(set(PARTS) - {p}))) for p in PARTS}
+    made |= {
+        f"without {p}": Town(seed, scans=count, skin=only(skin, tuple(set(PARTS) - {p})))
+        for p in PARTS
+    }
     made |= {f"{p} alone": Town(seed, scans=count, skin=only(skin, (p,))) for p in PARTS}
     return {name: made[name] for name in names} if names else made
 
@@ -68,13 +73,17 @@ def row(name: str, found: Recognition, real: Recognition) -> str:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", type=Path, help="real scans in SemanticKITTI's layout")
     parser.add_argument("--judge", type=Path, required=True, help="archive of lidar-bonnetal")
     parser.add_argument("--streets", type=int, default=24)
     parser.add_argument("--seed", type=int, default=7, help="of the town that is judged")
     parser.add_argument("--columns", type=int, nargs="+", default=[1024, 2048])
-    parser.add_argument("--places", nargs="*", default=[], help="sequences that the skin is learnt from")
+    parser.add_argument(
+        "--places", nargs="*", default=[], help="sequences that the skin is learnt from"
+    )
     parser.add_argument("--skin", type=Path, help="a skin that was learnt already")
     parser.add_argument("--lasers", action="store_true", help="learn the offsets of lasers, too")
     parser.add_argument("--rows", nargs="*", default=[], help="rows of the table [all]")
@@ -84,7 +93,11 @@ def main() -> None:
     scans = [source[i] for i in range(len(source))]
     learnt = [s for s in scans if not given.places or s.id.split("/")[0] in given.places]
     others = [s for s in scans if given.places and s.id.split("/")[0] not in given.places] or scans
-    skin = load_skin(given.skin) if given.skin else fit_skin(learnt, licence="CC BY-NC-SA 3.0", lasers=given.lasers)
+    skin = (
+        load_skin(given.skin)
+        if given.skin
+        else fit_skin(learnt, licence="CC BY-NC-SA 3.0", lasers=given.lasers)
+    )
     judges = {width: load_archive(given.judge, width) for width in given.columns}
     rows = towns(skin, given.streets * STRETCH_FRAMES, given.seed, given.rows)
     results: dict[tuple[str, int], list[tuple[np.ndarray, np.ndarray]]] = {}

@@ -2,8 +2,9 @@
 
     python tools/stress_service.py [--kills 50] [--reads 100000] [--workers 4] [--seed 0]
 
-A SIGKILL hits a worker, the generator or the trainer itself. Within the time limit the trainer has to continue or to
-end with an error that names the dead process, without a wrong scan and without leaving a process or a segment of shared
+A SIGKILL hits a worker, the generator or the trainer itself. Within the time limit the trainer has
+to continue or to end with an error that names the dead process, without a wrong scan and without
+leaving a process or a segment of shared
 memory behind. Linux only: processes are counted in /proc.
 """
 
@@ -60,7 +61,8 @@ class Reads(Dataset[int]):
 
     def __init__(self, bank: RollingBank, known: list[int], count: int) -> None:
         rng = np.random.default_rng(0)
-        self.bank, self.known = bank, known
+        self.bank = bank
+        self.known = known
         self.numbers = (np.arange(count) // 40 + rng.integers(0, 8, count)) % SCANS
         bank.expect(self.numbers.tolist())
 
@@ -111,15 +113,30 @@ def living(session: int) -> list[int]:
 
 def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> str:
     """One trainer, one kill; returns what is wrong with the outcome, or ""."""
-    call = [sys.executable, __file__, "--trainer", str(model), "--known", json.dumps(known), "--workers", "2"]
-    trainer = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    call = [
+        sys.executable,
+        __file__,
+        "--trainer",
+        str(model),
+        "--known",
+        json.dumps(known),
+        "--workers",
+        "2",
+    ]
+    trainer = subprocess.Popen(
+        call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     assert trainer.stdout is not None
     pids: dict[str, Any] = json.loads(trainer.stdout.readline() or "{}")
     if not pids:
         return f"the trainer did not start: {trainer.communicate()[1]}"
     everyone = living(trainer.pid)
     time.sleep(rng.random())
-    target = {"trainer": trainer.pid, "generator": pids["generator"], "worker": rng.choice(pids["worker"])}[victim]
+    target = {
+        "trainer": trainer.pid,
+        "generator": pids["generator"],
+        "worker": rng.choice(pids["worker"]),
+    }[victim]
     os.kill(target, signal.SIGKILL)
     try:
         output, errors = trainer.communicate(timeout=LIMIT)
@@ -136,13 +153,21 @@ def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> 
     end = time.monotonic() + 15
     while (left := living(trainer.pid)) and time.monotonic() < end:
         time.sleep(0.1)
-    segments = [p.name for p in Path("/dev/shm").glob("*") if any(f"_{pid}_" in p.name for pid in everyone)]
-    return f"{victim} killed: processes {left} and segments {segments} are left" if left or segments else ""
+    segments = [
+        p.name for p in Path("/dev/shm").glob("*") if any(f"_{pid}_" in p.name for pid in everyone)
+    ]
+    return (
+        f"{victim} killed: processes {left} and segments {segments} are left"
+        if left or segments
+        else ""
+    )
 
 
 def main() -> None:
     """Prints the outcome; exits with 1 if anything was wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--reads", type=int, default=100_000)
     parser.add_argument("--workers", type=int, default=4)
@@ -166,9 +191,14 @@ def main() -> None:
         print(f"{options.kills} kills: {len(wrong)} went wrong")
         if options.reads:
             with RollingBank(model, slots=16, threads=1) as bank:
-                batches = tqdm(loader(bank, known, options.reads, options.workers), desc="reads", unit="batch")
+                batches = tqdm(
+                    loader(bank, known, options.reads, options.workers), desc="reads", unit="batch"
+                )
                 torn = sum(batches)
-                print(f"{options.reads} reads by {options.workers} workers: {torn} torn or wrong; {bank.counts()}")
+                print(
+                    f"{options.reads} reads by {options.workers} workers: {torn} torn or wrong; "
+                    f"{bank.counts()}"
+                )
             wrong += [f"{torn} wrong reads"] if torn else []
     print(*wrong, sep="\n")
     sys.exit(bool(wrong))

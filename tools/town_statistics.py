@@ -1,9 +1,11 @@
-"""Compare the town with real KITTI-360 scans: angles, ranges, reflectance and missing returns in one Markdown table.
+"""Compare the town with real KITTI-360 scans: angles, ranges, reflectance and missing returns in
+one Markdown table.
 
     LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/town_statistics.py [--scans 120] [--seed 0]
 
-FOLDER contains ``kitti360`` in the dataset's own layout. Without the variable the table has the town only. Every figure
-is a mean over scans; both sides are projected onto the same 64 x 1024 range image. docs/research/town.md has the table.
+FOLDER contains ``kitti360`` in the dataset's own layout. Without the variable the table has the
+town only. Every figure is a mean over scans; both sides are projected onto the same 64 x 1024 range
+image. docs/research/town.md has the table.
 """
 
 import argparse
@@ -21,7 +23,18 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 
-GROUPS = [(0, 4), (4, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 40), (40, 48), (48, 56), (56, 64)]
+GROUPS = [
+    (0, 4),
+    (4, 8),
+    (8, 12),
+    (12, 16),
+    (16, 24),
+    (24, 32),
+    (32, 40),
+    (40, 48),
+    (48, 56),
+    (56, 64),
+]
 """Rows that one line of the table takes together, 0 = highest."""
 RANGES = (0, 5, 10, 15, 20, 30, 40, 60, 80)
 REFLECTANCE = (0, 1 / 256, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
@@ -37,12 +50,16 @@ def statistics(scan: Scan) -> dict[str, float]:
     """All figures of one scan by name."""
     sensor = load_sensor("town")
     image = project(scan, sensor)
-    filled, ranges = image.mask, image.range
+    filled = image.mask
+    ranges = image.range
     assert image.reflectance is not None
     distance = np.linalg.norm(scan.points, axis=1)
     assert sensor.firings is not None
     rings = (
-        np.bincount(ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64)[:64] / sensor.firings
+        np.bincount(ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64)[
+            :64
+        ]
+        / sensor.firings
     )
     figures = {"points": float(len(scan)), "cells filled of 65,536": filled.sum()}
     for a, b in GROUPS:
@@ -52,7 +69,9 @@ def statistics(scan: Scan) -> dict[str, float]:
     figures["single lost cells (both neighbours filled)"] = lost.mean()
     elevation = np.degrees(np.arcsin(scan.points[:, 2] / distance))
     for share in (0.5, 5, 25, 50, 75, 95, 99.5):
-        figures[f"elevation, {share:g} % lower than (degrees)"] = float(np.percentile(elevation, share))
+        figures[f"elevation, {share:g} % lower than (degrees)"] = float(
+            np.percentile(elevation, share)
+        )
     azimuth = np.degrees(-np.arctan2(scan.points[:, 1], scan.points[:, 0]))
     for a in range(-180, 180, 45):
         inside = (azimuth >= a) & (azimuth < a + 45)
@@ -62,9 +81,13 @@ def statistics(scan: Scan) -> dict[str, float]:
     for a, b in GROUPS:
         seen = ranges[a:b][filled[a:b]]
         for share in (10, 50, 90):
-            figures[f"range in rows {a} to {b - 1}, {share} % nearer than (m)"] = float(np.percentile(seen, share))
+            figures[f"range in rows {a} to {b - 1}, {share} % nearer than (m)"] = float(
+                np.percentile(seen, share)
+            )
     for a, b in pairwise(RANGES):
-        figures[f"cells at {a} to {b} m"] = ((ranges >= a) & (ranges < b) & filled).sum() / filled.sum()
+        figures[f"cells at {a} to {b} m"] = (
+            (ranges >= a) & (ranges < b) & filled
+        ).sum() / filled.sum()
     for a, b in pairwise(REFLECTANCE):
         value = image.reflectance[filled]
         name = "reflectance 0" if a == 0 else f"reflectance {a:.1f} to {b:.1f}"
@@ -75,7 +98,9 @@ def statistics(scan: Scan) -> dict[str, float]:
     ground = is_ground(scan.points)
     figures["share of ground"] = ground.mean()
     figures["share of ground beyond 20 m"] = ground[distance > 20].mean()
-    figures["mean reflectance of ground within 20 m"] = scan.reflectance[ground & (distance < 20)].mean()
+    figures["mean reflectance of ground within 20 m"] = scan.reflectance[
+        ground & (distance < 20)
+    ].mean()
     return figures
 
 
@@ -87,33 +112,53 @@ def gather(scans: Iterable[Scan], count: int, name: str) -> dict[str, np.ndarray
 
 def number(value: float) -> str:
     """A number with three significant digits; large numbers as integers."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}"
+    return (
+        f"{value:,.0f}"
+        if abs(value) >= 1000
+        else f"{value:.1f}"
+        if abs(value) >= 10
+        else f"{value:.3f}"
+    )
 
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scans", type=int, default=120, help="scans of the town, spread over stretches")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scans", type=int, default=120, help="scans of the town, spread over stretches"
+    )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    # Three scans of each stretch: neighbouring scans are similar, and building a stretch takes time.
+    # Three scans of each stretch: neighbouring scans are similar, and building a stretch takes
+    # time.
     stretches = -(-arguments.scans // 3)
     town = Town(arguments.seed, scans=STRETCH_FRAMES * stretches)
-    picked = [STRETCH_FRAMES * k + f for k in range(stretches) for f in (2, 9, 16)][: arguments.scans]
+    picked = [STRETCH_FRAMES * k + f for k in range(stretches) for f in (2, 9, 16)][
+        : arguments.scans
+    ]
     sides = {"town": gather((town[i] for i in picked), len(picked), "town")}
     folder = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
     if folder:
         scans = open_scans(Path(folder) / "kitti360")
         sides["real"] = gather(scans, len(scans), "KITTI-360")  # type: ignore[arg-type]
-    print("| figure | " + " | ".join(f"{name} ({len(next(iter(s.values())))} scans)" for name, s in sides.items())
-          + (" | real, lowest to highest | town / real |" if folder else " |"))  # fmt: skip
+    print(
+        "| figure | "
+        + " | ".join(f"{name} ({len(next(iter(s.values())))} scans)" for name, s in sides.items())
+        + (" | real, lowest to highest | town / real |" if folder else " |")
+    )
     print("| --- |" + " ---: |" * (len(sides) + 2 * bool(folder)))
     for key, values in sides["town"].items():
         cells = [key, number(values.mean())]
         if folder:
             real = sides["real"][key]
             ratio = values.mean() / real.mean() if real.mean() else float("nan")
-            cells += [number(real.mean()), f"{number(real.min())} to {number(real.max())}", f"{ratio:.2f}"]
+            cells += [
+                number(real.mean()),
+                f"{number(real.min())} to {number(real.max())}",
+                f"{ratio:.2f}",
+            ]
         print("| " + " | ".join(cells) + " |")
 
 

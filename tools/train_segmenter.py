@@ -1,10 +1,11 @@
 """Train a segmenter on real scans mixed with synthetic ones, and measure it on held-out scans.
 
-    python tools/train_segmenter.py [ROOT] [--split train] [--val-split val] [--ratio 0.25] [--model town]
-        [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
+    python tools/train_segmenter.py [ROOT] [--split train] [--val-split val] [--ratio 0.25] [--model
+        town] [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
 
-Without ROOT, scans of the town take the place of real ones, and scans of another town are held out. ROOT is any dataset
-with labels per scan, SemanticKITTI for instance. The training loop is in lidar_synth/lab/train/segmentation.py.
+Without ROOT, scans of the town take the place of real ones, and scans of another town are held out.
+ROOT is any dataset with labels per scan, SemanticKITTI for instance. The training loop is in
+lidar_synth/lab/train/segmentation.py.
 """
 
 import argparse
@@ -44,7 +45,9 @@ def fit(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", nargs="?", help="a labelled dataset [default: the town]")
     parser.add_argument("--split", default="train")
     parser.add_argument("--val-split", default="val")
@@ -63,10 +66,17 @@ def main() -> None:
         real = open_scans(given.root, split=given.split)
         validation = open_scans(given.root, split=given.val_split)
     else:
-        real, validation = town(0, given.scans), town(1, given.held_out)
+        real = town(0, given.scans)
+        validation = town(1, given.held_out)
     synthetic = load_generator(given.model) if given.ratio else None
     train = MixedScans(
-        real, synthetic, given.ratio, seed=given.seed, epoch_size="replace", balanced=True, collate="range"
+        real,
+        synthetic,
+        given.ratio,
+        seed=given.seed,
+        epoch_size="replace",
+        balanced=True,
+        collate="range",
     )
     judge, table = fit(train, validation, given.steps, given.batch, given.workers, given.seed)
     for name, iou in zip(NAMES, class_ious(table), strict=True):

@@ -2,10 +2,11 @@
 
     python tools/transfer_statistics.py SEMANTIC_KITTI PANDASET NUSCENES
 
-The arguments are those of ``tools/transfer_trial.py``, and a folder with sweeps of nuScenes. Rows tell the share of
-returns within 0.01 degrees of a beam of the target, the fill (returns per ray, of the beams that all sensors cover)
-and quantiles of the range over those beams. "To itself" is the share of a scan's returns that the same sensor in
-the same place gives back in the same ray, within 10 cm or 1 %.
+The arguments are those of ``tools/transfer_trial.py``, and a folder with sweeps of nuScenes. Rows
+tell the share of returns within 0.01 degrees of a beam of the target, the fill (returns per ray, of
+the beams that all sensors cover) and quantiles of the range over those beams. "To itself" is the
+share of a scan's returns that the same sensor in the same place gives back in the same ray, within
+10 cm or 1 %.
 """
 
 import argparse
@@ -24,7 +25,8 @@ from lidar_synth.geometry.transfer.rays import rays_of
 
 HDL32E_FIRINGS = 1084
 BAND = -12.0, -1.0
-"""Degrees of elevation that all sensors cover, also from the other mounts: only these beams are compared."""
+"""Degrees of elevation that all sensors cover, also from the other mounts: only these beams are
+compared."""
 NUSCENES_HEIGHT = 1.84
 """Metres of nuScenes' LiDAR above the road."""
 
@@ -35,10 +37,14 @@ def described(name: str, scans: Sequence[Scan], low: float, high: float) -> str:
     rays = rays_of(sensor)
     beams = np.degrees(np.arctan(rays.slope))
     counted = (beams >= low) & (beams <= high)
-    near, fill, ranges = [], [], []
+    near = []
+    fill = []
+    ranges = []
     for scan in scans:
         ring = ring_numbers(scan.points) if scan.ring is None else scan.ring
-        elevation = np.arctan2(scan.points[:, 2] - rays.height[ring], np.hypot(*scan.points[:, :2].T))
+        elevation = np.arctan2(
+            scan.points[:, 2] - rays.height[ring], np.hypot(*scan.points[:, :2].T)
+        )
         near.append(np.mean(np.abs(np.degrees(elevation) - beams[ring]) < 0.01))
         kept = counted[ring]
         fill.append(kept.sum() / (counted.sum() * rays.firings))
@@ -64,21 +70,33 @@ def _image(scan: Scan) -> NDArray[np.float64]:
     image = np.zeros((len(rays.slope), rays.firings))
     assert scan.ring is not None
     firing = (-np.arctan2(scan.points[:, 1], scan.points[:, 0]) - rays.first[scan.ring]) / rays.step
-    image[scan.ring, np.rint(firing).astype(int) % rays.firings] = np.linalg.norm(scan.points, axis=1)
+    image[scan.ring, np.rint(firing).astype(int) % rays.firings] = np.linalg.norm(
+        scan.points, axis=1
+    )
     return image
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kitti", type=Path)
     parser.add_argument("pandaset", type=Path)
     parser.add_argument("nuscenes", type=Path)
     given = parser.parse_args()
-    kitti, panda = read_semantic_kitti(given.kitti), read_pandaset(given.pandaset)
+    kitti = read_semantic_kitti(given.kitti)
+    panda = read_pandaset(given.pandaset)
     hdl32e: Sensor = replace(load_sensor("hdl32e_nuscenes"), firings=HDL32E_FIRINGS)
     nuscenes = [replace(s) for s in open_scans(given.nuscenes, sensor=hdl32e)]
-    height = {"kitti": road_height(kitti), "panda": road_height(panda), "nuscenes": -NUSCENES_HEIGHT}
-    print("| scans | number | on a beam, % | fill, % | 5 % | 25 % | median | 75 % | 95 % of ranges, m |")
+    height = {
+        "kitti": road_height(kitti),
+        "panda": road_height(panda),
+        "nuscenes": -NUSCENES_HEIGHT,
+    }
+    print(
+        "| scans | number | on a beam, % | fill, % | 5 % | 25 % | median | 75 % | 95 % of ranges, "
+        "m |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for name, source, own, target, real in (
         ("SemanticKITTI as Pandar64", kitti, "kitti", "panda", panda),
@@ -86,10 +104,17 @@ def main() -> None:
         ("PandaSet as HDL-64E", panda, "panda", "kitti", kitti),
     ):
         transfer = Transfer(real[0].sensor, Mount(round(height[own] - height[target], 2)))
-        print(described(f"{name}, {transfer.mount.z:+.2f} m", [transfer(scan) for scan in source], *BAND))
+        print(
+            described(
+                f"{name}, {transfer.mount.z:+.2f} m", [transfer(scan) for scan in source], *BAND
+            )
+        )
         print(described(f"real {real[0].sensor.name}", real, *BAND))
     print()
-    print(f"PandaSet to itself: {100 * np.mean([to_itself(scan) for scan in panda[::8]]):.1f} % of returns come back")
+    print(
+        f"PandaSet to itself: {100 * np.mean([to_itself(scan) for scan in panda[::8]]):.1f} % of "
+        "returns come back"
+    )
     print(f"firings of an HDL-64E: {HDL64E_FIRINGS}; of an HDL-32E: {HDL32E_FIRINGS}")
 
 

@@ -1,13 +1,18 @@
-"""Does the transfer from sensor to sensor help a segmenter? Trained on one real sensor, tested on another.
+"""Does the transfer from sensor to sensor help a segmenter? Trained on one real sensor, tested on
+another.
 
-    python tools/transfer_trial.py SEMANTIC_KITTI PANDASET [--seeds 3] [--steps 400] [--jobs 1] [--out TABLE.md]
+    python tools/transfer_trial.py SEMANTIC_KITTI PANDASET [--seeds 3] [--steps 400] [--jobs 1]
+    [--out TABLE.md]
 
-SEMANTIC_KITTI is a root with labels (64 beams, HDL-64E). PANDASET is a folder of Pandar64 frames as arrays
-(``sensor_frame/NN.npz`` with points, reflectance, ring and PandaSet's classes).
+SEMANTIC_KITTI is a root with labels (64 beams, HDL-64E). PANDASET is a folder of Pandar64 frames as
+arrays (``sensor_frame/NN.npz`` with points, reflectance, ring and PandaSet's classes).
 
-Every arm has the same network, iterations, order and augmentation, and is tested on the same frames of PandaSet: the
-last 15. Classes are pooled to those that both datasets label alike. The reference is trained on the first 15 frames of
-PandaSet, of the same street as the test: what the change of sensor, place and labelling costs together.
+Every arm has the same network, iterations, order and augmentation, and is tested on the same frames
+    of PandaSet: the
+last 15. Classes are pooled to those that both datasets label alike. The reference is trained on the
+first 15 frames of
+PandaSet, of the same street as the test: what the change of sensor, place and labelling costs
+    together.
 """
 
 import argparse
@@ -32,7 +37,8 @@ from lidar_synth.lab.train.precision import faster_in_bfloat16
 from lidar_synth.lab.train.segmentation import train_segmenter
 from lidar_synth.noise import keyed_rng
 
-COLUMNS, BATCH = 512, 4
+COLUMNS = 512
+BATCH = 4
 WIDTHS = (8, 16, 32, 48)
 """Channels of the segmenter: half of its default, for a short training on a CPU."""
 POOLED = {
@@ -63,12 +69,23 @@ def table(classes: dict[str, Sequence[int]]) -> NDArray[np.uint8]:
 
 def read_pandaset(folder: Path) -> list[Scan]:
     """The frames of PandaSet in order, with pooled classes."""
-    sensor, pooled, scans = load_sensor("pandar64"), table(PANDASET), []
+    sensor = load_sensor("pandar64")
+    pooled = table(PANDASET)
+    scans = []
     for path in sorted(folder.glob("sensor_frame/*.npz")):
         frame = np.load(path)
         reflectance = frame["reflectance"].astype(np.float32) / 255
         ring = frame["ring"].astype(np.int16)
-        scans.append(Scan(frame["points"], reflectance, sensor, pooled[frame["label"]], ring=ring, id=path.stem))
+        scans.append(
+            Scan(
+                frame["points"],
+                reflectance,
+                sensor,
+                pooled[frame["label"]],
+                ring=ring,
+                id=path.stem,
+            )
+        )
     return scans
 
 
@@ -82,7 +99,10 @@ def read_semantic_kitti(root: Path) -> list[Scan]:
 
 def road_height(scans: Sequence[Scan]) -> float:
     """Median height of the road within 12 m of the sensor, metres."""
-    near = [s.points[(s.label == TRAIN_ID["road"]) & (np.linalg.norm(s.points, axis=1) < 12), 2] for s in scans]
+    near = [
+        s.points[(s.label == TRAIN_ID["road"]) & (np.linalg.norm(s.points, axis=1) < 12), 2]
+        for s in scans
+    ]
     return float(np.median(np.concatenate(near)))
 
 
@@ -98,9 +118,18 @@ class Images:
     @classmethod
     def of(cls, scans: Sequence[Scan], columns: int = COLUMNS) -> "Images":
         """One row per laser, the nearest return of each cell."""
-        views = [unfold(scan, replace(scan.sensor.by_beams(), columns=columns, firings=None)) for scan in scans]
-        stacks = [np.stack(v) for v in zip(*((v.range, v.reflectance, v.label) for v in views), strict=True)]
-        return cls(*map(torch.from_numpy, stacks), torch.from_numpy(np.sin(views[0].sensor.ray_angles()[0])))
+        views = [
+            unfold(scan, replace(scan.sensor.by_beams(), columns=columns, firings=None))
+            for scan in scans
+        ]
+        stacks = [
+            np.stack(v)
+            for v in zip(*((v.range, v.reflectance, v.label) for v in views), strict=True)
+        ]
+        return cls(
+            *map(torch.from_numpy, stacks),
+            torch.from_numpy(np.sin(views[0].sensor.ray_angles()[0])),
+        )
 
     def batches(self, seed: int) -> Iterator[dict[str, Tensor]]:
         """Endless batches of random images, turned and mirrored."""
@@ -108,7 +137,8 @@ class Images:
         while True:
             parts = []
             for i in rng.choice(len(self.range), BATCH, replace=False):
-                turn, mirror = int(rng.integers(self.range.shape[-1])), bool(rng.integers(2))
+                turn = int(rng.integers(self.range.shape[-1]))
+                mirror = bool(rng.integers(2))
                 images = [t[i].roll(turn, -1) for t in (self.range, self.reflectance, self.label)]
                 parts.append([t.flip(-1) if mirror else t for t in images])
             names = ("range", "reflectance", "label")
@@ -156,10 +186,13 @@ def respond(scans: Sequence[Scan], response: Response) -> list[Scan]:
 
 def arms(kitti: list[Scan], panda: list[Scan]) -> dict[str, tuple[Images, dict[str, Images]]]:
     """{arm: (training set, {test: images})}."""
-    first, last = panda[:15], panda[-15:]
-    pandar, hdl64e = panda[0].sensor, kitti[0].sensor
+    first = panda[:15]
+    last = panda[-15:]
+    pandar = panda[0].sensor
+    hdl64e = kitti[0].sensor
     mount = Mount(z=round(road_height(kitti) - road_height(first), 2))
-    response, back = Response.match(kitti, first), Response.match(first, kitti)
+    response = Response.match(kitti, first)
+    back = Response.match(first, kitti)
     print(f"the Pandar64 is mounted {mount.z:+.2f} m above the HDL-64E")
     geometry = Transfer(pandar, mount)
     whole = replace(geometry, measurement=Measurement(response=response))
@@ -173,15 +206,22 @@ def arms(kitti: list[Scan], panda: list[Scan]) -> dict[str, tuple[Images, dict[s
         ),
         "SemanticKITTI as Pandar64": (Images.of([whole(s, rng) for s in kitti]), test),
         "PandaSet, first 15 frames (reference)": (Images.of(first), test),
-        "SemanticKITTI as Pandar64, reflectance as it is": (Images.of([geometry(s, rng) for s in kitti]), test),
+        "SemanticKITTI as Pandar64, reflectance as it is": (
+            Images.of([geometry(s, rng) for s in kitti]),
+            test,
+        ),
         "SemanticKITTI as it is, reflectance matched": (Images.of(respond(kitti, response)), test),
     }
 
 
 def report(results: dict[tuple[str, str], list[NDArray[np.int64]]]) -> str:
-    """A Markdown table: mIoU and IoU of every class, mean and standard deviation over seeds; and what is recovered."""
+    """A Markdown table: mIoU and IoU of every class, mean and standard deviation over seeds; and
+    what is recovered."""
     classes = [TRAIN_ID[name] for name in POOLED]
-    lines = [f"| trained on | tested on | mIoU, % | {' | '.join(NAMES[c] for c in classes)} | recovered |"]
+    lines = [
+        f"| trained on | tested on | mIoU, % | {' | '.join(NAMES[c] for c in classes)} | "
+        "recovered |"
+    ]
     lines.append("|---|---|---:|" + "---:|" * (len(classes) + 1))
     keys = list(results)
     reference = next(key for key in keys if "reference" in key[0])
@@ -191,13 +231,17 @@ def report(results: dict[tuple[str, str], list[NDArray[np.int64]]]) -> str:
         ious = np.mean([class_ious(t)[classes] for t in results[key]], 0)
         share = (scores - start) / (goal - start)
         cells = " | ".join(f"{100 * v:.0f}" for v in ious)
-        spread = f"{100 * scores.mean():.1f} ± {100 * scores.std(ddof=1) if len(scores) > 1 else 0:.1f}"
+        spread = (
+            f"{100 * scores.mean():.1f} ± {100 * scores.std(ddof=1) if len(scores) > 1 else 0:.1f}"
+        )
         lines.append(f"| {key[0]} | {key[1]} | {spread} | {cells} | {100 * share.mean():.0f} % |")
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kitti", type=Path)
     parser.add_argument("pandaset", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
@@ -205,23 +249,39 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=COLUMNS, help="of the range images")
     parser.add_argument("--jobs", type=int, default=1, help="processes, of one thread each")
     parser.add_argument("--out", type=Path, help="file for the table")
-    parser.add_argument("--work", type=Path, help="folder for the result of each training, to resume")
+    parser.add_argument(
+        "--work", type=Path, help="folder for the result of each training, to resume"
+    )
     given = parser.parse_args()
     if given.work:
         given.work.mkdir(parents=True, exist_ok=True)
     sets = arms(read_semantic_kitti(given.kitti), read_pandaset(given.pandaset))
     order = list(sets)
-    jobs = [(arm, seed) for part in (order[:3], order[3:]) for seed in range(given.seeds) for arm in part]
+    jobs = [
+        (arm, seed)
+        for part in (order[:3], order[3:])
+        for seed in range(given.seeds)
+        for arm in part
+    ]
     results: dict[tuple[str, str], list[NDArray[np.int64]]] = {
         (arm, test): [] for arm, (_, tests) in sets.items() for test in tests
     }
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:
-        kept = [given.work and given.work / f"{order.index(arm)}-{given.steps}-{seed}.npz" for arm, seed in jobs]
-        futures = [pool.submit(run, *sets[a], given.steps, s, k) for (a, s), k in zip(jobs, kept, strict=True)]
+        kept = [
+            given.work and given.work / f"{order.index(arm)}-{given.steps}-{seed}.npz"
+            for arm, seed in jobs
+        ]
+        futures = [
+            pool.submit(run, *sets[a], given.steps, s, k)
+            for (a, s), k in zip(jobs, kept, strict=True)
+        ]
         for (arm, seed), future in zip(tqdm(jobs, "trainings"), futures, strict=True):
             for test, found in future.result().items():
                 results[arm, test].append(found)
-                print(f"{arm}, tested on {test}, seed {seed}: {100 * mean_iou(found):.1f} %", flush=True)
+                print(
+                    f"{arm}, tested on {test}, seed {seed}: {100 * mean_iou(found):.1f} %",
+                    flush=True,
+                )
     text = report(results)
     print(text)
     if given.out:

@@ -1,11 +1,13 @@
-"""Run each trainer's own script on a mixture, in a fresh environment, with validation; print a Markdown table.
+"""Run each trainer's own script on a mixture, in a fresh environment, with validation; print a
+Markdown table.
 
     python tools/try_trainers.py --work FOLDER [--only NAME ...] [--scans 1]
 
-``tools/trainers/`` has one file for each trainer. Public source trees are found by environment variables such as
-OPENPCDET_ROOT and POINTCEPT_ROOT; each file names its own. Real scans are used where LIDAR_SYNTH_LABELLED_SCANS and
-LIDAR_SYNTH_REAL_SCANS name their folders, beside scans of the town. Logs are kept in FOLDER/<name>/logs. This shows
-that a trainer runs on the mixture, not that the mixture helps. The exit status is 1 if a trial failed.
+``tools/trainers/`` has one file for each trainer. Public source trees are found by environment
+variables such as OPENPCDET_ROOT and POINTCEPT_ROOT; each file names its own. Real scans are used
+where LIDAR_SYNTH_LABELLED_SCANS and LIDAR_SYNTH_REAL_SCANS name their folders, beside scans of the
+town. Logs are kept in FOLDER/<name>/logs. This shows that a trainer runs on the mixture, not that
+the mixture helps. The exit status is 1 if a trial failed.
 """
 
 import argparse
@@ -25,7 +27,11 @@ FRAME = ("__init__", "data", "trial")
 
 def names() -> list[str]:
     """The trainers that have a file."""
-    return sorted(path.stem for path in (Path(__file__).parent / "trainers").glob("*.py") if path.stem not in FRAME)
+    return sorted(
+        path.stem
+        for path in (Path(__file__).parent / "trainers").glob("*.py")
+        if path.stem not in FRAME
+    )
 
 
 def attempt(name: str, work: Path, data: Data, reuse: bool) -> list[Row]:
@@ -56,19 +62,41 @@ def line(row: Row) -> str:
 
 def main() -> None:
     """Runs the trials and prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, required=True, help="folder of environments, data and logs")
-    parser.add_argument("--only", nargs="+", choices=names(), default=names(), metavar="NAME", help=", ".join(names()))
-    parser.add_argument("--scans", type=int, default=1, help="scans of each SemanticKITTI sequence [1]")
-    parser.add_argument("--reuse-environments", action="store_true", help="keep those of an earlier run, to develop")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--work", type=Path, required=True, help="folder of environments, data and logs"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=names(),
+        default=names(),
+        metavar="NAME",
+        help=", ".join(names()),
+    )
+    parser.add_argument(
+        "--scans", type=int, default=1, help="scans of each SemanticKITTI sequence [1]"
+    )
+    parser.add_argument(
+        "--reuse-environments", action="store_true", help="keep those of an earlier run, to develop"
+    )
     options = parser.parse_args()
     work = options.work.absolute()
     shutil.rmtree(work / "wheel", ignore_errors=True)  # that of an earlier checkout
     data = Data(work / f"data-{options.scans}", options.scans)
-    done = [row for name in options.only for row in attempt(name, work, data, options.reuse_environments)]
+    done = [
+        row
+        for name in options.only
+        for row in attempt(name, work, data, options.reuse_environments)
+    ]
     machine = f"Python {platform.python_version()}, {os.cpu_count()} cores, {platform.machine()}"
     print(f"{machine}; scans called real: {data.real}\n")
-    print(f"| trainer | script | {' | '.join(STEPS)} | not on a CPU | minutes |\n|{'---|' * (len(STEPS) + 3)}---:|")
+    print(
+        f"| trainer | script | {' | '.join(STEPS)} | not on a CPU | minutes "
+        f"|\n|{'---|' * (len(STEPS) + 3)}---:|"
+    )
     print("\n".join(line(row) for row in done))
     sys.exit(any(row.failed for row in done))
 

@@ -1,10 +1,12 @@
 """A small segmenter trained on scans of the town only, tested on real scans: mIoU and IoU by class.
 
-    python tools/zero_shot.py SEMANTIC_KITTI [--pandaset FOLDER] [--streets 200] [--steps 500] [--seeds 2] [--skin NAME]
+    python tools/zero_shot.py SEMANTIC_KITTI [--pandaset FOLDER] [--streets 200] [--steps 500]
+    [--seeds 2] [--skin NAME]
 
-SEMANTIC_KITTI is a folder of labelled real scans in that layout; they are only tested on. FOLDER holds PandaSet, read
-with ``--pandaset``, whose scans are projected onto the same grid; its classes are pooled to those that both have. The
-network is the package's ``RangeSegmenter`` at 64 x 512, trained with batches of 4 that are turned and mirrored.
+SEMANTIC_KITTI is a folder of labelled real scans in that layout; they are only tested on. FOLDER
+holds PandaSet, read with ``--pandaset``, whose scans are projected onto the same grid; its classes
+are pooled to those that both have. The network is the package's ``RangeSegmenter`` at 64 x 512,
+trained with batches of 4 that are turned and mirrored.
 """
 
 import argparse
@@ -53,7 +55,10 @@ def images(scans: Sequence[Scan]) -> dict[str, Tensor]:
 def town_scans(streets: int, seed: int, **options: Any) -> list[Scan]:
     """One scan of each of the first streets of a town."""
     town = Town(seed, scans=streets * STRETCH_FRAMES, **options)
-    return [town[street * STRETCH_FRAMES + 7] for street in tqdm(range(streets), desc="town", unit="scan")]
+    return [
+        town[street * STRETCH_FRAMES + 7]
+        for street in tqdm(range(streets), desc="town", unit="scan")
+    ]
 
 
 def batches(data: dict[str, Tensor], seed: int, size: int = 4) -> Iterator[dict[str, Tensor]]:
@@ -61,11 +66,14 @@ def batches(data: dict[str, Tensor], seed: int, size: int = 4) -> Iterator[dict[
     rng = np.random.default_rng(seed)
     while True:
         picks = rng.choice(len(data["range"]), size, replace=False)
-        turns, mirrored = rng.integers(0, GRID.columns, size), rng.random(size) < 0.5
+        turns = rng.integers(0, GRID.columns, size)
+        mirrored = rng.random(size) < 0.5
         batch = {}
         for name, values in data.items():
             rows = [values[i].roll(int(t), -1) for i, t in zip(picks, turns, strict=True)]
-            batch[name] = torch.stack([r.flip(-1) if m else r for r, m in zip(rows, mirrored, strict=True)])
+            batch[name] = torch.stack(
+                [r.flip(-1) if m else r for r, m in zip(rows, mirrored, strict=True)]
+            )
         yield batch
 
 
@@ -82,9 +90,14 @@ def pooled(table: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def report(name: str, tables: list[NDArray[np.int64]], pool: bool) -> str:
-    """A line of the table: mean and spread of mIoU over seeds, then IoU by class of the first classes."""
+    """A line of the table: mean and spread of mIoU over seeds, then IoU by class of the first
+    classes."""
     ious = np.array([pooled(t) if pool else class_ious(t)[t.sum(1) > 0] for t in tables])
-    names = list(POOLS) if pool else [n for n, total in zip(NAMES, tables[0].sum(1), strict=True) if total]
+    names = (
+        list(POOLS)
+        if pool
+        else [n for n, total in zip(NAMES, tables[0].sum(1), strict=True) if total]
+    )
     means = 100 * ious.mean(1)
     cells = ", ".join(f"{n} {100 * v:.0f}" for n, v in zip(names, ious.mean(0), strict=True))
     accuracy = 100 * np.mean([np.trace(t) / t.sum() for t in tables])
@@ -92,8 +105,12 @@ def report(name: str, tables: list[NDArray[np.int64]], pool: bool) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("real", type=Path, help="labelled scans in the layout of SemanticKITTI, to test on")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "real", type=Path, help="labelled scans in the layout of SemanticKITTI, to test on"
+    )
     parser.add_argument("--pandaset", type=Path, help="labelled scans of PandaSet, to test on")
     parser.add_argument("--streets", type=int, default=200)
     parser.add_argument("--steps", type=int, default=500)
@@ -104,7 +121,9 @@ def main() -> None:
     if options.pandaset:
         tests["PandaSet, pooled"] = (images(list(open_scans(options.pandaset))), True)
         tests["SemanticKITTI, pooled"] = (tests["SemanticKITTI"][0], True)
-    data = images(town_scans(options.streets, 3, **({"skin": options.skin} if options.skin else {})))
+    data = images(
+        town_scans(options.streets, 3, **({"skin": options.skin} if options.skin else {}))
+    )
     height = torch.from_numpy(np.sin(GRID.ray_angles()[0]))
     tables: dict[str, list[NDArray[np.int64]]] = {name: [] for name in tests}
     for seed in range(options.seeds):

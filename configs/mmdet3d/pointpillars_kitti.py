@@ -1,6 +1,7 @@
 # ruff: noqa: C408
 # PointPillars on KITTI, real and synthetic: only the training data of the stock one changes.
-# The list is written by lidar_synth.integrations.mmdet3d_infos.write_infos; see docs/how-to/trainers/mmdetection3d.md.
+# The list is written by lidar_synth.integrations.mmdet3d_infos.write_infos; see
+# docs/how-to/trainers/mmdetection3d.md.
 _base_ = ["mmdet3d::pointpillars/pointpillars_hv_secfpn_8xb6-160e_kitti-3d-3class.py"]
 
 custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False)

@@ -1,10 +1,11 @@
 # ruff: noqa: C408
 # Sonata's stock pretraining, on SemanticKITTI's scans and synthetic ones, without labels:
 #   cd Pointcept
-#   python tools/train.py --config-file .../pretrain_sonata_semantickitti.py --options save_path=exp/sonata
-# The network, its losses and its schedule are those of the stock configuration. The data differ: a scan has a
-# reflectance where a room has colours and normals, and its metres are divided by five, as Utonia's configuration does,
-# so that the sizes of voxels, masks and matches fit.
+# python tools/train.py --config-file .../pretrain_sonata_semantickitti.py --options
+# save_path=exp/sonata The network, its losses and its schedule are those of the stock
+# configuration. The data differ: a scan has a reflectance where a room has colours and normals, and
+# its metres are divided by five, as Utonia's configuration does, so that the sizes of voxels, masks
+# and matches fit.
 from pathlib import Path as __Path
 
 _base_ = [str(__Path("configs/sonata/pretrain-sonata-v1m1-0-base.py").resolve())]
@@ -42,7 +43,11 @@ transform = [
     dict(type="Update", keys_dict={"grid_size": 0.02}),
     dict(
         type="Collect",
-        keys=(*[f"{size}_{part}" for size in ("global", "local") for part in parts], "grid_size", "name"),
+        keys=(
+            *[f"{size}_{part}" for size in ("global", "local") for part in parts],
+            "grid_size",
+            "name",
+        ),
         offset_keys_dict={},
         global_feat_keys=("global_coord", "global_strength"),
         local_feat_keys=("local_coord", "local_strength"),

@@ -1,10 +1,12 @@
 """Baking: writing banks of generated scans, on one machine or many.
 
-``options`` holds the settings and ``job`` the plan; ``shard`` writes one shard, whichever engine calls it; ``run``
-writes a complete bank with one of the engines (``local``, ``processes``, ``ray_actors``, ``slurm``, ``torchrun``).
-``verify``, ``repair`` and ``edit`` maintain existing banks.
+``options`` holds the settings and ``job`` the plan; ``shard`` writes one shard, whichever engine
+calls it; ``run`` writes a complete bank with one of the engines (``local``, ``processes``,
+``ray_actors``, ``slurm``, ``torchrun``). ``verify``, ``repair`` and ``edit`` maintain existing
+banks.
 
-Each name is imported when it is first used, so that the command line can read ``BakeJob`` without importing torch.
+Each name is imported when it is first used, so that the command line can read ``BakeJob`` without
+importing torch.
 """
 
 from importlib import import_module

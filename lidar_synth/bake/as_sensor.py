@@ -1,6 +1,7 @@
 """A bank whose scans are those of another one as another sensor would have recorded them.
 
-Casting rays takes ten times as long as reading a scan: a bank that is used for more than one epoch is turned once. Each
+Casting rays takes ten times as long as reading a scan: a bank that is used for more than one epoch
+    is turned once. Each
 cell of the target's grid keeps its nearest return; losses and noise are drawn once for each scan.
 """
 
@@ -25,8 +26,8 @@ from lidar_synth.noise import keyed_rng
 def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) -> Index:
     """Write a bank with the scans of another one as the target sensor would have recorded them.
 
-    An interrupted run resumes after its last complete shard when it is run again. Run on a complete bank, it makes
-    damaged and missing shards again.
+    An interrupted run resumes after its last complete shard when it is run again. Run on a complete
+    bank, it makes damaged and missing shards again.
 
     Args:
         bank: the bank.
@@ -49,7 +50,9 @@ def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) 
 
 
 def _facts(facts: Facts, transfer: Transfer) -> Facts:
-    return replace(facts, sensor=transfer.target, settings=facts.settings | {"as_sensor": transfer.identity})
+    return replace(
+        facts, sensor=transfer.target, settings=facts.settings | {"as_sensor": transfer.identity}
+    )
 
 
 def _shard(bank: Bank, number: int, facts: Facts, transfer: Transfer, out: Path) -> Entry:
@@ -57,7 +60,8 @@ def _shard(bank: Bank, number: int, facts: Facts, transfer: Transfer, out: Path)
     entry = bank.index.shards[number]
     path = out / entry.file
     if not path.is_file() or next(check_scans(path, facts, entry), None) is not None:
-        shard, part = bank.shard(number), part_of(path)
+        shard = bank.shard(number)
+        part = part_of(path)
         names = [name for p in range(entry.scans) if (name := shard.condition(p)) is not None]
         try:
             with ShardWriter(part, facts, entry, conditions=names) as writer:
@@ -73,11 +77,13 @@ def _shard(bank: Bank, number: int, facts: Facts, transfer: Transfer, out: Path)
 
 def _images(bank: Bank, number: int, transfer: Transfer) -> Iterator[RangeImage]:
     """The scans of a shard on the target's grid, dropped ones too."""
-    entry, shard = bank.index.shards[number], bank.shard(number)
+    entry = bank.index.shards[number]
+    shard = bank.shard(number)
     for position in range(entry.scans):
         scan = unproject(shard.encoding.decode(shard.read(position)))
         turned = transfer(
-            replace(scan, id=f"{position} of {entry.file}"), keyed_rng(entry.seed, entry.first + position)
+            replace(scan, id=f"{position} of {entry.file}"),
+            keyed_rng(entry.seed, entry.first + position),
         )
         image = project(turned)
         image.boxes = turned.boxes

@@ -1,4 +1,5 @@
-"""Conditions of generated scans: scan ``index`` is conditioned on entry ``index`` of a dataset, modulo its length.
+"""Conditions of generated scans: scan ``index`` is conditioned on entry ``index`` of a dataset,
+modulo its length.
 
 The dataset of a layout model may be a YAML file of a layout, or a folder of them.
 """
@@ -18,7 +19,8 @@ from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.scan import Scan
 
 FOCAL_TOLERANCE = 0.02
-"""Relative difference that is allowed between a camera's focal length and that of the training data."""
+"""Relative difference that is allowed between a camera's focal length and that of the training
+data."""
 
 
 class ConditionSource(Protocol):
@@ -66,7 +68,9 @@ class LayoutFiles:
 
 
 @lru_cache(maxsize=1)
-def open_conditions(path: str | None, layout: str | None = None, split: str | None = None) -> ConditionSource | None:
+def open_conditions(
+    path: str | None, layout: str | None = None, split: str | None = None
+) -> ConditionSource | None:
     """The dataset of the conditions, opened once per process; None without a path.
 
     Raises:
@@ -74,11 +78,18 @@ def open_conditions(path: str | None, layout: str | None = None, split: str | No
         FileError, DataError: as ``open_scans``.
     """
     if path is not None:
-        if layout is None and split is None and len(layouts := LayoutFiles(Path(path))) and _is_yaml(Path(path)):
+        if (
+            layout is None
+            and split is None
+            and len(layouts := LayoutFiles(Path(path)))
+            and _is_yaml(Path(path))
+        ):
             return layouts
         return open_scans(path, layout=layout, split=split)
     if layout is not None or split is not None:
-        raise ConfigError(f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH")
+        raise ConfigError(
+            f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH"
+        )
     return None
 
 
@@ -93,8 +104,8 @@ def conditions_for(
     """The dataset of a model's conditions, after a check that it fits the model.
 
     Raises:
-        ConfigError: if a conditional model gets no conditions or an unconditional one gets some, and as
-            ``open_conditions``.
+        ConfigError: if a conditional model gets no conditions or an unconditional one gets some,
+            and as ``open_conditions``.
         DataError: if the dataset's camera is unknown or differs from that of the training, and as
             ``open_conditions``.
         FileError: as ``open_conditions``.
@@ -107,14 +118,18 @@ def conditions_for(
         )
     source = open_conditions(path, layout, split)
     if isinstance(source, LayoutFiles) and generator.condition != "layout":
-        raise ConfigError(f"layouts for model {generator.name!r}", f"a dataset whose scans have {generator.condition}")
+        raise ConfigError(
+            f"layouts for model {generator.name!r}",
+            f"a dataset whose scans have {generator.condition}",
+        )
     if isinstance(source, ScanFiles) and generator.condition:
         _check_camera(source, generator.header.conditioning[generator.condition].get("focal"))
     return source
 
 
 def _check_camera(source: ScanFiles, focal: float | None) -> None:
-    """Refuse a camera of another focal length: its images have another field of view than those of the training."""
+    """Refuse a camera of another focal length: its images have another field of view than those of
+    the training."""
     if focal is None:
         return
     camera = source.calibration(0)
@@ -124,7 +139,8 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
         raise DataError(
             f"{source.root}: a camera with {given}",
             f"{focal:.1f} pixels, the focal length that the model was trained with",
-            "Crop and resize the images to that field of view, and change the dataset's calibration files accordingly.",
+            "Crop and resize the images to that field of view, and change the dataset's "
+            "calibration files accordingly.",
         )
 
 
@@ -141,7 +157,9 @@ def fingerprint(source: ConditionSource | None) -> str | None:
     return hash_of_names(source.ids)
 
 
-def conditions(source: ConditionSource | None, indices: Iterable[int]) -> list[Scan | Layout] | None:
+def conditions(
+    source: ConditionSource | None, indices: Iterable[int]
+) -> list[Scan | Layout] | None:
     """The entries that condition the scans with these indices; None for an unconditional model.
 
     Raises:

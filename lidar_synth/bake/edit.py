@@ -1,8 +1,9 @@
-"""New banks from existing ones: ``merge``, ``split``, ``head`` and ``drop``. Complete shards are hard-linked, or copied
-where the file system has no links.
+"""New banks from existing ones: ``merge``, ``split``, ``head`` and ``drop``. Complete shards are
+hard-linked, or copied where the file system has no links.
 
-The index of a curated bank leaves out some scans of its shards. The names of these shards end in ``.curated.h5``,
-because they still hold the dropped scans. Every bank that is made from a curated one is curated too.
+The index of a curated bank leaves out some scans of its shards. The names of these shards end in
+``.curated.h5``, because they still hold the dropped scans. Every bank that is made from a curated
+one is curated too.
 
 A call that was killed is completed by the same call.
 """
@@ -34,8 +35,8 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
         progress: show a bar.
 
     Raises:
-        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder that holds something
-            else.
+        ConfigError: on banks with different sensors or fields, banks that share scans, or a folder
+            that holds something else.
         FileError: if it cannot be written.
     """
     first = banks[0].facts
@@ -59,23 +60,32 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
         progress: show a bar.
 
     Raises:
-        ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that holds something else.
+        ConfigError: on shares that do not sum to 1 or leave a part empty, or a folder that holds
+            something else.
         FileError: if it cannot be written.
     """
     if any(not share > 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
         raise ConfigError(f"shares {list(parts.values())}", "positive numbers that sum to 1")
-    ends, total = [0], 0.0
+    ends = [0]
+    total = 0.0
     for share in parts.values():
         total += share
         ends.append(round(total * len(bank)))
     if any(start == stop for start, stop in pairwise(ends)):
-        raise ConfigError(f"{len(bank)} scans in shares {list(parts.values())}", "at least one scan for each")
+        raise ConfigError(
+            f"{len(bank)} scans in shares {list(parts.values())}", "at least one scan for each"
+        )
     with ExitStack() as claims:
         made = {}
         for out, start, stop in zip(parts, ends, ends[1:], strict=False):
-            made[out] = claims.enter_context(_making(out, "split", [bank], start, stop)), start, stop
+            made[out] = (
+                claims.enter_context(_making(out, "split", [bank], start, stop)),
+                start,
+                stop,
+            )
         return {
-            out: _write(out, complete, [(bank, start, stop)], progress) for out, (complete, start, stop) in made.items()
+            out: _write(out, complete, [(bank, start, stop)], progress)
+            for out, (complete, start, stop) in made.items()
         }
 
 
@@ -93,7 +103,8 @@ def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
 
 
 def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True) -> Index:
-    """A curated bank: all scans of a bank except some. Shards are linked, not rewritten; empty ones are omitted.
+    """A curated bank: all scans of a bank except some. Shards are linked, not rewritten; empty ones
+    are omitted.
 
     Args:
         bank: the original bank.
@@ -103,14 +114,17 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
         progress: show a bar.
 
     Raises:
-        ConfigError: if no scan is left, on a number out of range, or a folder that holds something else.
+        ConfigError: if no scan is left, on a number out of range, or a folder that holds something
+            else.
         FileError: if it cannot be written.
     """
     left_out = set(numbers)
     if invalid := sorted(number for number in left_out if not 0 <= number < len(bank)):
         raise ConfigError(f"scans {invalid[:8]} to leave out", f"0 to {len(bank) - 1}")
     if len(left_out) == len(bank):
-        raise ConfigError(f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some")
+        raise ConfigError(
+            f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some"
+        )
     with _making(out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why) as complete:
         return Bank(out).index if complete else _link_kept(bank, left_out, why, out, progress)
 
@@ -121,7 +135,9 @@ def _link_kept(bank: Bank, left_out: set[int], why: str, out: Path, progress: bo
     shards = tqdm(bank.index.shards, desc="shards", unit="shard", disable=not progress)
     for entry, end in zip(shards, bank.index.ends, strict=True):
         start = end - entry.kept
-        more = (entry.position(number - start) for number in range(start, end) if number in left_out)
+        more = (
+            entry.position(number - start) for number in range(start, end) if number in left_out
+        )
         dropped = tuple(sorted({*entry.dropped, *more}))
         if len(dropped) < entry.scans:
             entries.append(replace(entry, file=_name(len(entries), True), dropped=dropped))
@@ -134,7 +150,9 @@ def _name(number: int, curated: bool) -> str:
     return f"shard-{number:05d}{'.curated' if curated else ''}.h5"
 
 
-def _write(out: Path, complete: bool, parts: Sequence[tuple[Bank, int, int]], progress: bool) -> Index:
+def _write(
+    out: Path, complete: bool, parts: Sequence[tuple[Bank, int, int]], progress: bool
+) -> Index:
     """Write a bank from ranges of scans (bank, first, one past the last), unless it is complete."""
     if complete:
         return Bank(out).index
@@ -143,28 +161,35 @@ def _write(out: Path, complete: bool, parts: Sequence[tuple[Bank, int, int]], pr
     entries: list[Entry] = []
     with tqdm(total=sum(b - a for _, a, b in parts), unit="scan", disable=not progress) as bar:
         for bank, start, stop in parts:
-            for number, (entry, end) in enumerate(zip(bank.index.shards, bank.index.ends, strict=True)):
+            for number, (entry, end) in enumerate(
+                zip(bank.index.shards, bank.index.ends, strict=True)
+            ):
                 base = end - entry.kept
-                first, last = max(start - base, 0), min(stop - base, entry.kept)
+                first = max(start - base, 0)
+                last = min(stop - base, entry.kept)
                 if first >= last:
                     continue
                 facts = bank.index.sources[entry.source]
                 if facts not in sources:
                     sources.append(facts)
-                new = replace(entry, file=_name(len(entries), bool(curation)), source=sources.index(facts))
+                new = replace(
+                    entry, file=_name(len(entries), bool(curation)), source=sources.index(facts)
+                )
                 entries.append(_copy_part(bank, number, new, first, last, out))
                 bar.update(last - first)
     return write_bank_files(out, Index(tuple(sources), tuple(entries), curation=curation))
 
 
 def _copy_part(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
-    """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of another bank."""
+    """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of
+    another bank."""
     path = out / entry.file
     if (first, last) == (0, entry.kept):
         _link(Path(bank.root) / bank.index.shards[number].file, path)
         return entry
     # A file holds consecutive scans: dropped ones in between are copied too, and stay dropped.
-    start, stop = entry.position(first), entry.position(last - 1) + 1
+    start = entry.position(first)
+    stop = entry.position(last - 1) + 1
     dropped = tuple(position - start for position in entry.dropped if start <= position < stop)
     entry = replace(entry, first=entry.first + start, scans=stop - start, dropped=dropped)
     shard = bank.shard(number)
@@ -188,13 +213,16 @@ def _link(source: Path, path: Path) -> None:
             shutil.copyfile(source, part)
         except OSError as error:
             part.unlink(missing_ok=True)
-            raise FileError(f"{path} cannot be written ({error.strerror})", "a disk with free space") from error
+            raise FileError(
+                f"{path} cannot be written ({error.strerror})", "a disk with free space"
+            ) from error
     part.replace(path)
 
 
 @contextmanager
 def _making(out: Path, what: str, banks: Sequence[Bank], *more: Any) -> Iterator[bool]:
-    """Claim the folder of a new bank, without the shards of a killed call; yields whether it is complete.
+    """Claim the folder of a new bank, without the shards of a killed call; yields whether it is
+    complete.
 
     Args:
         out: the folder.
@@ -221,7 +249,8 @@ def _check_disjoint(banks: Sequence[Bank]) -> None:
             for first, stop, root in others:
                 if entry.first < stop and first < entry.first + entry.scans:
                     raise ConfigError(
-                        f"{root} and {bank.root} both hold scan {max(first, entry.first)} of seed {entry.seed}",
+                        f"{root} and {bank.root} both hold scan {max(first, entry.first)} of "
+                        f"seed {entry.seed}",
                         "every scan only once",
                         "Bake with another --seed, or a --first after the end of the other bank.",
                     )

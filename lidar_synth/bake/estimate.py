@@ -14,7 +14,8 @@ class Estimate(NamedTuple):
 
     Args:
         bytes: size of all shards.
-        seconds: time that one worker on this machine needs to generate the scans; compression runs in parallel.
+        seconds: time that one worker on this machine needs to generate the scans; compression runs
+            in parallel.
     """
 
     bytes: float
@@ -28,12 +29,15 @@ def estimate(plan: BakePlan) -> Estimate:
         ConfigError: if the device is not available.
     """
     job = plan.job
-    generator, batch = load_checked(job, plan.facts), job.batch or 1
+    generator = load_checked(job, plan.facts)
+    batch = job.batch or 1
     with torch_threads(job.threads):
         for _ in range(2):
             start = time.perf_counter()
             images = generate(generator, job, range(job.first, job.first + batch))
             seconds = time.perf_counter() - start
-    chunks = sum(len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values())
+    chunks = sum(
+        len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values()
+    )
     heads = sum(head_size(plan.facts, entry.scans) for entry in plan.shards)
     return Estimate(heads + chunks / batch * job.count, seconds / batch * job.count)

@@ -1,11 +1,12 @@
 """A bank's folder during a bake: its settings, its finished shards, and finally its index.
 
-A shard is written to a temporary file, synced, and renamed. Just before, its size and hash are recorded in
-``.lidar_synth/``; when all shards exist, ``finish`` gathers the records in ``index.json``. A shard counts as finished
-when its file has the recorded hash. So a run that is killed at any moment loses only the shards that it was writing.
+A shard is written to a temporary file, synced, and renamed. Just before, its size and hash are
+recorded in ``.lidar_synth/``; when all shards exist, ``finish`` gathers the records in
+``index.json``. A shard counts as finished when its file has the recorded hash. So a run that is
+killed at any moment loses only the shards that it was writing.
 
-Several runs may fill one folder at the same time. Each of them is ``at_work`` there, and temporary files are removed
-only after the last one has ended.
+Several runs may fill one folder at the same time. Each of them is ``at_work`` there, and temporary
+files are removed only after the last one has ended.
 """
 
 import hashlib
@@ -28,7 +29,8 @@ from lidar_synth.files.lock import alone, shared
 from lidar_synth.formats.writer import NOTES
 
 SETTINGS = ".bake.json"
-"""File in the bank's folder with the settings of the bake; runs that fill the folder hold a lock on it."""
+"""File in the bank's folder with the settings of the bake; runs that fill the folder hold a lock on
+it."""
 
 LOGS = ".slurm"
 """Folder with the logs of Slurm's jobs, in the bank's folder until the bank is finished."""
@@ -38,8 +40,8 @@ def prepare(plan: BakePlan) -> None:
     """Claim the folder for the plan's settings, and remove temporary files of killed runs.
 
     Raises:
-        ConfigError: if it holds a bank with other settings, and the message shows the difference; or files that the
-            bake would replace.
+        ConfigError: if it holds a bank with other settings, and the message shows the difference;
+            or files that the bake would replace.
         FileError: if it cannot be written.
     """
     if not (plan.out / SETTINGS).exists():
@@ -66,7 +68,8 @@ def refuse_others(root: Path) -> None:
 
 @contextmanager
 def at_work(plan: BakePlan) -> Iterator[None]:
-    """Prevent all processes from removing temporary files in the plan's folder until the block ends.
+    """Prevent all processes from removing temporary files in the plan's folder until the block
+    ends.
 
     Raises:
         FileError: if the folder is not, or is no longer, the one that ``prepare`` claimed.
@@ -115,7 +118,9 @@ def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     except OSError as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"{path} cannot be written ({error.strerror or error})", "a mounted folder") from error
+        raise FileError(
+            f"{path} cannot be written ({error.strerror or error})", "a mounted folder"
+        ) from error
     sync_folder(plan.out)
     return entry
 
@@ -133,7 +138,8 @@ def finish(plan: BakePlan) -> Index | None:
             if entry is None or not (plan.out / entry.file).is_file():
                 return None
             entries.append(entry)
-        index, there = Index((plan.facts,), tuple(entries)), _index(plan.out)
+        index = Index((plan.facts,), tuple(entries))
+        there = _index(plan.out)
         if there is not None and there.shards == index.shards:
             index = there  # it may list repairs
         index = write_bank_files(plan.out, index, baked=True)
@@ -159,14 +165,17 @@ def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
     for name, content in files.items():
         if not _holds(root / name, content):  # do not replace a file that others hold a lock on
             write_file(root / name, content)
-    index = replace(index, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
+    index = replace(
+        index, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    )
     write_file(root / INDEX, index.to_json(), durable=True)
     sync_folder(root)
     return index
 
 
 def _settings_file(root: Path, index: Index) -> dict[str, bytes]:
-    """The settings file of a bake, as ``claim`` writes it; an older file with another order of keys is kept."""
+    """The settings file of a bake, as ``claim`` writes it; an older file with another order of keys
+    is kept."""
     wanted = json.dumps(settings_of(index.sources[0]), indent=1).encode()
     with suppress(FileError, ValueError, RecursionError):
         there = read_file(root / SETTINGS)
@@ -210,7 +219,8 @@ def check_folder(plan: BakePlan) -> None:
 
 
 def _clear_up(root: Path, finished: bool) -> None:
-    """Remove temporary files of processes that have ended, and everything that a finished bank does not need.
+    """Remove temporary files of processes that have ended, and everything that a finished bank does
+    not need.
 
     While another process is at work in the folder, nothing is removed; that process does it later.
     """

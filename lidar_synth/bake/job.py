@@ -1,8 +1,9 @@
 """The plan of a bake: its settings, and which shard holds which scans.
 
-A scan is a function of (checkpoint, time grid, solver, seed, index). Its bytes also depend on the computation:
-precision, batch size, type of device, threads and versions. All of these are settings of the bank. Two runs with the
-same settings write the same bytes; a run with other settings is refused.
+A scan is a function of (checkpoint, time grid, solver, seed, index). Its bytes also depend on the
+computation: precision, batch size, type of device, threads and versions. All of these are settings
+of the bank. Two runs with the same settings write the same bytes; a run with other settings is
+refused.
 """
 
 import platform
@@ -32,12 +33,13 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 @dataclass(frozen=True)
 class BakePlan:
-    """A job, checked against its checkpoint, with the folder of the bank. Small enough to send to any process.
+    """A job, checked against its checkpoint, with the folder of the bank. Small enough to send to
+    any process.
 
     Args:
         out: the bank's folder.
-        job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a checkpoint file made
-            absolute.
+        job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a
+            checkpoint file made absolute.
         facts: the facts of the bank.
     """
 
@@ -53,7 +55,12 @@ class BakePlan:
         starts = range(0, job.count, job.shard_size)
         digits = max(5, len(str(len(starts) - 1)))
         return tuple(
-            Entry(f"shard-{number:0{digits}d}.h5", job.seed, job.first + start, min(job.shard_size, job.count - start))
+            Entry(
+                f"shard-{number:0{digits}d}.h5",
+                job.seed,
+                job.first + start,
+                min(job.shard_size, job.count - start),
+            )
             for number, start in enumerate(starts)
         )
 
@@ -65,13 +72,20 @@ class BakePlan:
     @property
     def scan_bytes(self) -> int:
         """Size of a scan before compression."""
-        return sum(shape[0] * shape[1] * dtype.itemsize for shape, dtype in self.facts.encoding.arrays().values())
+        return sum(
+            shape[0] * shape[1] * dtype.itemsize
+            for shape, dtype in self.facts.encoding.arrays().values()
+        )
 
 
 def settings_of(facts: Facts) -> dict[str, Any]:
     """All settings that determine the bytes of a bank with these facts, sorted by name."""
-    others = {"checkpoint": facts.checkpoint, "fields": list(facts.fields), "compression": facts.compression,
-              "layout": facts.layout}  # fmt: skip
+    others = {
+        "checkpoint": facts.checkpoint,
+        "fields": list(facts.fields),
+        "compression": facts.compression,
+        "layout": facts.layout,
+    }
     if facts.condition and "content" in facts.condition:  # banks of earlier versions do not have it
         others["condition_content"] = facts.condition["content"]
     return dict(sorted((facts.settings | others | facts.software).items()))
@@ -81,8 +95,8 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     """Check a job against its checkpoint and resolve its defaults, before any work starts.
 
     Raises:
-        ConfigError: on an unknown model, solver or data type, a field that the model does not generate, or a
-            conditional model without conditions.
+        ConfigError: on an unknown model, solver or data type, a field that the model does not
+            generate, or a conditional model without conditions.
         FileError, DataError: if the checkpoint or the dataset of the conditions cannot be read.
     """
     choose("solver", job.solver, SOLVERS)
@@ -92,9 +106,15 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     generator = load_generator(job.model, columns=job.columns)
     source = conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
     fields = _fields(job, generator.fields)
-    software = {"lidar_synth": lidar_synth.__version__, "torch": torch.__version__, "numpy": np.__version__,
-                "h5py": h5py.__version__, "hdf5": h5py.version.hdf5_version, "deflate": deflate.__version__,
-                "machine": platform.machine()}  # fmt: skip
+    software = {
+        "lidar_synth": lidar_synth.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "h5py": h5py.__version__,
+        "hdf5": h5py.version.hdf5_version,
+        "deflate": deflate.__version__,
+        "machine": platform.machine(),
+    }
     model = Path(job.model)
     resolved = job.model_copy(
         update={
@@ -105,18 +125,37 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         }
     )
     # Banks of earlier versions do not name the columns.
-    elsewhere = {"model", "fields", "compression", "layout", *(["columns"] if job.columns is None else [])}
+    elsewhere = {
+        "model",
+        "fields",
+        "compression",
+        "layout",
+        *(["columns"] if job.columns is None else []),
+    }
     header = generator.header
     labelled = "generated" if "label" in header.channels else "condition"
-    reference = {"kind": generator.condition, "source": job.condition, "layout": job.condition_layout,
-                 "split": job.condition_split, "content": fingerprint(source)}  # fmt: skip
+    reference = {
+        "kind": generator.condition,
+        "source": job.condition,
+        "layout": job.condition_layout,
+        "split": job.condition_split,
+        "content": fingerprint(source),
+    }
     facts = Facts(
-        sensor=generator.sensor, fields=fields, model=generator.name, checkpoint=generator.hash,
+        sensor=generator.sensor,
+        fields=fields,
+        model=generator.name,
+        checkpoint=generator.hash,
         settings=resolved.model_dump(exclude=elsewhere),
-        label_policy=labelled if "label" in fields else "none", condition=reference if generator.condition else None,
-        licence=str(header.provenance["licence"]), data_licence=str(header.provenance["data_licence"]),
-        provenance=header.provenance, software=software, compression=job.compression, layout=job.layout,
-    )  # fmt: skip
+        label_policy=labelled if "label" in fields else "none",
+        condition=reference if generator.condition else None,
+        licence=str(header.provenance["licence"]),
+        data_licence=str(header.provenance["data_licence"]),
+        provenance=header.provenance,
+        software=software,
+        compression=job.compression,
+        layout=job.layout,
+    )
     return BakePlan(Path(out), resolved, facts)
 
 
@@ -126,7 +165,11 @@ def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:
     if missing := sorted(wanted - generated):
         raise ConfigError(
             f"fields {missing} of model {job.model!r}",
-            f"some of {sorted(generated)}, which it generates" if generated else "none: it generates only ranges",
-            "A checkpoint with the channel 'label' generates labels with confidence." if "label" in missing else "",
+            f"some of {sorted(generated)}, which it generates"
+            if generated
+            else "none: it generates only ranges",
+            "A checkpoint with the channel 'label' generates labels with confidence."
+            if "label" in missing
+            else "",
         )
     return tuple(name for name in TYPES if name in wanted)

@@ -1,4 +1,5 @@
-"""The folder of a new bank that one process writes: claimed, locked, and resumed by the same call."""
+"""The folder of a new bank that one process writes: claimed, locked, and resumed by the same
+call."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,14 +12,16 @@ from lidar_synth.files.claims import claim
 from lidar_synth.files.lock import alone
 
 NOTE = ".made.json"
-"""File in the bank's folder with the settings of the call that makes it; a run holds a lock on it."""
+"""File in the bank's folder with the settings of the call that makes it; a run holds a lock on
+it."""
 
 
 @contextmanager
 def making(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """Claim a folder for a new bank, and keep other processes out of it until the block ends.
 
-    The claim stays, so that the same call resumes after a kill. Temporary files of killed calls are removed.
+    The claim stays, so that the same call resumes after a kill. Temporary files of killed calls are
+    removed.
 
     Args:
         out: the new bank's folder.

@@ -1,7 +1,7 @@
 """Engine ``processes``: several processes on this machine; each takes the next unassigned shard.
 
-Each process uses one GPU, assigned in turn. A killed worker stops the run with an error message; the next run writes
-its unfinished shard.
+Each process uses one GPU, assigned in turn. A killed worker stops the run with an error message;
+the next run writes its unfinished shard.
 """
 
 import signal
@@ -21,7 +21,9 @@ _POLL = 0.2  # seconds between two checks of the workers
 _PATIENCE = 60  # seconds for a worker to abort its shard
 
 
-def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_in_processes(
+    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
+) -> None:
     """Write the shards in ``resources.workers`` processes.
 
     Raises:
@@ -29,11 +31,16 @@ def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resourc
     """
     context = get_context("spawn")  # a fork would share torch's threads
     count = min(resources.workers, len(numbers))
-    taken, errors = context.Value("q", 0), context.SimpleQueue()
-    # This process reads only values without a lock: a worker killed while holding a lock would block it forever.
-    scans, stop = context.RawArray("q", count), context.RawValue("b", 0)
+    taken = context.Value("q", 0)
+    errors = context.SimpleQueue()
+    # This process reads only values without a lock: a worker killed while holding a lock would
+    # block it forever.
+    scans = context.RawArray("q", count)
+    stop = context.RawValue("b", 0)
     workers = [
-        context.Process(target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True)
+        context.Process(
+            target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True
+        )
         for rank in range(count)
     ]
     reported = 0
@@ -51,7 +58,8 @@ def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resourc
                 raise FileError(
                     f"a worker was killed (exit status {killed[0].exitcode})",
                     "enough memory for all workers",
-                    "Run the same command again, possibly with fewer workers: finished shards are kept.",
+                    "Run the same command again, possibly with fewer workers: finished shards "
+                    "are kept.",
                 )
         if not errors.empty():
             raise errors.get()
@@ -66,12 +74,15 @@ def bake_in_processes(plan: BakePlan, numbers: Sequence[int], resources: Resourc
 
 @contextmanager
 def _signals_deferred() -> Iterator[None]:
-    """Defer signals until the block has started all processes. These ignore Ctrl-C, which a terminal sends to every
-    process of the group: the parent process tells them when to stop."""
+    """Defer signals until the block has started all processes. These ignore Ctrl-C, which a
+    terminal sends to every process of the group: the parent process tells them when to stop."""
     received: list[int] = []
     in_charge = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGINT, signal.SIGTERM) if in_charge else ()
-    before = {number: signal.signal(number, lambda number, frame: received.append(number)) for number in numbers}
+    before = {
+        number: signal.signal(number, lambda number, frame: received.append(number))
+        for number in numbers
+    }
     masks = hasattr(signal, "pthread_sigmask")  # not on Windows
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
     try:
@@ -91,9 +102,19 @@ def _report(progress: Progress, scans: int) -> int:
     return scans
 
 
-def _work(plan: BakePlan, numbers: Sequence[int], taken: Any, scans: Any, stop: Any, errors: Any, rank: int) -> None:
+def _work(
+    plan: BakePlan,
+    numbers: Sequence[int],
+    taken: Any,
+    scans: Any,
+    stop: Any,
+    errors: Any,
+    rank: int,
+) -> None:
     """One worker: writes shards until none is left or the run is stopped."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows, where the parent cannot block it before the start
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # on Windows, where the parent cannot block it before the start
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if plan.job.device == "cuda":
         import torch

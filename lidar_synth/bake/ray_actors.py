@@ -1,7 +1,10 @@
-"""Engine ``ray``: actors on a Ray cluster, one accelerator each, all writing to a folder that every node shares.
+"""Engine ``ray``: actors on a Ray cluster, one accelerator each, all writing to a folder that every
+node shares.
 
-An actor gets a shard only when it is running, so that a pending actor blocks no shard. When an actor or its node is
-lost, its shard returns to the queue and a new actor is requested: nodes may join and leave during the bake.
+An actor gets a shard only when it is running, so that a pending actor blocks no shard. When an
+actor or its node is
+lost, its shard returns to the queue and a new actor is requested: nodes may join and leave during
+    the bake.
 """
 
 import os
@@ -14,7 +17,9 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
-_LOSSES = 5  # lost actors per worker, without a finished shard in between, after which the bake fails
+_LOSSES = (
+    5  # lost actors per worker, without a finished shard in between, after which the bake fails
+)
 
 
 class Baker:
@@ -31,7 +36,9 @@ class Baker:
         return bake_shard(self._plan, number).scans
 
 
-def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_on_ray(
+    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
+) -> None:
     """Write the shards with ``resources.workers`` actors.
 
     Raises:
@@ -46,11 +53,21 @@ def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, pr
         try:
             ray.init(address=resources.address, log_to_driver=False)
         except ConnectionError as error:
-            raise ConfigError(f"Ray address {resources.address!r} ({error})", "a running cluster") from error
-    share: dict[str, Any] = {"num_gpus": 1} if plan.job.device == "cuda" else {"num_cpus": plan.job.threads}
+            raise ConfigError(
+                f"Ray address {resources.address!r} ({error})", "a running cluster"
+            ) from error
+    share: dict[str, Any] = (
+        {"num_gpus": 1} if plan.job.device == "cuda" else {"num_cpus": plan.job.threads}
+    )
     actor = ray.remote(max_restarts=0, **share)(Baker)
     try:
-        _work_off(ray, lambda: actor.remote(plan), deque(numbers), min(resources.workers, len(numbers)), progress)
+        _work_off(
+            ray,
+            lambda: actor.remote(plan),
+            deque(numbers),
+            min(resources.workers, len(numbers)),
+            progress,
+        )
     finally:
         if started:
             ray.shutdown()
@@ -58,7 +75,9 @@ def bake_on_ray(plan: BakePlan, numbers: Sequence[int], resources: Resources, pr
 
 def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress: Progress) -> None:
     """Assign shards to actors until all are written."""
-    running: dict[Any, tuple[Any, int | None]] = {}  # pending result: (its actor, the shard it writes)
+    running: dict[
+        Any, tuple[Any, int | None]
+    ] = {}  # pending result: (its actor, the shard it writes)
     losses = 0  # since the last finished shard
 
     def begin() -> None:
@@ -75,14 +94,16 @@ def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress:
         except ray.exceptions.RayActorError as error:
             if error.actor_init_failed:
                 raise LibraryError(
-                    f"a Ray actor cannot start ({error})", "the same lidar_synth and versions on every node"
+                    f"a Ray actor cannot start ({error})",
+                    "the same lidar_synth and versions on every node",
                 ) from error
             losses += 1
             if losses > _LOSSES * workers:
                 raise FileError(
                     f"{losses} Ray actors were lost without a finished shard ({error})",
                     "nodes with enough memory",
-                    "Run the same command again, possibly with fewer workers: finished shards are kept.",
+                    "Run the same command again, possibly with fewer workers: finished shards "
+                    "are kept.",
                 ) from error
             if number is not None:
                 waiting.append(number)
@@ -103,6 +124,8 @@ def _import_ray() -> Any:
         import ray
     except ImportError as error:
         raise LibraryError(
-            f"engine 'ray', but ray cannot be imported ({error})", "the extra ray", "pip install 'lidar_synth[ray]'"
+            f"engine 'ray', but ray cannot be imported ({error})",
+            "the extra ray",
+            "pip install 'lidar_synth[ray]'",
         ) from error
     return ray

@@ -18,10 +18,11 @@ from lidar_synth.files.disk import part_of, sha256
 
 
 def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:
-    """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or settings file.
+    """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or
+    settings file.
 
-    On the machine and with the versions that made the bank, the bytes are the same. Elsewhere the scans are equal up to
-    rounding; the index then gets the new hashes and an entry in ``repairs``.
+    On the machine and with the versions that made the bank, the bytes are the same. Elsewhere the
+    scans are equal up to rounding; the index then gets the new hashes and an entry in ``repairs``.
 
     Args:
         root: the bank's folder.
@@ -44,10 +45,12 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
         index = read_index(root)
         baked = SETTINGS in index.files or (root / SETTINGS).is_file()
     except (DataError, FileError) as error:
-        index, baked = _index_from_shards(root, error), True
+        index = _index_from_shards(root, error)
+        baked = True
         done[INDEX] = "rebuilt from the shards"
     done |= {problem.file: "rewritten from the index" for problem in check_side_files(root, index)}
-    shards, repairs = list(index.shards), list(index.repairs)
+    shards = list(index.shards)
+    repairs = list(index.repairs)
     total = sum(entry.scans for entry in shards)
     with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
         for number, entry in enumerate(shards):
@@ -59,13 +62,18 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
             same = entry.sha256 in ("", new.sha256)
             done[entry.file] = "regenerated" + ("" if same else ", with different bytes")
             if not same:
-                repairs.append(f"{entry.file} was regenerated with torch {torch.__version__}, with different bytes")
+                repairs.append(
+                    f"{entry.file} was regenerated with torch {torch.__version__}, with different "
+                    "bytes"
+                )
     if done:
         write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked)
     return done
 
 
-def _regenerate(root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]) -> Entry:
+def _regenerate(
+    root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]
+) -> Entry:
     """Generate a shard and replace its file."""
     job = job_of(facts, model)
     part = part_of(root / entry.file)
@@ -76,7 +84,9 @@ def _regenerate(root: Path, facts: Facts, entry: Entry, model: str | None, progr
     except OSError as error:
         if isinstance(error, LidarSynthError):
             raise
-        raise FileError(f"{root / entry.file} cannot be written ({error.strerror})", "a writable folder") from error
+        raise FileError(
+            f"{root / entry.file} cannot be written ({error.strerror})", "a writable folder"
+        ) from error
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -85,7 +95,8 @@ def _regenerate(root: Path, facts: Facts, entry: Entry, model: str | None, progr
 
 
 def _index_from_shards(root: Path, damage: Exception) -> Index:
-    """Rebuild the lost index of a bake from its shards; an entry without a hash marks a shard to regenerate.
+    """Rebuild the lost index of a bake from its shards; an entry without a hash marks a shard to
+    regenerate.
 
     Raises:
         DataError: if no shard can be read, or the readable ones come from different bakes.
@@ -95,15 +106,24 @@ def _index_from_shards(root: Path, damage: Exception) -> Index:
         with suppress(DataError, FileError), ShardReader(path, str(path)) as shard:
             found[path.name] = shard.facts, shard.entry
     if not found:
-        raise DataError(f"{damage}, and no shard of {root} can be read", "at least one intact shard") from damage
+        raise DataError(
+            f"{damage}, and no shard of {root} can be read", "at least one intact shard"
+        ) from damage
     facts = next(iter(found.values()))[0]
     shards = BakePlan(root, job_of(facts), facts).shards
-    if any(other != facts for other, _ in found.values()) or not {e for _, e in found.values()} <= set(shards):
-        raise DataError(f"{damage}, and the shards of {root} are of different bakes", "a copy of the index") from damage
-    absent = [entry.file for entry in shards if not (root / entry.file).exists()]
-    if absent and not (root / SETTINGS).is_file():  # the part of a split, too, has the first shards of a bake
+    if any(other != facts for other, _ in found.values()) or not {
+        e for _, e in found.values()
+    } <= set(shards):
         raise DataError(
-            f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves", "a copy of the index"
+            f"{damage}, and the shards of {root} are of different bakes", "a copy of the index"
+        ) from damage
+    absent = [entry.file for entry in shards if not (root / entry.file).exists()]
+    if (
+        absent and not (root / SETTINGS).is_file()
+    ):  # the part of a split, too, has the first shards of a bake
+        raise DataError(
+            f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves",
+            "a copy of the index",
         ) from damage
     entries = []
     for entry in shards:

@@ -8,9 +8,11 @@ class Resources:
     """The resources of one run. They change its duration, never its result.
 
     Args:
-        workers: number of concurrent processes, actors or jobs; with device cuda each one uses its own GPU.
+        workers: number of concurrent processes, actors or jobs; with device cuda each one uses its
+            own GPU.
         address: address of a Ray cluster; by default Ray starts on this machine.
-        slurm: options of submitit for the jobs, for instance {"slurm_partition": "gpu", "timeout_min": 240}.
+        slurm: options of submitit for the jobs, for instance {"slurm_partition": "gpu",
+            "timeout_min": 240}.
     """
 
     workers: int = 1

@@ -1,6 +1,7 @@
 """A complete bake: claim the folder, write the missing shards with an engine, write the index.
 
-To add an engine, write a function with the signature of ``Engine`` in a file of its own and add it to ``ENGINES``.
+To add an engine, write a function with the signature of ``Engine`` in a file of its own and add it
+to ``ENGINES``.
 """
 
 import signal
@@ -53,7 +54,9 @@ class Share:
 
     def __post_init__(self) -> None:
         if not 0 <= self.index < self.of:
-            raise ConfigError(f"--shard-index {self.index} of --num-shards {self.of}", "0 <= index < number")
+            raise ConfigError(
+                f"--shard-index {self.index} of --num-shards {self.of}", "0 <= index < number"
+            )
 
 
 def bake(
@@ -76,20 +79,29 @@ def bake(
         The bank's index; None if shards of another run are still missing.
 
     Raises:
-        ConfigError: on an unknown engine, fewer than one worker, or a folder of a bake with other settings.
+        ConfigError: on an unknown engine, fewer than one worker, or a folder of a bake with other
+            settings.
         FileError: if the folder cannot be written or the disk is full; finished shards are kept.
         LibraryError: if the engine's library is not installed.
         KeyboardInterrupt: on SIGINT or SIGTERM; finished shards are kept.
     """
     run = choose("engine", engine, ENGINES)
-    resources, share = resources or Resources(), share or Share()
+    resources = resources or Resources()
+    share = share or Share()
     if resources.workers < 1:
         raise ConfigError(f"{resources.workers} workers", "at least 1")
     prepare(plan)
     with _terminated_as_interrupted():
         with at_work(plan):
             mine = range(len(plan.shards))[share.index :: share.of]
-            checked = tqdm(mine, "checking existing shards", unit="shard", leave=False, disable=not progress, delay=2)
+            checked = tqdm(
+                mine,
+                "checking existing shards",
+                unit="shard",
+                leave=False,
+                disable=not progress,
+                delay=2,
+            )
             missing = [number for number in checked if finished(plan, number) is None]
             scans = sum(plan.shards[number].scans for number in missing)
             if missing:

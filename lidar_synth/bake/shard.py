@@ -10,7 +10,13 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.bake.conditions import ConditionSource, condition_names, conditions, fingerprint, open_conditions
+from lidar_synth.bake.conditions import (
+    ConditionSource,
+    condition_names,
+    conditions,
+    fingerprint,
+    open_conditions,
+)
 from lidar_synth.bake.folder import at_work, finished, publish
 from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
@@ -39,8 +45,10 @@ def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: N
         The shard, with size and hash.
 
     Raises:
-        FileError: if the folder has vanished or cannot be written, or the disk is or would become full.
-        ConfigError: if the checkpoint has changed since the plan was made, or the device is not available.
+        FileError: if the folder has vanished or cannot be written, or the disk is or would become
+            full.
+        ConfigError: if the checkpoint has changed since the plan was made, or the device is not
+            available.
     """
     there = finished(plan, number)
     if there is not None:
@@ -59,14 +67,17 @@ def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: N
                 part.unlink(missing_ok=True)
 
 
-def write_shard(generator: Generator, path: Path, job: BakeJob, facts: Facts, entry: Entry, progress: Progress) -> None:
+def write_shard(
+    generator: Generator, path: Path, job: BakeJob, facts: Facts, entry: Entry, progress: Progress
+) -> None:
     """Generate the scans of a shard and write them; the same settings give the same bytes.
 
     Raises:
         FileError: if the file cannot be written or the disk is full.
     """
     names = condition_names(_source(job), range(entry.first, entry.first + entry.scans))
-    # One thread compresses 250 scans/s, more than a CPU generates; the number of threads changes no byte.
+    # One thread compresses 250 scans/s, more than a CPU generates; the number of threads changes no
+    # byte.
     compressors = job.threads if job.device == "cpu" else min(16, os.cpu_count() or 1)
     writer = ShardWriter(path, facts, entry, conditions=names, threads=compressors)
     with torch_threads(job.threads), writer:
@@ -91,7 +102,9 @@ def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list
         FileError, DataError: if a condition cannot be read.
     """
     given = conditions(_source(job), indices)
-    return generator.range_images(job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance)
+    return generator.range_images(
+        job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance
+    )
 
 
 def _source(job: BakeJob) -> ConditionSource | None:
@@ -100,7 +113,8 @@ def _source(job: BakeJob) -> ConditionSource | None:
 
 @contextmanager
 def torch_threads(threads: int) -> Iterator[None]:
-    """Set torch's number of threads, on which the computed bits depend, so that all engines compute the same."""
+    """Set torch's number of threads, on which the computed bits depend, so that all engines compute
+    the same."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

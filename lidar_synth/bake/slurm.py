@@ -1,8 +1,10 @@
-"""Engine ``slurm``: an array of Slurm jobs through submitit, all writing to a folder that every node shares.
+"""Engine ``slurm``: an array of Slurm jobs through submitit, all writing to a folder that every
+node shares.
 
-Slurm job k of n takes every n-th shard. submitit requeues a job that was preempted or ran out of time; it resumes after
-its last finished shard. The options are submitit's (``slurm_partition``, ``timeout_min``), and ``cluster``: "local"
-runs the jobs as processes of this machine, to test without Slurm.
+Slurm job k of n takes every n-th shard. submitit requeues a job that was preempted or ran out of
+time; it resumes after its last finished shard. The options are submitit's (``slurm_partition``,
+``timeout_min``), and ``cluster``: "local" runs the jobs as processes of this machine, to test
+without Slurm.
 """
 
 from collections.abc import Sequence
@@ -14,13 +16,17 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
-_OPTIONS = {"cluster": "slurm", "timeout_min": 240}  # submitit's default of 5 minutes may be too short for a shard
+_OPTIONS = {
+    "cluster": "slurm",
+    "timeout_min": 240,
+}  # submitit's default of 5 minutes may be too short for a shard
 _TIMEOUTS = 1000  # how often a job may run out of time and resume
 _POLL = 1  # seconds between two checks of the jobs
 
 
 class SlurmTask:
-    """The work of one job. submitit calls it, and calls ``checkpoint`` to requeue it after a preemption."""
+    """The work of one job. submitit calls it, and calls ``checkpoint`` to requeue it after a
+    preemption."""
 
     def __call__(self, plan: BakePlan, numbers: Sequence[int]) -> int:
         """Write the shards and return their number of scans."""
@@ -33,7 +39,9 @@ class SlurmTask:
         return submitit.helpers.DelayedSubmission(self, plan, numbers)
 
 
-def bake_on_slurm(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_on_slurm(
+    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
+) -> None:
     """Write the shards with an array of ``resources.workers`` jobs and wait for them.
 
     Raises:
@@ -44,7 +52,9 @@ def bake_on_slurm(plan: BakePlan, numbers: Sequence[int], resources: Resources, 
     submitit = _import_submitit()
     workers = min(resources.workers, len(numbers))
     executor = _executor(submitit, plan, resources.slurm)
-    jobs = executor.map_array(SlurmTask(), [plan] * workers, [numbers[k::workers] for k in range(workers)])
+    jobs = executor.map_array(
+        SlurmTask(), [plan] * workers, [numbers[k::workers] for k in range(workers)]
+    )
     try:
         for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL):
             progress(job.result())
@@ -62,15 +72,20 @@ def bake_on_slurm(plan: BakePlan, numbers: Sequence[int], resources: Resources, 
 
 def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> Any:
     """A submitit executor with the options of a job."""
-    share = {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
+    share = (
+        {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
+    )
     values = _OPTIONS | share | options
     cluster = values.pop("cluster")
     try:
-        executor = submitit.AutoExecutor(plan.out / LOGS, cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS})
+        executor = submitit.AutoExecutor(
+            plan.out / LOGS, cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
+        )
         executor.update_parameters(name="lidar-synth-bake", **values)
     except (RuntimeError, ValueError, NameError, TypeError) as error:
         raise ConfigError(
-            f"--slurm {options} ({error})", "a machine that submits to Slurm, and options of submitit"
+            f"--slurm {options} ({error})",
+            "a machine that submits to Slurm, and options of submitit",
         ) from error
     return executor
 

@@ -14,14 +14,18 @@ from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError
 
 
-def bake_under_torchrun(plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress) -> None:
+def bake_under_torchrun(
+    plan: BakePlan, numbers: Sequence[int], resources: Resources, progress: Progress
+) -> None:
     """Write this process's shards.
 
     Raises:
         ConfigError: if torchrun did not start this process.
     """
     try:
-        rank, ranks, local = (int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
+        rank, ranks, local = (
+            int(os.environ[name]) for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")
+        )
     except KeyError as error:
         raise ConfigError(
             f"engine 'torchrun' without {error} in the environment",

@@ -17,8 +17,9 @@ from lidar_synth.files.disk import read_file, sha256
 from lidar_synth.geometry.scan import RangeImage
 
 AGREE = 0.9
-"""Lowest share of cells in which a regenerated scan must agree. On the machine that made the bank all cells agree; on
-others rounding changes a few ranges and labels; a scan of another seed agrees in few cells."""
+"""Lowest share of cells in which a regenerated scan must agree. On the machine that made the bank
+all cells agree; on others rounding changes a few ranges and labels; a scan of another seed agrees
+in few cells."""
 
 SIDE_FILES = CARD, CROISSANT, SETTINGS
 """The other files of a bank, which can be rewritten from the index."""
@@ -40,8 +41,9 @@ class Problem:
 
 
 def verify(root: Path, progress: bool = True) -> list[Problem]:
-    """Check every shard's presence, size and hash, its attributes against the index, and the CRC of every scan; then
-    the hashes of the card and the other files that the index lists (indices of older versions list none).
+    """Check every shard's presence, size and hash, its attributes against the index, and the CRC of
+    every scan; then the hashes of the card and the other files that the index lists (indices of
+    older versions list none).
 
     Args:
         root: the bank's folder.
@@ -59,11 +61,18 @@ def verify(root: Path, progress: bool = True) -> list[Problem]:
     total = sum(entry.scans for entry in index.shards)
     with tqdm(total=total, desc="verify", unit="scan", disable=not progress) as bar:
         for entry in index.shards:
-            problems += [Problem(entry.file, what) for what in check_shard(root, index.sources[entry.source], entry)]
+            problems += [
+                Problem(entry.file, what)
+                for what in check_shard(root, index.sources[entry.source], entry)
+            ]
             bar.update(entry.scans)
     known = {entry.file for entry in index.shards}
     unlisted = sorted(path.name for path in root.glob("*.h5") if path.name not in known)
-    return problems + [Problem(name, "is not in the index") for name in unlisted] + check_side_files(root, index)
+    return (
+        problems
+        + [Problem(name, "is not in the index") for name in unlisted]
+        + check_side_files(root, index)
+    )
 
 
 def check_side_files(root: Path, index: Index) -> list[Problem]:
@@ -76,7 +85,10 @@ def check_side_files(root: Path, index: Index) -> list[Problem]:
             problems.append(Problem(name, f"cannot be read ({error.strerror or error})"))
             continue
         if actual != index.files[name]:
-            what = f"has sha256 {actual[:12]}, the index lists {index.files[name][:12]}: it was damaged or edited"
+            what = (
+                f"has sha256 {actual[:12]}, the index lists {index.files[name][:12]}: it was "
+                "damaged or edited"
+            )
             problems.append(Problem(name, what))
     return problems
 
@@ -85,7 +97,8 @@ def check_shard(root: Path, facts: Facts, entry: Entry) -> Iterator[str]:
     """Descriptions of a shard's problems."""
     path = root / entry.file
     try:
-        size, digest = path.stat().st_size, sha256(path)
+        size = path.stat().st_size
+        digest = sha256(path)
     except OSError as error:
         yield f"cannot be read ({error.strerror or error})"
         return
@@ -108,7 +121,12 @@ def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterato
 
 
 def regenerate(
-    root: Path, model: str | None = None, sample: int = 16, progress: bool = True, *, seed: int | None = None
+    root: Path,
+    model: str | None = None,
+    sample: int = 16,
+    progress: bool = True,
+    *,
+    seed: int | None = None,
 ) -> dict[str, float]:
     """Regenerate some scans from their seeds and compare them with the bank.
 
@@ -120,14 +138,19 @@ def regenerate(
         seed: seed of the sampling, >= 0; by default every call samples others.
 
     Returns:
-        {id: share of cells that agree}; less than ``AGREE`` means that the scan does not belong to its id.
+        {id: share of cells that agree}; less than ``AGREE`` means that the scan does not belong to
+        its id.
 
     Raises:
         ConfigError: if the checkpoint is not the one that made the scans.
         FileError, DataError: if the bank or the checkpoint cannot be read.
     """
     bank = Bank(root)
-    chosen = sorted(np.random.default_rng(seed).choice(len(bank), min(sample, len(bank)), replace=False).tolist())
+    chosen = sorted(
+        np.random.default_rng(seed)
+        .choice(len(bank), min(sample, len(bank)), replace=False)
+        .tolist()
+    )
     shares = {}
     for number in tqdm(chosen, desc="regenerate", unit="scan", disable=not progress):
         name = bank.ids[number]
@@ -165,7 +188,8 @@ def job_of(facts: Facts, model: str | None = None) -> BakeJob:
         raise DataError(
             f"scans of {facts.model!r} that were turned into scans of {facts.sensor.name!r}",
             "scans as their model made them",
-            "Run lidar-synth bank as-sensor again: it makes again what is damaged. --deep checks the original bank.",
+            "Run lidar-synth bank as-sensor again: it makes again what is damaged. --deep checks "
+            "the original bank.",
         )
     stored = {"compression": facts.compression, "layout": facts.layout, "fields": facts.fields}
     try:

@@ -1,9 +1,11 @@
-"""Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1", or /2 where they have boxes.
+"""Banks: folders of generated scans as range images in HDF5, "lidar-synth-bank/1", or /2 where they
+have boxes.
 
-``encoding`` and ``boxes`` convert range images to compact arrays, and ``chunks`` compresses them. ``shard`` reads one
-file of a bank, ``layout`` validates what such a file declares, ``storage`` reads byte ranges of files and URLs,
-``writer`` writes a shard. ``index`` holds a bank's metadata, ``reader`` offers a bank as a source of scans, and
-``card`` describes it to people and to data set tools.
+``encoding`` and ``boxes`` convert range images to compact arrays, and ``chunks`` compresses them.
+``shard`` reads one file of a bank, ``layout`` validates what such a file declares, ``storage``
+reads byte ranges of files and URLs, ``writer`` writes a shard. ``index`` holds a bank's metadata,
+``reader`` offers a bank as a source of scans, and ``card`` describes it to people and to data set
+tools.
 """
 
 from lidar_synth.bank.encoding import Encoding

@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes
 
-NAMES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "Motorcyclist")
+NAMES = (
+    "Car",
+    "Van",
+    "Truck",
+    "Pedestrian",
+    "Person_sitting",
+    "Cyclist",
+    "Tram",
+    "Misc",
+    "Motorcyclist",
+)
 """Classes in the order of their codes; new ones are appended."""
 
 MOST = 256
@@ -35,7 +45,9 @@ def encode_boxes(boxes: Boxes) -> NDArray[np.int32]:
     """
     if len(boxes) > MOST or not set(boxes.names) <= set(NAMES):
         unknown = sorted(set(boxes.names) - set(NAMES))
-        raise DataError(f"{len(boxes)} boxes of a scan, unknown classes {unknown}", f"at most {MOST} of {NAMES}")
+        raise DataError(
+            f"{len(boxes)} boxes of a scan, unknown classes {unknown}", f"at most {MOST} of {NAMES}"
+        )
     if len(boxes) and (boxes.instance.min() < 1 or np.abs(boxes.values).max() > _LARGEST):
         raise DataError("boxes without instance, or far away", "instances from 1 on, and metres")
     rows = np.zeros(SHAPE, np.int32)
@@ -51,7 +63,9 @@ def decode_boxes(rows: NDArray[np.int32]) -> Boxes:
     """The inverse of ``encode_boxes``, to 0.05 mm."""
     used = rows[rows[:, 0] > 0]
     values = (used[:, 2:] * _STEPS).astype(np.float32)
-    return Boxes(values, tuple(NAMES[code - 1] for code in used[:, 0]), instance=used[:, 1].astype(np.int32))
+    return Boxes(
+        values, tuple(NAMES[code - 1] for code in used[:, 0]), instance=used[:, 1].astype(np.int32)
+    )
 
 
 def check_boxes(rows: NDArray[np.int32]) -> None:
@@ -64,6 +78,9 @@ def check_boxes(rows: NDArray[np.int32]) -> None:
     count = int(used.sum())
     sound = used[:count].all() and not rows[count:].any() and (rows[:count, 1] > 0).all()
     if not (sound and (rows[:count, 0] > 0).all() and (rows[:count, 0] <= len(NAMES)).all()):
-        raise DataError("rows of boxes with an unknown class or instance", f"classes 1 to {len(NAMES)}, then zeros")
+        raise DataError(
+            "rows of boxes with an unknown class or instance",
+            f"classes 1 to {len(NAMES)}, then zeros",
+        )
     if (rows[:count, 5:8] <= 0).any():
         raise DataError("boxes with a size that is not positive", "metres")

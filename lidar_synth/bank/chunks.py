@@ -1,7 +1,7 @@
 """Compression of scans to the chunks of an HDF5 dataset, in the format of HDF5's own filters.
 
-HDF5 does not compress the chunks itself because it holds one global lock. libdeflate compresses and decompresses in
-half of zlib's time (docs/research/benchmarks.md).
+HDF5 does not compress the chunks itself because it holds one global lock. libdeflate compresses and
+decompresses in half of zlib's time (docs/research/benchmarks.md).
 """
 
 import math
@@ -19,13 +19,18 @@ from lidar_synth.errors import LibraryError
 _GZIP_LEVEL = 1
 _DEFLATE_RATIO = 1032  # highest compression ratio that deflate can reach
 
-FILTERS = {"gzip": (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32),
-           "blosc2": (32026, h5py.h5z.FILTER_FLETCHER32)}  # fmt: skip
+FILTERS = {
+    "gzip": (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32),
+    "blosc2": (32026, h5py.h5z.FILTER_FLETCHER32),
+}
 """HDF5 numbers of the filters of a chunk, in order, by ``compression``."""
 
 
-def checksum(seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b"") -> int:
-    """CRC-32 of a scan: seed and index (8 bytes each, little-endian), the condition's name, then the arrays."""
+def checksum(
+    seed: int, index: int, arrays: Mapping[str, NDArray[Any]], condition: bytes = b""
+) -> int:
+    """CRC-32 of a scan: seed and index (8 bytes each, little-endian), the condition's name, then
+    the arrays."""
     crc = libdeflate.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
     for values in arrays.values():
         crc = libdeflate.crc32(values.data, crc)
@@ -67,7 +72,9 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     return values.reshape(shape)
 
 
-def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compression: str) -> NDArray[Any]:
+def unpack(
+    chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compression: str
+) -> NDArray[Any]:
     """Decompress a chunk of a file to its array.
 
     Raises:
@@ -76,7 +83,8 @@ def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compressi
     """
     if compression == "gzip":
         return inflate(chunk, shape, dtype)
-    # hdf5plugin's filters work only within HDF5: a file in memory with this one chunk decompresses it.
+    # hdf5plugin's filters work only within HDF5: a file in memory with this one chunk decompresses
+    # it.
     options = {"chunks": (1, *shape), "fletcher32": True, **filters(compression)}
     with h5py.File("chunk", "w", driver="core", backing_store=False) as file:
         dataset = file.create_dataset("values", (1, *shape), dtype, **options)
@@ -86,7 +94,8 @@ def unpack(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any], compressi
 
 
 def fletcher32(data: bytes | bytearray | memoryview) -> int:
-    """The checksum of HDF5's fletcher32 filter, over big-endian 16-bit words; an odd last byte is a high byte."""
+    """The checksum of HDF5's fletcher32 filter, over big-endian 16-bit words; an odd last byte is a
+    high byte."""
     first, second = _fletcher_sums(np.frombuffer(data, np.uint8))
     if len(data) % 2:
         first += data[-1] << 8
@@ -109,7 +118,8 @@ def _fletcher_sums(data):  # type: ignore[no-untyped-def]  # (N,) uint8, compile
 
 
 def filters(compression: str) -> Mapping[str, Any]:
-    """Arguments of ``h5py.create_dataset`` for gzip, which every HDF5 reads, or for Blosc2 (zstd 3, bits shuffled).
+    """Arguments of ``h5py.create_dataset`` for gzip, which every HDF5 reads, or for Blosc2 (zstd 3,
+    bits shuffled).
 
     Blosc2 needs hdf5plugin; importing it also registers the filter with HDF5.
 

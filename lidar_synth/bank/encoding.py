@@ -1,19 +1,19 @@
 """Encoding of range images: 3 to 5 bytes per cell, the same bytes on every machine.
 
-=========== ====== ================================================================================================
-array       type   value
-=========== ====== ================================================================================================
-range       uint16 metres = value * scale, scale = the sensor's range_max / 65535 (1.2 mm for 80 m); 0 = no return
-reflectance uint8  value / 255
-label       uint8  train ids 0..18, 255 = ignore
-confidence  uint8  value / 15: four bits are precise enough for a confidence
-instance    uint16 the instance of the point's box; 0 = none
-boxes       int32  (256, 9) for each scan, see ``boxes``
-=========== ====== ================================================================================================
+=========== ======
+================================================================================================
+array       type   value =========== ======
+================================================================================================
+range       uint16 metres = value * scale, scale = the sensor's range_max / 65535 (1.2 mm for 80 m);
+0 = no return reflectance uint8  value / 255 label       uint8  train ids 0..18, 255 = ignore
+confidence  uint8  value / 15: four bits are precise enough for a confidence instance    uint16 the
+instance of the point's box; 0 = none boxes       int32  (256, 9) for each scan, see ``boxes``
+=========== ======
+================================================================================================
 
-``encode`` rounds by at most half a step, and ``encode(decode(x)) == x``. Every return stays a return: a range below
-half a step is stored as 1, not as 0, and decoded ranges stay within the sensor's limits, so that a projection keeps
-them.
+``encode`` rounds by at most half a step, and ``encode(decode(x)) == x``. Every return stays a
+return: a range below half a step is stored as 1, not as 0, and decoded ranges stay within the
+sensor's limits, so that a projection keeps them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -33,16 +33,21 @@ RANGE_STEPS = 65535
 """Steps of the range from 0 to the sensor's range_max."""
 
 TYPES: dict[str, type[np.integer[Any]]] = {
-    "range": np.uint16, "reflectance": np.uint8, "label": np.uint8, "confidence": np.uint8, "instance": np.uint16,
+    "range": np.uint16,
+    "reflectance": np.uint8,
+    "label": np.uint8,
+    "confidence": np.uint8,
+    "instance": np.uint16,
     "boxes": np.int32,
-}  # fmt: skip
+}
 """Arrays and their types, in the order in which they are stored."""
 
 LEVELS = {"reflectance": 255, "confidence": 15}
 """Steps from 0 to 1."""
 
 _INSIDE = 1e-6
-"""Relative margin between decoded ranges and the sensor's limits: the rounding error of float32 points."""
+"""Relative margin between decoded ranges and the sensor's limits: the rounding error of float32
+points."""
 
 
 class Encoding:
@@ -70,30 +75,43 @@ class Encoding:
 
     def arrays(self) -> dict[str, tuple[tuple[int, int], np.dtype[Any]]]:
         """Shape and type of each array of one scan."""
-        return {name: (SHAPE if name == "boxes" else self.sensor.shape, np.dtype(TYPES[name])) for name in self.names}
+        return {
+            name: (SHAPE if name == "boxes" else self.sensor.shape, np.dtype(TYPES[name]))
+            for name in self.names
+        }
 
-    def encode(self, image: RangeImage, out: Mapping[str, NDArray[Any]] | None = None) -> dict[str, NDArray[Any]]:
+    def encode(
+        self, image: RangeImage, out: Mapping[str, NDArray[Any]] | None = None
+    ) -> dict[str, NDArray[Any]]:
         """The arrays of a range image.
 
         Args:
-            image: on the sensor's grid, with a channel (or boxes) for each field; further channels are ignored.
+            image: on the sensor's grid, with a channel (or boxes) for each field; further channels
+                are ignored.
             out: arrays to write into, with the types of ``arrays``; new ones by default.
 
         Returns:
             {name: array}: ``out`` if given, otherwise new arrays.
 
         Raises:
-            DataError: on another grid, a missing channel, or a value that has no code: a range outside the sensor's
-                limits, a reflectance or confidence outside [0, 1], an unknown train id or class of a box, NaN.
+            DataError: on another grid, a missing channel, or a value that has no code: a range
+                outside the sensor's limits, a reflectance or confidence outside [0, 1], an unknown
+                train id or class of a box, NaN.
         """
         if image.sensor.shape != self.sensor.shape:
-            raise DataError(f"a range image of {image.sensor.shape}", f"{self.sensor.shape} of {self.sensor.name!r}")
+            raise DataError(
+                f"a range image of {image.sensor.shape}",
+                f"{self.sensor.shape} of {self.sensor.name!r}",
+            )
         given: dict[str, Any] = {**image.channels, "range": image.range}
         if image.boxes is not None:
             given["boxes"] = image.boxes
         if missing := [name for name in self.names if name not in given]:
             raise DataError(f"a range image without {missing}", f"channels {list(self.names[1:])}")
-        codes = {n: encode_boxes(given[n]) if n == "boxes" else self._code(n, given[n]) for n in self.names}
+        codes = {
+            n: encode_boxes(given[n]) if n == "boxes" else self._code(n, given[n])
+            for n in self.names
+        }
         if out is None:
             return codes
         for name, code in codes.items():
@@ -106,7 +124,9 @@ class Encoding:
         for name in (n for n in self.names[1:] if n != "boxes"):
             if name in LEVELS:
                 channels[name] = np.empty(self.sensor.shape, np.float32)
-                _decode_shares(arrays[name].ravel(), np.float32(LEVELS[name]), channels[name].reshape(-1))
+                _decode_shares(
+                    arrays[name].ravel(), np.float32(LEVELS[name]), channels[name].reshape(-1)
+                )
             else:
                 channels[name] = arrays[name].astype(np.int32 if name == "instance" else np.uint8)
         boxes = decode_boxes(arrays["boxes"]) if "boxes" in self.names else None
@@ -120,7 +140,9 @@ class Encoding:
         """
         for name in set(LEVELS) & set(arrays):
             if LEVELS[name] < arrays[name].max(initial=0):
-                raise DataError(f"a {name} with the code {arrays[name].max()}", f"at most {LEVELS[name]}")
+                raise DataError(
+                    f"a {name} with the code {arrays[name].max()}", f"at most {LEVELS[name]}"
+                )
         if "label" in arrays:
             _train_ids(arrays["label"])
         if "boxes" in arrays:
@@ -128,9 +150,16 @@ class Encoding:
 
     def metres(self, codes: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Ranges in metres (any shape) from their codes; 0 = no return."""
-        near, far = self.sensor.range_min * (1 + _INSIDE), self.sensor.range_max * (1 - _INSIDE)
+        near = self.sensor.range_min * (1 + _INSIDE)
+        far = self.sensor.range_max * (1 - _INSIDE)
         metres = np.empty(codes.shape, np.float32)
-        _decode_range(codes.ravel(), np.float32(self.scale), np.float32(near), np.float32(far), metres.reshape(-1))
+        _decode_range(
+            codes.ravel(),
+            np.float32(self.scale),
+            np.float32(near),
+            np.float32(far),
+            metres.reshape(-1),
+        )
         return metres
 
     def _code(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -143,13 +172,17 @@ class Encoding:
             return values.astype(np.uint16)
         codes = np.empty(values.shape, TYPES[name])
         if name == "range":
-            near, far = self.sensor.range_min - self.scale / 2, self.sensor.range_max + self.scale / 2
+            near = self.sensor.range_min - self.scale / 2
+            far = self.sensor.range_max + self.scale / 2
             limits = np.float32(max(near, 0)), np.float32(far)
-            if not _encode_range(values.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)):
+            if not _encode_range(
+                values.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)
+            ):
                 returns = values[values != 0]
                 raise DataError(
                     f"a range image with ranges from {returns.min():g} to {returns.max():g} m",
-                    f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of {self.sensor.name!r}, "
+                    f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of "
+                    f"{self.sensor.name!r}, "
                     "or 0 = no return",
                 )
         elif not _encode_shares(values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)):
@@ -161,7 +194,8 @@ def _train_ids(label: NDArray[Any]) -> NDArray[np.uint8]:
     wrong = (label >= len(NAMES)) & (label != IGNORE)
     if wrong.any():
         raise DataError(
-            f"train ids {np.unique(label[wrong]).tolist()[:8]}", f"0..{len(NAMES) - 1}, or {IGNORE} = ignore"
+            f"train ids {np.unique(label[wrong]).tolist()[:8]}",
+            f"0..{len(NAMES) - 1}, or {IGNORE} = ignore",
         )
     return label.astype(np.uint8)
 
@@ -173,7 +207,9 @@ def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-d
     for i in range(len(metres)):
         seen = metres[i] != 0
         sound &= ((metres[i] >= near) & (metres[i] <= far)) | (not seen)
-        out[i] = np.uint16(min(max(np.rint(metres[i] * inverse), np.float32(seen)), np.float32(RANGE_STEPS)))
+        out[i] = np.uint16(
+            min(max(np.rint(metres[i] * inverse), np.float32(seen)), np.float32(RANGE_STEPS))
+        )
     return sound
 
 
@@ -181,7 +217,9 @@ def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-d
 def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
     """The inverse of ``_encode_range``, clipped to near..far."""
     for i in range(len(codes)):
-        out[i] = min(max(np.float32(codes[i]) * scale, near), far) if codes[i] > 0 else np.float32(0)
+        out[i] = (
+            min(max(np.float32(codes[i]) * scale, near), far) if codes[i] > 0 else np.float32(0)
+        )
 
 
 @numba.njit(nogil=True, cache=True)

@@ -1,23 +1,26 @@
-"""A bank's metadata: the facts that its scans have in common, and ``index.json`` with every shard's size and hash.
+"""A bank's metadata: the facts that its scans have in common, and ``index.json`` with every shard's
+size and hash.
 
 ``index.json``::
 
-    format     "lidar-synth-bank/1", or "lidar-synth-bank/2" where scans have boxes and instances; readers refuse
-               every other value
+    format     "lidar-synth-bank/1", or "lidar-synth-bank/2" where scans have boxes and instances;
+               readers refuse every other value
     scans      number of scans
     sources    the facts of each bake; more than one after a merge
-    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256; in a
-               curated bank also ``dropped``: positions in the file of the scans that are left out
+    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes,
+               sha256; in a curated bank also ``dropped``: positions in the file of the scans that
+               are left out
     repairs    descriptions of the shards that a repair wrote with different bytes
     curation   in a curated bank: why scans were left out
     files      sha256 of the other files of the bank; missing in banks of older versions
     checksum   sha256 of all other values, as JSON without spaces and with sorted keys
 
-The root attributes of each shard repeat the facts and have to agree with them; text and numbers are stored directly,
-everything else as JSON::
+The root attributes of each shard repeat the facts and have to agree with them; text and numbers are
+stored directly, everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
-    fields         what is stored beside the range: reflectance, label, confidence; in /2 instance, boxes
+    fields         what is stored beside the range: reflectance, label, confidence; in /2 instance,
+        boxes
     model          the checkpoint's name; checkpoint: its hash; provenance: its header's provenance
     settings       of the bake: everything else that determines the scans
     label_policy   "generated", or "none"
@@ -45,8 +48,10 @@ from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.sensor import Sensor
 
-FORMAT, BOXED_FORMAT = "lidar-synth-bank/1", "lidar-synth-bank/2"
-"""The format of banks without boxes, which is also that of all older banks, and of those with boxes."""
+FORMAT = "lidar-synth-bank/1"
+BOXED_FORMAT = "lidar-synth-bank/2"
+"""The format of banks without boxes, which is also that of all older banks, and of those with
+boxes."""
 
 LAYOUTS = ("plain", "paged")
 INDEX = "index.json"
@@ -56,7 +61,16 @@ SCAN_NUMBERS = 20
 
 REPAIR = "lidar-synth repair BANK regenerates what is damaged or missing."
 
-_TEXT = ("format", "model", "checkpoint", "label_policy", "licence", "data_licence", "compression", "layout")
+_TEXT = (
+    "format",
+    "model",
+    "checkpoint",
+    "label_policy",
+    "licence",
+    "data_licence",
+    "compression",
+    "layout",
+)
 _DEPTH = 32  # most levels of nested JSON: Python recurses once per level
 
 
@@ -108,15 +122,17 @@ class Facts:
         """The inverse of ``to_dict``.
 
         Raises:
-            DataError: on another format, unknown keys, values of a wrong type, or a scale that does not match the
-                sensor.
+            DataError: on another format, unknown keys, values of a wrong type, or a scale that does
+                not match the sensor.
         """
         try:
             values = dict(values)
             given = values.pop("format", None)
             _check_format(given, where)
             scale = values.pop("scale", None)
-            facts = cls(**values | {"sensor": _sensor(values["sensor"]), "fields": tuple(values["fields"])})
+            facts = cls(
+                **values | {"sensor": _sensor(values["sensor"]), "fields": tuple(values["fields"])}
+            )
             facts._check_kinds()
             if given != facts.format:
                 raise ValueError(f"fields {facts.fields} in format {given!r}")
@@ -124,14 +140,21 @@ class Facts:
         except DataError:
             raise
         except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
-            raise DataError(f"{where}: facts that do not fit together ({error})", f"those of {FORMAT}") from error
+            raise DataError(
+                f"{where}: facts that do not fit together ({error})", f"those of {FORMAT}"
+            ) from error
         if scale != expected:
-            raise DataError(f"{where}: scale {scale!r}", f"{expected!r} for sensor {facts.sensor.name!r}", REPAIR)
+            raise DataError(
+                f"{where}: scale {scale!r}",
+                f"{expected!r} for sensor {facts.sensor.name!r}",
+                REPAIR,
+            )
         return facts
 
     def to_attributes(self) -> dict[str, Any]:
-        """Values for HDF5 attributes, ascending by size: HDF5 moves the first eight when a ninth is added, which
-        leaves a gap of their size. Text has a fixed length: HDF5 stores variable-length text without a checksum.
+        """Values for HDF5 attributes, ascending by size: HDF5 moves the first eight when a ninth is
+        added, which leaves a gap of their size. Text has a fixed length: HDF5 stores
+        variable-length text without a checksum.
         """
         attributes = {name: _attribute(value) for name, value in self.to_dict().items()}
         return dict(sorted(attributes.items(), key=lambda item: np.asarray(item[1]).nbytes))
@@ -145,12 +168,18 @@ class Facts:
         except DataError:
             raise
         except (ValueError, TypeError, RecursionError) as error:
-            raise DataError(f"{where}: attributes that cannot be read ({error})", f"those of {FORMAT}") from error
+            raise DataError(
+                f"{where}: attributes that cannot be read ({error})", f"those of {FORMAT}"
+            ) from error
         return cls.from_dict(values, where)
 
     def _check_kinds(self) -> None:
         """Raise ``TypeError`` or ``ValueError`` on a value of a wrong type."""
-        kinds = dict.fromkeys(_TEXT[1:], str) | {"settings": dict, "provenance": dict, "software": dict}
+        kinds = dict.fromkeys(_TEXT[1:], str) | {
+            "settings": dict,
+            "provenance": dict,
+            "software": dict,
+        }
         for name, kind in kinds.items():
             value = getattr(self, name)
             if not isinstance(value, kind):
@@ -195,13 +224,20 @@ class Entry:
 
     def position(self, rank: int) -> int:
         """The position in the file of the kept scan number ``rank``."""
-        # ``dropped[i] - i`` kept scans precede dropped scan i; it shifts every rank from there on by one.
-        return rank + bisect_right(range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i)
+        # ``dropped[i] - i`` kept scans precede dropped scan i; it shifts every rank from there on
+        # by one.
+        return rank + bisect_right(
+            range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The entry as plain values."""
         values = asdict(self)
-        return values if self.dropped else {name: value for name, value in values.items() if name != "dropped"}
+        return (
+            values
+            if self.dropped
+            else {name: value for name, value in values.items() if name != "dropped"}
+        )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Entry":
@@ -236,7 +272,8 @@ class Index:
         shards: at least one.
         repairs: descriptions of shards that a repair wrote with different bytes.
         curation: why scans were left out; () for a bank that is not curated.
-        files: {name: sha256} of the other files of the bank; they do not change the bank's identity.
+        files: {name: sha256} of the other files of the bank; they do not change the bank's
+            identity.
 
     Raises:
         DataError: if the values are inconsistent.
@@ -251,15 +288,31 @@ class Index:
     def __post_init__(self) -> None:
         for entry in self.shards:
             if not re.fullmatch(r"[\w.-]+\.h5", entry.file) or entry.file[0] == ".":
-                raise DataError(f"a bank's shard {entry.file!r}", "the name of an .h5 file in the bank's folder")
-            if not (0 <= entry.source < len(self.sources) and entry.scans >= 1 and entry.first >= 0):
+                raise DataError(
+                    f"a bank's shard {entry.file!r}", "the name of an .h5 file in the bank's folder"
+                )
+            if not (
+                0 <= entry.source < len(self.sources) and entry.scans >= 1 and entry.first >= 0
+            ):
                 raise DataError(f"a bank with {entry}", "at least one scan, of one of its sources")
             steps = pairwise((-1, *entry.dropped, entry.scans))
-            if not (entry.kept >= 1 and all(a < b for a, b in steps) and (self.curation or not entry.dropped)):
-                raise DataError(f"a bank with {entry}", "ascending positions that leave a scan, and the rule")
+            if not (
+                entry.kept >= 1
+                and all(a < b for a, b in steps)
+                and (self.curation or not entry.dropped)
+            ):
+                raise DataError(
+                    f"a bank with {entry}", "ascending positions that leave a scan, and the rule"
+                )
         if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
-            raise DataError(f"a bank with the shards {[e.file for e in self.shards]}", "at least one, each only once")
-        if any((f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields) for f in self.sources):
+            raise DataError(
+                f"a bank with the shards {[e.file for e in self.shards]}",
+                "at least one, each only once",
+            )
+        if any(
+            (f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields)
+            for f in self.sources
+        ):
             raise DataError("a bank with several sensors or fields", "the same for all scans")
 
     @property
@@ -284,13 +337,16 @@ class Index:
 
     @cached_property
     def checksum(self) -> str:
-        """The bank's identity: the sha256 of all values but ``files``, one of which contains this checksum."""
+        """The bank's identity: the sha256 of all values but ``files``, one of which contains this
+        checksum."""
         return _sum(self._values())
 
     def to_json(self) -> bytes:
         """The content of ``index.json``."""
         values = self._values() | ({"files": self.files} if self.files else {})
-        return (json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True) + "\n").encode()
+        return (
+            json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True) + "\n"
+        ).encode()
 
     @classmethod
     def from_json(cls, text: bytes, where: str) -> "Index":
@@ -304,7 +360,9 @@ class Index:
             _check_format(values.get("format"), where)
             given = values.pop("checksum", None)
             if given != _sum(values):
-                raise DataError(f"{where} does not match its checksum: it was damaged or edited", "an index")
+                raise DataError(
+                    f"{where} does not match its checksum: it was damaged or edited", "an index"
+                )
             index = cls(
                 tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
                 tuple(Entry.from_dict(entry) for entry in values["shards"]),
@@ -313,7 +371,9 @@ class Index:
                 {str(name): str(sha256) for name, sha256 in values.get("files", {}).items()},
             )
             if values["format"] != index.sources[0].format:
-                raise ValueError(f"format {values['format']!r} of scans with {index.sources[0].fields}")
+                raise ValueError(
+                    f"format {values['format']!r} of scans with {index.sources[0].fields}"
+                )
             if values["scans"] != index.scans:
                 raise ValueError(f"{values['scans']} scans, but its shards hold {index.scans}")
             for notes in (values["repairs"], values.get("curation", [])):
@@ -323,7 +383,9 @@ class Index:
         except DataError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise DataError(f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR) from error
+            raise DataError(
+                f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR
+            ) from error
 
     def _values(self) -> dict[str, Any]:
         values: dict[str, Any] = {
@@ -340,14 +402,20 @@ def _from_json(text: str | bytes) -> Any:
     """Parse a JSON text.
 
     Raises:
-        ValueError, RecursionError: if it is invalid, nested too deep, or has text that UTF-8 cannot represent.
+        ValueError, RecursionError: if it is invalid, nested too deep, or has text that UTF-8 cannot
+            represent.
     """
     values = json.loads(text)
-    json.dumps(values, ensure_ascii=False).encode()  # JSON permits half of a surrogate pair, UTF-8 does not
+    json.dumps(
+        values, ensure_ascii=False
+    ).encode()  # JSON permits half of a surrogate pair, UTF-8 does not
     level = [values]
     for _ in range(_DEPTH):
         level = [
-            child for v in level if isinstance(v, dict | list) for child in (v.values() if isinstance(v, dict) else v)
+            child
+            for v in level
+            if isinstance(v, dict | list)
+            for child in (v.values() if isinstance(v, dict) else v)
         ]
     if level:
         raise ValueError(f"values nested more than {_DEPTH} deep")
@@ -364,7 +432,9 @@ def _sensor(values: Any) -> Sensor:
 
 
 def _sum(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 def _check_format(given: Any, where: str) -> None:

@@ -1,8 +1,10 @@
-"""The positions of a shard's values in its file. All declarations are validated before memory is allocated for them.
+"""The positions of a shard's values in its file. All declarations are validated before memory is
+allocated for them.
 
-A shard may come from an untrusted source. HDF5 would follow links and external or virtual storage into other files, run
-arbitrary filters, and allocate memory for any declared shape. Here a shard has exactly the named datasets, each stored
-in the file itself, with the shapes and types that its facts imply.
+A shard may come from an untrusted source. HDF5 would follow links and external or virtual storage
+into other files, run arbitrary filters, and allocate memory for any declared shape. Here a shard
+has exactly the named datasets, each stored in the file itself, with the shapes and types that its
+facts imply.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,16 +24,25 @@ T = TypeVar("T")
 Arrays = Mapping[str, tuple[tuple[int, int], np.dtype[Any]]]
 """Shape and type of each array of one scan, as ``Encoding.arrays`` gives them."""
 
-NUMBERS: dict[str, np.dtype[Any]] = {"seed": np.dtype("<u8"), "index": np.dtype("<u8"), "crc": np.dtype("<u4")}
+NUMBERS: dict[str, np.dtype[Any]] = {
+    "seed": np.dtype("<u8"),
+    "index": np.dtype("<u8"),
+    "crc": np.dtype("<u4"),
+}
 """Datasets with one number per scan."""
 
 CONDITION = "condition"
 
-_ATTRIBUTES, _ATTRIBUTE_SIZE = 64, 1 << 20
-_BASE = 12 << 10  # bytes of a shard's metadata, without facts of more than 4 kB and without the chunks' addresses
+_ATTRIBUTES = 64
+_ATTRIBUTE_SIZE = 1 << 20
+_BASE = (
+    12 << 10
+)  # bytes of a shard's metadata, without facts of more than 4 kB and without the chunks' addresses
 _PLACE = 16  # bytes of a chunk's address in the metadata
 _PASSES = 32  # most reads to collect the metadata
-_BLOSC2_ARRAY = 32 << 20  # most bytes of one Blosc2 array: unlike deflate, Blosc2 has no highest compression ratio
+_BLOSC2_ARRAY = (
+    32 << 20
+)  # most bytes of one Blosc2 array: unlike deflate, Blosc2 has no highest compression ratio
 
 
 @dataclass(frozen=True)
@@ -65,8 +76,8 @@ class Layout:
 
 
 def metadata_size(facts: Facts, scans: int) -> int:
-    """Upper bound of a shard's metadata in bytes. The writer reserves this block at the beginning of the file; facts of
-    more than 4 kB follow it, and then the numbers.
+    """Upper bound of a shard's metadata in bytes. The writer reserves this block at the beginning
+    of the file; facts of more than 4 kB follow it, and then the numbers.
     """
     return _BASE + scans * _PLACE * len(facts.encoding.names)
 
@@ -76,8 +87,11 @@ def head_size(facts: Facts, scans: int) -> int:
     return metadata_size(facts, scans) + facts.text_size + scans * SCAN_NUMBERS
 
 
-def with_hdf5(storage: Storage, facts: Facts | None, scans: int, work: Callable[[h5py.File], T]) -> T:
-    """Call ``work`` on the metadata and numbers of a stored file; one read is enough where they are contiguous.
+def with_hdf5(
+    storage: Storage, facts: Facts | None, scans: int, work: Callable[[h5py.File], T]
+) -> T:
+    """Call ``work`` on the metadata and numbers of a stored file; one read is enough where they are
+    contiguous.
 
     Args:
         storage: the file.
@@ -114,7 +128,9 @@ def read_attributes(file: h5py.File) -> dict[str, Any]:
     return {name: _attribute(file, name) for name in file.attrs}
 
 
-def read_layout(file: h5py.File, storage: Storage, scans: int, arrays: Arrays, compression: str) -> Layout:
+def read_layout(
+    file: h5py.File, storage: Storage, scans: int, arrays: Arrays, compression: str
+) -> Layout:
     """Validate the datasets of a shard and locate their values.
 
     Raises:
@@ -122,20 +138,39 @@ def read_layout(file: h5py.File, storage: Storage, scans: int, arrays: Arrays, c
         OSError, RuntimeError, KeyError: from HDF5, if they are damaged.
     """
     expected = {*NUMBERS, *arrays}
-    if len(file) > len(expected) + 1 or not expected <= (given := set(file)) <= {*expected, CONDITION}:
+    if len(file) > len(expected) + 1 or not expected <= (given := set(file)) <= {
+        *expected,
+        CONDITION,
+    }:
         raise ValueError(f"it does not hold {', '.join(sorted(expected))} and nothing else")
-    # The numbers come first: they are stored uncompressed, so the size of the file bounds the number of scans.
-    numbers = {name: _one_a_scan(_stored(file, name), scans, storage, _is(dtype)) for name, dtype in NUMBERS.items()}
-    conditions = _one_a_scan(_stored(file, CONDITION), scans, storage, _is_text) if CONDITION in given else None
-    chunks = {name: _chunks(_stored(file, name), scans, *kind, compression) for name, kind in arrays.items()}
+    # The numbers come first: they are stored uncompressed, so the size of the file bounds the
+    # number of scans.
+    numbers = {
+        name: _one_a_scan(_stored(file, name), scans, storage, _is(dtype))
+        for name, dtype in NUMBERS.items()
+    }
+    conditions = (
+        _one_a_scan(_stored(file, CONDITION), scans, storage, _is_text)
+        if CONDITION in given
+        else None
+    )
+    chunks = {
+        name: _chunks(_stored(file, name), scans, *kind, compression)
+        for name, kind in arrays.items()
+    }
     return Layout(numbers, conditions, chunks)
 
 
 def _attribute(file: h5py.File, name: str) -> Any:
     attribute = file.attrs.get_id(name)
-    kind, shape = attribute.get_type(), attribute.get_space().get_simple_extent_type()
+    kind = attribute.get_type()
+    shape = attribute.get_space().get_simple_extent_type()
     number = kind.get_class() in (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
-    if shape != h5py.h5s.SCALAR or not (number or _is_text(kind)) or attribute.get_storage_size() > _ATTRIBUTE_SIZE:
+    if (
+        shape != h5py.h5s.SCALAR
+        or not (number or _is_text(kind))
+        or attribute.get_storage_size() > _ATTRIBUTE_SIZE
+    ):
         raise ValueError(f"{name} is not a number, or text of a fixed length")
     return file.attrs[name]
 
@@ -148,7 +183,8 @@ def _stored(file: h5py.File, name: str) -> h5py.Dataset:
     if not isinstance(found, h5py.Dataset):
         raise ValueError(f"{name} is not a dataset")
     properties = found.id.get_create_plist()
-    # This check comes first: reading the shape of a virtual dataset already opens the files behind it.
+    # This check comes first: reading the shape of a virtual dataset already opens the files behind
+    # it.
     if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
         raise ValueError(f"{name} is stored in another file")
     return found
@@ -158,11 +194,18 @@ def _one_a_scan(
     dataset: h5py.Dataset, scans: int, storage: Storage, fits: Callable[[h5py.h5t.TypeID], bool]
 ) -> NDArray[Any]:
     """(N,) values of a contiguous dataset."""
-    found, kind = dataset.id, dataset.id.get_type()
+    found = dataset.id
+    kind = dataset.id.get_type()
     if not fits(kind) or dataset.shape != (scans,):
-        raise ValueError(f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, for {scans} scans")
-    size, offset = scans * kind.get_size(), found.get_offset()
-    contiguous = found.get_create_plist().get_layout() == h5py.h5d.CONTIGUOUS and found.get_storage_size() == size
+        raise ValueError(
+            f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, for {scans} scans"
+        )
+    size = scans * kind.get_size()
+    offset = found.get_offset()
+    contiguous = (
+        found.get_create_plist().get_layout() == h5py.h5d.CONTIGUOUS
+        and found.get_storage_size() == size
+    )
     if not contiguous or offset is None or offset + size > storage.size:
         raise ValueError(f"{dataset.name} is not contiguous in the file")
     values: NDArray[Any] = dataset[:]
@@ -170,13 +213,19 @@ def _one_a_scan(
 
 
 def _chunks(
-    dataset: h5py.Dataset, scans: int, shape: tuple[int, int], dtype: np.dtype[Any], compression: str
+    dataset: h5py.Dataset,
+    scans: int,
+    shape: tuple[int, int],
+    dtype: np.dtype[Any],
+    compression: str,
 ) -> Chunks:
     """The addresses of an array's chunks."""
-    properties, kind = dataset.id.get_create_plist(), dataset.id.get_type()
+    properties = dataset.id.get_create_plist()
+    kind = dataset.id.get_type()
     if not _is(dtype.newbyteorder("<"))(kind) or dataset.shape != (scans, *shape):
         raise ValueError(
-            f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, not {(scans, *shape)} of {dtype.name}"
+            f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, not {(scans, *shape)} of "
+            f"{dtype.name}"
         )
     if properties.get_layout() != h5py.h5d.CHUNKED or properties.get_chunk() != (1, *shape):
         raise ValueError(f"{dataset.name} does not have one chunk for each scan")
@@ -185,7 +234,9 @@ def _chunks(
         raise ValueError(f"{dataset.name} has the filters {filters}, not {FILTERS[compression]}")
     if compression == "blosc2" and shape[0] * shape[1] * dtype.itemsize > _BLOSC2_ARRAY:
         raise ValueError(f"{dataset.name} of one scan takes more than {_BLOSC2_ARRAY >> 20} MiB")
-    found = Chunks(np.zeros(scans, np.uint64), np.zeros(scans, np.uint64), np.zeros(scans, np.uint32))
+    found = Chunks(
+        np.zeros(scans, np.uint64), np.zeros(scans, np.uint64), np.zeros(scans, np.uint32)
+    )
 
     def note(chunk: h5py.h5d.StoreInfo) -> None:
         position = chunk.chunk_offset[0]

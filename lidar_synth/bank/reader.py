@@ -24,7 +24,8 @@ _LEAST = 128  # a shard takes as much memory as one of so many scans at least
 class Bank:
     """The scans of a bank, read from disk on access.
 
-    Each process opens a shard when it first needs it, so that a bank can be passed to workers, forked or spawned.
+    Each process opens a shard when it first needs it, so that a bank can be passed to workers,
+    forked or spawned.
 
     Args:
         root: the bank's folder, or a URL that fsspec supports ("s3://bucket/bank").
@@ -103,7 +104,8 @@ class Bank:
         """
         shard, position = _place(self.index, number)
         image = self.facts.encoding.decode(self.shard(shard).read(position))
-        name, made = _name(self.index, shard, position), _provenance(self.index, shard)
+        name = _name(self.index, shard, position)
+        made = _provenance(self.index, shard)
         return replace(unproject(image), id=name, domain=SYNTHETIC, provenance=made)
 
     def image(self, number: int) -> RangeImage:
@@ -123,8 +125,11 @@ class Bank:
     def shard(self, number: int) -> ShardReader:
         """An open shard; raises as ``__getitem__``."""
         if self._process != os.getpid():
-            # After a fork: the parent's handles share its file positions and locks, so they are left to the parent.
-            self._shards, self._open, self._process = OrderedDict(), OrderedDict(), os.getpid()
+            # After a fork: the parent's handles share its file positions and locks, so they are
+            # left to the parent.
+            self._shards = OrderedDict()
+            self._open = OrderedDict()
+            self._process = os.getpid()
         shard = self._shards.get(number)
         if shard is None or not shard.reopen():
             shard = self._shards[number] = self._new_reader(number)
@@ -144,7 +149,9 @@ class Bank:
     def _new_reader(self, number: int) -> ShardReader:
         entry = self.index.shards[number]
         file = open_storage(self.root, entry.file, entry.bytes)
-        return ShardReader(file, f"{self.root}/{entry.file}", self.index.sources[entry.source], entry)
+        return ShardReader(
+            file, f"{self.root}/{entry.file}", self.index.sources[entry.source], entry
+        )
 
     def _check_files(self, root: Path) -> None:
         for entry in self.index.shards:
@@ -152,10 +159,16 @@ class Bank:
                 size = (root / entry.file).stat().st_size
             except OSError as error:
                 raise FileError(
-                    f"{root}: shard {entry.file} is missing ({error.strerror})", "a complete bank", REPAIR
+                    f"{root}: shard {entry.file} is missing ({error.strerror})",
+                    "a complete bank",
+                    REPAIR,
                 ) from error
             if size != entry.bytes:
-                raise DataError(f"{root / entry.file} is {size} bytes long", f"{entry.bytes}, by the index", REPAIR)
+                raise DataError(
+                    f"{root / entry.file} is {size} bytes long",
+                    f"{entry.bytes}, by the index",
+                    REPAIR,
+                )
 
 
 def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> None:

@@ -1,22 +1,26 @@
 """One file of a bank: scans with consecutive indices, each in chunks of its own.
 
-An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``seed``, ``first``, ``scans`` of this file.
-The datasets are::
+An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``seed``, ``first``,
+``scans`` of this file. The datasets are::
 
     range, reflectance, label, confidence   (scans, H, W), see ``encoding``; those in ``fields``
     instance                                (scans, H, W), in "lidar-synth-bank/2"
     boxes                                   (scans, 256, 9), see ``boxes``; in "lidar-synth-bank/2"
     seed, index                             (scans,) uint64: seed and index of the scan's noise
-    condition                               (scans,) text, in conditional banks: name of the conditioning scan
-    crc                                     (scans,) uint32: CRC-32 of a scan's seed, index, condition and arrays
+    condition                               (scans,) text, in conditional banks: name of the
+    conditioning scan crc                                     (scans,) uint32: CRC-32 of a scan's
+    seed, index, condition and arrays
 
-A chunk holds one array of one scan: shuffled, deflated (level 1), and followed by its Fletcher-32 checksum, as HDF5's
-own filters write it, so that any HDF5 library reads it. The file format is that of HDF5 1.10, whose metadata has
-checksums: in older formats a flipped bit in an attribute, such as the scale, would stay undetected. No byte of a file
+A chunk holds one array of one scan: shuffled, deflated (level 1), and followed by its Fletcher-32
+    checksum, as HDF5's
+own filters write it, so that any HDF5 library reads it. The file format is that of HDF5 1.10, whose
+metadata has
+checksums: in older formats a flipped bit in an attribute, such as the scale, would stay undetected.
+    No byte of a file
 depends on the time of writing.
 
-When a shard is opened, HDF5 reads the attributes and the addresses of the chunks once (``layout``). Scans are then read
-directly from the file, with a single read where their chunks are adjacent.
+When a shard is opened, HDF5 reads the attributes and the addresses of the chunks once (``layout``).
+Scans are then read directly from the file, with a single read where their chunks are adjacent.
 """
 
 from collections.abc import Iterator
@@ -54,7 +58,8 @@ class ShardReader:
 
     Raises:
         FileError: if it cannot be read.
-        DataError: on a file that is not a shard of this version, is damaged, or does not match the index.
+        DataError: on a file that is not a shard of this version, is damaged, or does not match the
+            index.
         LibraryError: on Blosc2 without hdf5plugin.
     """
 
@@ -93,7 +98,8 @@ class ShardReader:
             return None if self._layout.conditions is None else self._condition(position).decode()
 
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
-        """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as ``read``."""
+        """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as
+        ``read``."""
         return self._read(position)[1], int(self._layout.numbers["crc"][position])
 
     def close(self) -> None:
@@ -101,7 +107,8 @@ class ShardReader:
         self._file.close()
 
     def reopen(self) -> bool:
-        """Open the file again if it was closed; False if it has changed since, so that it needs a new reader.
+        """Open the file again if it was closed; False if it has changed since, so that it needs a
+        new reader.
 
         Raises:
             FileError: if it cannot be opened.
@@ -120,14 +127,18 @@ class ShardReader:
         def work(file: h5py.File) -> tuple[Facts, Entry, Layout]:
             with self._reading("its attributes"):
                 attributes = read_attributes(file)
-                numbers = [int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")]
+                numbers = [
+                    int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")
+                ]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
             found = facts or found  # one object for all shards of a bank
             actual = self._checked_entry(numbers, entry)
             filters(found.compression)
             with self._reading("its datasets"):
-                layout = read_layout(file, self._file, actual.scans, found.encoding.arrays(), found.compression)
+                layout = read_layout(
+                    file, self._file, actual.scans, found.encoding.arrays(), found.compression
+                )
             return found, actual, layout
 
         try:
@@ -136,21 +147,30 @@ class ShardReader:
             raise
         except (OSError, RuntimeError) as error:
             raise DataError(
-                f"{self.name} is truncated, damaged or not an HDF5 file ({error})", f"a shard of {FORMAT}", REPAIR
+                f"{self.name} is truncated, damaged or not an HDF5 file ({error})",
+                f"a shard of {FORMAT}",
+                REPAIR,
             ) from error
 
     def _check_facts(self, found: Facts, facts: Facts | None) -> None:
         if facts is not None and facts != found:
-            mine, others = found.to_dict(), facts.to_dict()
+            mine = found.to_dict()
+            others = facts.to_dict()
             wrong = ", ".join(key for key in others if mine[key] != others[key])
-            raise DataError(f"{self.name}: {wrong} differ from the bank's index", "a shard of this bank", REPAIR)
+            raise DataError(
+                f"{self.name}: {wrong} differ from the bank's index", "a shard of this bank", REPAIR
+            )
 
     def _checked_entry(self, numbers: list[int], entry: Entry | None) -> Entry:
         seed, first, scans = numbers
         found = Entry(Path(self.name).name, seed, first, scans)
         entry = found if entry is None else entry
         if (seed, first, scans) != (entry.seed, entry.first, entry.scans):
-            raise DataError(f"{self.name} holds {found.span}", f"{entry.span}, according to the bank's index", REPAIR)
+            raise DataError(
+                f"{self.name} holds {found.span}",
+                f"{entry.span}, according to the bank's index",
+                REPAIR,
+            )
         return entry
 
     def _read(self, position: int) -> tuple[dict[str, NDArray[Any]], dict[str, bytes]]:
@@ -158,7 +178,10 @@ class ShardReader:
         with self._reading(f"scan {position}"):
             packed = self._packed(position)
             kinds = self.encoding.arrays()
-            arrays = {name: unpack(chunk, *kinds[name], self.facts.compression) for name, chunk in packed.items()}
+            arrays = {
+                name: unpack(chunk, *kinds[name], self.facts.compression)
+                for name, chunk in packed.items()
+            }
             seed, index, crc = (int(values[position]) for values in self._layout.numbers.values())
             if checksum(seed, index, arrays, self._condition(position)) != crc:
                 raise ValueError("its CRC does not match")
@@ -172,17 +195,23 @@ class ShardReader:
         """The chunks of a scan; adjacent ones are read at once."""
         places = {}
         for name, chunks in self._layout.chunks.items():
-            offset, size, skipped = (int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped))
+            offset, size, skipped = (
+                int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped)
+            )
             if skipped:
                 raise ValueError(f"filters {skipped:b} were not applied")
             if not size or offset + size > self._file.size:
-                raise ValueError(f"its {name} is missing" if not size else f"its {name} lies outside the file")
+                raise ValueError(
+                    f"its {name} is missing" if not size else f"its {name} lies outside the file"
+                )
             places[name] = (offset, offset + size)
         packed: dict[str, bytes] = {}
         for names in _side_by_side(places):
             start = min(places[name][0] for name in names)
             content = self._file.read(start, max(places[name][1] for name in names) - start)
-            packed |= {name: content[places[name][0] - start : places[name][1] - start] for name in names}
+            packed |= {
+                name: content[places[name][0] - start : places[name][1] - start] for name in names
+            }
         return {name: packed[name] for name in places}
 
     def _condition(self, position: int) -> bytes:
@@ -195,8 +224,18 @@ class ShardReader:
             yield
         except LidarSynthError:
             raise  # from the storage: the file may be intact but out of reach
-        except (OSError, RuntimeError, LookupError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
-            raise DataError(f"{self.name}: {what} cannot be read ({error})", "an intact shard", REPAIR) from error
+        except (
+            OSError,
+            RuntimeError,
+            LookupError,
+            ValueError,
+            TypeError,
+            ArithmeticError,
+            MemoryError,
+        ) as error:
+            raise DataError(
+                f"{self.name}: {what} cannot be read ({error})", "an intact shard", REPAIR
+            ) from error
 
 
 def _side_by_side(places: dict[str, tuple[int, int]]) -> list[list[str]]:

@@ -1,8 +1,9 @@
-"""Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested ranges are read.
+"""Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested
+ranges are read.
 
-A failed request is repeated three times with growing waits, but not once 30 seconds are over; a server that is silent
-for 30 seconds has failed. At most 3 redirects are followed, to any host, but never from https to http. No answer may
-be longer than what was asked for.
+A failed request is repeated three times with growing waits, but not once 30 seconds are over; a
+server that is silent for 30 seconds has failed. At most 3 redirects are followed, to any host, but
+never from https to http. No answer may be longer than what was asked for.
 """
 
 import io
@@ -73,12 +74,14 @@ class LocalFile:
     window = 1 << 20
 
     def __init__(self, path: Path) -> None:
-        self._path, self._descriptor = path, -1
+        self._path = path
+        self._descriptor = -1
         self._state = self._open()
         self.size = self._state[0]
 
     def reopen(self) -> bool:
-        """Open it again if it was closed. False if it is not the file that it was: what was read of it may be wrong.
+        """Open it again if it was closed. False if it is not the file that it was: what was read of
+        it may be wrong.
 
         Raises:
             FileError: if it cannot be opened.
@@ -114,11 +117,14 @@ class LocalFile:
         return found.st_size, found.st_mtime_ns, found.st_ino
 
     def _unreadable(self, error: OSError) -> FileError:
-        return FileError(f"{self._path} cannot be read ({error.strerror or error})", "a file of a bank")
+        return FileError(
+            f"{self._path} cannot be read ({error.strerror or error})", "a file of a bank"
+        )
 
 
 class RemoteFile:
-    """A file at a URL that fsspec supports; see ``Storage``. Each ``read`` is one request; opening needs none.
+    """A file at a URL that fsspec supports; see ``Storage``. Each ``read`` is one request; opening
+    needs none.
 
     Args:
         url: URL of the file.
@@ -132,7 +138,8 @@ class RemoteFile:
     window = 12 << 10
 
     def __init__(self, url: str, size: int = 0) -> None:
-        self.url, self.size = url, size
+        self.url = url
+        self.size = size
         scheme = url.partition("://")[0]
         if scheme not in SCHEMES:  # a chain such as zip::http is not among them either
             raise FileError(f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}")
@@ -147,11 +154,15 @@ class RemoteFile:
                 "pip install 'lidar_synth[remote]' for http and https, s3fs for s3, gcsfs for gs.",
             ) from error
         except (OSError, ValueError) as error:
-            raise FileError(f"{url} cannot be read ({error})", "a URL that fsspec supports") from error
+            raise FileError(
+                f"{url} cannot be read ({error})", "a URL that fsspec supports"
+            ) from error
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
-            raise DataError(f"{self.url} ends before byte {offset + size}", "the size in the bank's index")
+            raise DataError(
+                f"{self.url} ends before byte {offset + size}", "the size in the bank's index"
+            )
         content = self._fetch(offset, offset + size)
         if len(content) != size:
             raise FileError(
@@ -180,7 +191,8 @@ class RemoteFile:
         return True
 
     def _fetch(self, start: int, end: int | None, at_most: int = 0) -> bytes:
-        """The bytes of a request, repeated while its failure may pass; a few more than asked for may come."""
+        """The bytes of a request, repeated while its failure may pass; a few more than asked for
+        may come."""
         began = time.monotonic()
         for wait in (*WAITS, None):
             try:
@@ -188,7 +200,9 @@ class RemoteFile:
             except Exception as error:  # each file system of fsspec raises its own classes
                 if wait is None or not _may_pass(error) or time.monotonic() - began > PATIENCE:
                     reason = str(error) or type(error).__name__
-                    raise FileError(f"{self.url} cannot be read ({reason})", "a file of a bank") from error
+                    raise FileError(
+                        f"{self.url} cannot be read ({reason})", "a file of a bank"
+                    ) from error
             time.sleep(wait)
         raise AssertionError
 
@@ -200,7 +214,8 @@ class RemoteFile:
         return bytes(self._system.cat_file(self._path, start=start, end=end or at_most + 1))
 
     async def _get(self, start: int, end: int | None, at_most: int) -> bytearray:
-        """One byte more than ``at_most`` at most; fsspec itself would read an answer of any length."""
+        """One byte more than ``at_most`` at most; fsspec itself would read an answer of any
+        length."""
         from aiohttp import ClientTimeout
 
         session = await self._system.set_session()
@@ -208,11 +223,15 @@ class RemoteFile:
         timeout = ClientTimeout(total=4 * PATIENCE, sock_connect=PATIENCE, sock_read=PATIENCE)
         asked = session.get(self.url, headers=headers, timeout=timeout, max_redirects=_REDIRECTS)
         async with asked as answer:
-            if self.url.startswith("https") and any(r.url.scheme != "https" for r in (*answer.history, answer)):
+            if self.url.startswith("https") and any(
+                r.url.scheme != "https" for r in (*answer.history, answer)
+            ):
                 raise PermissionError("it redirects from https to http")
             answer.raise_for_status()
             content = bytearray()
-            while len(content) <= at_most and (part := await answer.content.read(at_most + 1 - len(content))):
+            while len(content) <= at_most and (
+                part := await answer.content.read(at_most + 1 - len(content))
+            ):
                 content += part
         return content
 
@@ -228,8 +247,10 @@ def _may_pass(error: Exception) -> bool:
 class View(io.RawIOBase):
     """A file object for HDF5 over the parts of a file that have been read so far.
 
-    HDF5 holds a lock while it reads. Fetching from a URL uses other threads, and one of them that happens to free an
-    object of HDF5 would wait for that lock: a deadlock. So ``readinto`` never fetches: it records the missing range and
+    HDF5 holds a lock while it reads. Fetching from a URL uses other threads, and one of them that
+    happens to free an
+    object of HDF5 would wait for that lock: a deadlock. So ``readinto`` never fetches: it records
+        the missing range and
     fails; the caller of HDF5 then calls ``fetch_missing`` and tries again.
 
     Args:
@@ -237,14 +258,16 @@ class View(io.RawIOBase):
         head: number of bytes to read at once from its beginning.
 
     Attributes:
-        missing: (offset, size) of the requested range that has not been read; None if there is none.
+        missing: (offset, size) of the requested range that has not been read; None if there is
+            none.
 
     Raises:
         FileError, DataError: as ``Storage.read``.
     """
 
     def __init__(self, file: Storage, head: int) -> None:
-        self._file, self._position = file, 0
+        self._file = file
+        self._position = 0
         self._spans: list[tuple[int, bytes]] = []
         self.missing: tuple[int, int] | None = None
         self._fetch(0, head)
@@ -259,7 +282,10 @@ class View(io.RawIOBase):
         return self._position
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._position = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._file.size}[whence]
+        self._position = (
+            offset
+            + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._file.size}[whence]
+        )
         return self._position
 
     def readinto(self, buffer: Any) -> int:
@@ -268,7 +294,8 @@ class View(io.RawIOBase):
         Raises:
             OSError: if these bytes have not been read yet.
         """
-        start, size = self._position, min(len(buffer), max(self._file.size - self._position, 0))
+        start = self._position
+        size = min(len(buffer), max(self._file.size - self._position, 0))
         for first, content in self._spans:
             if first <= start and start + size <= first + len(content):
                 buffer[:size] = memoryview(content)[start - first : start - first + size]
@@ -308,4 +335,8 @@ def open_storage(root: str | Path, name: str, size: int) -> Storage:
     Raises:
         FileError, LibraryError: if it cannot be opened.
     """
-    return LocalFile(root / name) if isinstance(root, Path) else RemoteFile(f"{root.rstrip('/')}/{name}", size)
+    return (
+        LocalFile(root / name)
+        if isinstance(root, Path)
+        else RemoteFile(f"{root.rstrip('/')}/{name}", size)
+    )

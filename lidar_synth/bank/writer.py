@@ -19,13 +19,16 @@ from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry.scan import RangeImage
 
 _VERSION = "v110"
-_PAGE = 4 << 20  # bytes: a paged file keeps its metadata together, for fewer requests over a network
+_PAGE = (
+    4 << 20
+)  # bytes: a paged file keeps its metadata together, for fewer requests over a network
 _BLOCK = 4 << 20  # bytes by which a shard grows in memory
 _PENDING = 8  # scans per thread that may wait to be written
 
 
 class ShardWriter:
-    """Writes one shard. It is built in memory, and its file is complete only after ``close`` has returned.
+    """Writes one shard. It is built in memory, and its file is complete only after ``close`` has
+    returned.
 
     Args:
         path: path of the file; an existing file is overwritten.
@@ -48,7 +51,8 @@ class ShardWriter:
         conditions: Sequence[str] = (),
         threads: int = 1,
     ) -> None:
-        self.path, self.entry = path, entry
+        self.path = path
+        self.entry = entry
         self.encoding = facts.encoding
         self._compression = facts.compression
         self._direct = facts.compression == "gzip"
@@ -117,7 +121,12 @@ class ShardWriter:
     def __enter__(self) -> "ShardWriter":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         if kind is not None:
             self.discard()
             return
@@ -130,7 +139,11 @@ class ShardWriter:
     def _declare(self, facts: Facts) -> None:
         """Write the attributes and create the datasets."""
         count = self.entry.scans
-        own = {"seed": np.uint64(self.entry.seed), "first": np.uint64(self.entry.first), "scans": count}
+        own = {
+            "seed": np.uint64(self.entry.seed),
+            "first": np.uint64(self.entry.first),
+            "scans": count,
+        }
         for name, value in (facts.to_attributes() | own).items():
             self._file.attrs[name] = value
         numbers = {
@@ -158,13 +171,17 @@ class ShardWriter:
     def _pack(self, position: int, image: RangeImage) -> tuple[int, dict[str, bytes]]:
         """CRC and chunks of a scan; runs in a thread."""
         arrays = self.encoding.encode(image)
-        plain = {name: arrays[name].astype(dtype, copy=False) for name, dtype in self._types().items()}
+        plain = {
+            name: arrays[name].astype(dtype, copy=False) for name, dtype in self._types().items()
+        }
         condition = self._conditions[position] if self._conditions else b""
         crc = checksum(self.entry.seed, self.entry.first + position, plain, condition)
         return crc, {name: deflate(a) if self._direct else a.tobytes() for name, a in plain.items()}
 
     def _types(self) -> dict[str, np.dtype[Any]]:
-        return {name: dtype.newbyteorder("<") for name, (_, dtype) in self.encoding.arrays().items()}
+        return {
+            name: dtype.newbyteorder("<") for name, (_, dtype) in self.encoding.arrays().items()
+        }
 
     def _write_ready(self, keep: int) -> None:
         """Write scans, in order, until no more than ``keep`` wait."""
@@ -173,7 +190,8 @@ class ShardWriter:
             self._put(self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct)
 
     def _put(self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool) -> None:
-        """Write a scan: compressed chunks if ``ready``, otherwise plain arrays, which HDF5 compresses."""
+        """Write a scan: compressed chunks if ``ready``, otherwise plain arrays, which HDF5
+        compresses."""
         self._crc[position] = crc
         with _on_disk(self.path):
             for name, chunk in chunks.items():
@@ -181,7 +199,9 @@ class ShardWriter:
                     self._datasets[name].id.write_direct_chunk((position, 0, 0), chunk)
                 else:
                     shape, _ = self.encoding.arrays()[name]
-                    self._datasets[name][position] = np.frombuffer(chunk, self._types()[name]).reshape(shape)
+                    self._datasets[name][position] = np.frombuffer(
+                        chunk, self._types()[name]
+                    ).reshape(shape)
 
 
 def _create(name: str, facts: Facts, scans: int) -> h5py.File:
@@ -202,9 +222,12 @@ def _on_disk(path: Path) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         if isinstance(error, LibraryError):
             raise
-        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+        reason = (
+            os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+        )
         raise FileError(
             f"{path} cannot be written ({reason})",
             "a writable folder on a disk with free space",
-            "Free some space or fix the folder, then run the same command again: finished shards are kept.",
+            "Free some space or fix the folder, then run the same command again: finished shards "
+            "are kept.",
         ) from error

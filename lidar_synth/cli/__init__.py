@@ -1,7 +1,8 @@
-"""The command line ``lidar-synth``: one file per command; this module converts errors to exit statuses.
+"""The command line ``lidar-synth``: one file per command; this module converts errors to exit
+statuses.
 
-Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments, 130 = interrupted by Ctrl-C; a failure
-prints one message.
+Exit status 0 = success, 1 = the run failed, 2 = wrong options or arguments, 130 = interrupted by
+Ctrl-C; a failure prints one message.
 """
 
 import sys
@@ -23,7 +24,8 @@ from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, LidarSynthError
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C, as of a program that a shell saw end by SIGINT; typer exits with it, without a message."""
+"""Exit status after Ctrl-C, as of a program that a shell saw end by SIGINT; typer exits with it,
+without a message."""
 
 COMMANDS: dict[str, Callable[..., None] | str] = {
     "town": "town",
@@ -46,14 +48,18 @@ COMMANDS: dict[str, Callable[..., None] | str] = {
     "import": "import_",
     "doctor": doctor,
 }
-"""Commands by name, in the order of the help text; of the laboratory's, the module of ``lidar_synth.lab.cli``."""
+"""Commands by name, in the order of the help text; of the laboratory's, the module of
+``lidar_synth.lab.cli``."""
 
 GROUPS: list[typer.Typer | str] = [bank, edit, "sensor", "skin", "metrics"]
 """Commands with commands of their own; the laboratory's by name."""
 
 app = typer.Typer(
     name="lidar-synth",
-    help="Synthetic LiDAR scans for perception training: generate, bake, curate, convert, evaluate, view.",
+    help=(
+        "Synthetic LiDAR scans for perception training: generate, bake, curate, convert, "
+        "evaluate, view."
+    ),
     no_args_is_help=True,
     invoke_without_command=True,
     add_completion=False,
@@ -64,7 +70,9 @@ app = typer.Typer(
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)
+    ] = False,
 ) -> None:
     if version:
         print(f"lidar-synth {__version__}")

@@ -18,25 +18,42 @@ def bake(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder of the bank")],
     config: Annotated[
         Path | None,
-        typer.Option(help="YAML file with the options --model to --layout; the command line takes precedence"),
+        typer.Option(
+            help="YAML file with the options --model to --layout; the command line takes precedence"
+        ),
     ] = None,
-    engine: Annotated[str, typer.Option(help="how to run: local | processes | ray | slurm | torchrun")] = "local",
+    engine: Annotated[
+        str, typer.Option(help="how to run: local | processes | ray | slurm | torchrun")
+    ] = "local",
     workers: Annotated[
-        int | None, typer.Option(help="number of processes, actors or jobs [one per CPU core or GPU]")
+        int | None,
+        typer.Option(help="number of processes, actors or jobs [one per CPU core or GPU]"),
     ] = None,
-    address: Annotated[str | None, typer.Option(help="address of a Ray cluster; 'auto' finds a running one")] = None,
+    address: Annotated[
+        str | None, typer.Option(help="address of a Ray cluster; 'auto' finds a running one")
+    ] = None,
     slurm: Annotated[
         list[str] | None,
-        typer.Option(help="KEY=VALUE option for submitit, for instance slurm_partition=gpu; repeatable"),
+        typer.Option(
+            help="KEY=VALUE option for submitit, for instance slurm_partition=gpu; repeatable"
+        ),
     ] = None,
-    shard_index: Annotated[int, typer.Option(help="write only every n-th shard, starting with this one")] = 0,
-    num_shards: Annotated[int, typer.Option(help="the n of --shard-index: number of runs that share the work")] = 1,
+    shard_index: Annotated[
+        int, typer.Option(help="write only every n-th shard, starting with this one")
+    ] = 0,
+    num_shards: Annotated[
+        int, typer.Option(help="the n of --shard-index: number of runs that share the work")
+    ] = 1,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="print the size of the bank and the time it takes, without baking")
+        bool,
+        typer.Option(
+            "--dry-run", help="print the size of the bank and the time it takes, without baking"
+        ),
     ] = False,
     **settings: Any,
 ) -> None:
-    """Bakes a bank: a folder of HDF5 files with scans for training. Run it again to resume an interrupted bake.
+    """Bakes a bank: a folder of HDF5 files with scans for training. Run it again to resume an
+    interrupted bake.
 
     The same settings give the same bytes with every engine, with or without interruptions.
 
@@ -45,9 +62,9 @@ def bake(
       lidar-synth bake bank --count 20000 --seed 1 --engine processes
       lidar-synth bake bank --config bake_town --dry-run
       lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
-      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
-      lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
-      torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
+      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split
+      train lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4 torchrun
+      --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
     """
     from lidar_synth.bake import Share, make_plan
     from lidar_synth.bake import bake as run
@@ -62,14 +79,23 @@ def bake(
         return
     quiet = os.environ.get("LOCAL_RANK", "0") != "0"
     try:
-        index = run(plan, engine, _resources(plan, workers, address, slurm), share, progress=not quiet)
+        index = run(
+            plan, engine, _resources(plan, workers, address, slurm), share, progress=not quiet
+        )
     except KeyboardInterrupt:
-        typer.echo(f"stopped; finished shards are kept in {out}, the same command resumes", err=True)
+        typer.echo(
+            f"stopped; finished shards are kept in {out}, the same command resumes", err=True
+        )
         raise typer.Exit(130) from None
     if index is None:
-        typer.echo(f"{out}: this share is finished; the last of all {len(plan.shards)} shards completes the bank")
+        typer.echo(
+            f"{out}: this share is finished; the last of all {len(plan.shards)} shards completes "
+            "the bank"
+        )
     else:
-        typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB")
+        typer.echo(
+            f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB"
+        )
         _report_unboxed(out)
 
 
@@ -81,10 +107,15 @@ def _report_unboxed(bank: Path, scans: int = 8) -> None:
     opened = Bank(bank)
     found = measure(opened[i] for i in range(min(scans, len(opened))))
     if found.objects:
-        typer.echo(f"  {found}; a detector needs labels: mix, which removes them and pastes objects with boxes")
+        typer.echo(
+            f"  {found}; a detector needs labels: mix, which removes them and pastes objects with "
+            "boxes"
+        )
 
 
-def _resources(plan: "BakePlan", workers: int | None, address: str | None, slurm: list[str] | None) -> "Resources":
+def _resources(
+    plan: "BakePlan", workers: int | None, address: str | None, slurm: list[str] | None
+) -> "Resources":
     import torch
 
     from lidar_synth.bake import Resources
@@ -104,12 +135,20 @@ def _describe(plan: "BakePlan") -> None:
     """Print what a bake would write; the time and size are estimated from a few scans."""
     from lidar_synth.bake.estimate import estimate
 
-    job, shards = plan.job, plan.shards
+    job = plan.job
+    shards = plan.shards
     expected = estimate(plan)
     typer.echo(f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}")
-    typer.echo(f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor {plan.facts.sensor.name}")
-    typer.echo(f"  fields: range, {', '.join(plan.facts.fields)}; label policy {plan.facts.label_policy}")
-    typer.echo(f"  about {expected.bytes / 1e6:.3g} MB, {expected.bytes / job.count / 1e3:.0f} kB per scan")
     typer.echo(
-        f"  about {expected.seconds / 60:.1f} minutes with one worker, {job.count / expected.seconds:.2f} scans/s"
+        f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor {plan.facts.sensor.name}"
+    )
+    typer.echo(
+        f"  fields: range, {', '.join(plan.facts.fields)}; label policy {plan.facts.label_policy}"
+    )
+    typer.echo(
+        f"  about {expected.bytes / 1e6:.3g} MB, {expected.bytes / job.count / 1e3:.0f} kB per scan"
+    )
+    typer.echo(
+        f"  about {expected.seconds / 60:.1f} minutes with one worker, "
+        f"{job.count / expected.seconds:.2f} scans/s"
     )

@@ -15,11 +15,16 @@ def verify(
     deep: Annotated[
         bool, typer.Option("--deep", help="also regenerate some scans from their seeds and compare")
     ] = False,
-    sample: Annotated[int, typer.Option(min=1, help="number of scans that --deep regenerates")] = 16,
-    seed: Annotated[int | None, typer.Option(min=0, help="seed that selects these scans [random]")] = None,
+    sample: Annotated[
+        int, typer.Option(min=1, help="number of scans that --deep regenerates")
+    ] = 16,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="seed that selects these scans [random]")
+    ] = None,
     model: Model = None,
 ) -> None:
-    """Checks a bank: index, every shard's hash and attributes, every scan, and the card. Exit status 1 = damaged.
+    """Checks a bank: index, every shard's hash and attributes, every scan, and the card. Exit
+    status 1 = damaged.
 
     \b
     Examples:
@@ -36,7 +41,10 @@ def verify(
     for problem in problems:
         typer.echo(f"{problem.file}: {problem.what}", err=True)
     if problems:
-        typer.echo(f"{bank}: {len(problems)} problems. lidar-synth repair {bank} regenerates what is damaged.")
+        typer.echo(
+            f"{bank}: {len(problems)} problems. lidar-synth repair {bank} regenerates what is "
+            "damaged."
+        )
         raise typer.Exit(1)
     typer.echo(f"{bank}: intact")
     if not deep:
@@ -47,16 +55,20 @@ def verify(
     different = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in different.items():
         typer.echo(f"{name}: {share:.1%} of its cells agree with the regenerated scan", err=True)
-    typer.echo(f"{bank}: {len(shares)} scans regenerated, at least {min(shares.values()):.2%} of the cells agree")
+    typer.echo(
+        f"{bank}: {len(shares)} scans regenerated, at least {min(shares.values()):.2%} of the "
+        "cells agree"
+    )
     if different:
         raise typer.Exit(1)
 
 
 def repair(bank: BankFolder, model: Model = None) -> None:
-    """Regenerates exactly the damaged or missing shards of a bank, and rewrites a damaged index or card.
+    """Regenerates exactly the damaged or missing shards of a bank, and rewrites a damaged index or
+    card.
 
-    On the machine and with the versions that made the bank, the bytes are the same; elsewhere the scans are equal up to
-    rounding, and the index records the repair.
+    On the machine and with the versions that made the bank, the bytes are the same; elsewhere the
+    scans are equal up to rounding, and the index records the repair.
 
     \b
     Examples:
@@ -98,9 +110,12 @@ def info(
 
 def merge(
     out: Out,
-    banks: Annotated[list[Path], typer.Argument(metavar="BANK...", help="banks with the same sensor and fields")],
+    banks: Annotated[
+        list[Path], typer.Argument(metavar="BANK...", help="banks with the same sensor and fields")
+    ],
 ) -> None:
-    """Merges several banks into one. Shards are hard-linked instead of copied where the file system allows it.
+    """Merges several banks into one. Shards are hard-linked instead of copied where the file system
+    allows it.
 
     \b
     Example:
@@ -118,7 +133,8 @@ def split(
     parts: Annotated[
         list[str],
         typer.Argument(
-            metavar="FOLDER=SHARE...", help="folders, each with its share of the scans; the shares sum to 1"
+            metavar="FOLDER=SHARE...",
+            help="folders, each with its share of the scans; the shares sum to 1",
         ),
     ],
 ) -> None:
@@ -168,15 +184,22 @@ def as_sensor(
     out: Out,
     sensor: Annotated[str, typer.Option(help="sensor of the new bank: a preset or a YAML file")],
     mount: Annotated[
-        str | None, typer.Option(metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]")
+        str | None,
+        typer.Option(metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]"),
     ] = None,
-    like: Annotated[Path | None, typer.Option(help="real scans of that sensor, to match its reflectance")] = None,
+    like: Annotated[
+        Path | None, typer.Option(help="real scans of that sensor, to match its reflectance")
+    ] = None,
     range_noise: Annotated[float, typer.Option(help="metres, noise beyond that of the bank")] = 0.0,
     reach: Annotated[
-        float | None, typer.Option(help="metres at which it loses every second ray to a surface of 10 % reflectance")
+        float | None,
+        typer.Option(
+            help="metres at which it loses every second ray to a surface of 10 % reflectance"
+        ),
     ] = None,
 ) -> None:
-    """Makes a bank of the scans as another sensor would have recorded them, once instead of in every epoch.
+    """Makes a bank of the scans as another sensor would have recorded them, once instead of in
+    every epoch.
 
     Run it again to resume an interrupted run, or to make damaged shards again.
 
@@ -190,13 +213,17 @@ def as_sensor(
     from lidar_synth.formats.as_sensor import make_transfer
 
     source = Bank(bank)
-    transfer = make_transfer(sensor, read_mount(mount), like, source, range_noise=range_noise, reach=reach)
+    transfer = make_transfer(
+        sensor, read_mount(mount), like, source, range_noise=range_noise, reach=reach
+    )
     index = turn_bank(source, out, transfer)
     typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards")
 
 
 bank = typer.Typer(
-    name="bank", help="Makes new banks from existing ones: merge, split, head, as-sensor.", no_args_is_help=True
+    name="bank",
+    help="Makes new banks from existing ones: merge, split, head, as-sensor.",
+    no_args_is_help=True,
 )
 bank.command("merge")(merge)
 bank.command("split")(split)

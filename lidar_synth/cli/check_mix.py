@@ -11,15 +11,27 @@ if TYPE_CHECKING:
 
 
 def check_mix(
-    mix: Annotated[Path, typer.Argument(metavar="MIX.yaml", help="settings of a mixture, as trainers take them")],
-    real: Annotated[Path, typer.Argument(metavar="REAL", help="folder or root of the dataset with the real scans")],
-    out: Annotated[Path | None, typer.Option(help="picture to write: .png (sheet) or .html (interactive page)")] = None,
+    mix: Annotated[
+        Path,
+        typer.Argument(metavar="MIX.yaml", help="settings of a mixture, as trainers take them"),
+    ],
+    real: Annotated[
+        Path,
+        typer.Argument(metavar="REAL", help="folder or root of the dataset with the real scans"),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="picture to write: .png (sheet) or .html (interactive page)")
+    ] = None,
     count: Annotated[int, typer.Option(min=4, max=64, help="number of scans of each kind")] = 8,
-    sensor: Annotated[str | None, typer.Option(help="sensor of the real scans [named by the files]")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of the real scans [named by the files]")
+    ] = None,
 ) -> None:
-    """Compares synthetic scans with real ones: points, rows, ground, columns and classes, side by side.
+    """Compares synthetic scans with real ones: points, rows, ground, columns and classes, side by
+    side.
 
-    Exit status 2 if they certainly mean something else: another unit, axis, origin, scale or numbering of classes.
+    Exit status 2 if they certainly mean something else: another unit, axis, origin, scale or
+        numbering of classes.
 
     \b
     Examples:
@@ -27,7 +39,13 @@ def check_mix(
     """
     from lidar_synth.formats import open_scans
     from lidar_synth.mixing.compare import USUAL_IGNORE, report
-    from lidar_synth.mixing.meaning import contradictions, measure_tables, rows_in_use, spread, table_of
+    from lidar_synth.mixing.meaning import (
+        contradictions,
+        measure_tables,
+        rows_in_use,
+        spread,
+        table_of,
+    )
     from lidar_synth.mixing.settings import mix as make_mixture
     from lidar_synth.mixing.settings import read_settings
     from lidar_synth.viz import view_suffix, write_view
@@ -37,11 +55,18 @@ def check_mix(
     source = open_scans(real, sensor=sensor)
     mixture = make_mixture(len(source), read_settings(mix) | {"ratio": 0.5}, lambda scan, rng: scan)
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
-    kinds: list[list[Scan]] = [[source[i] for i in spread(len(source), count)], [mixture[i] for i in chosen]]
-    theirs, ours = (measure_tables([table_of(scan) for scan in scans], USUAL_IGNORE) for scans in kinds)
+    kinds: list[list[Scan]] = [
+        [source[i] for i in spread(len(source), count)],
+        [mixture[i] for i in chosen],
+    ]
+    theirs, ours = (
+        measure_tables([table_of(scan) for scan in scans], USUAL_IGNORE) for scans in kinds
+    )
     _print(theirs, ours, *(rows_in_use(scans) for scans in kinds))
     if out is not None:
-        write_view(out, [*kinds[0][:4], *kinds[1][:4]], title=f"{real.resolve().name}, then {mix.name}")
+        write_view(
+            out, [*kinds[0][:4], *kinds[1][:4]], title=f"{real.resolve().name}, then {mix.name}"
+        )
         typer.echo(f"{out}: real scans, then synthetic ones")
     report(list(contradictions(theirs, ours)))
 
@@ -58,11 +83,19 @@ def _print(real: "Meaning", synthetic: "Meaning", *rows: int) -> None:
         ("ground, m", [f"{each.ground:.2f}" for each in both]),
     ]
     for number, name in enumerate(NAMES_OF_COLUMNS):
-        lines.append((f"{name}: 1, 50, 99 %", ["  ".join(f"{v:.3g}" for v in each.quantiles[number]) for each in both]))
+        lines.append(
+            (
+                f"{name}: 1, 50, 99 %",
+                ["  ".join(f"{v:.3g}" for v in each.quantiles[number]) for each in both],
+            )
+        )
     for value in sorted(real.classes.keys() | synthetic.classes.keys()):
         looks = [each.classes.get(value) for each in both]
         name = NAMES[value] if value < len(NAMES) else str(value)
-        cells = ["-" if k is None else f"{k.share:.1%}  {k.height:.1f} m  {k.range:.0f} m away" for k in looks]
+        cells = [
+            "-" if k is None else f"{k.share:.1%}  {k.height:.1f} m  {k.range:.0f} m away"
+            for k in looks
+        ]
         lines.append((f"{value} {name}", cells))
     for name, cells in lines:
         print(f"{name:<22}" + "".join(f"{cell:>28}" for cell in cells))

@@ -13,33 +13,59 @@ if TYPE_CHECKING:
     from lidar_synth.formats.convert import Report
 
 
-Source = Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")]
+Source = Annotated[
+    Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")
+]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 To = Annotated[
     str,
     typer.Option(
-        help="format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | png | webdataset"
+        help=(
+            "format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | "
+            "png | webdataset"
+        )
     ),
 ]
 InputSensor = Annotated[
-    str | None, typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]")
+    str | None,
+    typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]"),
 ]
 AsSensorName = Annotated[
-    str | None, typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file")
+    str | None,
+    typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file"),
 ]
 MountText = Annotated[
     str | None,
-    typer.Option(metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"),
+    typer.Option(
+        metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"
+    ),
 ]
-Sweeps = Annotated[int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")]
-Like = Annotated[Path | None, typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance")]
-RangeNoise = Annotated[float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")]
+Sweeps = Annotated[
+    int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")
+]
+Like = Annotated[
+    Path | None,
+    typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance"),
+]
+RangeNoise = Annotated[
+    float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")
+]
 Reach = Annotated[
     float | None,
-    typer.Option(help="of --as-sensor: metres at which it loses every second ray to a surface of 10 % reflectance"),
+    typer.Option(
+        help=(
+            "of --as-sensor: metres at which it loses every second ray to a surface of 10 % "
+            "reflectance"
+        )
+    ),
 ]
-Unfold = Annotated[bool, typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points")]
-Strict = Annotated[bool, typer.Option("--strict", help="stop at a scan with something that the format cannot hold")]
+Unfold = Annotated[
+    bool,
+    typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points"),
+]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="stop at a scan with something that the format cannot hold")
+]
 Jobs = Annotated[int, typer.Option(help="number of worker processes")]
 
 
@@ -90,9 +116,15 @@ def convert(
 
 def _print(report: "Report", out: Path, to: str, as_sensor: str | None) -> None:
     """What was written, and on standard error what was not."""
-    print(f"{out}: {report.written} scans written, {report.kept} were there already, {len(report.skipped)} skipped")
+    print(
+        f"{out}: {report.written} scans written, {report.kept} were there already, "
+        f"{len(report.skipped)} skipped"
+    )
     if report.seen:
-        print(f"  {100 * sum(report.seen) / len(report.seen):.0f} % of the field of view of {as_sensor} was seen")
+        print(
+            f"  {100 * sum(report.seen) / len(report.seen):.0f} % of the field of view of "
+            f"{as_sensor} was seen"
+        )
     for name, reason in report.skipped.items():
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
@@ -100,22 +132,35 @@ def _print(report: "Report", out: Path, to: str, as_sensor: str | None) -> None:
     for name, count in report.lost.items():
         print(f"  dropped {name} of {count} scans, which {to} cannot hold", file=sys.stderr)
     if report.unlabelled:
-        print(f"  labels of {report.unlabelled} scans are unknown: written as 0, unlabelled", file=sys.stderr)
+        print(
+            f"  labels of {report.unlabelled} scans are unknown: written as 0, unlabelled",
+            file=sys.stderr,
+        )
     for what in report.left_out:
         print(f"  left out {what}", file=sys.stderr)
 
 
 def _change(
-    scans: "ScanFiles", as_sensor: str | None, mount: str | None, sweeps: int, like: Path | None, **how: Any
+    scans: "ScanFiles",
+    as_sensor: str | None,
+    mount: str | None,
+    sweeps: int,
+    like: Path | None,
+    **how: Any,
 ) -> Any:
     """What ``--as-sensor`` and its options do to the scans; None without it."""
     from lidar_synth.errors import ConfigError
     from lidar_synth.formats.as_sensor import AsSensor, make_transfer
 
     if as_sensor is None:
-        given = {k: v for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items() if v}
+        given = {
+            k: v for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items() if v
+        }
         if given:
-            raise ConfigError(f"{', '.join(given)} without --as-sensor", "the sensor that the scans are turned into")
+            raise ConfigError(
+                f"{', '.join(given)} without --as-sensor",
+                "the sensor that the scans are turned into",
+            )
         return None
     return AsSensor(make_transfer(as_sensor, read_mount(mount), like, scans, **how), sweeps)
 

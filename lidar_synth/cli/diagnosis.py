@@ -17,8 +17,8 @@ from typing import Literal
 from lidar_synth import __version__
 
 State = Literal["ok", "absent", "check", "broken"]
-"""``absent``: an optional part is missing; ``check``: an optional part does not work; ``broken``: the package does not
-work without this part."""
+"""``absent``: an optional part is missing; ``check``: an optional part does not work; ``broken``:
+the package does not work without this part."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,10 @@ SHARED_OBJECTS = {
 """The system libraries that open3d loads, and the Debian and Ubuntu packages that hold them."""
 
 DATA_ROOTS = {
-    "KITTI360_ROOT": ("data_3d_raw/*/velodyne_points/data/*.bin", ("data_poses", "calibration", "data_2d_raw")),
+    "KITTI360_ROOT": (
+        "data_3d_raw/*/velodyne_points/data/*.bin",
+        ("data_poses", "calibration", "data_2d_raw"),
+    ),
     "SEMANTICKITTI_ROOT": ("sequences/*/velodyne/*.bin", ()),
     "KITTI_ROOT": ("training/velodyne/*.bin", ("training/label_2", "training/calib")),
     "NUSCENES_ROOT": ("samples/LIDAR_TOP/*.pcd.bin", ()),
@@ -94,7 +97,8 @@ def report(findings: list[Finding]) -> str:
     """The findings as a text table."""
     width = max(len(finding.name) for finding in findings)
     lines = [
-        f"lidar_synth {__version__} on Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+        f"lidar_synth {__version__} on Python {platform.python_version()}, {platform.system()} "
+        f"{platform.machine()}"
     ]
     group = ""
     for finding in findings:
@@ -107,7 +111,9 @@ def report(findings: list[Finding]) -> str:
             lines.append(f"  {'':<7} {'':<{width}}  -> {finding.fix}")
     lines += [
         "",
-        "The package works." if works(findings) else "The package does not work: see the lines marked broken.",
+        "The package works."
+        if works(findings)
+        else "The package does not work: see the lines marked broken.",
     ]
     return "\n".join(lines)
 
@@ -125,8 +131,13 @@ def as_dict(findings: list[Finding]) -> dict[str, object]:
 
 def _libraries() -> Iterator[Finding]:
     enough = sys.version_info >= (3, 10)
-    yield Finding("libraries", "python", "ok" if enough else "broken", platform.python_version(),
-                  fix="" if enough else "install Python 3.10 or later")  # fmt: skip
+    yield Finding(
+        "libraries",
+        "python",
+        "ok" if enough else "broken",
+        platform.python_version(),
+        fix="" if enough else "install Python 3.10 or later",
+    )
     try:
         wanted = requires("lidar_synth") or []
     except PackageNotFoundError:
@@ -149,12 +160,23 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
     try:
         module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except ModuleNotFoundError:
-        return Finding("libraries", name, "absent" if buys else "broken", "not installed", buys, wheel)
+        return Finding(
+            "libraries", name, "absent" if buys else "broken", "not installed", buys, wheel
+        )
     except Exception as error:  # a broken installation may raise anything; it is reported
         if name == "open3d" and (packages := missing_packages()):
             line = "apt-get install -y --no-install-recommends " + " ".join(packages)
-            return Finding("libraries", name, "absent", "lacks system libraries", buys, _as_root(line))
-        return Finding("libraries", name, worst, f"{type(error).__name__}: {error}", buys, f"{wheel} --force-reinstall")
+            return Finding(
+                "libraries", name, "absent", "lacks system libraries", buys, _as_root(line)
+            )
+        return Finding(
+            "libraries",
+            name,
+            worst,
+            f"{type(error).__name__}: {error}",
+            buys,
+            f"{wheel} --force-reinstall",
+        )
     version = str(getattr(module, "__version__", None) or installed_version(name))
     if _numbers(version) < _numbers(minimum):
         return Finding("libraries", name, worst, f"{version}, older than {minimum}", buys, wheel)
@@ -162,7 +184,8 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
 
 
 def _geometry() -> Finding:
-    """Check that a range image survives the round trip to points, which needs compatible numpy and numba."""
+    """Check that a range image survives the round trip to points, which needs compatible numpy and
+    numba."""
     try:
         import numpy as np
 
@@ -177,13 +200,22 @@ def _geometry() -> Finding:
     except Exception as error:  # any error belongs in the report
         return Finding("libraries", "projection", "broken", f"{type(error).__name__}: {error}")
     if not same:
-        return Finding("libraries", "projection", "broken", "a range image comes back changed",
-                       fix="pip install --force-reinstall numba numpy")  # fmt: skip
-    return Finding("libraries", "projection", "ok", "range image -> points -> range image returns every cell")
+        return Finding(
+            "libraries",
+            "projection",
+            "broken",
+            "a range image comes back changed",
+            fix="pip install --force-reinstall numba numpy",
+        )
+    return Finding(
+        "libraries", "projection", "ok", "range image -> points -> range image returns every cell"
+    )
 
 
 def _devices() -> Iterator[Finding]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     yield Finding("devices", "CPU", "ok", f"{_cpu_name()}, {cores} cores{_instructions()}")
     if hasattr(os, "sysconf"):
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
@@ -201,18 +233,31 @@ def _cuda() -> Iterator[Finding]:
         return
     for number, card in enumerate(cards):
         memory = card.total_memory / 2**30
-        found = f"{card.name}, {memory:.0f} GiB, compute {card.major}.{card.minor}, CUDA {torch.version.cuda}"
+        found = (
+            f"{card.name}, {memory:.0f} GiB, compute {card.major}.{card.minor}, CUDA "
+            f"{torch.version.cuda}"
+        )
         yield Finding("devices", f"cuda:{number}", "ok", found)
     if cards:
         return
     if shutil.which("nvidia-smi") is None:
         yield Finding("devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU")
     elif torch.version.cuda is None:
-        yield Finding("devices", "CUDA", "check", "driver found, but torch is built for the CPU",
-                      fix="the line for this machine's CUDA on https://pytorch.org/get-started/locally")  # fmt: skip
+        yield Finding(
+            "devices",
+            "CUDA",
+            "check",
+            "driver found, but torch is built for the CPU",
+            fix="the line for this machine's CUDA on https://pytorch.org/get-started/locally",
+        )
     else:
-        yield Finding("devices", "CUDA", "check", f"driver found, but torch (CUDA {torch.version.cuda}) finds no GPU",
-                      fix="nvidia-smi")  # fmt: skip
+        yield Finding(
+            "devices",
+            "CUDA",
+            "check",
+            f"driver found, but torch (CUDA {torch.version.cuda}) finds no GPU",
+            fix="nvidia-smi",
+        )
 
 
 def _data() -> Iterator[Finding]:
@@ -224,12 +269,29 @@ def _data() -> Iterator[Finding]:
         root = Path(value)
         first = next(iter(root.glob(pattern)), None)
         if not root.is_dir():
-            yield Finding("data", variable, "check", f"{root} is not a folder", fix=f"export {variable}=/the/folder")
+            yield Finding(
+                "data",
+                variable,
+                "check",
+                f"{root} is not a folder",
+                fix=f"export {variable}=/the/folder",
+            )
         elif first is None:
-            yield Finding("data", variable, "check", f"{root} holds no {pattern}", fix=f"export {variable}=/the/folder")
+            yield Finding(
+                "data",
+                variable,
+                "check",
+                f"{root} holds no {pattern}",
+                fix=f"export {variable}=/the/folder",
+            )
         else:
             lacking = [name for name in companions if not (root / name).is_dir()]
-            yield Finding("data", variable, "ok", f"{root}" + (f", without {', '.join(lacking)}" if lacking else ""))
+            yield Finding(
+                "data",
+                variable,
+                "ok",
+                f"{root}" + (f", without {', '.join(lacking)}" if lacking else ""),
+            )
 
 
 def _loads(library: str) -> bool:

@@ -9,7 +9,8 @@ import typer
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Lists available and missing libraries, devices and data, and the command that installs what is missing.
+    """Lists available and missing libraries, devices and data, and the command that installs what
+    is missing.
 
     Exit status 0 = the package works, 1 = a required part is missing or broken.
 

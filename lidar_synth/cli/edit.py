@@ -9,21 +9,33 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
 
 edit = typer.Typer(
-    name="edit", help="Surgery on scans: remove, insert and move objects with their boxes.", no_args_is_help=True
+    name="edit",
+    help="Surgery on scans: remove, insert and move objects with their boxes.",
+    no_args_is_help=True,
 )
 
-Source = Annotated[Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")]
+Source = Annotated[
+    Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")
+]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 Model = Annotated[
-    str | None, typer.Option(help="model that draws the holes, for instance town [none: filled by geometry]")
+    str | None,
+    typer.Option(help="model that draws the holes, for instance town [none: filled by geometry]"),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="seed of the model's noise")]
 Format = Annotated[
-    str, typer.Option(help="output format: npz (keeps every field) | kitti_object | semantic_kitti | ...")
+    str,
+    typer.Option(
+        help="output format: npz (keeps every field) | kitti_object | semantic_kitti | ..."
+    ),
 ]
 ScanNumber = Annotated[int, typer.Option(min=0, help="number of the scan in IN")]
 Place = Annotated[
-    str, typer.Option(metavar="X,Y[,YAW]", help="metres, and degrees; without a yaw the recorded side faces the sensor")
+    str,
+    typer.Option(
+        metavar="X,Y[,YAW]",
+        help="metres, and degrees; without a yaw the recorded side faces the sensor",
+    ),
 ]
 
 
@@ -32,7 +44,9 @@ def remove_objects(
     source: Source,
     out: Out,
     box: Annotated[list[int] | None, typer.Option(help="number of a box; repeatable")] = None,
-    name: Annotated[list[str] | None, typer.Option(help="remove all boxes of this class, for instance Car")] = None,
+    name: Annotated[
+        list[str] | None, typer.Option(help="remove all boxes of this class, for instance Car")
+    ] = None,
     scan: Annotated[int | None, typer.Option(min=0, help="number of the scan in IN [all]")] = None,
     model: Model = None,
     seed: Seed = 0,
@@ -52,7 +66,8 @@ def remove_objects(
     if bool(box) == bool(name):
         raise ConfigError(f"--box {box}, --name {name}", "one of the two")
     scans = open_scans(source)
-    writer, count = _writer(out, to), 0
+    writer = _writer(out, to)
+    count = 0
     writer.carry(scans)
     for index in range(len(scans)) if scan is None else [_number(scan, len(scans))]:
         given = scans[index]
@@ -63,7 +78,8 @@ def remove_objects(
     writer.finish()
     if name and not count:
         raise ConfigError(
-            f"--name {', '.join(name)}", "the class of some box in these scans, such as KITTI's or the town's"
+            f"--name {', '.join(name)}",
+            "the class of some box in these scans, such as KITTI's or the town's",
         )
     print(f"{out}: {count} objects removed")
 
@@ -113,7 +129,9 @@ def move_object(
     """
     from lidar_synth.labels.edit import move
 
-    _edit_one(source, out, scan, to, lambda given: move(given, box, _pose(at), model=model, seed=seed))
+    _edit_one(
+        source, out, scan, to, lambda given: move(given, box, _pose(at), model=model, seed=seed)
+    )
 
 
 def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> None:
@@ -128,7 +146,10 @@ def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> Non
     writer.finish()
     box = edited.boxes.values[-1]
     inside = int(edited.boxes.contain(edited.points)[-1].sum())
-    print(f"{out}: {edited.boxes.names[-1]} at {box[0]:.1f}, {box[1]:.1f} m with {inside} points in its box")
+    print(
+        f"{out}: {edited.boxes.names[-1]} at {box[0]:.1f}, {box[1]:.1f} m with {inside} points in "
+        "its box"
+    )
 
 
 def _writer(out: Path, to: str) -> Any:
@@ -147,8 +168,13 @@ def _number(scan: int, count: int) -> int:
 
 
 def _named(scan: "Scan", names: list[str]) -> list[int]:
-    """The numbers of the boxes with some names; none in a scan without boxes, as in KITTI's ``testing``."""
-    return [] if scan.boxes is None else [i for i, name in enumerate(scan.boxes.names) if name in names]
+    """The numbers of the boxes with some names; none in a scan without boxes, as in KITTI's
+    ``testing``."""
+    return (
+        []
+        if scan.boxes is None
+        else [i for i, name in enumerate(scan.boxes.names) if name in names]
+    )
 
 
 def _pose(text: str) -> list[float]:
@@ -162,5 +188,7 @@ def _pose(text: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) not in (2, 3):
-        raise ConfigError(f"--at {text}", "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90")
+        raise ConfigError(
+            f"--at {text}", "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90"
+        )
     return [*values[:2], *map(radians, values[2:])]

@@ -17,7 +17,8 @@ class Reading(BaseModel):
     split: str | None = Field(None, description="split of the input, for instance r2flow/train")
     fields: int | None = Field(None, description="floats per point in plain .bin files [4]")
     reflectance_max: float | None = Field(
-        None, description="highest reflectance value in plain files, for instance 255 [1; 255 in logs of drivers]"
+        None,
+        description="highest reflectance value in plain files, for instance 255 [1; 255 in logs of drivers]",
     )
     on_bad: str | None = Field(
         None,
@@ -31,7 +32,9 @@ def only_given(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def options_from(kind: type[BaseModel], after: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def options_from(
+    kind: type[BaseModel], after: str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator that replaces a command's ``**values`` by one option for each field of a pydantic model.
 
     An option that is not given is None, so that the command can tell it from one that is given. The help text is the
@@ -64,12 +67,15 @@ def _option(name: str, field: FieldInfo) -> inspect.Parameter:
         annotation = Annotated[Any, typer.Option(help=text, parser=_names, metavar="NAME,...")]
     else:
         annotation = Annotated[base | None, typer.Option(help=text)]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+    )
 
 
 def _base_type(annotation: Any) -> Any:
     """int, float, str or tuple: what an annotation is without None, constraints and the list of its literals."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    arguments = get_args(annotation)
     if origin in (Union, UnionType):
         return _base_type(next(argument for argument in arguments if argument is not NoneType))
     if origin is Annotated:

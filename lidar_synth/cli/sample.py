@@ -11,41 +11,68 @@ from lidar_synth.datasets.recordings import NOTE
 
 def sample(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
-    model: Annotated[str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")] = "town",
+    model: Annotated[
+        str, typer.Option(help="name of a shipped model, or a .safetensors checkpoint")
+    ] = "town",
     count: Annotated[int, typer.Option(min=1, help="number of scans")] = 16,
-    seed: Annotated[int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")] = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="number of steps [the model's own]")] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")
+    ] = 0,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="number of steps [the model's own]")
+    ] = None,
     solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
     condition: Annotated[
         str | None,
-        typer.Option(help="dataset with the labels, images or boxes that a conditional model needs, or a layout.yaml"),
+        typer.Option(
+            help=(
+                "dataset with the labels, images or boxes that a conditional model needs, or a "
+                "layout.yaml"
+            )
+        ),
     ] = None,
-    condition_layout: Annotated[str | None, typer.Option(help="layout of that dataset [detected]")] = None,
+    condition_layout: Annotated[
+        str | None, typer.Option(help="layout of that dataset [detected]")
+    ] = None,
     condition_split: Annotated[
         str | None, typer.Option(help="split of that dataset, for instance r2flow/train")
     ] = None,
     guidance: Annotated[
-        float, typer.Option(min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance")
+        float,
+        typer.Option(min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance"),
     ] = 1.0,
     to: Annotated[
-        str, typer.Option(help="output format: npz (keeps every field) | kitti | semantic_kitti | range | pcd | ...")
+        str,
+        typer.Option(
+            help=(
+                "output format: npz (keeps every field) | kitti | semantic_kitti | range | pcd | "
+                "..."
+            )
+        ),
     ] = "npz",
     device: Annotated[str, typer.Option(help="device of the network: cpu | cuda")] = "cpu",
-    dtype: Annotated[str, typer.Option(help="data type of the network's computation: float32 | bfloat16")] = "float32",
-    batch: Annotated[int | None, typer.Option(min=1, help="scans per batch; limits the memory")] = None,
-    columns: Annotated[int | None, typer.Option(help="columns of the scans, for models that know several")] = None,
+    dtype: Annotated[
+        str, typer.Option(help="data type of the network's computation: float32 | bfloat16")
+    ] = "float32",
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="scans per batch; limits the memory")
+    ] = None,
+    columns: Annotated[
+        int | None, typer.Option(help="columns of the scans, for models that know several")
+    ] = None,
 ) -> None:
     """Generates scans and writes them in any format. Run it again to resume an interrupted run.
 
-    A conditional model generates scan i from scan i of the dataset of conditions, modulo the length of that dataset.
+    A conditional model generates scan i from scan i of the dataset of conditions, modulo the length
+    of that dataset.
 
     \b
     Examples:
       lidar-synth sample out
       lidar-synth sample out --count 100 --seed 7 --to semantic_kitti
       lidar-synth sample out --model runs/town_teacher/town_teacher.safetensors --steps 50
-      lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI --condition-split val
-      lidar-synth sample out --model town-layout --condition behind_a_van.yaml
+      lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI
+      --condition-split val lidar-synth sample out --model town-layout --condition behind_a_van.yaml
     """
     import torch
     from tqdm import tqdm
@@ -62,10 +89,18 @@ def sample(
     generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
     given = conditions_for(generator, condition, condition_layout, condition_split)
     settings = {
-        "checkpoint": generator.hash, "seed": seed, "steps": steps, "solver": solver, "dtype": dtype, "to": to,
-        "condition": condition, "condition_layout": condition_layout, "condition_split": condition_split,
-        "guidance": guidance, **({} if columns is None else {"columns": columns}),
-    }  # fmt: skip
+        "checkpoint": generator.hash,
+        "seed": seed,
+        "steps": steps,
+        "solver": solver,
+        "dtype": dtype,
+        "to": to,
+        "condition": condition,
+        "condition_layout": condition_layout,
+        "condition_split": condition_split,
+        "guidance": guidance,
+        **({} if columns is None else {"columns": columns}),
+    }
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": leakage.seen_by(provenance).to_list()}
     with claimed(writer.root / NOTE, settings | trained):
@@ -74,7 +109,12 @@ def sample(
             for first in range(0, len(missing), generator.batch):
                 indices = missing[first : first + generator.batch]
                 scans = generator.scans(
-                    seed, indices, conditions(given, indices), steps=steps, solver=solver, guidance=guidance
+                    seed,
+                    indices,
+                    conditions(given, indices),
+                    steps=steps,
+                    solver=solver,
+                    guidance=guidance,
                 )
                 for index, scan in zip(indices, scans, strict=True):
                     writer.write(scan, index)

@@ -16,15 +16,22 @@ if TYPE_CHECKING:
 @options_from(Reading, after="sensor")
 def view(
     path: Annotated[Path, typer.Argument(help="file, folder, root of a dataset, or bank")],
-    index: Annotated[int, typer.Option(help="number of the first scan, from 0; -1 is the last one")] = 0,
+    index: Annotated[
+        int, typer.Option(help="number of the first scan, from 0; -1 is the last one")
+    ] = 0,
     count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
-    out: Annotated[Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")] = None,
-    sensor: Annotated[str | None, typer.Option(help="sensor: a preset or a YAML file [named by the files]")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor: a preset or a YAML file [named by the files]")
+    ] = None,
     **reading: Any,
 ) -> None:
     """Shows scans as range image, bird's-eye view and 3-D points.
 
-    Without --out a window opens if there is a screen; otherwise a page is written to the current folder.
+    Without --out a window opens if there is a screen; otherwise a page is written to the current
+    folder.
 
     \b
     Examples:
@@ -57,6 +64,8 @@ def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
 
     first = index + len(source) if index < 0 else index
     if not 0 <= first < len(source):
-        raise ConfigError(f"--index {index}: {source.root} holds {len(source)} scans", f"0 .. {len(source) - 1}")
+        raise ConfigError(
+            f"--index {index}: {source.root} holds {len(source)} scans", f"0 .. {len(source) - 1}"
+        )
     chosen = range(first, min(first + count, len(source)))
     return [source[i] for i in tqdm(chosen, "reading", unit="scan", disable=len(chosen) < 8)]

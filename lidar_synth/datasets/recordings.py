@@ -1,13 +1,16 @@
 """The recorded frames of a set of scans, to detect evaluation of a model on its training data.
 
-A frame is identified by dataset, drive and number. Names of splits are not sufficient: the training data of LiDM
-(``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of KITTI-360. Neither are names of
-datasets: the sequences of SemanticKITTI are those of KITTI's odometry benchmark, which are parts of KITTI's raw
-drives. Both are therefore represented as raw drives, by the table in the odometry devkit's readme (``ODOMETRY``).
-KITTI-360 was recorded two years later and has no frames in common with them.
+A frame is identified by dataset, drive and number. Names of splits are not sufficient: the training
+    data of LiDM
+(``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of KITTI-360.
+Neither are names of
+datasets: the sequences of SemanticKITTI are those of KITTI's odometry benchmark, which are parts of
+    KITTI's raw
+drives. Both are therefore represented as raw drives, by the table in the odometry devkit's readme
+(``ODOMETRY``). KITTI-360 was recorded two years later and has no frames in common with them.
 
-KITTI's object set was also sampled from the raw drives, in random order. Only its devkit (mapping/) contains the
-mapping, so that the object set counts as a dataset of its own.
+KITTI's object set was also sampled from the raw drives, in random order. Only its devkit (mapping/)
+contains the mapping, so that the object set counts as a dataset of its own.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,10 +19,15 @@ from typing import Any
 
 from lidar_synth.errors import DataError
 
-KITTI360, KITTI, KITTI_OBJECT, PANDASET = "KITTI-360", "KITTI", "KITTI object", "PandaSet"
-TOWN, FILES, CONTENT = "town", "files", "content"
-"""Names of datasets. A drive of the town is a seed; a drive of ``FILES`` is a path with scans of an unknown dataset; a
-drive of ``CONTENT`` is the hash of a single scan, wherever it lies."""
+KITTI360 = "KITTI-360"
+KITTI = "KITTI"
+KITTI_OBJECT = "KITTI object"
+PANDASET = "PandaSet"
+TOWN = "town"
+FILES = "files"
+CONTENT = "content"
+"""Names of datasets. A drive of the town is a seed; a drive of ``FILES`` is a path with scans of an
+unknown dataset; a drive of ``CONTENT`` is the hash of a single scan, wherever it lies."""
 
 Frames = tuple[tuple[int, int], ...] | None
 """Frames of a drive as increasing intervals (first, last); None = all."""
@@ -38,7 +46,8 @@ KITTI360_SPLITS: dict[str, tuple[str, ...] | None] = {
     "lidm-camera/val": _drives(3),
     "all": None,
 }
-"""Drives of KITTI-360's splits, named after the work that introduced each; None = all existing drives."""
+"""Drives of KITTI-360's splits, named after the work that introduced each; None = all existing
+drives."""
 
 ODOMETRY = {
     "00": ("2011_10_03_drive_0027", 0, 4540),
@@ -53,15 +62,19 @@ ODOMETRY = {
     "09": ("2011_09_30_drive_0033", 0, 1590),
     "10": ("2011_09_30_drive_0034", 0, 1200),
 }
-"""Raw drive, first and last frame of each sequence of the odometry benchmark; those of 11 to 21 are not published."""
+"""Raw drive, first and last frame of each sequence of the odometry benchmark; those of 11 to 21 are
+not published."""
 
 NOTE = ".sample.json"
-"""The file beside generated scans with the settings of generation and the training data of the model."""
+"""The file beside generated scans with the settings of generation and the training data of the
+model."""
 
 MODELS = ".models.json"
 """The file beside converted scans with the provenances of the models that generated them."""
 
-_MOST_RUNS = 200  # maximum number of intervals of a drive; more become one from the first frame to the last
+_MOST_RUNS = (
+    200  # maximum number of intervals of a drive; more become one from the first frame to the last
+)
 _SHOWN = 6  # number of drives in a message
 
 
@@ -86,7 +99,11 @@ class Recordings:
         return Recordings(joined)
 
     def __and__(self, other: "Recordings") -> "Recordings":
-        shared = {key: _shared(self.drives[key], other.drives[key]) for key in self.drives if key in other.drives}
+        shared = {
+            key: _shared(self.drives[key], other.drives[key])
+            for key in self.drives
+            if key in other.drives
+        }
         return Recordings({key: frames for key, frames in shared.items() if frames != ()})
 
     def __str__(self) -> str:
@@ -98,11 +115,13 @@ class Recordings:
         return ", ".join(named[:_SHOWN]) + more
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Convert to plain values, for a checkpoint's provenance: for each dataset its drives, and for each drive the
-        intervals (first, last) of its frames, or null for all frames."""
+        """Convert to plain values, for a checkpoint's provenance: for each dataset its drives, and
+        for each drive the intervals (first, last) of its frames, or null for all frames."""
         values: dict[str, dict[str, list[list[int]] | None]] = {}
         for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0]):
-            values.setdefault(dataset, {})[drive] = None if frames is None else [list(run) for run in frames]
+            values.setdefault(dataset, {})[drive] = (
+                None if frames is None else [list(run) for run in frames]
+            )
         return [{"dataset": dataset, "drives": drives} for dataset, drives in values.items()]
 
     @classmethod
@@ -113,8 +132,17 @@ class Recordings:
             DataError: on values of another form.
         """
         try:
-            drives = {(str(p["dataset"]), str(d)): frames for p in values for d, frames in p["drives"].items()}
-            return cls({k: None if v is None else _merged((int(a), int(b)) for a, b in v) for k, v in drives.items()})
+            drives = {
+                (str(p["dataset"]), str(d)): frames
+                for p in values
+                for d, frames in p["drives"].items()
+            }
+            return cls(
+                {
+                    k: None if v is None else _merged((int(a), int(b)) for a, b in v)
+                    for k, v in drives.items()
+                }
+            )
         except (TypeError, KeyError, ValueError, AttributeError) as error:
             raise DataError(
                 f"recordings {str(values)[:200]} ({error!r})", "datasets, their drives and frames"
@@ -131,7 +159,8 @@ def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
 
     Args:
         layout: one of ``PLACES``; the result for any other layout is empty.
-        ids: ``drive/frame`` of each scan in the layout's naming, or ``drive`` for all of its frames.
+        ids: ``drive/frame`` of each scan in the layout's naming, or ``drive`` for all of its
+            frames.
     """
     numbers: dict[str, set[str]] = {}
     for name in ids if layout in PLACES else ():
@@ -148,7 +177,8 @@ def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
 
 
 Place = tuple[str, str, int, int | None]
-"""Dataset, drive, and the numbers of the first and the last frame within the drive (None = to its end)."""
+"""Dataset, drive, and the numbers of the first and the last frame within the drive (None = to its
+end)."""
 
 
 def _sequence(name: str) -> Place:
@@ -160,7 +190,12 @@ def _sequence(name: str) -> Place:
 
 PLACES: dict[str, Callable[[str], Place]] = {
     "kitti360": lambda drive: (KITTI360, drive, 0, None),
-    "kitti_raw": lambda drive: (KITTI, drive.removesuffix("_sync").removesuffix("_extract"), 0, None),
+    "kitti_raw": lambda drive: (
+        KITTI,
+        drive.removesuffix("_sync").removesuffix("_extract"),
+        0,
+        None,
+    ),
     "semantic_kitti": _sequence,
     "kitti_object": lambda part: (KITTI_OBJECT, part, 0, None),
     "pandaset": lambda sequence: (PANDASET, sequence, 0, None),

@@ -1,4 +1,5 @@
-"""Claims: an output folder keeps the settings that it is filled with, and refuses a run with others."""
+"""Claims: an output folder keeps the settings that it is filled with, and refuses a run with
+others."""
 
 import json
 from collections.abc import Iterator
@@ -30,10 +31,17 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     if not path.is_file():
         # Another process may create it at the same time.
         write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
-    existing = parse_json(read_text(path), f"{path}, which is damaged,", "the settings that this package wrote")
+    existing = parse_json(
+        read_text(path), f"{path}, which is damaged,", "the settings that this package wrote"
+    )
     if not isinstance(existing, dict):
-        raise DataError(f"{path} is damaged (it holds {type(existing).__name__})", hint="Choose another output folder.")
-    other = {name: existing[name] for name, value in wanted.items() if existing.get(name, value) != value}
+        raise DataError(
+            f"{path} is damaged (it holds {type(existing).__name__})",
+            hint="Choose another output folder.",
+        )
+    other = {
+        name: existing[name] for name, value in wanted.items() if existing.get(name, value) != value
+    }
     if other:
         raise ConfigError(
             f"{path.parent} was filled with {other}",
@@ -44,10 +52,11 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
 
 @contextmanager
 def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """``claim`` a folder for the block, and take the claim back if the block has written nothing, so that the corrected
-    call may use the folder.
+    """``claim`` a folder for the block, and take the claim back if the block has written nothing,
+    so that the corrected call may use the folder.
 
-    A claim that was there before is left alone: it may be that of a process that has not written its first file yet.
+    A claim that was there before is left alone: it may be that of a process that has not written
+        its first file yet.
 
     Raises:
         ConfigError, DataError, FileError: as ``claim``.
@@ -58,7 +67,9 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
         with writing(path):
             yield
         if not _alone(path):
-            claim(path, settings)  # again: the process that came first may have written nothing and taken it back
+            claim(
+                path, settings
+            )  # again: the process that came first may have written nothing and taken it back
     finally:
         if first and _alone(path):
             path.unlink(missing_ok=True)
@@ -66,7 +77,8 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Write into a claimed folder; the last of several runs removes the temporary files that killed ones left.
+    """Write into a claimed folder; the last of several runs removes the temporary files that killed
+    ones left.
 
     Args:
         path: the file of the claim.

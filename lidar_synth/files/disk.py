@@ -1,6 +1,7 @@
 """Reading and writing of files and of numbers in text files, with clear errors.
 
-A file is written under a temporary name and then renamed, so that a reader never sees a partial file.
+A file is written under a temporary name and then renamed, so that a reader never sees a partial
+file.
 """
 
 import hashlib
@@ -27,7 +28,8 @@ STRAY = "allow_pickle"
 SKIP_HINT = "Copy the file again, or skip it with on_bad='skip'."
 
 LONGEST_NAME = 200
-"""Maximum length of a file's name in bytes. File systems allow 255, but the temporary name while writing is longer."""
+"""Maximum length of a file's name in bytes. File systems allow 255, but the temporary name while
+writing is longer."""
 
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
@@ -40,15 +42,22 @@ def part_of(path: Path) -> Path:
 
 
 def write_file(
-    path: Path, content: bytes | Callable[[BinaryIO], object], *, durable: bool = False, overwrite: bool = True
+    path: Path,
+    content: bytes | Callable[[BinaryIO], object],
+    *,
+    durable: bool = False,
+    overwrite: bool = True,
 ) -> None:
-    """Write a temporary file beside ``path``, then rename it; a failure leaves an existing file unchanged.
+    """Write a temporary file beside ``path``, then rename it; a failure leaves an existing file
+    unchanged.
 
     Args:
         path: the output file; its folder is created.
         content: the bytes, or a function that writes them to an open binary file.
-        durable: whether to flush the bytes to disk before the rename, so that the file is complete after a power cut.
-        overwrite: whether to replace an existing file; otherwise the first of several processes wins.
+        durable: whether to flush the bytes to disk before the rename, so that the file is complete
+            after a power cut.
+        overwrite: whether to replace an existing file; otherwise the first of several processes
+            wins.
 
     Raises:
         FileError: if the target cannot be written or the disk is full.
@@ -57,7 +66,9 @@ def write_file(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)
-        with part.open("xb") as file:  # always a new file, never the target of a link with this name
+        with part.open(
+            "xb"
+        ) as file:  # always a new file, never the target of a link with this name
             if callable(content):
                 content(file)
             else:
@@ -71,7 +82,8 @@ def write_file(
         raise FileError(
             f"{path} cannot be written ({error.strerror or error})",
             "a writable folder on a disk with free space",
-            "Choose another output folder or free some space, then run the same again: complete files are kept.",
+            "Choose another output folder or free some space, then run the same again: complete "
+            "files are kept.",
         ) from error
     finally:
         with suppress(OSError):
@@ -79,7 +91,8 @@ def write_file(
 
 
 def _linked(part: Path, path: Path) -> bool:
-    """Link a file to its final path unless that exists; False if the file system has no hard links."""
+    """Link a file to its final path unless that exists; False if the file system has no hard
+    links."""
     try:
         os.link(part, path)
     except FileExistsError:
@@ -89,7 +102,9 @@ def _linked(part: Path, path: Path) -> bool:
     return True
 
 
-def read_file(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> bytes:
+def read_file(
+    path: Path, expected: str = "a file of the dataset", at_most: int | None = None
+) -> bytes:
     """Read the bytes of a file.
 
     Args:
@@ -133,13 +148,16 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     """
     values = {name: np.asanyarray(array) for name, array in arrays.items()}
     if objects := [name for name, array in values.items() if array.dtype.hasobject]:
-        raise DataError(f"arrays {objects} of Python objects for {path}", "numbers, truth values or text")
+        raise DataError(
+            f"arrays {objects} of Python objects for {path}", "numbers, truth values or text"
+        )
     save = np.savez_compressed if compressed else np.savez
     write_file(path, lambda file: save(file, **values))
 
 
 def hash_of_names(names: Iterable[str]) -> str:
-    """SHA-256 of several names, in their order; of any names, such as those of files that are no UTF-8."""
+    """SHA-256 of several names, in their order; of any names, such as those of files that are no
+    UTF-8."""
     return hashlib.sha256("\n".join(names).encode(errors="surrogatepass")).hexdigest()
 
 
@@ -169,8 +187,8 @@ def inside(folder: Path, name: str) -> Path:
         name: relative path with / as separator.
 
     Raises:
-        DataError: on a name that leads out of the folder, that could denote the same file as another name, or that is
-            not a valid file name on every system.
+        DataError: on a name that leads out of the folder, that could denote the same file as
+            another name, or that is not a valid file name on every system.
     """
     if fault := _name_fault(name):
         raise DataError(
@@ -197,7 +215,8 @@ def _name_fault(name: str) -> str:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse an output folder with a link that leads out of it, because files would be written elsewhere.
+    """Refuse an output folder with a link that leads out of it, because files would be written
+    elsewhere.
 
     Raises:
         FileError: if there is such a link; the message names it.
@@ -214,15 +233,20 @@ def refuse_links(folder: Path) -> None:
 
 
 def list_files(folder: Path, *suffixes: str) -> list[Path]:
-    """The files of a folder with one of the suffixes, sorted by name; hidden (partial) files are skipped.
+    """The files of a folder with one of the suffixes, sorted by name; hidden (partial) files are
+    skipped.
 
     Raises:
         FileError: if the folder cannot be read.
     """
     try:
-        names = sorted(e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != ".")
+        names = sorted(
+            e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != "."
+        )
     except OSError as error:
-        raise FileError(f"{folder} cannot be read ({error.strerror})", "a folder with scans") from error
+        raise FileError(
+            f"{folder} cannot be read ({error.strerror})", "a folder with scans"
+        ) from error
     return [folder / name for name in names]
 
 
@@ -236,11 +260,15 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
     content = read_file(path)
     width = np.dtype(dtype).itemsize
     if len(content) % width:
-        raise DataError(f"{path} is {len(content)} bytes long", f"a multiple of {width} ({dtype})", SKIP_HINT)
+        raise DataError(
+            f"{path} is {len(content)} bytes long", f"a multiple of {width} ({dtype})", SKIP_HINT
+        )
     return np.frombuffer(content, dtype)
 
 
-def read_text(path: Path, expected: str = "a file of the dataset", at_most: int | None = None) -> str:
+def read_text(
+    path: Path, expected: str = "a file of the dataset", at_most: int | None = None
+) -> str:
     """Read the text of a file; the arguments are those of ``read_file``.
 
     Raises:
@@ -266,7 +294,9 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
             raise ValueError("a line of another length")
         return np.array(rows, np.float64).reshape(-1, columns)
     except ValueError as error:
-        raise DataError(f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line") from error
+        raise DataError(
+            f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line"
+        ) from error
 
 
 @contextmanager
@@ -279,7 +309,8 @@ def naming(where: str | Path) -> Iterator[None]:
 
 
 def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read {name: (N,) values} from KITTI's calibration files: ``name: number number ...`` per line.
+    """Read {name: (N,) values} from KITTI's calibration files: ``name: number number ...`` per
+    line.
 
     Lines whose values are not all numbers (dates) are skipped.
 
@@ -302,12 +333,15 @@ def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]
     Raises:
         FileError: if it cannot be written.
     """
-    lines = [f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()]
+    lines = [
+        f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()
+    ]
     write_file(path, "".join(lines).encode())
 
 
 def png_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of a PNG, from its header; None if the file is missing or its header damaged."""
+    """(width, height) of a PNG, from its header; None if the file is missing or its header
+    damaged."""
     try:
         with path.open("rb") as file:
             header = file.read(24)
@@ -316,7 +350,9 @@ def png_size(path: Path) -> tuple[int, int] | None:
     if len(header) < 24 or header[:8] != b"\x89PNG\r\n\x1a\n":
         return None
     width, height = np.frombuffer(header[16:], ">u4").tolist()
-    return (width, height) if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE else None
+    return (
+        (width, height) if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE else None
+    )
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -1,8 +1,10 @@
 """A lock on a file, which the system releases when its process ends or is killed.
 
-Processes that work in one folder hold the lock together (``shared``); only a process that holds it exclusively
-(``alone``) removes leftover files. The lock is flock; over NFS, a lock on the server. On a file system without locks
-nothing is ever removed. On Windows every process counts as exclusive: an open file cannot be removed there.
+Processes that work in one folder hold the lock together (``shared``); only a process that holds it
+exclusively (``alone``) removes leftover files. The lock is flock; over NFS, a lock on the server.
+On a file system without locks
+nothing is ever removed. On Windows every process counts as exclusive: an open file cannot be
+    removed there.
 """
 
 import sys
@@ -23,14 +25,16 @@ else:
     import fcntl
 
     def _lock(file: BinaryIO, alone: bool) -> bool:
-        """Take the lock: shared after waiting, or exclusive (``alone``) without waiting; False if unavailable."""
+        """Take the lock: shared after waiting, or exclusive (``alone``) without waiting; False if
+        unavailable."""
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
             return True
         return False
 
     def _take(file: BinaryIO) -> bool:
-        """Take the lock; False only if another process holds it, not where the file system has no locks."""
+        """Take the lock; False only if another process holds it, not where the file system has no
+        locks."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -65,7 +69,8 @@ def shared(path: Path) -> Iterator[None]:
 
 @contextmanager
 def alone(path: Path) -> Iterator[bool]:
-    """Try to hold an exclusive lock on a file until the block ends; yields whether it was available."""
+    """Try to hold an exclusive lock on a file until the block ends; yields whether it was
+    available."""
     try:
         file = path.open("r+b")  # NFS grants exclusive locks only on writable files
     except OSError:

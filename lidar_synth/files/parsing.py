@@ -1,7 +1,8 @@
 """Safe parsers with limits for untrusted files: JSON, YAML, numpy arrays and images.
 
-A hostile file may declare huge sizes, depths or nested aliases. What it declares is compared with its actual size and
-with a limit before memory is allocated, and every fault becomes an error of this package.
+A hostile file may declare huge sizes, depths or nested aliases. What it declares is compared with
+its actual size and with a limit before memory is allocated, and every fault becomes an error of
+this package.
 """
 
 import hashlib
@@ -42,8 +43,10 @@ LONGEST_YAML = 1 << 18
 LONGEST_PLAIN = 3000
 """Maximum number of characters of an unquoted YAML value."""
 
-MOST_NODES, DEEPEST = 20_000, 64
-"""Maximum number of values in a YAML text, with all aliases expanded, and maximum number of levels."""
+MOST_NODES = 20_000
+DEEPEST = 64
+"""Maximum number of values in a YAML text, with all aliases expanded, and maximum number of
+levels."""
 
 DAMAGED_ZIP = (
     zipfile.BadZipFile,
@@ -55,7 +58,8 @@ DAMAGED_ZIP = (
     OverflowError,
     RuntimeError,
 )
-"""Exceptions of ``zipfile`` on a damaged file; encrypted members and unknown methods are a RuntimeError."""
+"""Exceptions of ``zipfile`` on a damaged file; encrypted members and unknown methods are a
+RuntimeError."""
 
 ARRAYS = "arrays of numbers written by numpy, none of them pickled"
 
@@ -69,7 +73,9 @@ def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{where} is not JSON ({type(error).__name__}: {error})", expected, SKIP_HINT) from error
+        raise DataError(
+            f"{where} is not JSON ({type(error).__name__}: {error})", expected, SKIP_HINT
+        ) from error
 
 
 def read_facts(path: Path, expected: str) -> dict[str, Any]:
@@ -136,7 +142,11 @@ def parse_yaml(text: str, where: str) -> Any:
     try:
         fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
         values = None if fault else yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date such as 2001-99-99 is a ValueError
+    except (
+        yaml.YAMLError,
+        ValueError,
+        OverflowError,
+    ) as error:  # a date such as 2001-99-99 is a ValueError
         raise ConfigError(f"{where} is not YAML ({error})") from error
     if fault:
         raise ConfigError(f"{where} is not YAML of plain values: it has {fault}")
@@ -145,7 +155,8 @@ def parse_yaml(text: str, where: str) -> Any:
 
 def _yaml_fault(events: Iterable[Any]) -> str:
     """Why a YAML text is refused, by its events; "" if it is accepted."""
-    count, opened = 0, []
+    count = 0
+    opened = []
     sizes: dict[str, int] = {}
     for event in events:
         if isinstance(event, yaml.AliasEvent):
@@ -161,7 +172,9 @@ def _yaml_fault(events: Iterable[Any]) -> str:
             elif event.anchor is not None:
                 sizes[event.anchor] = 1
             if (
-                isinstance(event, yaml.ScalarEvent) and event.style is None and len(event.value) > LONGEST_PLAIN
+                isinstance(event, yaml.ScalarEvent)
+                and event.style is None
+                and len(event.value) > LONGEST_PLAIN
             ):  # Python prints no number of 4300 digits
                 return f"a value of {len(event.value)} characters without quotes"
         elif isinstance(event, yaml.CollectionEndEvent):
@@ -173,7 +186,9 @@ def _yaml_fault(events: Iterable[Any]) -> str:
     return ""
 
 
-def read_arrays(path: Path, only: Collection[str] | None = None, most: int = MOST_BYTES) -> dict[str, NDArray[Any]]:
+def read_arrays(
+    path: Path, only: Collection[str] | None = None, most: int = MOST_BYTES
+) -> dict[str, NDArray[Any]]:
     """Read the arrays of an ``.npz`` file, or that of an ``.npy`` file under the name ``array``.
 
     Args:
@@ -183,8 +198,8 @@ def read_arrays(path: Path, only: Collection[str] | None = None, most: int = MOS
 
     Raises:
         FileError: if it cannot be read.
-        DataError: if it is not such a file, is damaged, declares more than it holds or than ``most``, or holds
-            anything but numbers and text.
+        DataError: if it is not such a file, is damaged, declares more than it holds or than
+            ``most``, or holds anything but numbers and text.
     """
     content = read_file(path)
     if not content.startswith(b"PK"):
@@ -223,7 +238,10 @@ def zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
     deflated = sum(info.file_size for info in infos if info.compress_type == zipfile.ZIP_DEFLATED)
     stored = sum(info.file_size for info in infos) - deflated
     if deflated > most or stored > size:
-        return f"declares {deflated + stored} bytes of arrays in {size}, more than it can hold or {most} bytes"
+        return (
+            f"declares {deflated + stored} bytes of arrays in {size}, more than it can hold or "
+            f"{most} bytes"
+        )
     return ""
 
 
@@ -238,13 +256,18 @@ _TYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|U[1-9]\d{0,6})")
 
 
 def parse_npy(content: bytes, where: str) -> NDArray[Any]:
-    """Parse the array of an ``.npy`` file (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
+    """Parse the array of an ``.npy`` file
+    (https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html).
 
     Raises:
-        DataError: if it is not such a file, its size does not match its header, or it holds anything but numbers and
-            text.
+        DataError: if it is not such a file, its size does not match its header, or it holds
+            anything but numbers and text.
     """
-    width = {1: 2, 2: 4, 3: 4}.get(content[6], 0) if len(content) > 10 and content[:6] == b"\x93NUMPY" else 0
+    width = (
+        {1: 2, 2: 4, 3: 4}.get(content[6], 0)
+        if len(content) > 10 and content[:6] == b"\x93NUMPY"
+        else 0
+    )
     start = 8 + width + int.from_bytes(content[8 : 8 + width], "little")
     if not width or start > min(len(content), 10_000):
         raise DataError(f"{where} has no header of an .npy file", ARRAYS, SKIP_HINT)
@@ -258,13 +281,24 @@ def parse_npy(content: bytes, where: str) -> NDArray[Any]:
 
 
 def _array(
-    content: bytes, start: int, dtype: np.dtype[Any], shape: tuple[int, ...], fortran: bool, where: str
+    content: bytes,
+    start: int,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    fortran: bool,
+    where: str,
 ) -> NDArray[Any]:
     """The array whose values are stored in ``content`` from ``start`` on."""
     held = len(content) - start
-    if prod(shape) * dtype.itemsize != held or len(shape) > 8 or prod(max(n, 1) for n in shape) >= 1 << 58:
+    if (
+        prod(shape) * dtype.itemsize != held
+        or len(shape) > 8
+        or prod(max(n, 1) for n in shape) >= 1 << 58
+    ):
         raise DataError(
-            f"{where} holds {held} bytes for {dtype} of shape {shape}", "as many as its shape requires", SKIP_HINT
+            f"{where} holds {held} bytes for {dtype} of shape {shape}",
+            "as many as its shape requires",
+            SKIP_HINT,
         )
     values = np.frombuffer(content, dtype, offset=start).copy()
     if dtype.kind == "U":
@@ -292,7 +326,22 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
                 opened.load()
                 return opened
     # The exceptions of Pillow's readers on damaged files.
-    except (OSError, SyntaxError, ValueError, EOFError, OverflowError, IndexError, KeyError, TypeError, struct.error,
-            zlib.error, Image.DecompressionBombError) as error:  # fmt: skip
-        raise DataError(f"{path} cannot be read ({error or type(error).__name__})", expected, SKIP_HINT) from error
-    raise DataError(f"{path} has {size} columns and rows", f"at most {MOST_PIXELS} pixels", SKIP_HINT)
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        OverflowError,
+        IndexError,
+        KeyError,
+        TypeError,
+        struct.error,
+        zlib.error,
+        Image.DecompressionBombError,
+    ) as error:
+        raise DataError(
+            f"{path} cannot be read ({error or type(error).__name__})", expected, SKIP_HINT
+        ) from error
+    raise DataError(
+        f"{path} has {size} columns and rows", f"at most {MOST_PIXELS} pixels", SKIP_HINT
+    )

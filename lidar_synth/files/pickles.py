@@ -1,9 +1,11 @@
-"""Pickles read as data: the opcodes build plain values and named calls, and nothing is imported or called.
+"""Pickles read as data: the opcodes build plain values and named calls, and nothing is imported or
+called.
 
-A pickle is a program. Python's own reader looks up functions by name and calls them, so a foreign file can do anything.
-Here a name stays text, and a call stays a ``Call`` that holds the name and the arguments. Whoever reads a format takes
-the calls that it knows apart, such as those of numpy's arrays. All protocols (0 to 5) are read. A reader either lists
-the names that may occur, so that any other refuses the file, or takes every name as an inert placeholder.
+A pickle is a program. Python's own reader looks up functions by name and calls them, so a foreign
+file can do anything. Here a name stays text, and a call stays a ``Call`` that holds the name and
+the arguments. Whoever reads a format takes the calls that it knows apart, such as those of numpy's
+arrays. All protocols (0 to 5) are read. A reader either lists the names that may occur, so that any
+other refuses the file, or takes every name as an inert placeholder.
 """
 
 import pickletools
@@ -20,14 +22,17 @@ MOST_STEPS = 200_000
 """Maximum number of opcodes; PandaSet's tables have up to a few thousand."""
 
 PERSISTENT = "persistent_load"
-"""Name of the ``Call`` that stands for what a pickle keeps outside itself, such as a tensor's values."""
+"""Name of the ``Call`` that stands for what a pickle keeps outside itself, such as a tensor's
+values."""
 
 
-DTYPE, ENCODE = "numpy.dtype", "_codecs.encode"
+DTYPE = "numpy.dtype"
+ENCODE = "_codecs.encode"
 """Names of the calls with which numpy writes types, and protocol 2 bytes."""
 
 TYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"))
-"""Types of arrays of numbers; arrays of objects (``O8``) may hold text, numbers, truth values and None."""
+"""Types of arrays of numbers; arrays of objects (``O8``) may hold text, numbers, truth values and
+None."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,8 @@ class Call:
         name: of the function or class.
         args: its arguments: plain values, names and calls.
         state: the state that the object would get afterwards.
-        items, values: what it would hold as a dictionary and as a list; only where all names are placeholders.
+        items, values: what it would hold as a dictionary and as a list; only where all names are
+            placeholders.
     """
 
     name: str
@@ -66,17 +72,19 @@ def parse_pickle(
 
     Args:
         content: the bytes of the pickle, or an open file that is read up to the pickle's end.
-        known: names of functions and classes that may occur; None to take all of them as inert placeholders.
+        known: names of functions and classes that may occur; None to take all of them as inert
+            placeholders.
         where: name of the pickle in errors, usually its path.
         expected: description of what it should hold, for errors.
         most: maximum number of opcodes.
 
     Returns:
-        None, truth values, numbers, text, bytes, tuples, lists, dictionaries, ``Name`` and ``Call``. Values that occur
-        several times in the pickle are one object.
+        None, truth values, numbers, text, bytes, tuples, lists, dictionaries, ``Name`` and
+        ``Call``. Values that occur several times in the pickle are one object.
 
     Raises:
-        DataError: on a truncated or damaged pickle, a name that is not ``known``, or too many opcodes.
+        DataError: on a truncated or damaged pickle, a name that is not ``known``, or too many
+            opcodes.
     """
     machine = _OpenMachine() if known is None else _Machine(known)
     try:
@@ -89,9 +97,11 @@ def parse_pickle(
         raise DataError(
             f"{where} would {error} when loaded, and was not loaded",
             expected,
-            "A pickle that contains code can do anything: get the file from the dataset's own release page.",
+            "A pickle that contains code can do anything: get the file from the dataset's own "
+            "release page.",
         ) from None
-    # What a damaged pickle causes: an empty stack, an unknown reference, a value of another kind, invalid text.
+    # What a damaged pickle causes: an empty stack, an unknown reference, a value of another kind,
+    # invalid text.
     except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise
@@ -161,7 +171,8 @@ class _Machine:
 
     def since_mark(self) -> list[Any]:
         """The values above the last mark, which are taken off the stack."""
-        values, self.stack = self.stack, self.below.pop()
+        values = self.stack
+        self.stack = self.below.pop()
         return values
 
     def push_since_mark(self, kind: Callable[[list[Any]], Any]) -> None:
@@ -183,19 +194,22 @@ class _Machine:
         self.stack.append(Name(text))
 
     def stack_name(self, _: Any) -> None:
-        attribute, module = self.stack.pop(), self.stack.pop()
+        attribute = self.stack.pop()
+        module = self.stack.pop()
         if not isinstance(module, str) or not isinstance(attribute, str):
             raise TypeError("a name that is not text")
         self.name(f"{module}.{attribute}")
 
     def call(self, _: Any) -> None:
-        args, name = self.stack.pop(), self.stack.pop()
+        args = self.stack.pop()
+        name = self.stack.pop()
         if not isinstance(name, Name) or not isinstance(args, tuple):
             raise TypeError("a call of something else than a name")
         self.stack.append(Call(name.text, args))
 
     def build(self, _: Any) -> None:
-        state, call = self.stack.pop(), self.stack[-1]
+        state = self.stack.pop()
+        call = self.stack[-1]
         if not isinstance(call, Call) or call.state is not None:
             raise TypeError("a state for something else than a new object")
         call.state = state
@@ -213,13 +227,18 @@ class _Machine:
         self.stack[-1].extend(values)
 
     def set_items(self, values: list[Any]) -> None:
-        if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str) for key in values[::2]):
-            raise TypeError("items for something else than a dictionary, or with a key that is not text")
+        if not isinstance(self.stack[-1], dict) or not all(
+            isinstance(key, str) for key in values[::2]
+        ):
+            raise TypeError(
+                "items for something else than a dictionary, or with a key that is not text"
+            )
         self.stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
 
 class _OpenMachine(_Machine):
-    """A machine for pickles of any objects: all names are placeholders, and what cannot be kept becomes text."""
+    """A machine for pickles of any objects: all names are placeholders, and what cannot be kept
+    becomes text."""
 
     def __init__(self) -> None:
         super().__init__(())
@@ -228,14 +247,19 @@ class _OpenMachine(_Machine):
         self.stack.append(Name(text))
 
     def call(self, _: Any) -> None:
-        args, name = self.stack.pop(), self.stack.pop()
+        args = self.stack.pop()
+        name = self.stack.pop()
         self.call_of(name, args if isinstance(args, tuple) else ())
 
     def call_of(self, name: Any, args: Any) -> None:
         self.stack.append(Call(name.text if isinstance(name, Name) else _text(name), tuple(args)))
 
     def call_since_mark(self, name: Any) -> None:
-        name, *args = self.since_mark() if name is None else [Name(name.replace(" ", ".")), *self.since_mark()]
+        name, *args = (
+            self.since_mark()
+            if name is None
+            else [Name(name.replace(" ", ".")), *self.since_mark()]
+        )
         self.call_of(name, args)
 
     def build(self, _: Any) -> None:
@@ -272,9 +296,13 @@ _VALUES = frozenset(
 """Opcodes whose argument is a value."""
 
 _MAKERS: dict[str, Callable[[], Any]] = {
-    "NONE": lambda: None, "NEWTRUE": lambda: True, "NEWFALSE": lambda: False,
-    "EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict,
-}  # fmt: skip
+    "NONE": lambda: None,
+    "NEWTRUE": lambda: True,
+    "NEWFALSE": lambda: False,
+    "EMPTY_TUPLE": tuple,
+    "EMPTY_LIST": list,
+    "EMPTY_DICT": dict,
+}
 """Opcodes of a value that they do not tell."""
 
 _STEPS: dict[str, Callable[[_Machine, Any], object]] = {

@@ -1,4 +1,5 @@
-"""Work in several processes, with results in order, which Ctrl-C stops without a traceback of a worker."""
+"""Work in several processes, with results in order, which Ctrl-C stops without a traceback of a
+worker."""
 
 import os
 import signal
@@ -16,7 +17,8 @@ _busy = _stopped = False
 
 
 def _start(work: Callable[[Any], Any]) -> None:
-    """Pass the function to a worker once, instead of with every item, and let Ctrl-C reach it from now on."""
+    """Pass the function to a worker once, instead of with every item, and let Ctrl-C reach it from
+    now on."""
     global _work
     _work = work
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -26,8 +28,8 @@ def _start(work: Callable[[Any], Any]) -> None:
 
 
 def _interrupted(number: int, frame: Any) -> None:
-    """End a worker's items at Ctrl-C, which a terminal sends to every process. While it waits for items, an exception
-    would end it with a traceback; the main process ends it."""
+    """End a worker's items at Ctrl-C, which a terminal sends to every process. While it waits for
+    items, an exception would end it with a traceback; the main process ends it."""
     global _stopped
     _stopped = True
     if _busy:
@@ -48,7 +50,8 @@ def _next(item: Any) -> Any:
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask for it."""
+    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask
+    for it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -74,8 +77,8 @@ def in_processes(
     if jobs == 1 or len(items) < 2:
         yield map(work, items)
         return
-    # Spawned, not forked: a fork would break threads of the parent (numba, torch). With one process per core, threads
-    # inside numpy would only compete for the cores.
+    # Spawned, not forked: a fork would break threads of the parent (numba, torch). With one process
+    # per core, threads inside numpy would only compete for the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:

@@ -1,8 +1,9 @@
 """Recipes: configurations that are found by name and built on shared bases.
 
-A recipe is a YAML file. Its key ``base`` names one file or a list of files that it builds on: mappings are merged;
-later files and the recipe's own values take precedence. Its key ``about`` describes it for ``lidar-synth recipes``.
-Both keys are removed before the values are checked.
+A recipe is a YAML file. Its key ``base`` names one file or a list of files that it builds on:
+    mappings are merged;
+later files and the recipe's own values take precedence. Its key ``about`` describes it for
+``lidar-synth recipes``. Both keys are removed before the values are checked.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -121,7 +122,11 @@ def _merged(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 def _base(path: Path, name: Any) -> Path:
     """The file of a base: beside the recipe, in its folder ``base``, or a published one."""
-    for candidate in (path.parent / str(name), path.parent / "base" / f"{name}.yaml", path.parent / f"{name}.yaml"):
+    for candidate in (
+        path.parent / str(name),
+        path.parent / "base" / f"{name}.yaml",
+        path.parent / f"{name}.yaml",
+    ):
         if candidate.is_file() and candidate != path:
             return candidate
     for candidate in (folder() / "base" / f"{name}.yaml", folder() / f"{name}.yaml"):
@@ -166,7 +171,9 @@ def _first(kind: type[BaseModel], error: ValidationError) -> str:
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _keys(kind, fault["loc"][:-1])
         hint = suggest(fault["loc"][-1], known)
-        return f"unknown key {place!r}; known there: {', '.join(known)}" + (f". {hint}" if hint else "")
+        return f"unknown key {place!r}; known there: {', '.join(known)}" + (
+            f". {hint}" if hint else ""
+        )
     if fault["type"] == "missing":
         return f"{place!r} is missing"
     return f"{place} = {shorten(repr(fault['input']), 400)}: {fault['msg']}"

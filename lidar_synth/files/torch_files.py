@@ -1,8 +1,12 @@
-"""Weight files of PyTorch (``torch.save``), read without running any of their code and without ``torch.load``.
+"""Weight files of PyTorch (``torch.save``), read without running any of their code and without
+``torch.load``.
 
-A file is a ZIP archive (``data.pkl`` and one file for each storage), or, before PyTorch 1.6, a row of pickles followed
-by the storages. Either pickle is read as data: tensors are made of the storages, numbers of numpy become numbers, and
-the objects of other classes become the plain values that they hold, or text with the name of the class.
+A file is a ZIP archive (``data.pkl`` and one file for each storage), or, before PyTorch 1.6, a row
+of pickles followed
+by the storages. Either pickle is read as data: tensors are made of the storages, numbers of numpy
+    become numbers, and
+the objects of other classes become the plain values that they hold, or text with the name of the
+class.
 """
 
 import os
@@ -25,13 +29,14 @@ MOST_PICKLE = 64 << 20
 """Maximum size of the pickle in bytes, without the tensors' values."""
 
 MOST_STEPS = 3_000_000
-"""Maximum number of opcodes, and of plain values with those that occur several times counted again: a tensor takes
-about 20, and the optimizer of a network of 2,000 tensors holds 4,000 more."""
+"""Maximum number of opcodes, and of plain values with those that occur several times counted again:
+a tensor takes about 20, and the optimizer of a network of 2,000 tensors holds 4,000 more."""
 
 MOST_ELEMENTS = 1 << 28
 """Maximum number of elements of a tensor; a stride of 0 repeats one element without memory."""
 
-MAGIC, PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
+MAGIC = 0x1950A86A20F9469CFC6C
+PROTOCOL = 1001
 """The first two pickles of a file that PyTorch before 1.6 wrote."""
 
 _TYPES = {
@@ -62,8 +67,9 @@ def load_pickle(path: Path, peer: str) -> Any:
         peer: name of the project that released it, for errors.
 
     Returns:
-        Tensors, None, truth values, numbers, text, bytes, tuples, lists and dictionaries. Objects become the items,
-        values or attributes that they hold, and text with the name of their class where they hold none.
+        Tensors, None, truth values, numbers, text, bytes, tuples, lists and dictionaries. Objects
+        become the items, values or attributes that they hold, and text with the name of their class
+        where they hold none.
 
     Raises:
         FileError: if the file cannot be read.
@@ -73,7 +79,9 @@ def load_pickle(path: Path, peer: str) -> Any:
         file = path.open("rb")
     except OSError as error:
         kind = path.suffix or "weight"
-        raise FileError(f"{path} cannot be read ({error.strerror or error})", f"a {kind} file of {peer}") from error
+        raise FileError(
+            f"{path} cannot be read ({error.strerror or error})", f"a {kind} file of {peer}"
+        ) from error
     with file:
         return unpickle(file, path, peer)
 
@@ -105,26 +113,36 @@ def state_of(content: Any, key: str, path: Path) -> dict[str, Tensor]:
         DataError: if the value is not a dictionary of tensors.
     """
     weights = content.get(key, content)
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise DataError(f"{path}: its weights are not tensors by name", "the state dictionary of a network")
+    if not isinstance(weights, dict) or not all(
+        isinstance(value, Tensor) for value in weights.values()
+    ):
+        raise DataError(
+            f"{path}: its weights are not tensors by name", "the state dictionary of a network"
+        )
     names = [str(name).replace("_orig_mod.", "") for name in weights]
     if all(name.startswith("module.") for name in names):
         names = [name.removeprefix("module.") for name in names]
     if len(set(names)) < len(names):
-        raise DataError(f"{path}: several of its weights have one name", "the state dictionary of a network")
+        raise DataError(
+            f"{path}: several of its weights have one name", "the state dictionary of a network"
+        )
     return dict(zip(names, weights.values(), strict=True))
 
 
 def _read_zip(file: BinaryIO, where: str) -> Any:
     with zipfile.ZipFile(file) as archive:
         infos = {info.filename: info for info in archive.infolist()}
-        if fault := zip_fault(archive.infolist(), file.seek(0, os.SEEK_END), 0):  # PyTorch does not compress
+        if fault := zip_fault(
+            archive.infolist(), file.seek(0, os.SEEK_END), 0
+        ):  # PyTorch does not compress
             raise DataError(f"it {fault}")
         [main] = [name for name in infos if name.endswith("/data.pkl") and name.count("/") == 1]
         folder = main.removesuffix("data.pkl")
         order = archive.read(f"{folder}byteorder") if f"{folder}byteorder" in infos else b"little"
         if order != b"little" or infos[main].file_size > MOST_PICKLE:
-            raise DataError(f"byte order {order[:10]!r}, or a pickle of more than {MOST_PICKLE} bytes")
+            raise DataError(
+                f"byte order {order[:10]!r}, or a pickle of more than {MOST_PICKLE} bytes"
+            )
         content = parse_pickle(archive.read(main), None, where, "", MOST_STEPS)
         return _Plain(lambda key, *_: archive.read(f"{folder}data/{key}")).value(content)
 
@@ -157,7 +175,8 @@ class _Plain:
     """Turns calls into tensors and plain values; what several places share is one object again.
 
     Args:
-        read: (key of a storage, size in bytes) -> its bytes, or None to make tensors without values.
+        read: (key of a storage, size in bytes) -> its bytes, or None to make tensors without
+            values.
     """
 
     def __init__(self, read: Callable[[Any, int], bytes | None]) -> None:
@@ -200,7 +219,9 @@ class _Plain:
             return self.value(Call(_text_of(call.args[0]), call.args[2]), level)
         if name in _NUMBERS:
             return np.frombuffer(bytes_of(call.args[1]), dtype_of(call.args[0]))[0].item()
-        if name == "collections.OrderedDict":  # its state is no part of its items; Python 2 lists the items
+        if (
+            name == "collections.OrderedDict"
+        ):  # its state is no part of its items; Python 2 lists the items
             pairs = dict(call.args[0]) if call.args else {}
             return self._make(pairs | call.items, level)
         for held in (call.items, call.values, call.state):
@@ -211,7 +232,9 @@ class _Plain:
     def _tensor(self, reference: Call, offset: Any, size: Any, stride: Any) -> Tensor:
         kind, storage, key, _, count = reference.args[0][:5]
         dtype = _TYPES[_text_of(storage).rpartition(".")[2]]
-        if (reference.name, kind) != (PERSISTENT, "storage") or not _are_counts((count, offset, *size, *stride)):
+        if (reference.name, kind) != (PERSISTENT, "storage") or not _are_counts(
+            (count, offset, *size, *stride)
+        ):
             raise DataError("a tensor without a storage, or with a size that is no number")
         flat = self._storage(key, dtype, count)
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))

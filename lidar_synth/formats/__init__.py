@@ -1,8 +1,9 @@
 """Readers and writers of datasets and file formats.
 
-A reader is an indexable source of ``Scan`` (source.py); a writer writes scans into one output folder (writer.py). Each
-dataset or format has one module with both. To add a format, write such a module and add its classes to ``READERS`` and
-``WRITERS``; ``open_scans``, the command line and the parametrised tests then include it.
+A reader is an indexable source of ``Scan`` (source.py); a writer writes scans into one output
+folder (writer.py). Each dataset or format has one module with both. To add a format, write such a
+module and add its classes to ``READERS`` and ``WRITERS``; ``open_scans``, the command line and the
+parametrised tests then include it.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,14 @@ from lidar_synth.errors import ConfigError, DataError, FileError, choose
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.folder import SUFFIXES, Folder, KITTIWriter, NPZWriter, PCDWriter, PLYWriter
+from lidar_synth.formats.folder import (
+    SUFFIXES,
+    Folder,
+    KITTIWriter,
+    NPZWriter,
+    PCDWriter,
+    PLYWriter,
+)
 from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
 from lidar_synth.formats.kitti_raw import DRIVES, KITTIRaw
@@ -85,16 +93,20 @@ SIGNS: dict[str, Callable[[Path], bool]] = {
     "semantic_kitti": lambda root: any(root.glob("sequences/*/velodyne")),
     "kitti_object": lambda root: any(root.glob("t[er]*ing/velodyne*")),
     "nuscenes": lambda root: (
-        root.name.endswith(SUFFIX) or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
+        root.name.endswith(SUFFIX)
+        or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
     ),
     "pandaset": lambda root: any(any(root.glob(p)) for p in (FRAMES, f"*/{FRAMES}")),
-    "kitti_raw": lambda root: any(any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")),
+    "kitti_raw": lambda root: any(
+        any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")
+    ),
     "bank": is_bank,
     "webdataset": lambda root: root.suffix == TAR or any(root.glob(f"*{TAR}")),
     "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
     "range": lambda root: _holds_range_images(root),
     "folder": lambda root: (
-        root.suffix.lower() in SUFFIXES or any(p.suffix.lower() in SUFFIXES for p in root.rglob("*"))
+        root.suffix.lower() in SUFFIXES
+        or any(p.suffix.lower() in SUFFIXES for p in root.rglob("*"))
     ),
 }
 """{layout: test of a path} by which layouts are recognised, in this order."""
@@ -118,9 +130,10 @@ def open_scans(
         layout: one of ``READERS``; by default it is recognised from the files.
         split: name of a split, if the layout has splits.
         fields: floats per point of plain ``.bin`` files.
-        reflectance_max: maximum of the reflectance in plain files, such as 255; values are divided by it.
-        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a warning;
-            ``"drop-points"`` drops points that are NaN or infinite, and counts them.
+        reflectance_max: maximum of the reflectance in plain files, such as 255; values are divided
+            by it.
+        on_bad: ``"error"`` raises on a scan that cannot be read; ``"skip"`` skips it, with a
+            warning; ``"drop-points"`` drops points that are NaN or infinite, and counts them.
 
     Returns:
         An indexable source of ``Scan``.
@@ -151,7 +164,9 @@ def open_scans(
     plain = {"fields": fields, "reflectance_max": reflectance_max}
     if reader is not Folder and any(v is not None for v in plain.values()):
         wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
-        raise ConfigError(f"{wrong} for {path}", f"neither: layout {name!r} has a fixed file format", _AS_FOLDER)
+        raise ConfigError(
+            f"{wrong} for {path}", f"neither: layout {name!r} has a fixed file format", _AS_FOLDER
+        )
     options |= plain
     return reader(path, on_bad=on_bad, **{k: v for k, v in options.items() if v is not None})  # type: ignore[arg-type]
 
@@ -167,20 +182,27 @@ def layout_of(path: Path) -> str:
         DataError: if no reader recognises it.
     """
     if not path.exists():
-        raise FileError(f"{path} does not exist", "a dataset's root, a folder of scans, or one file")
+        raise FileError(
+            f"{path} does not exist", "a dataset's root, a folder of scans, or one file"
+        )
     layout = next((name for name, sign in SIGNS.items() if sign(path)), None)
     if layout is None:
         raise DataError(
             f"{path} holds no scan in a layout that is known",
             f"one of {', '.join(READERS)}, or {', '.join(SUFFIXES)} files",
-            "Give the dataset's root, for instance the folder with data_3d_raw, sequences, training or samples.",
+            "Give the dataset's root, for instance the folder with data_3d_raw, sequences, "
+            "training or samples.",
         )
     return layout
 
 
 def _holds_range_images(root: Path) -> bool:
     """Whether the first array file is an image and not a list of points."""
-    paths = [root] if root.is_file() else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
+    paths = (
+        [root]
+        if root.is_file()
+        else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
+    )
     if not paths or paths[0].suffix not in (".npz", ".npy"):
         return False
     try:

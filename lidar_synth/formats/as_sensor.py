@@ -1,4 +1,5 @@
-"""The scans of a source as another sensor would have recorded them, with what files need beside the scan."""
+"""The scans of a source as another sensor would have recorded them, with what files need beside the
+scan."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,8 +24,8 @@ class AsSensor:
 
     Args:
         transfer: to that sensor.
-        sweeps: number of scans before and after each scan, of the same sequence, whose surfaces fill what the scan
-            itself does not show; they need poses.
+        sweeps: number of scans before and after each scan, of the same sequence, whose surfaces
+            fill what the scan itself does not show; they need poses.
 
     Raises:
         ConfigError: on a negative number of sweeps.
@@ -35,7 +36,9 @@ class AsSensor:
 
     def __post_init__(self) -> None:
         if self.sweeps < 0:
-            raise ConfigError(f"{self.sweeps} sweeps", "a number of scans before and after each scan")
+            raise ConfigError(
+                f"{self.sweeps} sweeps", "a number of scans before and after each scan"
+            )
 
     def cast(self, scan: Scan, source: Source, index: int) -> Transferred:
         """The scan at ``index`` of a source, which has been read; its noise depends on the index.
@@ -45,7 +48,10 @@ class AsSensor:
         Raises:
             DataError, FileError: as ``Transfer.cast``; also if a neighbouring sweep cannot be read.
         """
-        others = [source.load(i) if isinstance(source, ScanFiles) else source[i] for i in self._around(source, index)]
+        others = [
+            source.load(i) if isinstance(source, ScanFiles) else source[i]
+            for i in self._around(source, index)
+        ]
         cast, seen = self.transfer.cast(scan, keyed_rng(0, index), others)
         if cast.boxes is not None:
             held = cast.boxes.enlarged(_SURFACE).contain(cast.points, above_floor=_FLOOR + _SURFACE)
@@ -58,7 +64,8 @@ class AsSensor:
         return [i for i in near if i != index and _sequence(source, i) == _sequence(source, index)]
 
     def calibration(self, camera: Calibration | None) -> Calibration | None:
-        """The camera as seen from the target's mount. The dataset's own matrices hold the recording sensor's."""
+        """The camera as seen from the target's mount. The dataset's own matrices hold the recording
+        sensor's."""
         if camera is None or not self.moves:
             return camera
         moved = camera.camera_from_sensor @ self.transfer.mount.matrix
@@ -87,7 +94,8 @@ def make_transfer(
     Args:
         sensor: a preset's name or a YAML file.
         mount: metres higher, degrees looking further down.
-        like: real scans of that sensor, in any layout, whose distribution of reflectance the transfer gives.
+        like: real scans of that sensor, in any layout, whose distribution of reflectance the
+            transfer gives.
         scans: the scans that will be turned: by index, or of a generator.
         measured: other arguments of ``Measurement``.
 
@@ -107,8 +115,8 @@ def read_transfer(given: Any, scans: Any) -> Any:
     """What the setting ``as_sensor`` of a configuration stands for.
 
     Args:
-        given: ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``, of which only the sensor is required; anything
-            else is returned unchanged.
+        given: ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``, of which only the sensor
+            is required; anything else is returned unchanged.
         scans: as in ``make_transfer``.
 
     Raises:
@@ -117,13 +125,23 @@ def read_transfer(given: Any, scans: Any) -> Any:
     """
     if not isinstance(given, Mapping):
         return given
-    values = {"mount": (0.0, 0.0), "like": None} | {str(key).lower(): value for key, value in given.items()}
+    values = {"mount": (0.0, 0.0), "like": None} | {
+        str(key).lower(): value for key, value in given.items()
+    }
     mount = values["mount"]
-    numbers = isinstance(mount, list | tuple) and [type(v) in (int, float) for v in mount] == [True, True]
-    if values.keys() != {"sensor", "mount", "like"} or not isinstance(values["sensor"], str) or not numbers:
+    numbers = isinstance(mount, list | tuple) and [type(v) in (int, float) for v in mount] == [
+        True,
+        True,
+    ]
+    if (
+        values.keys() != {"sensor", "mount", "like"}
+        or not isinstance(values["sensor"], str)
+        or not numbers
+    ):
         raise ConfigError(
             f"as_sensor: {dict(given)}",
-            "sensor: a preset's name or a YAML file; optionally mount: [metres higher, degrees down], like: a "
+            "sensor: a preset's name or a YAML file; optionally mount: [metres higher, degrees "
+            "down], like: a "
             "folder of real scans",
         )
     return make_transfer(values["sensor"], tuple(mount), values["like"], scans)

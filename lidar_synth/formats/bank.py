@@ -24,10 +24,18 @@ class BankScans(ScanFiles):
         LibraryError: on a URL whose file system is not installed.
     """
 
-    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
         self.bank = Bank(root)
         if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
-            raise ConfigError(f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds")
+            raise ConfigError(
+                f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds"
+            )
         super().__init__(Path(root), self.bank.ids, None, on_bad, stored=self.bank.sensor)
 
     def read(self, index: int) -> Scan:

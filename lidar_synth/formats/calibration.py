@@ -21,10 +21,11 @@ class Calibration:
 
     Args:
         projection: (3, 4) float64, the camera's P: pixels of points in the rectified camera frame.
-        camera_from_sensor: (4, 4) float64 rigid transform from the sensor frame to the camera frame.
+        camera_from_sensor: (4, 4) float64 rigid transform from the sensor frame to the camera
+            frame.
         image_size: (width, height) in pixels; None if unknown.
-        matrices: the original matrices of the dataset's calibration files by name, so that they can be written back
-            without loss.
+        matrices: the original matrices of the dataset's calibration files by name, so that they can
+            be written back without loss.
 
     Raises:
         DataError: on another shape, a transform that is not rigid, or an impossible image size.
@@ -39,11 +40,18 @@ class Calibration:
         for name, shape in (("projection", (3, 4)), ("camera_from_sensor", (4, 4))):
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise DataError(f"calibration: {name} of shape {value.shape}", f"{shape}, all values finite")
+                raise DataError(
+                    f"calibration: {name} of shape {value.shape}", f"{shape}, all values finite"
+                )
             object.__setattr__(self, name, value)
         check_rigid(self.camera_from_sensor, "calibration: camera_from_sensor")
-        if self.image_size is not None and not all(1 <= n <= LARGEST_IMAGE for n in self.image_size):
-            raise DataError(f"calibration: an image of {self.image_size} pixels", f"1 to {LARGEST_IMAGE} each way")
+        if self.image_size is not None and not all(
+            1 <= n <= LARGEST_IMAGE for n in self.image_size
+        ):
+            raise DataError(
+                f"calibration: an image of {self.image_size} pixels",
+                f"1 to {LARGEST_IMAGE} each way",
+            )
 
     @property
     def image_from_sensor(self) -> Matrix:
@@ -62,8 +70,9 @@ class Calibration:
             points: (N, 3) metres, sensor frame.
 
         Returns:
-            (N, 2) column and row in pixels, NaN for points in or behind the camera's plane, and (N,) depth in
-            metres along the optical axis. A point is in the image if its pixel is within ``image_size``.
+            (N, 2) column and row in pixels, NaN for points in or behind the camera's plane, and
+            (N,) depth in metres along the optical axis. A point is in the image if its pixel is
+            within ``image_size``.
         """
         matrix = self.image_from_sensor
         homogeneous = np.asarray(points, np.float64) @ matrix[:, :3].T + matrix[:, 3]
@@ -81,7 +90,8 @@ def check_rigid(transforms: Matrix, where: str) -> None:
         where: name of the transforms in the error.
 
     Raises:
-        DataError: on values that are not finite, or a left 3 x 3 part that is not a rotation within ``NOT_RIGID``.
+        DataError: on values that are not finite, or a left 3 x 3 part that is not a rotation within
+            ``NOT_RIGID``.
     """
     rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -91,7 +101,8 @@ def check_rigid(transforms: Matrix, where: str) -> None:
     if not sound.all():
         first = int(np.flatnonzero(~sound)[0])
         raise DataError(
-            f"{where}: {np.count_nonzero(~sound)} of {len(sound)} transforms are not rigid, the first is number "
+            f"{where}: {np.count_nonzero(~sound)} of {len(sound)} transforms are not rigid, the "
+            "first is number "
             f"{first}: {transforms.reshape(-1, *transforms.shape[-2:])[first].tolist()}",
             "finite numbers whose left 3 x 3 part is a rotation",
         )
@@ -103,20 +114,29 @@ def read_image_size(values: Matrix, where: str) -> tuple[int, int]:
     Raises:
         DataError: on anything but two integers of a possible image size.
     """
-    if values.shape != (2,) or not ((values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))).all():
-        raise DataError(f"{where}: an image of {values.tolist()} pixels", f"two whole numbers, 1 to {LARGEST_IMAGE}")
+    if (
+        values.shape != (2,)
+        or not ((values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))).all()
+    ):
+        raise DataError(
+            f"{where}: an image of {values.tolist()} pixels",
+            f"two whole numbers, 1 to {LARGEST_IMAGE}",
+        )
     return int(values[0]), int(values[1])
 
 
 def homogeneous(matrix: Matrix) -> Matrix:
-    """(4, 4) homogeneous matrix of 9 values (a rotation) or 12 (rotation and translation, row by row)."""
+    """(4, 4) homogeneous matrix of 9 values (a rotation) or 12 (rotation and translation, row by
+    row)."""
     result = np.eye(4)
     matrix = np.asarray(matrix, np.float64).reshape(3, -1)
     result[:3, : matrix.shape[1]] = matrix
     return result
 
 
-AXES_CAMERA_FROM_SENSOR: Matrix = np.array([(0, -1, 0, 0), (0, 0, -1, 0), (1, 0, 0, 0), (0, 0, 0, 1)], np.float64)
+AXES_CAMERA_FROM_SENSOR: Matrix = np.array(
+    [(0, -1, 0, 0), (0, 0, -1, 0), (1, 0, 0, 0), (0, 0, 0, 1)], np.float64
+)
 """(4, 4) rotation from x forward, y left, z up to a camera's x right, y down, z forward."""
 
 

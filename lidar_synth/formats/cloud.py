@@ -1,12 +1,15 @@
-"""Shared parts of PCD and PLY: named values per point, as records or as text, and their conversion to scans.
+"""Shared parts of PCD and PLY: named values per point, as records or as text, and their conversion
+to scans.
 
-Reflectance is stored in the field ``intensity``, which other tools understand; all other fields of a scan keep their
-names. ``raw_label`` is stored bit for bit as a signed integer, because not every PLY reader supports unsigned 32-bit
-values.
+Reflectance is stored in the field ``intensity``, which other tools understand; all other fields of
+a scan keep their names. ``raw_label`` is stored bit for bit as a signed integer, because not every
+PLY reader supports unsigned 32-bit values.
 
-The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any integers, the time as
-``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or ``timestamp``, and Ouster's ``reflectivity``, which
-is calibrated and takes precedence over its ``intensity``, the number of photons.
+The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any
+    integers, the time as
+``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or ``timestamp``, and Ouster's
+``reflectivity``, which is calibrated and takes precedence over its ``intensity``, the number of
+photons.
 """
 
 import io
@@ -21,10 +24,24 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT
 from lidar_synth.geometry.scan import Scan
 
-STORED = {"label": "<u1", "raw_label": "<i4", "instance": "<i4", "ring": "<i4", "confidence": "<f4", "time": "<f4"}
+STORED = {
+    "label": "<u1",
+    "raw_label": "<i4",
+    "instance": "<i4",
+    "ring": "<i4",
+    "confidence": "<f4",
+    "time": "<f4",
+}
 """Type on disk of each field of a scan except reflectance."""
 
-IN_MEMORY = {"label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4", "time": "f4"}
+IN_MEMORY = {
+    "label": "u1",
+    "raw_label": "u4",
+    "instance": "i4",
+    "ring": "i2",
+    "confidence": "f4",
+    "time": "f4",
+}
 
 REFLECTANCES = ("reflectivity", "intensity", "reflectance")
 RINGS = ("ring", "channel")
@@ -32,7 +49,8 @@ TIMES = ("t", "time_stamp", "timestamp")
 """Names of a field in the logs of drivers, of which the first one counts."""
 
 LONGEST_TURN = 1.05
-"""Seconds from the first to the last point of a scan, by which the unit of float times is recognised."""
+"""Seconds from the first to the last point of a scan, by which the unit of float times is
+recognised."""
 
 WANTED = ("x", "y", "z", *REFLECTANCES, *STORED, "channel", *TIMES)
 """The fields that are read from a file; all others are ignored."""
@@ -64,7 +82,9 @@ class Field:
 def cut(where: str, held: int, wanted: int, unit: str = "bytes") -> DataError:
     """The error for a file whose size does not match its header."""
     given = "is truncated" if held < wanted else "holds more than its header declares"
-    return DataError(f"{where} {given}: {held} {unit} of points", f"{wanted}, by its header", SKIP_HINT)
+    return DataError(
+        f"{where} {given}: {held} {unit} of points", f"{wanted}, by its header", SKIP_HINT
+    )
 
 
 def check_size(body: bytes, size: int, where: str, *, more: bool = False) -> None:
@@ -83,23 +103,34 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
     """Refuse fields from which no scan can be made.
 
     Raises:
-        DataError: if x, y or z is missing, a wanted field occurs twice or has several values per point, a point has
-            more than ``WIDEST`` bytes, or there are no points.
+        DataError: if x, y or z is missing, a wanted field occurs twice or has several values per
+            point, a point has more than ``WIDEST`` bytes, or there are no points.
     """
     names = [field.name for field in fields if field.name in WANTED]
-    if len(set(names)) < len(names) or any(field.count != 1 for field in fields if field.name in WANTED):
-        raise DataError(f"{where} has the fields {names} twice or with several values", "one value of each", SKIP_HINT)
+    if len(set(names)) < len(names) or any(
+        field.count != 1 for field in fields if field.name in WANTED
+    ):
+        raise DataError(
+            f"{where} has the fields {names} twice or with several values",
+            "one value of each",
+            SKIP_HINT,
+        )
     if not {"x", "y", "z"} <= set(names):
         raise DataError(f"{where} has the fields {names}", "x, y and z among them")
     if sum(field.width for field in fields) > WIDEST:
-        raise DataError(f"{where} has {sum(field.width for field in fields)} bytes per point", f"at most {WIDEST}")
+        raise DataError(
+            f"{where} has {sum(field.width for field in fields)} bytes per point",
+            f"at most {WIDEST}",
+        )
     if count == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
 
 
 def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, NDArray[Any]]:
-    """{name: (N,)} the wanted fields of points stored as consecutive records; ``body`` must be long enough."""
-    wanted, offset = [], 0
+    """{name: (N,)} the wanted fields of points stored as consecutive records; ``body`` must be long
+    enough."""
+    wanted = []
+    offset = 0
     for field in fields:
         if field.name in WANTED:
             wanted.append((field.name, field.type, offset))
@@ -110,7 +141,9 @@ def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, 
     return {name: records[name] for name in names}
 
 
-def from_text(text: str, fields: Sequence[Field], count: int, where: str) -> dict[str, NDArray[Any]]:
+def from_text(
+    text: str, fields: Sequence[Field], count: int, where: str
+) -> dict[str, NDArray[Any]]:
     """{name: (N,)} the wanted fields of points stored as text, one point per line.
 
     Raises:
@@ -123,10 +156,15 @@ def from_text(text: str, fields: Sequence[Field], count: int, where: str) -> dic
     try:
         table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
     except ValueError as error:
-        raise DataError(f"{where}: {error}", f"{columns} numbers in each line", SKIP_HINT) from error
+        raise DataError(
+            f"{where}: {error}", f"{columns} numbers in each line", SKIP_HINT
+        ) from error
     if table.shape != (count, columns):
-        raise DataError(f"{where} has {table.shape[1]} values in a line", f"{columns}, by its header", SKIP_HINT)
-    arrays, column = {}, 0
+        raise DataError(
+            f"{where} has {table.shape[1]} values in a line", f"{columns}, by its header", SKIP_HINT
+        )
+    arrays = {}
+    column = 0
     for field in fields:
         if field.name in WANTED:
             arrays[field.name] = _typed(table[:, column], field, where)
@@ -142,22 +180,34 @@ def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any
             return values.astype(dtype)
     limits = np.iinfo(dtype)
     if not ((values == np.floor(values)) & (values >= limits.min) & (values <= limits.max)).all():
-        raise DataError(f"{where}: field {field.name!r} holds other values than {dtype}", "integers", SKIP_HINT)
+        raise DataError(
+            f"{where}: field {field.name!r} holds other values than {dtype}", "integers", SKIP_HINT
+        )
     return values.astype(dtype)
 
 
 def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Rename and convert a file's fields to those of a ``Scan``.
 
-    Labels and the like are read only if they have the type of ``STORED``; other programs use the names otherwise.
+    Labels and the like are read only if they have the type of ``STORED``; other programs use the
+    names otherwise.
     """
     with np.errstate(over="ignore"):
         points = np.column_stack([stored[axis] for axis in "xyz"]).astype(np.float32)
         intensity = _first(stored, REFLECTANCES)
-        reflectance = np.zeros(len(points), np.float32) if intensity is None else intensity.astype(np.float32)
-    own = [n for n, kind in STORED.items() if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)]
-    arrays = {"points": points, "reflectance": reflectance} | {n: stored[n].astype(IN_MEMORY[n]) for n in own}
-    ring, time = _first(stored, RINGS), _first(stored, TIMES)
+        reflectance = (
+            np.zeros(len(points), np.float32) if intensity is None else intensity.astype(np.float32)
+        )
+    own = [
+        n
+        for n, kind in STORED.items()
+        if n in stored and stored[n].dtype.newbyteorder("<") == np.dtype(kind)
+    ]
+    arrays = {"points": points, "reflectance": reflectance} | {
+        n: stored[n].astype(IN_MEMORY[n]) for n in own
+    }
+    ring = _first(stored, RINGS)
+    time = _first(stored, TIMES)
     if ring is not None and ring.dtype.kind in "iu" and 0 <= ring.min() <= ring.max() < 1 << 15:
         arrays["ring"] = ring.astype(np.int16)
     if time is not None and "time" not in arrays:
@@ -171,7 +221,8 @@ def _first(stored: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[
 
 
 def _seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """``time`` as seconds from the first point: nanoseconds if whole, otherwise in the unit in which a turn is short.
+    """``time`` as seconds from the first point: nanoseconds if whole, otherwise in the unit in
+    which a turn is short.
 
     Nothing if there is no such unit, or all points have one time: that is the time of the file.
     """
@@ -186,7 +237,9 @@ def _seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
 def to_records(scan: Scan) -> NDArray[np.void]:
     """The points of a scan as consecutive records; ``to_arrays`` is the inverse."""
     values = dict(zip("xyz", scan.points.T, strict=True)) | {"intensity": scan.reflectance}
-    values |= {name: array.astype(STORED[name]) for name, array in scan.fields().items() if name in STORED}
+    values |= {
+        name: array.astype(STORED[name]) for name, array in scan.fields().items() if name in STORED
+    }
     records = np.empty(len(scan), [(name, STORED.get(name, "<f4")) for name in values])
     for name, array in values.items():
         records[name] = array

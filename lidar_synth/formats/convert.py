@@ -1,8 +1,8 @@
 """Conversion of any source of scans to any format, in parallel and resumable.
 
-Scans that were written completely by an earlier run are not read again. A scan that cannot be read stops the run, or
-is skipped and reported. Each worker process has its own copy of source and writer; the main process writes the files
-of the whole folder at the end.
+Scans that were written completely by an earlier run are not read again. A scan that cannot be read
+stops the run, or is skipped and reported. Each worker process has its own copy of source and
+writer; the main process writes the files of the whole folder at the end.
 """
 
 import os
@@ -46,9 +46,11 @@ class Report:
         skipped: {id: reason} of the scans that could not be read or written.
         dropped: {id: number} of points that were dropped because they are NaN or infinite.
         left_out: descriptions of files that the format supports but the source does not have.
-        seen: for each scan that another sensor saw, the share of its rays within the first sensor's field of view.
+        seen: for each scan that another sensor saw, the share of its rays within the first sensor's
+            field of view.
         lost: {field: number of written scans that had it, though the format cannot hold it}.
-        unlabelled: number of written scans without labels, where the format has labels of every scan.
+        unlabelled: number of written scans without labels, where the format has labels of every
+            scan.
     """
 
     written: int = 0
@@ -100,22 +102,25 @@ def convert(
         source: the scans, read one at a time. With more than one job it is pickled.
         writer: the output. The scans of a dataset keep their names.
         jobs: number of worker processes.
-        on_bad: ``"error"`` stops at the first scan that cannot be read, or that the format cannot represent;
-            ``"skip"`` skips and reports it; ``"drop-points"`` drops points that are NaN or infinite, counts them, and
-            stops at any other fault.
+        on_bad: ``"error"`` stops at the first scan that cannot be read, or that the format cannot
+            represent; ``"skip"`` skips and reports it; ``"drop-points"`` drops points that are NaN
+            or infinite, counts them, and stops at any other fault.
         as_sensor: turn every scan into one of this sensor first (``geometry.transfer``).
         unfold: unfold every scan to a grid with one row per laser (``projection.unfold``).
-        strict: refuse a scan with something that the format cannot hold, such as boxes, instead of counting it.
+        strict: refuse a scan with something that the format cannot hold, such as boxes, instead of
+            counting it.
         progress: whether to show a progress bar.
 
     Returns:
         Number of scans written and kept, skipped scans with reasons, and what was left out.
 
     Raises:
-        ConfigError: on fewer than one job, an output folder with the scans of another conversion or sensor, or a source
-            whose points are not those of its sensor; with ``strict``, on a scan that would lose something.
+        ConfigError: on fewer than one job, an output folder with the scans of another conversion or
+            sensor, or a source whose points are not those of its sensor; with ``strict``, on a scan
+            that would lose something.
         FileError: if the output cannot be written, for any ``on_bad``.
-        DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is damaged.
+        DataError: on a bad scan, unless ``on_bad="skip"``; if what lies beside the scans is
+            damaged.
     """
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
@@ -145,14 +150,20 @@ def _write_missing(
     missing, report = _compare(source, writer, on_bad)
     if change is not None and change.moves:
         if type(writer).carry is not Writer.carry:
-            report.left_out = ["files such as times.txt, which are copied only where the sensor stays in its place"]
+            report.left_out = [
+                "files such as times.txt, which are copied only where the sensor stays in its place"
+            ]
     elif isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
     with in_processes(work, missing, jobs, CHUNK) as results:
-        for done in tqdm(results, total=len(missing), unit="scan", disable=not (progress and missing)):
+        for done in tqdm(
+            results, total=len(missing), unit="scan", disable=not (progress and missing)
+        ):
             _count(report, done, name_of(source, done.number) or str(done.number))
             if done.origin is not None and jobs > 1 and (writer.root / NAME).is_file():
-                add_origin(writer.root, done.origin)  # again: two workers may have added theirs at the same moment
+                add_origin(
+                    writer.root, done.origin
+                )  # again: two workers may have added theirs at the same moment
     writer.finish()
     return report
 
@@ -180,17 +191,23 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
     """Indices of the scans that are still to be written, and a report of the existing ones.
 
     Raises:
-        DataError: with ``on_bad="error"``, on a scan whose name cannot be a path under the output folder, or is
-            that of an earlier scan.
+        DataError: with ``on_bad="error"``, on a scan whose name cannot be a path under the output
+            folder, or is that of an earlier scan.
     """
-    report, missing = Report(), []
+    report = Report()
+    missing = []
     taken: set[str] = set()
     for index in range(len(source)):
         name = name_of(source, index)
         try:
-            places = {os.path.normcase(writer.path(index, name))} | ({f"id {name}"} if name is not None else set())
+            places = {os.path.normcase(writer.path(index, name))} | (
+                {f"id {name}"} if name is not None else set()
+            )
             if places & taken:
-                raise DataError(f"scan {index} is called {name!r}", "a name, and a file, that no earlier scan has")
+                raise DataError(
+                    f"scan {index} is called {name!r}",
+                    "a name, and a file, that no earlier scan has",
+                )
             taken |= places
         except DataError as error:
             if on_bad == "error":
@@ -205,18 +222,28 @@ def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], 
 
 
 def convert_one(
-    source: Source, writer: Writer, change: AsSensor | None, unfold: bool, on_bad: OnBad, strict: bool, index: int
+    source: Source,
+    writer: Writer,
+    change: AsSensor | None,
+    unfold: bool,
+    on_bad: OnBad,
+    strict: bool,
+    index: int,
 ) -> Outcome:
     """Write the scan at ``index``, as another sensor would have recorded it if one is given.
 
     Raises:
         ConfigError, DataError, FileError: as ``convert``.
     """
-    camera, dropped, seen = None, 0, None
+    camera = None
+    dropped = 0
+    seen = None
     try:
         if isinstance(source, ScanFiles):
-            # Not source[index]: with on_bad="skip" that would be the next scan, under the name of the bad one.
-            scan, camera = source.load(index, on_bad == "drop-points"), source.calibration(index)
+            # Not source[index]: with on_bad="skip" that would be the next scan, under the name of
+            # the bad one.
+            scan = source.load(index, on_bad == "drop-points")
+            camera = source.calibration(index)
             dropped = source.dropped.get(source.ids[index], 0)
         else:
             scan = source[index]
@@ -246,7 +273,8 @@ def convert_one(
 
 
 def reproject(scan: Scan, sensor: Sensor | None = None, unfold: bool = False) -> Scan:
-    """Re-project a scan to a sensor's grid: one return per cell, on the ray through the cell's centre.
+    """Re-project a scan to a sensor's grid: one return per cell, on the ray through the cell's
+    centre.
 
     Boxes, pose and image stay unchanged.
 
@@ -269,9 +297,15 @@ def name_of(source: Source, index: int) -> str | None:
     return source.ids[index] if isinstance(source, ScanFiles) else None
 
 
-def _settings(source: Source, writer: Writer, change: AsSensor | None, unfold: bool) -> dict[str, Any]:
+def _settings(
+    source: Source, writer: Writer, change: AsSensor | None, unfold: bool
+) -> dict[str, Any]:
     """The settings that determine which scans are written, as far as the source has them."""
-    settings: dict[str, Any] = {"scans": len(source), "writer": type(writer).__name__, "unfold": unfold}
+    settings: dict[str, Any] = {
+        "scans": len(source),
+        "writer": type(writer).__name__,
+        "unfold": unfold,
+    }
     if isinstance(source, ScanFiles):
         settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict()}
         settings["names"] = hash_of_names(source.ids)

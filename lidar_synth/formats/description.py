@@ -1,18 +1,22 @@
-"""``Description``: what files say about their scans: the sensor, its grid, and where the scans come from.
+"""``Description``: what files say about their scans: the sensor, its grid, and where the scans come
+from.
 
-Formats with room hold it in each file: ``.npz``, PCD and PLY (as comments), PNG, WebDataset, and banks. For all others
+Formats with room hold it in each file: ``.npz``, PCD and PLY (as comments), PNG, WebDataset, and
+    banks. For all others
 it stands in ``scans.json`` in the root of their folder::
 
     {"format": "lidar-synth-scans/1",
      "sensor": {"name": "os1_128", "rows": 128, ...},            the keys of sensors.yaml
      "grid": [128, 1024],                                        rows and columns of the sensor
-     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...", "seed": 7}]}
+     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...",
+     "seed": 7}]}
 
-An origin is the domain of some of the scans (``real`` or ``synthetic``) with their ``Scan.provenance``. A folder has
-several if scans of several were written into it; then it does not say which scan has which.
+An origin is the domain of some of the scans (``real`` or ``synthetic``) with their
+``Scan.provenance``. A folder has several if scans of several were written into it; then it does not
+say which scan has which.
 
-For your own folder, ``{"format": "lidar-synth-scans/1", "sensor": "os1_128"}`` is enough: the name of a preset, or the
-keys of ``sensors.yaml``. Without ``origins`` the scans are real.
+For your own folder, ``{"format": "lidar-synth-scans/1", "sensor": "os1_128"}`` is enough: the name
+of a preset, or the keys of ``sensors.yaml``. Without ``origins`` the scans are real.
 
 Folders of earlier versions have ``synthetic.json`` or ``town.json`` instead, which are read too.
 """
@@ -56,7 +60,8 @@ LONGEST = 1 << 20
 LINE = 100
 """Number of characters of a comment: readers of PCD and PLY limit the length of a line."""
 
-_MOST_FACTS, _LONGEST_TEXT = 32, 1000
+_MOST_FACTS = 32
+_LONGEST_TEXT = 1000
 
 _OF_A_LAYOUT = re.compile(
     r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
@@ -85,7 +90,8 @@ class Origin:
 
     def apply(self, scan: Scan) -> Scan:
         """The scan with this origin, as far as the scan has none of its own."""
-        domain, provenance = max(scan.domain, self.domain), scan.provenance or self.provenance
+        domain = max(scan.domain, self.domain)
+        provenance = scan.provenance or self.provenance
         if (domain, provenance) == (scan.domain, scan.provenance):
             return scan
         return replace(scan, domain=domain, provenance=provenance)
@@ -105,7 +111,8 @@ class Description:
 
     @property
     def origin(self) -> Origin:
-        """What all scans have in common: synthetic if all of them are, and the provenance if there is only one."""
+        """What all scans have in common: synthetic if all of them are, and the provenance if there
+        is only one."""
         if len(self.origins) == 1:
             return self.origins[0]
         return Origin(min(origin.domain for origin in self.origins))
@@ -113,7 +120,11 @@ class Description:
     def to_dict(self) -> dict[str, Any]:
         """Plain values; ``from_dict`` is the inverse."""
         names = {number: name for name, number in DOMAINS.items()}
-        sensor = {} if self.sensor is None else {"sensor": self.sensor.to_dict(), "grid": list(self.sensor.shape)}
+        sensor = (
+            {}
+            if self.sensor is None
+            else {"sensor": self.sensor.to_dict(), "grid": list(self.sensor.shape)}
+        )
         origins = [{"domain": names[origin.domain], **origin.provenance} for origin in self.origins]
         return {"format": FORMAT, **sensor, "origins": origins}
 
@@ -129,15 +140,26 @@ class Description:
             raise ValueError(f"its format is {shorten(repr(given), 100)}, not {FORMAT!r}")
         sensor = _sensor(values["sensor"]) if "sensor" in values else None
         if sensor is not None and values.get("grid", list(sensor.shape)) != list(sensor.shape):
-            raise ValueError(f"its grid is {shorten(repr(values['grid']), 100)}, but its sensor has {sensor.shape}")
+            raise ValueError(
+                f"its grid is {shorten(repr(values['grid']), 100)}, but its sensor has "
+                f"{sensor.shape}"
+            )
         origins = values.get("origins", [{"domain": "real"}])
-        if not isinstance(origins, list) or not origins or not all(isinstance(origin, dict) for origin in origins):
+        if (
+            not isinstance(origins, list)
+            or not origins
+            or not all(isinstance(origin, dict) for origin in origins)
+        ):
             raise ValueError("its origins are not a list of mappings")
         if any(not isinstance(o.get("domain"), str) or o["domain"] not in DOMAINS for o in origins):
             raise ValueError(f"the domain of an origin is not one of {', '.join(DOMAINS)}")
-        facts = [{key: value for key, value in origin.items() if key != "domain"} for origin in origins]
+        facts = [
+            {key: value for key, value in origin.items() if key != "domain"} for origin in origins
+        ]
         pairs = zip(origins, facts, strict=True)
-        return cls(sensor, tuple(Origin(DOMAINS[o["domain"]], check_provenance(kept)) for o, kept in pairs))
+        return cls(
+            sensor, tuple(Origin(DOMAINS[o["domain"]], check_provenance(kept)) for o, kept in pairs)
+        )
 
 
 def _sensor(value: Any) -> Sensor:
@@ -160,14 +182,19 @@ def check_provenance(values: Any) -> dict[str, Any]:
         raise ValueError(f"a provenance that is not a mapping of at most {_MOST_FACTS} values")
     for key, value in values.items():
         texts = [text for text in (key, value) if isinstance(text, str)]
-        valid = isinstance(value, str | None) or (isinstance(value, int | float) and abs(value) < 1e300)
+        valid = isinstance(value, str | None) or (
+            isinstance(value, int | float) and abs(value) < 1e300
+        )
         if not valid or any(len(text) > _LONGEST_TEXT for text in texts):
-            raise ValueError(f"a provenance with {shorten(repr(key), 100)} that is not a short text or a number")
+            raise ValueError(
+                f"a provenance with {shorten(repr(key), 100)} that is not a short text or a number"
+            )
     return values
 
 
 def same_grid(a: Sensor, b: Sensor) -> bool:
-    """Whether two sensors have the same rows and columns, whatever their names, beams and range limits."""
+    """Whether two sensors have the same rows and columns, whatever their names, beams and range
+    limits."""
     return a is b or (a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5)))
 
 
@@ -176,7 +203,8 @@ def read_description(root: Path, plain: bool = False) -> Description | None:
 
     Args:
         root: a dataset's root, one of its folders, or one scan.
-        plain: whether the scans are plain files, which lie in folders of any name below that of their ``scans.json``.
+        plain: whether the scans are plain files, which lie in folders of any name below that of
+            their ``scans.json``.
 
     Raises:
         FileError, DataError: if there is one that cannot be read, or is damaged.
@@ -195,14 +223,17 @@ def read_description(root: Path, plain: bool = False) -> Description | None:
 def _above(folders: Sequence[Path]) -> Description | None:
     """The description of a plain folder, from the folders above the first one.
 
-    A folder has nothing to say about those below it if it is a dataset, or holds scans itself: the ids of a source,
+    A folder has nothing to say about those below it if it is a dataset, or holds scans itself: the
+        ids of a source,
     from which the names come, are of one form.
     """
     for below, folder in pairwise(folders):
         if _is_dataset(below):
             return None
         path = folder / NAME
-        if path.is_file() and _FORMATS in read_start(path, LONGEST):  # other programs have files of this name
+        if path.is_file() and _FORMATS in read_start(
+            path, LONGEST
+        ):  # other programs have files of this name
             return None if _is_dataset(folder) or any(folder.glob("*.bin")) else _current(path)
     return None
 
@@ -214,7 +245,9 @@ def _is_dataset(folder: Path) -> bool:
 def _current(path: Path) -> Description:
     expected = f"a description of scans that this package wrote ({FORMAT})"
     try:
-        return Description.from_dict(parse_json(read_text(path, expected, LONGEST), str(path), expected))
+        return Description.from_dict(
+            parse_json(read_text(path, expected, LONGEST), str(path), expected)
+        )
     except ValueError as error:
         raise DataError(
             f"{path} is damaged ({error})",
@@ -228,11 +261,14 @@ def _of_mark(path: Path) -> Description:
 
 
 def _of_town(path: Path) -> Description:
-    """The description in the settings of a town, which earlier versions wrote without ``scans.json``."""
+    """The description in the settings of a town, which earlier versions wrote without
+    ``scans.json``."""
     expected = "the settings of a town"
     settings = parse_json(read_text(path, expected, LONGEST), str(path), expected)
     facts = settings if isinstance(settings, dict) else {}
-    provenance = {"made_by": "town"} | {key: facts[key] for key in ("seed", "interval") if key in facts}
+    provenance = {"made_by": "town"} | {
+        key: facts[key] for key in ("seed", "interval") if key in facts
+    }
     try:
         sensor = Sensor.from_dict(facts["sensor"]) if "sensor" in facts else None
         return Description(sensor, (Origin(SYNTHETIC, check_provenance(provenance)),))
@@ -241,7 +277,8 @@ def _of_town(path: Path) -> Description:
 
 
 def record(root: Path, sensor: Sensor, origin: Origin) -> Description:
-    """Write the sensor and the origin of a scan into the description of its folder, which may exist already.
+    """Write the sensor and the origin of a scan into the description of its folder, which may exist
+    already.
 
     Args:
         root: the folder.
@@ -265,7 +302,8 @@ def record(root: Path, sensor: Sensor, origin: Origin) -> Description:
 def add_origin(root: Path, origin: Origin) -> Description:
     """Add an origin to the description of a folder, and return it.
 
-    If two processes add one at the same moment, one of the two is lost: the process that started them adds it again.
+    If two processes add one at the same moment, one of the two is lost: the process that started
+        them adds it again.
 
     Raises:
         DataError, FileError: if the description is damaged, or cannot be read or written.
@@ -287,7 +325,8 @@ def require_grid(root: Path, there: Description, sensor: Sensor) -> None:
         raise ConfigError(
             f"a scan of {_named(sensor)} for {root}, which holds scans of {_named(there.sensor)}",
             "scans on one grid in one folder",
-            f"Choose another folder, or convert them with --as-sensor {there.sensor.name} (as_sensor=...).",
+            f"Choose another folder, or convert them with --as-sensor {there.sensor.name} "
+            "(as_sensor=...).",
         )
 
 
@@ -300,7 +339,8 @@ def _encode(description: Description) -> bytes:
 
 
 def to_comments(scan: Scan) -> list[str]:
-    """The description of a scan as lines of a header, of at most ``LINE`` ASCII characters each and a prefix."""
+    """The description of a scan as lines of a header, of at most ``LINE`` ASCII characters each and
+    a prefix."""
     text = json.dumps(Description(scan.sensor, (Origin.of(scan),)).to_dict(), separators=(",", ":"))
     text = text.replace(" ", r"\u0020")  # so that no program that trims or splits a line changes it
     return [f"lidar_synth {text[i : i + LINE]}" for i in range(0, len(text), LINE)]
@@ -318,7 +358,9 @@ def from_comments(lines: Iterable[str], where: str) -> Description | None:
         return None
     expected = f"a description of the scan that this package wrote ({FORMAT})"
     try:
-        return Description.from_dict(parse_json("".join(parts), f"{where}: its description", expected))
+        return Description.from_dict(
+            parse_json("".join(parts), f"{where}: its description", expected)
+        )
     except DataError:
         raise
     except ValueError as error:

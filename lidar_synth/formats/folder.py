@@ -1,9 +1,12 @@
-"""A plain folder of scans, one file each: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply``; or one such file.
+"""A plain folder of scans, one file each: ``.bin``, ``.npy``, ``.npz``, ``.pcd`` or ``.ply``; or
+one such file.
 
-- ``.bin``: float32 x, y, z, reflectance per point, as in KITTI; optional ``NAME.label`` with SemanticKITTI's labels.
+- ``.bin``: float32 x, y, z, reflectance per point, as in KITTI; optional ``NAME.label`` with
+  SemanticKITTI's labels.
 - ``.npy``: the same as an array (N, 4); further columns are ignored.
 - ``.npz``: the package's own format, see npz.py.
-- ``.pcd``, ``.ply``: see pcd.py and ply.py; optional ``NAME.boxes.json`` with the fields of ``Boxes`` as lists.
+- ``.pcd``, ``.ply``: see pcd.py and ply.py; optional ``NAME.boxes.json`` with the fields of
+  ``Boxes`` as lists.
 
 Files in subfolders are included; a scan's id is its relative path without the suffix.
 """
@@ -48,16 +51,19 @@ class Folder(ScanFiles):
 
     Args:
         root: the folder or the file.
-        sensor: the sensor that recorded the scans; by default the one that the files name (``.npz``, ``.pcd`` and
-            ``.ply`` files of this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
+        sensor: the sensor that recorded the scans; by default the one that the files name
+            (``.npz``, ``.pcd`` and ``.ply`` files of this package), or ``scans.json`` beside them,
+            or else ``hdl64e_kitti``.
         fields: floats per point of ``.bin`` files.
-        reflectance_max: maximum of the reflectance in the files; values are divided by it. By default 1, and 255 in
-            scans of PCD and PLY logs of a driver that hold more than 1: those have rings and no description of ours.
+        reflectance_max: maximum of the reflectance in the files; values are divided by it. By
+            default 1, and 255 in scans of PCD and PLY logs of a driver that hold more than 1: those
+            have rings and no description of ours.
         on_bad: see ``ScanFiles``.
 
     Raises:
         FileError: if the path does not exist.
-        ConfigError: if there are files of several kinds; on invalid ``fields`` or ``reflectance_max``.
+        ConfigError: if there are files of several kinds; on invalid ``fields`` or
+            ``reflectance_max``.
         DataError: if there is no file.
     """
 
@@ -73,12 +79,15 @@ class Folder(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         if fields < 4 or not (reflectance_max is None or 0 < reflectance_max < np.inf):
-            raise ConfigError(f"fields={fields}, reflectance_max={reflectance_max}", "at least 4, and above 0")
+            raise ConfigError(
+                f"fields={fields}, reflectance_max={reflectance_max}", "at least 4, and above 0"
+            )
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
         super().__init__(root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0]))
-        self._fields, self._reflectance_max = fields, reflectance_max
+        self._fields = fields
+        self._reflectance_max = reflectance_max
 
     @property
     def options(self) -> dict[str, Any]:
@@ -95,20 +104,30 @@ class Folder(ScanFiles):
         if suffix == ".bin":
             points = read_points(path, self._fields, scale)
             beside = path.with_suffix(".label")
-            labels = read_labels(beside, path, len(points), SEMANTIC_KITTI) if beside.is_file() else {}
+            labels = (
+                read_labels(beside, path, len(points), SEMANTIC_KITTI) if beside.is_file() else {}
+            )
             scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
         elif suffix == ".npz":
-            scan = decode_scan(read_arrays(path), str(path), self.sensor if self._unknown else self._given)
+            scan = decode_scan(
+                read_arrays(path), str(path), self.sensor if self._unknown else self._given
+            )
             check_scan(scan, str(path))
             return scan
         else:
             arrays: dict[str, Any] = ARRAYS[suffix](path)
             said = _description(path)
-            scan = Scan(sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays)
+            scan = Scan(
+                sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays
+            )
             scan = said.origin.apply(scan) if said else without_empty_firings(scan)
             scan.boxes = read_boxes(path)
             is_log = said is None and scan.ring is not None
-            if is_log and self._reflectance_max is None and np.nanmax(scan.reflectance, initial=0) > 1:
+            if (
+                is_log
+                and self._reflectance_max is None
+                and np.nanmax(scan.reflectance, initial=0) > 1
+            ):
                 scale = LOG_REFLECTANCE
             check_scan(scan, str(path), scale)
             if is_log and self._given is not None:
@@ -157,14 +176,17 @@ def without_empty_firings(scan: Scan) -> Scan:
 
 
 def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
-    """(N,) the row of the sensor for each ring: drivers count from below, or in the order of the lasers.
+    """(N,) the row of the sensor for each ring: drivers count from below, or in the order of the
+    lasers.
 
     A ring is the row that is nearest to most of its points.
     """
     assert scan.ring is not None
     _, number = np.unique(scan.ring, return_inverse=True)
     rows = scan.sensor.shape[0]
-    votes = np.bincount(number * rows + assign_beams(scan).ring, minlength=rows * (int(number.max()) + 1))
+    votes = np.bincount(
+        number * rows + assign_beams(scan).ring, minlength=rows * (int(number.max()) + 1)
+    )
     nearest = votes.reshape(-1, rows).argmax(axis=1)
     return np.asarray(nearest[number], np.int16)
 
@@ -172,14 +194,20 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
 def _columns(path: Path) -> dict[str, NDArray[Any]]:
     array = read_arrays(path)["array"]
     if array.ndim != 2 or array.shape[1] < 4:
-        raise DataError(f"{path} holds an array of shape {array.shape}", "(N, 4): x, y, z, reflectance")
+        raise DataError(
+            f"{path} holds an array of shape {array.shape}", "(N, 4): x, y, z, reflectance"
+        )
     check_numbers(array, str(path))
     with np.errstate(over="ignore"):
         array = array.astype(np.float32, copy=False)
     return {"points": array[:, :3], "reflectance": array[:, 3]}
 
 
-ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {".npy": _columns, ".pcd": read_pcd, ".ply": read_ply}
+ARRAYS: dict[str, Callable[[Path], dict[str, NDArray[Any]]]] = {
+    ".npy": _columns,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+}
 """{suffix: reader of a scan's arrays}."""
 
 HEADERS: dict[str, Callable[[Path], Description | None]] = {
@@ -196,7 +224,8 @@ def _description(path: Path) -> Description | None:
 
 
 def _named_sensor(path: Path) -> Sensor | None:
-    """The sensor that a file names; None if it names none, or if reading the scan will raise an error."""
+    """The sensor that a file names; None if it names none, or if reading the scan will raise an
+    error."""
     if path.suffix.lower() == ".npz":
         return stored_sensor(path)
     try:
@@ -221,10 +250,16 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes)
-    paths = sorted(p for p in found if not any(part[0] == "." for part in p.relative_to(root).parts))
+    paths = sorted(
+        p for p in found if not any(part[0] == "." for part in p.relative_to(root).parts)
+    )
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
-        raise ConfigError(f"{root} holds {' and '.join(kinds)} files", "one kind", "Give the folder of one of them.")
+        raise ConfigError(
+            f"{root} holds {' and '.join(kinds)} files",
+            "one kind",
+            "Give the folder of one of them.",
+        )
     if not paths:
         raise DataError(f"{root} holds no scan", f"files with one of {', '.join(suffixes)}")
     return root, paths
@@ -236,7 +271,9 @@ class KITTIWriter(FileWriter):
     suffix = ".bin"
     keeps = LABELS
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         if scan.label is not None:
             write_labels(path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI))
         self._write_points(path, scan)
@@ -248,27 +285,35 @@ class NPZWriter(FileWriter):
     suffix = ".npz"
     keeps = frozenset(DETAILS) - {"image_path"}
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         write_scan(path, scan)
 
 
 class PCDWriter(FileWriter):
-    """Writes ``NAME.pcd`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``, without pose."""
+    """Writes ``NAME.pcd`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``,
+    without pose."""
 
     suffix = ".pcd"
     keeps = frozenset({*POINT_FIELDS, "boxes"})
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         write_boxes(path, scan.boxes)
         write_pcd(path, scan)
 
 
 class PLYWriter(FileWriter):
-    """Writes ``NAME.ply`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``, without pose."""
+    """Writes ``NAME.ply`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``,
+    without pose."""
 
     suffix = ".ply"
     keeps = frozenset({*POINT_FIELDS, "boxes"})
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         write_boxes(path, scan.boxes)
         write_ply(path, scan)

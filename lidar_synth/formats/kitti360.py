@@ -2,21 +2,25 @@
 
 Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
-    data_3d_raw/DRIVE/velodyne_points/data/FFFFFFFFFF.bin       float32 x, y, z, reflectance; sensor frame
-    data_2d_raw/DRIVE/image_00/data_rect/FFFFFFFFFF.png         rectified left camera
-    data_poses/DRIVE/poses.txt                                  F and 12 numbers: the car's IMU at frame F to world
-    data_3d_bboxes/train/DRIVE.xml                              boxes, see kitti360_boxes.py
-    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label        labels per scan, see below
-    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin      uint8 per point, 255 = certain
-    calibration/perspective.txt                                 P_rect_00, R_rect_00
-    calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to the IMU
+    data_3d_raw/DRIVE/velodyne_points/data/FFFFFFFFFF.bin       float32 x, y, z, reflectance; sensor
+    frame data_2d_raw/DRIVE/image_00/data_rect/FFFFFFFFFF.png         rectified left camera
+    data_poses/DRIVE/poses.txt                                  F and 12 numbers: the car's IMU at
+    frame F to world data_3d_bboxes/train/DRIVE.xml                              boxes, see
+    kitti360_boxes.py data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label        labels per scan,
+    see below data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin      uint8 per point, 255 =
+    certain calibration/perspective.txt                                 P_rect_00, R_rect_00
+    calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to
+    the IMU
 
-The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers labels per scan from
-them (kitti360_labels.py), and so does github.com/JulesSanchez/recoverKITTI360label, which writes
-DRIVE/labels/FFFFFFFFFF.bin: int16 per point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan,
-the reader accepts both and distinguishes the two encodings by their size: two bytes per point are the encoding of that
-tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance above), which the writer
-uses. Only frames of annotated windows can have labels; all others are read without labels.
+The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers
+labels per scan from them (kitti360_labels.py), and so does
+github.com/JulesSanchez/recoverKITTI360label, which writes DRIVE/labels/FFFFFFFFFF.bin: int16 per
+point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan,
+the reader accepts both and distinguishes the two encodings by their size: two bytes per point are
+    the encoding of that
+tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance
+above), which the writer uses. Only frames of annotated windows can have labels; all others are read
+without labels.
 
 The pose of a ``Scan`` is velodyne to world: pose calib_cam_to_pose[image_00] calib_cam_to_velo^-1.
 """
@@ -33,38 +37,61 @@ from lidar_synth.datasets.recordings import KITTI360_SPLITS
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import list_files, read_file, read_values
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.kitti360_boxes import MAX_INSTANCES, MOST_INSTANCE, WorldBoxes, read_boxes, write_boxes
-from lidar_synth.formats.kitti360_poses import CAMERA, read_calibration, read_poses, write_calibration, write_poses
+from lidar_synth.formats.kitti360_boxes import (
+    MAX_INSTANCES,
+    MOST_INSTANCE,
+    WorldBoxes,
+    read_boxes,
+    write_boxes,
+)
+from lidar_synth.formats.kitti360_poses import (
+    CAMERA,
+    read_calibration,
+    read_poses,
+    write_calibration,
+    write_poses,
+)
 from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.formats.writer import (
+    LABELS,
+    Picture,
+    Writer,
+    clear_notes,
+    read_notes,
+    write_image,
+    write_note,
+)
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 SPLITS = KITTI360_SPLITS
-"""Drives of each split, named after the work that introduced it; None = all existing drives. The splits overlap: LiDM
-trains on drives on which R2Flow tests."""
+"""Drives of each split, named after the work that introduced it; None = all existing drives. The
+splits overlap: LiDM trains on drives on which R2Flow tests."""
 
 
 class KITTI360(ScanFiles):
-    """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes, calibration, images.
+    """KITTI-360's drives: <root>/data_3d_raw/DRIVE/velodyne_points/data/*.bin with poses, boxes,
+    calibration, images.
 
-    A scan has labels if its label file exists, and boxes if the drive has boxes and the scan a pose.
+    A scan has labels if its label file exists, and boxes if the drive has boxes and the scan a
+    pose.
 
     Args:
         root: the folder that holds ``data_3d_raw``.
         split: the full name of a split, such as ``r2flow/train``, or ``all``.
-        labels: the folder with ``data_3d_semantics_scan``; then only scans that have labels there are read. By default
-            all scans are read, with labels where ``root`` has them.
-        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
-            else ``hdl64e_kitti360``.
+        labels: the folder with ``data_3d_semantics_scan``; then only scans that have labels there
+            are read. By default all scans are read, with labels where ``root`` has them.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
+            (``scans.json``), or else ``hdl64e_kitti360``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        ConfigError: on an unknown split; ``train`` alone is unknown, because published works split the drives
-            differently.
-        DataError: if the folder has none of the split's drives, or ``labels`` has none of its scans.
+        ConfigError: on an unknown split; ``train`` alone is unknown, because published works split
+            the drives differently.
+        DataError: if the folder has none of the split's drives, or ``labels`` has none of its
+            scans.
 
     Example:
         >>> from lidar_synth import KITTI360
@@ -89,7 +116,9 @@ class KITTI360(ScanFiles):
     ) -> None:
         root = Path(root)
         drives = drives_of(root, split)
-        ids = [f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")]
+        ids = [
+            f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")
+        ]
         self._labels = root if labels is None else Path(labels)
         if labels is not None:
             ids = [name for name in ids if label_file(self._labels, *name.split("/"))]
@@ -97,7 +126,8 @@ class KITTI360(ScanFiles):
                 raise DataError(
                     f"{labels} has no labels of scans of {root}",
                     "data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label",
-                    f"lidar-synth label kitti360 {root} {labels} makes them from the accumulated clouds.",
+                    f"lidar-synth label kitti360 {root} {labels} makes them from the accumulated "
+                    "clouds.",
                 )
         super().__init__(root, ids, sensor, on_bad)
         self._camera = read_calibration(root)
@@ -135,10 +165,11 @@ class KITTI360(ScanFiles):
 class KITTI360Writer(Writer):
     """Writes KITTI-360's layout: scans, poses, calibration, boxes, images and labels per scan.
 
-    Drive and frame of an id ``DRIVE/FFFFFFFFFF`` are kept, and those of SemanticKITTI's sequences (sequence 03 is
-    drive 0003); all other scans go into ``drive``, numbered by index. Boxes are written for each frame with their
-    timestamp, as the dataset does for moving objects. A scan with boxes but without a pose gets the identity as its
-    pose, so that its world frame is its sensor frame.
+    Drive and frame of an id ``DRIVE/FFFFFFFFFF`` are kept, and those of SemanticKITTI's sequences
+    (sequence 03 is drive 0003); all other scans go into ``drive``, numbered by index. Boxes are
+    written for each frame with their timestamp, as the dataset does for moving objects. A scan with
+    boxes but without a pose gets the identity as its pose, so that its world frame is its sensor
+    frame.
 
     Args:
         root: output folder.
@@ -157,16 +188,25 @@ class KITTI360Writer(Writer):
     ) -> None:
         super().__init__(root, calibration=calibration)
         if not drive or "/" in drive:
-            raise ConfigError(f"drive {drive!r}", "a folder's name, such as 2013_05_28_drive_0000_sync")
+            raise ConfigError(
+                f"drive {drive!r}", "a folder's name, such as 2013_05_28_drive_0000_sync"
+            )
         self.drive = drive
 
     def _place(self, index: int, name: str | None) -> str:
-        match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or "")
-        drive, frame = (f"2013_05_28_drive_00{match[1]}_sync", int(match[2])) if match else (self.drive, index)
+        match = re.fullmatch(
+            r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or ""
+        )
+        drive, frame = (
+            (f"2013_05_28_drive_00{match[1]}_sync", int(match[2])) if match else (self.drive, index)
+        )
         return (scans_folder(Path(), drive) / f"{frame:010d}.bin").as_posix()
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        drive, frame = path.parents[2].name, path.stem
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
+        drive = path.parents[2].name
+        frame = path.stem
         if not (self.root / "calibration" / "perspective.txt").is_file():
             write_calibration(self.root, camera or CAMERA)
         write_note(self.root / "data_poses" / drive, int(frame), _facts(scan))
@@ -180,7 +220,9 @@ class KITTI360Writer(Writer):
         for folder in sorted((self.root / "data_poses").glob("*")):
             notes = read_notes(folder)
             poses = read_poses(self.root, folder.name, read_calibration(self.root))
-            new = {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            new = {
+                f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None
+            }
             write_poses(self.root, folder.name, new)
             poses |= new
             boxes = {
@@ -194,7 +236,8 @@ class KITTI360Writer(Writer):
 
 
 def label_values(scan: Scan) -> NDArray[np.uint32]:
-    """(N,) values of a scan's label file: KITTI-360's id, and above it id * 1000 + n, which labels and boxes use.
+    """(N,) values of a scan's label file: KITTI-360's id, and above it id * 1000 + n, which labels
+    and boxes use.
 
     Raises:
         DataError: on a train id or an instance that the file cannot hold.
@@ -202,9 +245,12 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
     labels = encode_labels(scan, CLASSES)
     if labels is scan.raw_label:
         return labels
-    ids, instances = labels & 0xFFFF, labels >> 16
+    ids = labels & 0xFFFF
+    instances = labels >> 16
     local = (instances > 0) & (instances < MAX_INSTANCES)
-    return np.where(local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels).astype(np.uint32)
+    return np.where(local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels).astype(
+        np.uint32
+    )
 
 
 def _facts(scan: Scan) -> dict[str, Any]:
@@ -213,9 +259,13 @@ def _facts(scan: Scan) -> dict[str, Any]:
     Raises:
         DataError: on an instance of a box that the file cannot hold.
     """
-    boxes, pose = scan.boxes, scan.pose
+    boxes = scan.boxes
+    pose = scan.pose
     if boxes is not None and boxes.instance.max(initial=0) > MOST_INSTANCE:
-        raise DataError(f"scan {scan.id!r}: a box of instance {boxes.instance.max()}", f"at most {MOST_INSTANCE}")
+        raise DataError(
+            f"scan {scan.id!r}: a box of instance {boxes.instance.max()}",
+            f"at most {MOST_INSTANCE}",
+        )
     if boxes is not None and pose is None:
         pose = np.eye(4)
     return {
@@ -245,11 +295,14 @@ def drives_of(root: Path, split: str) -> list[str]:
     """
     hint = "Published works split the drives differently: give the full name of a split."
     wanted = choose("KITTI-360 split", split, SPLITS, hint)
-    existing = sorted(p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data"))
+    existing = sorted(
+        p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data")
+    )
     drives = [d for d in existing if wanted is None or d in wanted]
     if not drives:
         raise DataError(
-            f"{root} has no drive of split {split!r} (it has {', '.join(existing) or 'none at all'})",
+            f"{root} has no drive of split {split!r} (it has "
+            f"{', '.join(existing) or 'none at all'})",
             "data_3d_raw/2013_05_28_drive_NNNN_sync/velodyne_points/data/*.bin",
         )
     return drives
@@ -276,12 +329,16 @@ def label_file(root: Path, drive: str, frame: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def read_scan_labels(root: Path, drive: str, frame: str, points: Path, count: int) -> dict[str, Any]:
-    """``label``, ``raw_label``, ``instance`` and, if known, ``confidence`` of a scan; empty if it has no label file.
+def read_scan_labels(
+    root: Path, drive: str, frame: str, points: Path, count: int
+) -> dict[str, Any]:
+    """``label``, ``raw_label``, ``instance`` and, if known, ``confidence`` of a scan; empty if it
+    has no label file.
 
     Raises:
         FileError: if its label file cannot be read.
-        DataError: if the numbers of labels and points differ; on an id that KITTI-360 does not define.
+        DataError: if the numbers of labels and points differ; on an id that KITTI-360 does not
+            define.
     """
     path = label_file(root, drive, frame)
     if path is None:

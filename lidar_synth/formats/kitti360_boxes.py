@@ -1,16 +1,20 @@
 """KITTI-360's boxes: one XML per drive, in the world frame.
 
-Each object (https://www.cvlibs.net/datasets/kitti-360/documentation.php, data_3d_bboxes) is a unit cube, ``vertices``,
-that ``transform`` rotates, scales and moves into the world frame: its columns are the axes of the box, scaled by its
-size. A moving object has one entry per frame, whose ``timestamp`` is the frame. A static object has one entry with
-timestamp -1; ``start_frame`` and ``end_frame`` bound the *window* of the drive, about 200 m, in which it was
-annotated. The file does not contain the frames in which it is visible.
+Each object (https://www.cvlibs.net/datasets/kitti-360/documentation.php, data_3d_bboxes) is a unit
+cube, ``vertices``,
+that ``transform`` rotates, scales and moves into the world frame: its columns are the axes of the
+    box, scaled by its
+size. A moving object has one entry per frame, whose ``timestamp`` is the frame. A static object has
+one entry with timestamp -1; ``start_frame`` and ``end_frame`` bound the *window* of the drive,
+about 200 m, in which it was annotated. The file does not contain the frames in which it is visible.
 
-The reader therefore lists a static object in every frame whose sensor is within range of it, if its window is at most
-``MARGIN`` frames away. Cars of the next window thus appear before it begins, and cars that parked at the same place at
-another time do not appear. ``Boxes`` has no tilt, so a box that is tilted relative to the sensor keeps only its yaw.
+The reader therefore lists a static object in every frame whose sensor is within range of it, if its
+window is at most ``MARGIN`` frames away. Cars of the next window thus appear before it begins, and
+cars that parked at the same place at another time do not appear. ``Boxes`` has no tilt, so a box
+that is tilted relative to the sensor keeps only its yaw.
 
-``semanticId`` is not the id of the label images, but an older numbering (``OBJECTS``); drive 0004 has labels only.
+``semanticId`` is not the id of the label images, but an older numbering (``OBJECTS``); drive 0004
+has labels only.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -29,19 +33,33 @@ MARGIN = 100
 """Maximum distance in frames (about 80 m) from an object's window at which the object is listed."""
 
 OBJECTS = {
-    13: ("car", 26, "Car"), 14: ("truck", 27, "Truck"), 15: ("trailer", 30, "Misc"), 16: ("caravan", 29, "Misc"),
-    17: ("motorcycle", 32, "Misc"), 18: ("bicycle", 33, "Misc"), 19: ("pedestrian", 24, "Pedestrian"),
-    20: ("rider", 25, "Cyclist"), 33: ("train", 31, "Tram"), 34: ("bus", 28, "Misc"),
+    13: ("car", 26, "Car"),
+    14: ("truck", 27, "Truck"),
+    15: ("trailer", 30, "Misc"),
+    16: ("caravan", 29, "Misc"),
+    17: ("motorcycle", 32, "Misc"),
+    18: ("bicycle", 33, "Misc"),
+    19: ("pedestrian", 24, "Pedestrian"),
+    20: ("rider", 25, "Cyclist"),
+    33: ("train", 31, "Tram"),
+    34: ("bus", 28, "Misc"),
     36: ("unknownVehicle", 43, "Misc"),
-}  # fmt: skip
-"""{semanticId: (label, id in the label images, KITTI's name)} of the classes for detectors; all others are skipped.
-Lossy: a rider's box does not include the bicycle, which has its own box."""
+}
+"""{semanticId: (label, id in the label images, KITTI's name)} of the classes for detectors; all
+others are skipped. Lossy: a rider's box does not include the bicycle, which has its own box."""
 
 BY_LABEL = {label: semantic for semantic, (label, _, _) in OBJECTS.items()}
 
 BY_NAME = {
-    "Car": 13, "Van": 13, "Truck": 14, "Pedestrian": 19, "Person_sitting": 19, "Cyclist": 20, "Tram": 33, "Misc": 36,
-}  # fmt: skip
+    "Car": 13,
+    "Van": 13,
+    "Truck": 14,
+    "Pedestrian": 19,
+    "Person_sitting": 19,
+    "Cyclist": 20,
+    "Tram": 33,
+    "Misc": 36,
+}
 """{KITTI's name: semanticId to write}. Lossy: vans become cars, and sitting persons pedestrians."""
 
 MAX_INSTANCES = 1000
@@ -51,7 +69,17 @@ MOST_INSTANCE = (1 << 31) - 1 - 100 * MAX_INSTANCES
 """Maximum instance of a box to write: the reader adds its class to it."""
 
 CUBE = np.array(
-    [(1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, -1), (-1, 1, 1), (-1, -1, -1), (-1, -1, 1)], np.float64
+    [
+        (1, 1, 1),
+        (1, 1, -1),
+        (1, -1, 1),
+        (1, -1, -1),
+        (-1, 1, -1),
+        (-1, 1, 1),
+        (-1, -1, -1),
+        (-1, -1, 1),
+    ],
+    np.float64,
 )
 """(8, 3) twice the vertices of the unit cube, in the order of the dataset."""
 
@@ -66,7 +94,8 @@ class WorldBoxes:
         transforms: (M, 4, 4) float64 from the unit cube to the world.
         names: (M,) KITTI's names.
         instances: (M,) int32.
-        windows: (M, 2) int64 first and last frame in which an object may be listed; the same for a moving object.
+        windows: (M, 2) int64 first and last frame in which an object may be listed; the same for a
+            moving object.
     """
 
     transforms: NDArray[np.float64]
@@ -101,18 +130,28 @@ def read_boxes(path: Path) -> WorldBoxes:
         FileError: if it cannot be read.
         DataError: if it is not a file of KITTI-360, or an object's vertices do not form a box.
     """
-    transforms, names, instances, windows = [], [], [], []
+    transforms = []
+    names = []
+    instances = []
+    windows = []
     try:
         for _, node in ElementTree.iterparse(path):
             if node.find("transform") is None:
                 continue
-            semantic = int(node.findtext("semanticId") or BY_LABEL.get(node.findtext("label", ""), -1))
+            semantic = int(
+                node.findtext("semanticId") or BY_LABEL.get(node.findtext("label", ""), -1)
+            )
             if semantic in OBJECTS:
                 _, image_id, name = OBJECTS[semantic]
-                transforms.append(_matrix(node, "transform", (4, 4)) @ _unit_cube(_matrix(node, "vertices", (-1, 3))))
+                transforms.append(
+                    _matrix(node, "transform", (4, 4))
+                    @ _unit_cube(_matrix(node, "vertices", (-1, 3)))
+                )
                 names.append(name)
                 instances.append(image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0))
-                frame, first, last = (int(node.findtext(t) or -1) for t in ("timestamp", "start_frame", "end_frame"))
+                frame, first, last = (
+                    int(node.findtext(t) or -1) for t in ("timestamp", "start_frame", "end_frame")
+                )
                 windows.append((frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN))
             node.clear()
         found = WorldBoxes(
@@ -126,11 +165,14 @@ def read_boxes(path: Path) -> WorldBoxes:
     except (ElementTree.ParseError, ValueError, LookupError, OverflowError) as error:
         raise DataError(f"{path}: {error}", "KITTI-360's data_3d_bboxes") from error
     sizes = np.linalg.norm(found.transforms[:, :3, :3], axis=1)
-    sound = np.isfinite(found.transforms).all(axis=(1, 2)) & ((sizes > 0) & (sizes <= FARTHEST)).all(axis=1)
+    sound = np.isfinite(found.transforms).all(axis=(1, 2)) & (
+        (sizes > 0) & (sizes <= FARTHEST)
+    ).all(axis=1)
     if not sound.all():
         wrong = found.transforms[~sound][0].tolist()
         raise DataError(
-            f"{path}: {np.count_nonzero(~sound)} objects are not boxes, such as {wrong}", "finite sizes above 0"
+            f"{path}: {np.count_nonzero(~sound)} objects are not boxes, such as {wrong}",
+            "finite sizes above 0",
         )
     return found
 
@@ -140,8 +182,10 @@ def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> NDAr
 
 
 def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) transform from the unit cube around the origin to the box of the vertices, usually the identity."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    """(4, 4) transform from the unit cube around the origin to the box of the vertices, usually the
+    identity."""
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     matrix = np.diag([*(high - low), 1.0])
     matrix[:3, 3] = (low + high) / 2
     return matrix
@@ -158,25 +202,36 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
         FileError: if it cannot be read or written.
         DataError: if the existing file is not XML, or a timestamp in it is no frame.
     """
-    root, kept = ElementTree.Element("opencv_storage"), []
+    root = ElementTree.Element("opencv_storage")
+    kept = []
     if path.is_file():
         try:
             root = ElementTree.parse(path).getroot()
             kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
         except OSError as error:
             raise unreadable(path, error) from error
-        except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
+        except (
+            ElementTree.ParseError,
+            ValueError,
+            LookupError,
+        ) as error:  # LookupError: an unknown encoding
             raise DataError(
                 f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write a new one."
             ) from error
-    objects = [node for frame, (boxes, pose) in sorted(frames.items()) for node in _objects(frame, boxes, pose)]
+    objects = [
+        node
+        for frame, (boxes, pose) in sorted(frames.items())
+        for node in _objects(frame, boxes, pose)
+    ]
     # In the order of frames, so that a resumed export has the bytes of one in a single run.
     root[:] = sorted([*kept, *objects], key=lambda node: int(node.findtext("timestamp") or -1))
     for index, node in enumerate(root):
         node.tag = f"object{index}"
         _child(node, "index").text = str(index)
     ElementTree.indent(root, " ")
-    write_file(path, lambda file: ElementTree.ElementTree(root).write(file, "utf-8", xml_declaration=True))
+    write_file(
+        path, lambda file: ElementTree.ElementTree(root).write(file, "utf-8", xml_declaration=True)
+    )
 
 
 def _objects(frame: int, boxes: Boxes, pose: NDArray[np.float64]) -> list[ElementTree.Element]:
@@ -184,7 +239,8 @@ def _objects(frame: int, boxes: Boxes, pose: NDArray[np.float64]) -> list[Elemen
     for i, (x, y, z, length, width, height, yaw) in enumerate(boxes.values.astype(np.float64)):
         semantic = BY_NAME.get(boxes.names[i], BY_NAME["Misc"])
         label, image_id, _ = OBJECTS[semantic]
-        c, s = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         local = np.eye(4)
         local[:3, :3] = np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)]) * (length, width, height)
         local[:3, 3] = x, y, z
@@ -209,7 +265,14 @@ def _child(node: ElementTree.Element, tag: str) -> ElementTree.Element:
     return ElementTree.SubElement(node, tag) if found is None else found
 
 
-def _opencv(node: ElementTree.Element, tag: str, shape: tuple[int, int], kind: str, data: str) -> None:
+def _opencv(
+    node: ElementTree.Element, tag: str, shape: tuple[int, int], kind: str, data: str
+) -> None:
     matrix = ElementTree.SubElement(node, tag, type_id="opencv-matrix")
-    for name, text in (("rows", str(shape[0])), ("cols", str(shape[1])), ("dt", kind), ("data", data)):
+    for name, text in (
+        ("rows", str(shape[0])),
+        ("cols", str(shape[1])),
+        ("dt", kind),
+        ("data", data),
+    ):
         ElementTree.SubElement(matrix, name).text = text

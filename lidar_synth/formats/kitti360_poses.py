@@ -6,7 +6,8 @@ Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
     calibration/calib_cam_to_velo.txt    12 numbers: camera 0, unrectified, to velodyne
     calibration/calib_cam_to_pose.txt    image_00: camera 0, unrectified, to IMU
     data_poses/DRIVE/poses.txt           a frame and 12 numbers per line: IMU to world
-    data_poses/DRIVE/cam0_to_world.txt   a frame and 16 numbers per line: rectified camera 0 to world
+    data_poses/DRIVE/cam0_to_world.txt   a frame and 16 numbers per line: rectified camera 0 to
+    world
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,7 +25,13 @@ from lidar_synth.files.disk import (
     write_file,
     write_named_matrices,
 )
-from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera, read_image_size
+from lidar_synth.formats.calibration import (
+    Calibration,
+    check_rigid,
+    homogeneous,
+    ideal_camera,
+    read_image_size,
+)
 
 CAMERA = ideal_camera(552.554261, (1408, 376))
 """The camera that is written if none is known: image_00's size and focal length, at the sensor."""
@@ -33,7 +40,8 @@ IMU_FROM_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 """The IMU has x forward, y right, z down; without calibration it is assumed to be at the sensor."""
 
 STILL = 0.5
-"""Maximum distance, metres, that the car moved between two poses for the frames between them to get poses, too."""
+"""Maximum distance, metres, that the car moved between two poses for the frames between them to get
+poses, too."""
 
 SIZES = {"P_rect_00": 12, "R_rect_00": 9, "S_rect_00": 2, "image_00": 12, "cam_to_velo": 12}
 """Number of values of each matrix of the calibration."""
@@ -46,26 +54,36 @@ def read_calibration(root: Path) -> Calibration | None:
         DataError: if a file does not hold the required matrices.
     """
     folder = root / "calibration"
-    paths = [folder / name for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")]
+    paths = [
+        folder / name
+        for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")
+    ]
     if not all(path.is_file() for path in paths):
         return None
     found = read_named_matrices(paths[0]) | read_named_matrices(paths[2])
     found["cam_to_velo"] = read_matrix(paths[1], 12).reshape(-1)
     try:
         matrices = {name: found[name] for name in SIZES}
-        if wrong := {name: values.size for name, values in matrices.items() if values.size != SIZES[name]}:
+        if wrong := {
+            name: values.size for name, values in matrices.items() if values.size != SIZES[name]
+        }:
             raise ValueError(f"{wrong} values, not {SIZES}")
         for name in ("image_00", "cam_to_velo"):
             check_rigid(homogeneous(matrices[name]), name)
-        camera_from_sensor = homogeneous(matrices["R_rect_00"]) @ np.linalg.inv(homogeneous(matrices["cam_to_velo"]))
+        camera_from_sensor = homogeneous(matrices["R_rect_00"]) @ np.linalg.inv(
+            homogeneous(matrices["cam_to_velo"])
+        )
         size = read_image_size(matrices["S_rect_00"], "S_rect_00")
         return Calibration(matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, size, matrices)
     except (KeyError, ValueError) as error:
-        raise DataError(f"{folder}: {error!r}", "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers") from error
+        raise DataError(
+            f"{folder}: {error!r}", "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers"
+        ) from error
 
 
 def write_calibration(root: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: KITTI-360's own matrices unchanged; other cameras as unrectified."""
+    """The inverse of ``read_calibration``: KITTI-360's own matrices unchanged; other cameras as
+    unrectified."""
     matrices = camera.matrices
     if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(matrices):
         matrices = {
@@ -76,10 +94,15 @@ def write_calibration(root: Path, camera: Calibration) -> None:
             "cam_to_velo": camera.sensor_from_camera[:3],
         }
     folder = root / "calibration"
-    write_file(folder / "calib_cam_to_velo.txt", f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode())
+    write_file(
+        folder / "calib_cam_to_velo.txt", f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode()
+    )
     write_named_matrices(folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]})
     # Last, because its presence marks the calibration as complete.
-    write_named_matrices(folder / "perspective.txt", {n: matrices[n] for n in ("S_rect_00", "R_rect_00", "P_rect_00")})
+    write_named_matrices(
+        folder / "perspective.txt",
+        {n: matrices[n] for n in ("S_rect_00", "R_rect_00", "P_rect_00")},
+    )
 
 
 def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
@@ -90,11 +113,15 @@ def imu_from_sensor(camera: Calibration | None) -> NDArray[np.float64]:
     return homogeneous(camera.matrices["image_00"]) @ np.linalg.inv(cam_to_velo)
 
 
-def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
-    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every frame has a pose.
+def read_poses(
+    root: Path, drive: str, camera: Calibration | None
+) -> dict[int, NDArray[np.float64]]:
+    """{frame: (4, 4) velodyne to world}; empty without ``poses.txt`` or calibration. Not every
+    frame has a pose.
 
     Raises:
-        DataError: on a line without 13 numbers, an invalid or repeated frame number, or a pose that is not rigid.
+        DataError: on a line without 13 numbers, an invalid or repeated frame number, or a pose that
+            is not rigid.
     """
     path = root / "data_poses" / drive / "poses.txt"
     if camera is None or not path.is_file():
@@ -105,13 +132,16 @@ def read_poses(root: Path, drive: str, camera: Calibration | None) -> dict[int, 
     frames = lines[:, 0]
     valid = (frames >= 0) & (frames < 1e10) & (frames == np.rint(frames))
     if not valid.all() or len(np.unique(frames)) < len(frames):
-        raise DataError(f"{path} has invalid or repeated frame numbers", "each frame once, integers from 0 on")
+        raise DataError(
+            f"{path} has invalid or repeated frame numbers", "each frame once, integers from 0 on"
+        )
     check_rigid(matrices, str(path))
     return dict(zip(frames.astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
 
 
 def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
-    """The inverse of ``read_poses``, with the calibration in ``root``; poses of other frames in the files stay.
+    """The inverse of ``read_poses``, with the calibration in ``root``; poses of other frames in the
+    files stay.
 
     ``cam0_to_world.txt``, which the dataset also has, is written beside ``poses.txt``.
     """
@@ -121,20 +151,28 @@ def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -
     folder = root / "data_poses" / drive
     sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
     imu = {frame: numbers((pose @ sensor_from_imu)[:3].ravel()) for frame, pose in poses.items()}
-    cam0 = {frame: numbers((pose @ camera.sensor_from_camera).ravel()) for frame, pose in poses.items()}
+    cam0 = {
+        frame: numbers((pose @ camera.sensor_from_camera).ravel()) for frame, pose in poses.items()
+    }
     _add_lines(folder / "poses.txt", imu)
     _add_lines(folder / "cam0_to_world.txt", cam0)
 
 
 def _add_lines(path: Path, lines: dict[int, str]) -> None:
-    """Write lines by frame; those of other frames stay as they are, since reading a pose rounds it."""
+    """Write lines by frame; those of other frames stay as they are, since reading a pose rounds
+    it."""
     there = read_text(path).splitlines() if path.is_file() else []
-    kept = {int(float(frame)): values for frame, _, values in (line.partition(" ") for line in there if line)}
+    kept = {
+        int(float(frame)): values
+        for frame, _, values in (line.partition(" ") for line in there if line)
+    }
     text = [f"{frame} {values}\n" for frame, values in sorted((kept | lines).items())]
     write_file(path, "".join(text).encode())
 
 
-def fill_poses(poses: dict[int, NDArray[np.float64]], frames: Iterable[int]) -> dict[int, NDArray[np.float64]]:
+def fill_poses(
+    poses: dict[int, NDArray[np.float64]], frames: Iterable[int]
+) -> dict[int, NDArray[np.float64]]:
     """Poses of further frames, between two known poses that are at most ``STILL`` apart.
 
     The dataset leaves out frames in which the car hardly moved.
@@ -155,7 +193,8 @@ def fill_poses(poses: dict[int, NDArray[np.float64]], frames: Iterable[int]) -> 
         after = int(np.searchsorted(known, frame))
         if not 0 < after < len(known):
             continue
-        first, last = int(known[after - 1]), int(known[after])
+        first = int(known[after - 1])
+        last = int(known[after])
         if np.linalg.norm(poses[last][:3, 3] - poses[first][:3, 3]) <= STILL:
             share = (frame - first) / (last - first)
             filled[frame] = poses[first if share < 0.5 else last].copy()
@@ -166,7 +205,8 @@ def fill_poses(poses: dict[int, NDArray[np.float64]], frames: Iterable[int]) -> 
 def ego_motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[np.float64]:
     """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
 
-    Without a pose of the frame before, the motion to the next frame is taken; without both, the car stood still.
+    Without a pose of the frame before, the motion to the next frame is taken; without both, the car
+    stood still.
     """
     if frame - 1 in poses:
         return np.asarray(np.linalg.inv(poses[frame]) @ poses[frame - 1])
@@ -175,12 +215,14 @@ def ego_motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[
     return np.eye(4)
 
 
-def undo_ego_motion(points: NDArray[np.floating], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+def undo_ego_motion(
+    points: NDArray[np.floating], motion: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Points of one revolution as seen from the sensor's place at the moment of the pose.
 
-    The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point at azimuth a
-    (counter-clockwise from ahead) was measured a / 2 pi of a frame earlier. This is the rule by which the dataset's own
-    tool (kitti360Scripts, accumuLaser) accumulated its clouds.
+    The sensor turns clockwise once per frame and looks ahead at the moment of the pose, so a point
+    at azimuth a (counter-clockwise from ahead) was measured a / 2 pi of a frame earlier. This is
+    the rule by which the dataset's own tool (kitti360Scripts, accumuLaser) accumulated its clouds.
 
     Args:
         points: (N, 3) metres, as measured.
@@ -191,6 +233,7 @@ def undo_ego_motion(points: NDArray[np.floating], motion: NDArray[np.float64]) -
     sine = np.sqrt((skew**2).sum() / 2)
     moved: NDArray[np.float64] = points + share * motion[:3, 3]
     if sine > 0:  # Rodrigues' formula
-        angle, turned = share * np.arcsin(min(sine, 1.0)), points @ (skew.T / sine)
+        angle = share * np.arcsin(min(sine, 1.0))
+        turned = points @ (skew.T / sine)
         moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (turned @ (skew.T / sine))
     return moved

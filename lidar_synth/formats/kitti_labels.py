@@ -1,9 +1,10 @@
 """KITTI's ``label_2`` files: boxes in the rectified camera frame, one object per line of text.
 
-A line (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme) is ``name truncation occlusion alpha
-left top right bottom h w l x y z rotation_y``, with x, y, z the centre of the box's *floor*. A ``Boxes`` holds the
-centre of gravity in the sensor frame and the yaw about its z axis. The camera is tilted by about one degree relative
-to the sensor, so that the ends of a long box move by some centimetres; conversion back is exact.
+A line (https://www.cvlibs.net/datasets/kitti/eval_object.php, devkit's readme) is ``name truncation
+occlusion alpha left top right bottom h w l x y z rotation_y``, with x, y, z the centre of the box's
+*floor*. A ``Boxes`` holds the centre of gravity in the sensor frame and the yaw about its z axis.
+The camera is tilted by about one degree relative to the sensor, so that the ends of a long box move
+by some centimetres; conversion back is exact.
 """
 
 from pathlib import Path
@@ -36,14 +37,18 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     rows = [line.split() for line in text.splitlines() if line.strip()]
     bad = [row for row in rows if len(row) not in (15, 16)]
     if bad:
-        raise DataError(f"{path}: a line with {len(bad[0])} fields", "15 fields: a name and 14 numbers")
+        raise DataError(
+            f"{path}: a line with {len(bad[0])} fields", "15 fields: a name and 14 numbers"
+        )
     try:
         values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
     except ValueError as error:
         raise DataError(f"{path}: {error}", "15 fields: a name and 14 numbers") from error
     ignored = np.array([row[0] == "DontCare" for row in rows], bool)
     _check_values(values, ignored, path)
-    truncation, occlusion, alpha, image_box, size, floor, turn = np.split(values, [1, 2, 3, 7, 10, 13], axis=1)
+    truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
+        values, [1, 2, 3, 7, 10, 13], axis=1
+    )
     keep = ~ignored
     return Boxes(
         boxes_from_camera(floor[keep], size[keep], turn[keep, 0], camera),
@@ -57,7 +62,8 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
 
 
 def _check_values(values: NDArray[np.float64], ignored: NDArray[np.bool_], path: Path) -> None:
-    """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and occlusions."""
+    """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and
+    occlusions."""
     within = np.abs(values) <= FARTHEST  # NaN is not
     sizes = (values[:, 7:10] > 0).all(axis=1) | ignored
     sound = within.all(axis=1) & np.isin(values[:, 1], (-1, 0, 1, 2, 3)) & sizes
@@ -70,7 +76,10 @@ def _check_values(values: NDArray[np.float64], ignored: NDArray[np.bool_], path:
 
 
 def boxes_from_camera(
-    floor: NDArray[np.float64], size: NDArray[np.float64], rotation_y: NDArray[np.float64], camera: Calibration
+    floor: NDArray[np.float64],
+    size: NDArray[np.float64],
+    rotation_y: NDArray[np.float64],
+    camera: Calibration,
 ) -> NDArray[np.float32]:
     """(M, 7) boxes in the sensor frame; the inverse of ``boxes_to_camera``.
 
@@ -85,13 +94,16 @@ def boxes_from_camera(
     back = camera.sensor_from_camera
     ahead = np.stack([np.cos(rotation_y), 0 * rotation_y, -np.sin(rotation_y)], -1) @ back[:3, :3].T
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-    return np.column_stack([centre @ back[:3, :3].T + back[:3, 3], length, width, height, yaw]).astype(np.float32)
+    return np.column_stack(
+        [centre @ back[:3, :3].T + back[:3, 3], length, width, height, yaw]
+    ).astype(np.float32)
 
 
 def boxes_to_camera(
     values: NDArray[np.float32], camera: Calibration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """``floor``, ``size`` and ``rotation_y`` of ``boxes_from_camera`` for (M, 7) boxes in the sensor frame."""
+    """``floor``, ``size`` and ``rotation_y`` of ``boxes_from_camera`` for (M, 7) boxes in the
+    sensor frame."""
     values = values.astype(np.float64)
     length, width, height, yaw = values[:, 3:].T
     to = camera.camera_from_sensor
@@ -102,9 +114,11 @@ def boxes_to_camera(
 
 
 def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
-    """The inverse of ``read_label_2`` with KITTI's two decimals; ``KITTIObjectWriter`` defines which boxes are listed.
+    """The inverse of ``read_label_2`` with KITTI's two decimals; ``KITTIObjectWriter`` defines
+    which boxes are listed.
 
-    An unknown alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The devkit says the
+    An unknown alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The
+        devkit says the
     camera, but KITTI's own files agree with the sensor, up to rounding.)
 
     Raises:
@@ -114,24 +128,35 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     image_box, truncation = _in_image(boxes, camera)
     floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
     seen = floor - camera.camera_from_sensor[:3, 3]
-    alpha = np.where(boxes.alpha > -10, boxes.alpha, _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])))
+    alpha = np.where(
+        boxes.alpha > -10, boxes.alpha, _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2]))
+    )
     lines = []
     listed = np.flatnonzero((image_box >= 0).all(axis=1))
     for i in listed:
         occlusion = boxes.occlusion[i] if boxes.occlusion[i] >= 0 else 3
         row = (alpha[i], *image_box[i], *size[i], *floor[i], rotation_y[i])
-        lines.append(f"{boxes.names[i]} {_two(truncation[i])} {occlusion} {' '.join(map(_two, row))}")
+        lines.append(
+            f"{boxes.names[i]} {_two(truncation[i])} {occlusion} {' '.join(map(_two, row))}"
+        )
     for rectangle in boxes.dont_care:
-        lines.append(f"DontCare -1 -1 -10 {' '.join(map(_two, rectangle))} -1 -1 -1 -1000 -1000 -1000 -10")
-    text, names = "".join(line + "\n" for line in lines), tuple(boxes.names[i] for i in listed)
+        lines.append(
+            f"DontCare -1 -1 -10 {' '.join(map(_two, rectangle))} -1 -1 -1 -1000 -1000 -1000 -10"
+        )
+    text = "".join(line + "\n" for line in lines)
+    names = tuple(boxes.names[i] for i in listed)
     if decode_label_2(text, path, camera).names != names:
-        raise DataError(f"{path}: boxes called {sorted(set(names))}", "names of one word, such as Person_sitting")
+        raise DataError(
+            f"{path}: boxes called {sorted(set(names))}",
+            "names of one word, such as Person_sitting",
+        )
     write_file(path, text.encode())
 
 
 def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners."""
-    image_box, truncation = boxes.image_box.astype(np.float64), boxes.truncation.astype(np.float64)
+    image_box = boxes.image_box.astype(np.float64)
+    truncation = boxes.truncation.astype(np.float64)
     unknown = np.flatnonzero((boxes.image_box < 0).any(axis=1))
     if camera.image_size is None:
         return image_box, truncation
@@ -140,8 +165,10 @@ def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], N
         pixels, depth = camera.pixels(boxes[[i]].corners()[0])
         if depth.min() <= 0:
             continue
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
-        seen_low, seen_high = np.clip(low, 0, edge), np.clip(high, 0, edge)
+        low = pixels.min(axis=0)
+        high = pixels.max(axis=0)
+        seen_low = np.clip(low, 0, edge)
+        seen_high = np.clip(high, 0, edge)
         if (seen_high > seen_low).all():
             image_box[i] = *seen_low, *seen_high
             truncation[i] = 1 - np.prod(seen_high - seen_low) / np.prod(high - low)

@@ -48,23 +48,27 @@ SPLITS: dict[str, tuple[Part, ...]] = {
 """{split: folders}; ``ImageSets`` lists the frames."""
 
 OBJECT_CAMERA = ideal_camera(721.5377, (1242, 375))
-"""The camera that is written if none is known: KITTI's image size and focal length, at the sensor."""
+"""The camera that is written if none is known: KITTI's image size and focal length, at the
+sensor."""
 
 
 class KITTIObject(ScanFiles):
-    """KITTI's object set: <root>/training and testing with velodyne, label_2, calib, image_2, and ImageSets.
+    """KITTI's object set: <root>/training and testing with velodyne, label_2, calib, image_2, and
+    ImageSets.
 
     Args:
         root: the folder that holds ``training`` and ``testing``.
-        split: ``train``, ``val``, ``trainval``, ``test`` (as listed in ``ImageSets/<split>.txt``) or ``all``. Without
-            ``ImageSets``, ``trainval`` is all of ``training`` and ``test`` all of ``testing``.
+        split: ``train``, ``val``, ``trainval``, ``test`` (as listed in ``ImageSets/<split>.txt``)
+            or ``all``. Without ``ImageSets``, ``trainval`` is all of ``training`` and ``test`` all
+            of ``testing``.
         reduced: read ``velodyne_reduced``, the points in the view of camera 2.
-        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
-            else ``hdl64e_kitti``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
+            (``scans.json``), or else ``hdl64e_kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
-        ConfigError: on a split that KITTI does not have, or ``train`` or ``val`` without ``ImageSets``.
+        ConfigError: on a split that KITTI does not have, or ``train`` or ``val`` without
+            ``ImageSets``.
         DataError: if the folder has none of the split's scans.
 
     Example:
@@ -95,7 +99,9 @@ class KITTIObject(ScanFiles):
         if split != "all" and image_set.is_file():
             frames = read_text(image_set).split()
             if bad := [frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)]:
-                raise DataError(f"{image_set} lists {bad[0][:100]!r}", "names of frames, such as 000123")
+                raise DataError(
+                    f"{image_set} lists {bad[0][:100]!r}", "names of frames, such as 000123"
+                )
             ids = [f"{parts[0]}/{frame}" for frame in frames]
         elif split in ("train", "val"):
             raise ConfigError(
@@ -104,15 +110,24 @@ class KITTIObject(ScanFiles):
                 "Copy KITTI's ImageSets there, or use split='trainval', all of training.",
             )
         else:
-            folders = [(p, root / p / self._velodyne) for p in parts if (root / p / self._velodyne).is_dir()]
-            ids = [f"{part}/{path.stem}" for part, folder in folders for path in list_files(folder, ".bin")]
+            folders = [
+                (p, root / p / self._velodyne)
+                for p in parts
+                if (root / p / self._velodyne).is_dir()
+            ]
+            ids = [
+                f"{part}/{path.stem}"
+                for part, folder in folders
+                for path in list_files(folder, ".bin")
+            ]
         super().__init__(root, ids, sensor, on_bad)
 
     def read(self, index: int) -> Scan:
         part, frame = self.ids[index].split("/")
         folder = self.root / part
         points = read_points(folder / self._velodyne / f"{frame}.bin")
-        labels, image = folder / "label_2" / f"{frame}.txt", folder / "image_2" / f"{frame}.png"
+        labels = folder / "label_2" / f"{frame}.txt"
+        image = folder / "image_2" / f"{frame}.png"
         boxes = None
         if labels.is_file():
             boxes = read_label_2(labels, read_calibration(folder / "calib" / f"{frame}.txt"))
@@ -138,14 +153,16 @@ class KITTIObject(ScanFiles):
 
 
 class KITTIObjectWriter(Writer):
-    """Writes the object set's folders: velodyne, label_2, calib, image_2 and, at the end, ImageSets.
+    """Writes the object set's folders: velodyne, label_2, calib, image_2 and, at the end,
+    ImageSets.
 
-    As in KITTI, ``label_2`` lists only boxes in the camera's view: those with a known ``image_box``, and those whose
-    corners are in the image, for which ``image_box`` and truncation are computed. A scan without known boxes is
-    refused for ``training``. Trainers read the image size from ``image_2``, so a scan without an image gets a black
-    one.
+    As in KITTI, ``label_2`` lists only boxes in the camera's view: those with a known
+    ``image_box``, and those whose corners are in the image, for which ``image_box`` and truncation
+    are computed. A scan without known boxes is refused for ``training``. Trainers read the image
+    size from ``image_2``, so a scan without an image gets a black one.
 
-    An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; all other scans go into ``part``, numbered by index.
+    An id ``training/FFFFFF`` or ``testing/FFFFFF`` is kept; all other scans go into ``part``,
+    numbered by index.
 
     Args:
         root: output folder.
@@ -155,7 +172,9 @@ class KITTIObjectWriter(Writer):
 
     keeps = frozenset({"boxes", "image_path"})
 
-    def __init__(self, root: str | Path, *, part: Part = "training", calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, root: str | Path, *, part: Part = "training", calibration: Calibration | None = None
+    ) -> None:
         super().__init__(root, calibration=calibration)
         self.part = part
         if part == "testing":
@@ -166,13 +185,17 @@ class KITTIObjectWriter(Writer):
         part, frame = (match[1], int(match[2])) if match else (self.part, index)
         return f"{part}/velodyne/{frame:06d}.bin"
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        folder, frame = path.parents[1], path.stem
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
+        folder = path.parents[1]
+        frame = path.stem
         if folder.name == "training" and scan.boxes is None:
             raise DataError(
                 f"scan {scan.id!r} has no boxes",
                 "a scan whose boxes are known: an empty label_2 would mean that there is no object",
-                "Write it as semantic_kitti, or without label_2: KITTIObjectWriter(root, part='testing').",
+                "Write it as semantic_kitti, or without label_2: KITTIObjectWriter(root, "
+                "part='testing').",
             )
         camera = camera or OBJECT_CAMERA
         if picture is None:
@@ -192,7 +215,10 @@ class KITTIObjectWriter(Writer):
             folder = self.root / part / "velodyne"
             if split in ("train", "trainval", "test") and folder.is_dir():
                 frames = [p.stem for p in list_files(folder, ".bin")]
-                write_file(self.root / "ImageSets" / f"{split}.txt", "".join(f"{f}\n" for f in frames).encode())
+                write_file(
+                    self.root / "ImageSets" / f"{split}.txt",
+                    "".join(f"{f}\n" for f in frames).encode(),
+                )
 
 
 def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> Calibration:
@@ -203,16 +229,21 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
         DataError: if P2, R0_rect or Tr_velo_to_cam is missing or invalid.
     """
     matrices = read_named_matrices(path)
-    sizes = {name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")}
+    sizes = {
+        name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")
+    }
     if sizes != {"P2": 12, "R0_rect": 9, "Tr_velo_to_cam": 12}:
-        raise DataError(f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12")
+        raise DataError(
+            f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12"
+        )
     camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
     with naming(path):
         return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
 
 
 def write_calibration(path: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: KITTI's own matrices unchanged; another camera is written as all four."""
+    """The inverse of ``read_calibration``: KITTI's own matrices unchanged; another camera is
+    written as all four."""
     own = {"P0", "P1", "P2", "P3", "R0_rect", "Tr_velo_to_cam"} <= set(camera.matrices)
     lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
         "R0_rect": np.eye(3),

@@ -3,11 +3,12 @@
 Layout (https://www.cvlibs.net/datasets/kitti/raw_data.php)::
 
     DATE/DATE_drive_NNNN_sync/velodyne_points/data/FFFFFFFFFF.bin     float32 x, y, z, reflectance
-    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml                     boxes of the whole drive, velodyne frame
-    DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png            left colour camera
-    DATE/calib_velo_to_cam.txt, DATE/calib_cam_to_cam.txt
+    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml                     boxes of the whole drive,
+    velodyne frame DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png            left colour
+    camera DATE/calib_velo_to_cam.txt, DATE/calib_cam_to_cam.txt
 
-A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the centre of the
+A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the
+    centre of the
 box's *floor* and rz the yaw. The package reads this layout and does not write it.
 """
 
@@ -30,14 +31,16 @@ DRIVES = "*_drive_*/velodyne_points/data"
 
 
 class KITTIRaw(ScanFiles):
-    """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin, tracklet_labels.xml.
+    """KITTI's raw drives: <root>/[DATE/]DATE_drive_NNNN_sync/velodyne_points/data/*.bin,
+    tracklet_labels.xml.
 
-    If the drive has tracklets, a scan has the boxes of its frame, possibly zero; otherwise ``boxes`` is None.
+    If the drive has tracklets, a scan has the boxes of its frame, possibly zero; otherwise
+    ``boxes`` is None.
 
     Args:
         root: the folder that holds the dates, the folder of one date, or the folder of one drive.
-        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
-            else ``hdl64e_kitti``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
+            (``scans.json``), or else ``hdl64e_kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -54,10 +57,20 @@ class KITTIRaw(ScanFiles):
 
     default_sensor = "hdl64e_kitti"
 
-    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
         root = Path(root)
         own = [root] if (root / "velodyne_points" / "data").is_dir() else []
-        found = own or [p.parent.parent for pattern in (DRIVES, f"*/{DRIVES}") for p in sorted(root.glob(pattern))]
+        found = own or [
+            p.parent.parent
+            for pattern in (DRIVES, f"*/{DRIVES}")
+            for p in sorted(root.glob(pattern))
+        ]
         self._drives = {drive.resolve().name: drive for drive in found}
         ids = [
             f"{name}/{path.stem}"
@@ -80,7 +93,9 @@ class KITTIRaw(ScanFiles):
             points[:, :3],
             points[:, 3],
             self.sensor,
-            boxes=None if boxes is None else boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ())),
+            boxes=None
+            if boxes is None
+            else boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ())),
             image_path=image if image.is_file() else None,
             id=self.ids[index],
         )
@@ -88,7 +103,9 @@ class KITTIRaw(ScanFiles):
     def calibration(self, index: int) -> Calibration | None:
         name, frame = self.ids[index].split("/")
         drive = self._drives[name]
-        return read_calibration(drive.resolve().parent, png_size(drive / "image_02" / "data" / f"{frame}.png"))
+        return read_calibration(
+            drive.resolve().parent, png_size(drive / "image_02" / "data" / f"{frame}.png")
+        )
 
 
 def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) -> Calibration | None:
@@ -103,15 +120,19 @@ def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) ->
     velo, cam = map(read_named_matrices, paths)
     try:
         to_cam_0 = homogeneous(np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)]))
-        rectify, projection = homogeneous(cam["R_rect_00"].reshape(3, 3)), cam["P_rect_02"].reshape(3, 4)
+        rectify = homogeneous(cam["R_rect_00"].reshape(3, 3))
+        projection = cam["P_rect_02"].reshape(3, 4)
         size = image_size or read_image_size(cam["S_rect_02"], "S_rect_02")
         return Calibration(projection, rectify @ to_cam_0, size)
     except (KeyError, ValueError) as error:
-        raise DataError(f"{paths[0]} and {paths[1]}: {error}", "R and T; R_rect_00, P_rect_02 and S_rect_02") from error
+        raise DataError(
+            f"{paths[0]} and {paths[1]}: {error}", "R and T; R_rect_00, P_rect_02 and S_rect_02"
+        ) from error
 
 
 def read_tracklets(path: Path) -> dict[int, Boxes]:
-    """{frame: boxes} of a drive, in the sensor frame; a box's instance is the tracklet's number in the file.
+    """{frame: boxes} of a drive, in the sensor frame; a box's instance is the tracklet's number in
+    the file.
 
     Truncation is known (0) only if the tracklet marks the object as completely in the image.
 
@@ -123,22 +144,46 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
     try:
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
         for instance, tracklet in enumerate(tracklets):
-            name = tracklet.findtext("objectType", "").replace(" ", "_").replace("(", "").replace(")", "")
+            name = (
+                tracklet.findtext("objectType", "")
+                .replace(" ", "_")
+                .replace("(", "")
+                .replace(")", "")
+            )
             height, width, length = (float(tracklet.findtext(tag, "")) for tag in "hwl")
             for k, pose in enumerate(tracklet.findall("poses/item")):
-                x, y, floor, yaw = (float(pose.findtext(tag, "")) for tag in ("tx", "ty", "tz", "rz"))
-                box = (x, y, floor + height / 2, length, width, height, (yaw + np.pi) % (2 * np.pi) - np.pi)
+                x, y, floor, yaw = (
+                    float(pose.findtext(tag, "")) for tag in ("tx", "ty", "tz", "rz")
+                )
+                box = (
+                    x,
+                    y,
+                    floor + height / 2,
+                    length,
+                    width,
+                    height,
+                    (yaw + np.pi) % (2 * np.pi) - np.pi,
+                )
                 hidden = int(pose.findtext("occlusion", "-1"))
                 whole = pose.findtext("truncation") == "0"
                 frame = int(tracklet.findtext("first_frame", "")) + k
-                rows[frame].append((box, name, hidden if 0 <= hidden <= 2 else -1, 0 if whole else -1, instance))
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
+                rows[frame].append(
+                    (box, name, hidden if 0 <= hidden <= 2 else -1, 0 if whole else -1, instance)
+                )
+    except (
+        ElementTree.ParseError,
+        ValueError,
+        LookupError,
+    ) as error:  # LookupError: an unknown encoding
         raise DataError(f"{path}: {error}", "KITTI's tracklet_labels.xml") from error
     boxes = {}
     for frame, found in sorted(rows.items()):
         values, names, occlusion, truncation, instances = zip(*found, strict=True)
         if not (np.abs(values) <= FARTHEST).all():  # NaN is not
-            raise DataError(f"{path}: a box of frame {frame} with {values}", f"metres within {FARTHEST:g}, and radians")
+            raise DataError(
+                f"{path}: a box of frame {frame} with {values}",
+                f"metres within {FARTHEST:g}, and radians",
+            )
         with naming(path):
             boxes[frame] = Boxes(
                 np.array(values, np.float32),

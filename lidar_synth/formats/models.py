@@ -1,4 +1,5 @@
-"""What lies beside generated scans about the training data of their models: read, and kept by conversions."""
+"""What lies beside generated scans about the training data of their models: read, and kept by
+conversions."""
 
 import json
 from pathlib import Path
@@ -15,10 +16,12 @@ Provenances = list[dict[str, Any]]
 
 
 def models_of(path: Path) -> Provenances:
-    """The provenances of the models that generated the scans at a path; empty if nothing beside the scans has them.
+    """The provenances of the models that generated the scans at a path; empty if nothing beside the
+    scans has them.
 
     Args:
-        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were converted.
+        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were
+            converted.
 
     Raises:
         FileError, DataError: if what lies beside them is damaged.
@@ -28,7 +31,9 @@ def models_of(path: Path) -> Provenances:
     found: Provenances = []
     if (path / NOTE).is_file():
         note = read_facts(path / NOTE, "the settings that lidar-synth sample wrote")
-        found.append({"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {}))
+        found.append(
+            {"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {})
+        )
     if (path / MODELS).is_file():
         expected = "what lidar-synth convert wrote about models"
         models = read_facts(path / MODELS, expected).get("models")

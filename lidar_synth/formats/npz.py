@@ -1,4 +1,5 @@
-"""The package's own ``.npz`` files: a scan's points, or a range image, with all other fields. Lossless.
+"""The package's own ``.npz`` files: a scan's points, or a range image, with all other fields.
+Lossless.
 
 Arrays of both (numpy's format, never pickled)::
 
@@ -8,8 +9,8 @@ Arrays of both (numpy's format, never pickled)::
     pose                         (4, 4) float64, if known
     box_values, box_names ...    the fields of ``Boxes``, if there are any
 
-A scan has ``points`` (N, 3) float32 and the fields of ``POINT_FIELDS`` that are known, (N,) each. A range image has
-``range`` (H, W) float32 metres, 0 = no return, and one (H, W) array per channel.
+A scan has ``points`` (N, 3) float32 and the fields of ``POINT_FIELDS`` that are known, (N,) each. A
+range image has ``range`` (H, W) float32 metres, 0 = no return, and one (H, W) array per channel.
 """
 
 import json
@@ -35,14 +36,21 @@ FACTS = ("sensor", "id", "domain", "provenance", "pose")
 BOX = "box_"
 
 TYPES = {
-    "points": "f4", "reflectance": "f4", "label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2",
-    "confidence": "f4", "time": "f4",
-}  # fmt: skip
+    "points": "f4",
+    "reflectance": "f4",
+    "label": "u1",
+    "raw_label": "u4",
+    "instance": "i4",
+    "ring": "i2",
+    "confidence": "f4",
+    "time": "f4",
+}
 """numpy types of a scan's fields."""
 
 
 def stored_sensor(path: Path) -> Sensor | None:
-    """The sensor that is stored in an ``.npz`` file, without reading its other arrays; None if there is none."""
+    """The sensor that is stored in an ``.npz`` file, without reading its other arrays; None if
+    there is none."""
     try:
         return _sensor(read_arrays(path, only=["sensor"]))
     except (LidarSynthError, KeyError):
@@ -50,7 +58,8 @@ def stored_sensor(path: Path) -> Sensor | None:
 
 
 def stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, NDArray[Any]]:
-    """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are float64.
+    """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are
+    float64.
 
     Args:
         arrays: points, or fields of ``TYPES``; others stay as they are.
@@ -68,7 +77,9 @@ def stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, N
             cast = np.ascontiguousarray(values, wanted)
         if wanted.kind in "iu" and not np.array_equal(cast, values):
             outside = values[cast != values].flat[0]
-            raise DataError(f"{where}: {name} holds {outside}", f"whole numbers that {wanted} can hold")
+            raise DataError(
+                f"{where}: {name} holds {outside}", f"whole numbers that {wanted} can hold"
+            )
         result[name] = cast
     return result
 
@@ -104,12 +115,17 @@ def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | No
 
 
 def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -> None:
-    """Write a range image as compressed ``.npz``, with the facts of its scan; ``decode_range_image`` is the inverse.
+    """Write a range image as compressed ``.npz``, with the facts of its scan;
+    ``decode_range_image`` is the inverse.
 
     Raises:
         FileError: if it cannot be written.
     """
-    facts = {"sensor": np.array(json.dumps(image.sensor.to_dict()))} if scan is None else _facts(scan, image.sensor)
+    facts = (
+        {"sensor": np.array(json.dumps(image.sensor.to_dict()))}
+        if scan is None
+        else _facts(scan, image.sensor)
+    )
     arrays = {"range": np.asarray(image.range, np.float32), **stored(image.channels, path), **facts}
     write_arrays(path, arrays, compressed=True)
 
@@ -117,7 +133,8 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
 def decode_range_image(
     arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None
 ) -> tuple[RangeImage, dict[str, Any]]:
-    """Make a range image from the arrays of an ``.npz`` file; also return the scan's facts that are not per cell.
+    """Make a range image from the arrays of an ``.npz`` file; also return the scan's facts that are
+    not per cell.
 
     Raises:
         DataError: if range or sensor is missing, or a shape does not match the sensor.
@@ -125,28 +142,38 @@ def decode_range_image(
     try:
         facts = _known(arrays, sensor)
         if sensor is not None and sensor.shape != facts["sensor"].shape:
-            raise ValueError(f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}")
-        channels = {n: a for n, a in arrays.items() if n not in ("range", *FACTS) and not n.startswith(BOX)}
+            raise ValueError(
+                f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}"
+            )
+        channels = {
+            n: a for n, a in arrays.items() if n not in ("range", *FACTS) and not n.startswith(BOX)
+        }
         _check_types(channels)
         return range_image(arrays["range"], facts["sensor"], channels, where), facts
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {error}", "range and sensor of a range image") from error
 
 
-def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDArray[Any]], where: str) -> RangeImage:
+def range_image(
+    distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDArray[Any]], where: str
+) -> RangeImage:
     """Make a range image, after checking the values of all cells.
 
     Raises:
-        DataError: on text, NaN, infinite or negative ranges, which would silently become cells without a return; on a
-            shape that does not match the sensor; on labels that are not train ids, and on reflectance or confidence
-            outside [0, 1]. Values of cells without a return are ignored, and set as ``RangeImage`` defines.
+        DataError: on text, NaN, infinite or negative ranges, which would silently become cells
+            without a return; on a shape that does not match the sensor; on labels that are not
+            train ids, and on reflectance or confidence outside [0, 1]. Values of cells without a
+            return are ignored, and set as ``RangeImage`` defines.
     """
     check_numbers(distance, f"{where}: range")
     with np.errstate(over="ignore"):
         image = RangeImage(distance.astype(np.float32, copy=False), sensor, channels)
     bad = ~(np.isfinite(image.range) & (image.range >= 0))
     if bad.any():
-        raise DataError(f"{where}: {bad.sum()} cells whose range is negative or not finite", "metres, 0 = no return")
+        raise DataError(
+            f"{where}: {bad.sum()} cells whose range is negative or not finite",
+            "metres, 0 = no return",
+        )
     for name in [n for n in image.channels if n in POINT_FIELDS]:
         values = image.channels[name].copy()
         values[~image.mask] = IGNORE if name == "label" else 0
@@ -154,7 +181,10 @@ def range_image(distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDAr
         if name in ("reflectance", "confidence") and not ((values >= 0) & (values <= 1)).all():
             raise DataError(f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1")
         if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
-            raise DataError(f"{where}: labels {np.unique(values)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
+            raise DataError(
+                f"{where}: labels {np.unique(values)[-8:].tolist()}",
+                "train ids 0..18, or 255 = ignore",
+            )
     return image
 
 
@@ -176,7 +206,9 @@ def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 def _sensor(arrays: Mapping[str, NDArray[Any]]) -> Sensor:
     """The sensor stored in the arrays; raises KeyError if there is none."""
-    return Sensor.from_dict(parse_json(str(arrays["sensor"]), "its sensor", "the keys of sensors.yaml"))
+    return Sensor.from_dict(
+        parse_json(str(arrays["sensor"]), "its sensor", "the keys of sensors.yaml")
+    )
 
 
 def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
@@ -206,9 +238,13 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
                 raise ValueError(f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}")
             known[name] = arrays[name].item()
     if known.get("domain", REAL) not in (REAL, SYNTHETIC):
-        raise ValueError(f"domain is {known['domain']}, not {REAL} (real) or {SYNTHETIC} (synthetic)")
+        raise ValueError(
+            f"domain is {known['domain']}, not {REAL} (real) or {SYNTHETIC} (synthetic)"
+        )
     if "provenance" in arrays:
-        known["provenance"] = check_provenance(parse_json(str(arrays["provenance"]), "its provenance"))
+        known["provenance"] = check_provenance(
+            parse_json(str(arrays["provenance"]), "its provenance")
+        )
     if "pose" in arrays:
         known["pose"] = check_pose(arrays["pose"])
     if BOX + "values" in arrays:

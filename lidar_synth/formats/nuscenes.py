@@ -6,9 +6,11 @@ Layout (https://www.nuscenes.org/nuscenes#data-format, https://www.nuscenes.org/
     lidarseg/VERSION/TOKEN_lidarseg.bin  uint8 class per point
     VERSION/lidarseg.json                which labels belong to which sweep
 
-nuScenes has x right and y forward; both are converted to the package's x forward, y left. Intensity is divided by 255
-and rings are counted from the top. Points nearer than one metre belong to the recording car or, in full sweeps, to
-firings without a return, which are stored at the origin: they are dropped with their labels, as in nuScenes' own
+nuScenes has x right and y forward; both are converted to the package's x forward, y left. Intensity
+is divided by 255 and rings are counted from the top. Points nearer than one metre belong to the
+recording car or, in full sweeps, to
+firings without a return, which are stored at the origin: they are dropped with their labels, as in
+    nuScenes' own
 tools. The package reads this layout and does not write it.
 """
 
@@ -33,16 +35,18 @@ SUFFIX = ".pcd.bin"
 INTENSITY_MAX = 255.0
 RINGS = 32
 NEAREST = 1.0
-"""Minimum range, metres: nearer points belong to the recording car, or are firings without a return."""
+"""Minimum range, metres: nearer points belong to the recording car, or are firings without a
+return."""
 
 
 class NuScenes(ScanFiles):
-    """nuScenes' key frames: <root>/samples/LIDAR_TOP/*.pcd.bin, or one such file, with lidarseg's labels.
+    """nuScenes' key frames: <root>/samples/LIDAR_TOP/*.pcd.bin, or one such file, with lidarseg's
+    labels.
 
     Args:
         root: the dataset's folder, a folder of ``.pcd.bin`` files, or one file.
-        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
-            else ``hdl32e_nuscenes``.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
+            (``scans.json``), or else ``hdl32e_nuscenes``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -59,10 +63,18 @@ class NuScenes(ScanFiles):
 
     default_sensor = "hdl32e_nuscenes"
 
-    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
         root = Path(root)
         folder = root / "samples" / "LIDAR_TOP"
-        paths = [root] if root.is_file() else list_files(folder if folder.is_dir() else root, SUFFIX)
+        paths = (
+            [root] if root.is_file() else list_files(folder if folder.is_dir() else root, SUFFIX)
+        )
         super().__init__(root, [path.name.removesuffix(SUFFIX) for path in paths], sensor, on_bad)
         self._folder = paths[0].parent
         self._labels = {} if root.is_file() else lidarseg_files(root)
@@ -73,7 +85,8 @@ class NuScenes(ScanFiles):
         rings = points[:, 4]
         if not ((rings >= 0) & (rings < RINGS) & (rings == np.floor(rings))).all():
             raise DataError(
-                f"{path}: the fifth field of its points is not a ring ({rings.min():g} to {rings.max():g})",
+                f"{path}: the fifth field of its points is not a ring ({rings.min():g} to "
+                f"{rings.max():g})",
                 f"integers 0..{RINGS - 1}",
                 f"It may hold four floats per point (KITTI), or be damaged. {SKIP_HINT}",
             )
@@ -92,9 +105,15 @@ class NuScenes(ScanFiles):
             id=self.ids[index],
             **labels,
         )
-        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)  # keeps NaN, which on_bad handles
+        kept = ~(
+            np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2
+        )  # keeps NaN, which on_bad handles
         if not kept.any():
-            raise DataError(f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m", "a sweep", SKIP_HINT)
+            raise DataError(
+                f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m",
+                "a sweep",
+                SKIP_HINT,
+            )
         return scan[kept]
 
 
@@ -112,12 +131,18 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
     files = {}
     for table in sorted(root.glob("*/lidarseg.json")):
         try:
-            samples, rows = (_table(table.with_name(name)) for name in ("sample_data.json", table.name))
+            samples, rows = (
+                _table(table.with_name(name)) for name in ("sample_data.json", table.name)
+            )
             names = {row["token"]: row["filename"] for row in samples}
             for row in rows:
-                files[PurePosixPath(names[row["sample_data_token"]]).name] = inside(root, row["filename"])
+                files[PurePosixPath(names[row["sample_data_token"]]).name] = inside(
+                    root, row["filename"]
+                )
         except (KeyError, TypeError, AttributeError) as error:
-            raise DataError(f"{table}: {error!r}", "nuScenes' tables lidarseg.json and sample_data.json") from error
+            raise DataError(
+                f"{table}: {error!r}", "nuScenes' tables lidarseg.json and sample_data.json"
+            ) from error
     return files
 
 

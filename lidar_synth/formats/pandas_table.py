@@ -1,8 +1,10 @@
-"""Pickled tables of pandas (``DataFrame.to_pickle``), read without pandas and without running their code.
+"""Pickled tables of pandas (``DataFrame.to_pickle``), read without pandas and without running their
+code.
 
-A pickled table names about a dozen functions and classes (``KNOWN``). It holds the columns' names as an index, and
-blocks of columns of one type, each an array with the places of its columns. The spellings are those of pandas 0.25
-(which wrote PandaSet) to 3 and of numpy 1 and 2. A file that names anything else is refused.
+A pickled table names about a dozen functions and classes (``KNOWN``). It holds the columns' names
+as an index, and blocks of columns of one type, each an array with the places of its columns. The
+spellings are those of pandas 0.25 (which wrote PandaSet) to 3 and of numpy 1 and 2. A file that
+names anything else is refused.
 """
 
 import zlib
@@ -29,29 +31,52 @@ FRAMES = ("pandas.core.frame.DataFrame", "pandas.DataFrame")
 INDICES = ("pandas.core.indexes.base.Index", "pandas.Index")
 MAKE_INDEX = ("pandas.core.indexes.base._new_Index",)
 OTHER_INDICES = (
-    "pandas.core.indexes.range.RangeIndex", "pandas.RangeIndex", "pandas.core.indexes.numeric.Int64Index",
-)  # fmt: skip
+    "pandas.core.indexes.range.RangeIndex",
+    "pandas.RangeIndex",
+    "pandas.core.indexes.numeric.Int64Index",
+)
 BACKED_ARRAYS = ("pandas._libs.arrays.__pyx_unpickle_NDArrayBacked",)
 STRINGS = (
-    "pandas.arrays.StringArray", "pandas.core.arrays.string_.StringArray", "pandas.core.arrays.string_.StringDtype",
+    "pandas.arrays.StringArray",
+    "pandas.core.arrays.string_.StringArray",
+    "pandas.core.arrays.string_.StringDtype",
     "pandas.StringDtype",
-)  # fmt: skip
+)
 ARRAYS = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 BUFFERS = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 PLAIN_OBJECTS = ("copy_reg._reconstructor", "copyreg._reconstructor")
 SLICES = ("builtins.slice", "__builtin__.slice")
 
 KNOWN = frozenset(
-    (*MANAGERS, *BLOCKS, *FRAMES, *INDICES, *MAKE_INDEX, *OTHER_INDICES, *BACKED_ARRAYS, *STRINGS, *ARRAYS, *BUFFERS,
-     *PLAIN_OBJECTS, DTYPE, ENCODE, *SLICES, "numpy.ndarray", "builtins.object", "__builtin__.object")
-)  # fmt: skip
+    (
+        *MANAGERS,
+        *BLOCKS,
+        *FRAMES,
+        *INDICES,
+        *MAKE_INDEX,
+        *OTHER_INDICES,
+        *BACKED_ARRAYS,
+        *STRINGS,
+        *ARRAYS,
+        *BUFFERS,
+        *PLAIN_OBJECTS,
+        DTYPE,
+        ENCODE,
+        *SLICES,
+        "numpy.ndarray",
+        "builtins.object",
+        "__builtin__.object",
+    )
+)
 """The names that may occur in a pickled table; none of them is imported."""
 
 MOST_COLUMNS = 1000
 """Maximum number of columns of a table, and of their blocks; PandaSet's have at most 17."""
 
 
-def read_table(path: Path, columns: Iterable[str], optional: Iterable[str] = ()) -> dict[str, NDArray[Any]]:
+def read_table(
+    path: Path, columns: Iterable[str], optional: Iterable[str] = ()
+) -> dict[str, NDArray[Any]]:
     """Read columns of a pickled table, compressed with gzip or not.
 
     Args:
@@ -64,7 +89,8 @@ def read_table(path: Path, columns: Iterable[str], optional: Iterable[str] = ())
 
     Raises:
         FileError: if the file cannot be read.
-        DataError: if it is not a pickled table, would run code, lacks a column, or holds more than ``MOST_BYTES``.
+        DataError: if it is not a pickled table, would run code, lacks a column, or holds more than
+            ``MOST_BYTES``.
     """
     content = read_file(path, EXPECTED, MOST_BYTES)
     if content.startswith(GZIP):
@@ -77,26 +103,39 @@ def read_table(path: Path, columns: Iterable[str], optional: Iterable[str] = ())
             raise
         raise DataError(f"{path} holds another table ({error})", EXPECTED, SKIP_HINT) from error
     if missing := [name for name in columns if name not in table]:
-        raise DataError(f"{path} has no column {', '.join(missing)}", f"a table with {', '.join(columns)}")
+        raise DataError(
+            f"{path} has no column {', '.join(missing)}", f"a table with {', '.join(columns)}"
+        )
     if len(lengths := {len(values) for values in table.values()}) > 1:
-        raise DataError(f"{path} has columns of {sorted(lengths)} rows", "columns of one length", SKIP_HINT)
+        raise DataError(
+            f"{path} has columns of {sorted(lengths)} rows", "columns of one length", SKIP_HINT
+        )
     return table
 
 
-def require_numbers(table: dict[str, NDArray[Any]], columns: Iterable[str], path: Path, kinds: str = "iuf") -> None:
+def require_numbers(
+    table: dict[str, NDArray[Any]], columns: Iterable[str], path: Path, kinds: str = "iuf"
+) -> None:
     """Refuse columns of another type.
 
     Args:
         table: as ``read_table`` gives it.
         columns: names of columns of numbers.
         path: of the table, for the error.
-        kinds: numpy's letters of the types that are accepted; by default integers and floating-point numbers.
+        kinds: numpy's letters of the types that are accepted; by default integers and
+            floating-point numbers.
 
     Raises:
         DataError: on a column of another type.
     """
-    if wrong := [f"{name} of type {table[name].dtype}" for name in columns if table[name].dtype.kind not in kinds]:
-        raise DataError(f"{path} has columns {', '.join(wrong)}", "numbers" if "f" in kinds else "whole numbers")
+    if wrong := [
+        f"{name} of type {table[name].dtype}"
+        for name in columns
+        if table[name].dtype.kind not in kinds
+    ]:
+        raise DataError(
+            f"{path} has columns {', '.join(wrong)}", "numbers" if "f" in kinds else "whole numbers"
+        )
 
 
 def _gunzip(content: bytes, path: Path) -> bytes:
@@ -146,7 +185,8 @@ def _call(value: Any, names: tuple[str, ...]) -> Call:
 
 
 class _Arrays:
-    """Makes numpy's arrays of calls, as long as all of them together hold at most ``MOST_BYTES``."""
+    """Makes numpy's arrays of calls, as long as all of them together hold at most
+    ``MOST_BYTES``."""
 
     def __init__(self) -> None:
         self.left = MOST_BYTES
@@ -154,14 +194,18 @@ class _Arrays:
     def make(self, value: Any) -> NDArray[Any]:
         """An array of numbers, or of objects that are numbers, text, truth values or None."""
         if isinstance(value, Call) and value.name in BACKED_ARRAYS:  # text in pandas 3
-            [value] = [part for part in value.state if isinstance(part, Call) and part.name in ARRAYS]
+            [value] = [
+                part for part in value.state if isinstance(part, Call) and part.name in ARRAYS
+            ]
         if isinstance(value, Call) and value.name in BUFFERS:
             data, dtype, shape, order = value.args
         else:
             _, shape, dtype, fortran, data = _call(value, ARRAYS).state
             order = "F" if fortran else "C"
         lengths = shape if isinstance(shape, tuple) else ()
-        if len(lengths) not in (1, 2) or not all(type(length) is int and length >= 0 for length in lengths):
+        if len(lengths) not in (1, 2) or not all(
+            type(length) is int and length >= 0 for length in lengths
+        ):
             raise ValueError("an array of another shape than (N,) or (N, M)")
         kind = dtype_of(dtype)
         self.left -= prod(shape) * kind.itemsize
@@ -181,7 +225,9 @@ class _Arrays:
 
 
 def _objects(values: Any) -> NDArray[Any]:
-    if not isinstance(values, list) or not all(v is None or type(v) in (str, int, float, bool) for v in values):
+    if not isinstance(values, list) or not all(
+        v is None or type(v) in (str, int, float, bool) for v in values
+    ):
         raise TypeError("objects that are neither numbers nor text")
     array = np.empty(len(values), object)
     array[:] = values

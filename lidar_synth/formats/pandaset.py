@@ -2,19 +2,22 @@
 
 Layout (https://github.com/scaleapi/pandaset-devkit), a folder for each sequence::
 
-    NNN/lidar/FF.pkl.gz                  table x, y, z (world, metres), i 0..255, t (seconds), d (0 Pandar64, 1 GT)
-    NNN/lidar/poses.json                 for each frame position and heading (w, x, y, z): vehicle to world
-    NNN/lidar/timestamps.json            seconds, one for each frame
+    NNN/lidar/FF.pkl.gz                  table x, y, z (world, metres), i 0..255, t (seconds), d (0
+    Pandar64, 1 GT) NNN/lidar/poses.json                 for each frame position and heading (w, x,
+    y, z): vehicle to world NNN/lidar/timestamps.json            seconds, one for each frame
     NNN/annotations/semseg/FF.pkl.gz     table class, a row for each point; not for every sequence
-    NNN/annotations/cuboids/FF.pkl.gz    table of boxes in the world frame
-    NNN/camera/NAME/FF.jpg               six cameras, with poses.json, timestamps.json, intrinsics.json
+    NNN/annotations/cuboids/FF.pkl.gz    table of boxes in the world frame NNN/camera/NAME/FF.jpg
+    six cameras, with poses.json, timestamps.json, intrinsics.json
 
-The tables are pickled by pandas; ``pandas_table`` reads them without running their code. The points are compensated
-for the motion of the vehicle: each is in the world frame. By default the reader undoes this, because only then do
-points lie on the sensor's beams: every point is given in the frame of the sensor at the time of its own measurement.
-The package reads this layout and does not write it.
+The tables are pickled by pandas; ``pandas_table`` reads them without running their code. The points
+are compensated
+for the motion of the vehicle: each is in the world frame. By default the reader undoes this,
+    because only then do
+points lie on the sensor's beams: every point is given in the frame of the sensor at the time of its
+own measurement. The package reads this layout and does not write it.
 
-The data are licensed under CC BY 4.0 with PandaSet's Dataset Terms: name Scale AI and Hesai in what you publish.
+The data are licensed under CC BY 4.0 with PandaSet's Dataset Terms: name Scale AI and Hesai in what
+you publish.
 """
 
 from collections.abc import Sequence
@@ -44,22 +47,33 @@ INTENSITY_MAX = 255.0
 VIEW = np.radians(32)
 """The forward sensor sees objects up to this angle to the left and to the right."""
 IMAGE_SIZE = (1920, 1080)
-CAMERAS = ("front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera")
+CAMERAS = (
+    "front_camera",
+    "front_left_camera",
+    "front_right_camera",
+    "left_camera",
+    "right_camera",
+    "back_camera",
+)
 
 
 class PandaSet(ScanFiles):
-    """PandaSet's sequences: <root>/NNN/lidar/*.pkl.gz with poses.json and timestamps.json, annotations and cameras.
+    """PandaSet's sequences: <root>/NNN/lidar/*.pkl.gz with poses.json and timestamps.json,
+    annotations and cameras.
 
-    A scan has labels if its sequence has them, boxes, and in ``time`` the seconds between its timestamp and each point.
-    ``pose`` is the pose of the sensor at the timestamp. Points of the Pandar64 have rings, of the nearest beam.
+    A scan has labels if its sequence has them, boxes, and in ``time`` the seconds between its
+    timestamp and each point. ``pose`` is the pose of the sensor at the timestamp. Points of the
+    Pandar64 have rings, of the nearest beam.
 
     Args:
         root: the folder of the sequences, or one sequence.
-        sensor: ``pandar64`` (the default) or ``pandar_gt``, the forward sensor; a YAML file or a ``Sensor`` describes a
-            Pandar64 unless it is named ``pandar_gt``.
-        motion_compensated: whether all points are in the frame of the sensor at the scan's timestamp, as in KITTI's
-            odometry; by default each is in the frame of the sensor at its own time, as it was measured.
-        sequences: names of the sequences to read, such as ``("002",)``; all by default. PandaSet has no splits.
+        sensor: ``pandar64`` (the default) or ``pandar_gt``, the forward sensor; a YAML file or a
+            ``Sensor`` describes a Pandar64 unless it is named ``pandar_gt``.
+        motion_compensated: whether all points are in the frame of the sensor at the scan's
+            timestamp, as in KITTI's odometry; by default each is in the frame of the sensor at its
+            own time, as it was measured.
+        sequences: names of the sequences to read, such as ``("002",)``; all by default. PandaSet
+            has no splits.
         camera: the camera of ``image_path`` and of the calibration, one of ``CAMERAS``.
         on_bad: see ``ScanFiles``.
 
@@ -96,9 +110,19 @@ class PandaSet(ScanFiles):
         existing = sorted({path.parents[1].name for path in root.glob(f"*/{FRAMES}")})
         wanted = existing if sequences is None else list(sequences)
         if missing := [name for name in wanted if name not in existing]:
-            raise DataError(f"{root} has no sequence {', '.join(missing)}", f"some of {', '.join(existing) or 'none'}")
-        frames = [(name, path) for name in wanted for path in list_files(root / name / "lidar", SUFFIX)]
-        super().__init__(root, [f"{name}/{path.name.removesuffix(SUFFIX)}" for name, path in frames], sensor, on_bad)
+            raise DataError(
+                f"{root} has no sequence {', '.join(missing)}",
+                f"some of {', '.join(existing) or 'none'}",
+            )
+        frames = [
+            (name, path) for name in wanted for path in list_files(root / name / "lidar", SUFFIX)
+        ]
+        super().__init__(
+            root,
+            [f"{name}/{path.name.removesuffix(SUFFIX)}" for name, path in frames],
+            sensor,
+            on_bad,
+        )
         self.camera = camera
         self.motion_compensated = motion_compensated
         self._device = int(self.sensor.name == FORWARD)
@@ -117,8 +141,12 @@ class PandaSet(ScanFiles):
         time = table["t"][kept].astype(np.float64)
         pose = track.poses[number] @ self._mount
         with naming(path):
-            measured = from_world(world, interpolate_poses(track.times, track.poses, time) @ self._mount)
-        points = (from_world(world, pose) if self.motion_compensated else measured).astype(np.float32)
+            measured = from_world(
+                world, interpolate_poses(track.times, track.poses, time) @ self._mount
+            )
+        points = (from_world(world, pose) if self.motion_compensated else measured).astype(
+            np.float32
+        )
         intensity = table["i"][kept].astype(np.float32)
         check_points(points, intensity, str(path), INTENSITY_MAX)
         image = folder / "camera" / self.camera / f"{frame}.jpg"
@@ -138,16 +166,22 @@ class PandaSet(ScanFiles):
     def calibration(self, index: int) -> Calibration | None:
         """The camera relative to the sensor.
 
-        A rotating sensor passes a camera's view when the camera takes its image. Points as measured are therefore
-        projected from the sensor at the time of the image, and compensated ones from the sensor at the timestamp.
+        A rotating sensor passes a camera's view when the camera takes its image. Points as measured
+        are therefore projected from the sensor at the time of the image, and compensated ones from
+        the sensor at the timestamp.
         """
         folder, frame = self._place(index)
         source = folder / "camera" / self.camera
         if not (source / "intrinsics.json").is_file():
             return None
-        track, camera = self._track(folder / "lidar"), self._track(source)
+        track = self._track(folder / "lidar")
+        camera = self._track(source)
         number = camera.number(frame, source)
-        when = track.times[track.number(frame, source)] if self.motion_compensated else camera.times[number]
+        when = (
+            track.times[track.number(frame, source)]
+            if self.motion_compensated
+            else camera.times[number]
+        )
         with naming(source / "intrinsics.json"):
             pose = interpolate_poses(track.times, track.poses, np.array([when]))[0] @ self._mount
             projection = read_intrinsics(source)
@@ -163,7 +197,9 @@ class PandaSet(ScanFiles):
             self._tracks[folder] = read_track(folder)
         return self._tracks[folder]
 
-    def _labels(self, folder: Path, frame: str, points: Path, kept: NDArray[np.bool_]) -> dict[str, Any]:
+    def _labels(
+        self, folder: Path, frame: str, points: Path, kept: NDArray[np.bool_]
+    ) -> dict[str, Any]:
         """The labels of one sensor's points, as arguments of ``Scan``."""
         path = folder / "annotations" / "semseg" / f"{frame}{SUFFIX}"
         if not path.parent.is_dir():
@@ -173,7 +209,10 @@ class PandaSet(ScanFiles):
         raw = table["class"]
         if len(raw) != len(kept):
             raise mismatch(path, len(raw), points, len(kept))
-        return {"label": PANDASET.decode(raw[kept], str(path)), "raw_label": raw[kept].astype(np.uint32)}
+        return {
+            "label": PANDASET.decode(raw[kept], str(path)),
+            "raw_label": raw[kept].astype(np.uint32),
+        }
 
     def _boxes(self, path: Path, pose: NDArray[np.float64]) -> Boxes | None:
         if not path.is_file():

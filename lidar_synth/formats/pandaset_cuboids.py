@@ -12,14 +12,35 @@ from lidar_synth.geometry.motion import from_world
 from lidar_synth.geometry.scan import Boxes
 
 BOXES = {
-    "Car": "Car", "Pickup Truck": "Truck", "Medium-sized Truck": "Truck", "Semi-truck": "Truck",
-    "Towed Object": "Misc", "Motorcycle": "Misc", "Other Vehicle - Construction Vehicle": "Misc",
-    "Other Vehicle - Uncommon": "Misc", "Other Vehicle - Pedicab": "Misc", "Emergency Vehicle": "Misc", "Bus": "Misc",
-    "Personal Mobility Device": "Misc", "Motorized Scooter": "Misc", "Bicycle": "Misc", "Train": "Tram",
-    "Trolley": "Tram", "Tram / Subway": "Tram", "Pedestrian": "Pedestrian", "Pedestrian with Object": "Pedestrian",
-    "Animals - Bird": None, "Animals - Other": None, "Pylons": None, "Road Barriers": None, "Signs": None,
-    "Cones": None, "Construction Signs": None, "Temporary Construction Barriers": None, "Rolling Containers": None,
-}  # fmt: skip
+    "Car": "Car",
+    "Pickup Truck": "Truck",
+    "Medium-sized Truck": "Truck",
+    "Semi-truck": "Truck",
+    "Towed Object": "Misc",
+    "Motorcycle": "Misc",
+    "Other Vehicle - Construction Vehicle": "Misc",
+    "Other Vehicle - Uncommon": "Misc",
+    "Other Vehicle - Pedicab": "Misc",
+    "Emergency Vehicle": "Misc",
+    "Bus": "Misc",
+    "Personal Mobility Device": "Misc",
+    "Motorized Scooter": "Misc",
+    "Bicycle": "Misc",
+    "Train": "Tram",
+    "Trolley": "Tram",
+    "Tram / Subway": "Tram",
+    "Pedestrian": "Pedestrian",
+    "Pedestrian with Object": "Pedestrian",
+    "Animals - Bird": None,
+    "Animals - Other": None,
+    "Pylons": None,
+    "Road Barriers": None,
+    "Signs": None,
+    "Cones": None,
+    "Construction Signs": None,
+    "Temporary Construction Barriers": None,
+    "Rolling Containers": None,
+}
 """{PandaSet's class: KITTI's name; None = no box}. A bicycle with a rider is a ``Cyclist``."""
 
 
@@ -27,20 +48,31 @@ CYCLIST = ("Bicycle", "With Rider")
 
 
 def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Boxes:
-    """The boxes of one frame in the sensor frame; those that only the other sensor saw are left out.
+    """The boxes of one frame in the sensor frame; those that only the other sensor saw are left
+    out.
 
     Args:
         path: the table.
         pose: (4, 4) sensor to world.
-        other_sensor: 0 = Pandar64 or 1 = PandarGT. Of an object in the view of both, each sensor has a box of its own;
-            -1 in the table stands for all other objects.
+        other_sensor: 0 = Pandar64 or 1 = PandarGT. Of an object in the view of both, each sensor
+            has a box of its own; -1 in the table stands for all other objects.
 
     Raises:
         FileError: if it cannot be read.
         DataError: on a class that PandaSet does not have, or impossible boxes.
     """
-    numbers = ("position.x", "position.y", "position.z", "dimensions.y", "dimensions.x", "dimensions.z", "yaw")
-    table = read_table(path, (*numbers, "label", "uuid"), ("cuboids.sensor_id", "attributes.rider_status"))
+    numbers = (
+        "position.x",
+        "position.y",
+        "position.z",
+        "dimensions.y",
+        "dimensions.x",
+        "dimensions.z",
+        "yaw",
+    )
+    table = read_table(
+        path, (*numbers, "label", "uuid"), ("cuboids.sensor_id", "attributes.rider_status")
+    )
     require_numbers(table, numbers, path)
     labels = table["label"].tolist()
     if unknown := sorted({str(label) for label in labels} - BOXES.keys()):
@@ -53,8 +85,15 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)[kept]
     # PandaSet's yaw turns a box whose length is along y.
     with np.errstate(invalid="ignore"):  # Boxes refuses what is not finite
-        heading = np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1) @ pose[:3, :3]
+        heading = (
+            np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1)
+            @ pose[:3, :3]
+        )
     values[:, :3] = from_world(values[:, :3], pose)
     values[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
     instance = [crc32(str(uuid).encode("utf-8", "replace")) >> 1 for uuid in table["uuid"][kept]]
-    return Boxes(values.astype(np.float32), tuple(np.array(names, object)[kept]), instance=np.array(instance, np.int32))
+    return Boxes(
+        values.astype(np.float32),
+        tuple(np.array(names, object)[kept]),
+        instance=np.array(instance, np.int32),
+    )

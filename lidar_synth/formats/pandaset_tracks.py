@@ -1,4 +1,5 @@
-"""PandaSet's poses, times and camera parameters (JSON files), and where its sensors stand on the vehicle."""
+"""PandaSet's poses, times and camera parameters (JSON files), and where its sensors stand on the
+vehicle."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,20 +15,31 @@ from lidar_synth.files.parsing import parse_json
 Matrix = NDArray[np.float64]
 
 FORWARD = "pandar_gt"
-"""Name of the sensor that is read from the rows with d = 1; every other sensor is read from those with d = 0."""
+"""Name of the sensor that is read from the rows with d = 1; every other sensor is read from those
+with d = 0."""
 
 
 def _mounts() -> dict[str, Matrix]:
-    """{sensor: (4, 4) from the sensor's frame to the frame of the poses (x right, y forward, z up)}.
+    """{sensor: (4, 4) from the sensor's frame to the frame of the poses (x right, y forward, z
+    up)}.
 
-    Pandar64: fitted on frame 002/00, where the vehicle stands, such that elevations lie on the beams: at (0.001,
-    0.7752, 1.8589) m, Rx(-0.0157) Ry(0.0005) rad from the poses' frame. PandarGT: parallel to the Pandar64, 0.562 m
-    ahead of it and 0.282 m below, fitted on 002/00 and 002/40 such that its lines of points stay straight where the
-    range jumps (by PandaSet's own calibration 0.606 m and 0.302 m).
+    Pandar64: fitted on frame 002/00, where the vehicle stands, such that elevations lie on the
+        beams: at (0.001,
+    0.7752, 1.8589) m, Rx(-0.0157) Ry(0.0005) rad from the poses' frame. PandarGT: parallel to the
+    Pandar64, 0.562 m ahead of it and 0.282 m below, fitted on 002/00 and 002/40 such that its lines
+    of points stay straight where the range jumps (by PandaSet's own calibration 0.606 m and 0.302
+    m).
     """
-    about_x, about_y = -0.0157, 0.0005
-    tilt = np.array([(1, 0, 0), (0, np.cos(about_x), -np.sin(about_x)), (0, np.sin(about_x), np.cos(about_x))])
-    tilt = tilt @ [(np.cos(about_y), 0, np.sin(about_y)), (0, 1, 0), (-np.sin(about_y), 0, np.cos(about_y))]
+    about_x = -0.0157
+    about_y = 0.0005
+    tilt = np.array(
+        [(1, 0, 0), (0, np.cos(about_x), -np.sin(about_x)), (0, np.sin(about_x), np.cos(about_x))]
+    )
+    tilt = tilt @ [
+        (np.cos(about_y), 0, np.sin(about_y)),
+        (0, 1, 0),
+        (-np.sin(about_y), 0, np.cos(about_y)),
+    ]
     top = np.eye(4)
     top[:3, :3] = tilt.T @ [(0, -1, 0), (1, 0, 0), (0, 0, 1)]
     top[:3, 3] = 0.001, 0.7752, 1.8589
@@ -41,7 +53,8 @@ MOUNTS = _mounts()
 
 @dataclass(frozen=True)
 class Track:
-    """(P,) times in seconds and (P, 4, 4) poses to the world of a vehicle or a camera, one for each frame."""
+    """(P,) times in seconds and (P, 4, 4) poses to the world of a vehicle or a camera, one for each
+    frame."""
 
     times: Matrix
     poses: Matrix
@@ -53,7 +66,9 @@ class Track:
             DataError: if there is none; ``where`` names the frame in the error.
         """
         if not frame.isdecimal() or int(frame) >= len(self.times):
-            raise DataError(f"{where}: frame {frame!r}, but {len(self.times)} poses", "a pose for each frame")
+            raise DataError(
+                f"{where}: frame {frame!r}, but {len(self.times)} poses", "a pose for each frame"
+            )
         return int(frame)
 
 
@@ -66,8 +81,15 @@ def read_track(folder: Path) -> Track:
     """
     times, poses = (_parse(folder / name) for name in ("timestamps.json", "poses.json"))
     with naming(folder / "poses.json"):
-        if not isinstance(times, list) or not isinstance(poses, list) or not 2 <= len(times) == len(poses):
-            raise DataError("another number of poses than of timestamps", "one for each frame, two or more frames")
+        if (
+            not isinstance(times, list)
+            or not isinstance(poses, list)
+            or not 2 <= len(times) == len(poses)
+        ):
+            raise DataError(
+                "another number of poses than of timestamps",
+                "one for each frame, two or more frames",
+            )
         seconds = np.array(_numbers(times, *range(len(times))), np.float64)
         if not (np.diff(seconds) > 0).all():
             raise DataError("timestamps that do not increase", "seconds, one for each frame")
@@ -96,7 +118,9 @@ def _numbers(values: Any, *keys: Any) -> list[float]:
         if not all(type(value) in (int, float) and abs(value) < 1e12 for value in found):
             raise TypeError("something else than finite numbers")
     except (KeyError, TypeError, IndexError) as error:
-        raise DataError(f"no numbers {keys[:4]} ({error!r})", "metres, unit quaternions, seconds, pixels") from error
+        raise DataError(
+            f"no numbers {keys[:4]} ({error!r})", "metres, unit quaternions, seconds, pixels"
+        ) from error
     return found
 
 

@@ -1,7 +1,10 @@
-"""PCD files, version 0.7 (https://pointclouds.org/documentation/tutorials/pcd_file_format.html). Lossless for a scan.
+"""PCD files, version 0.7 (https://pointclouds.org/documentation/tutorials/pcd_file_format.html).
+Lossless for a scan.
 
-The package reads ``ascii``, ``binary`` and ``binary_compressed`` files and writes ``binary``. The header is compared
-with the file before any value is read: a false header could otherwise drop points, or read beyond the data.
+The package reads ``ascii``, ``binary`` and ``binary_compressed`` files and writes ``binary``. The
+header is compared
+with the file before any value is read: a false header could otherwise drop points, or read beyond
+    the data.
 """
 
 import re
@@ -14,7 +17,15 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, write_file
-from lidar_synth.formats.cloud import Field, check_fields, check_size, from_records, from_text, to_arrays, to_records
+from lidar_synth.formats.cloud import (
+    Field,
+    check_fields,
+    check_size,
+    from_records,
+    from_text,
+    to_arrays,
+    to_records,
+)
 from lidar_synth.formats.description import Description, from_comments, to_comments
 from lidar_synth.geometry.scan import Scan
 
@@ -62,19 +73,23 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         FileError: if it cannot be read.
         DataError: if its header is invalid or does not match the file, or it holds no points.
     """
-    content, where = read_file(path), str(path)
+    content = read_file(path)
+    where = str(path)
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t\r]*\n", content[:LONGEST_HEADER], re.M)
     if end is None:
         raise DataError(f"{where} has no header of a .pcd file", "a PCD file", SKIP_HINT)
     fields, count = _header(content[: end.start()].decode("latin-1"), where)
     check_fields(fields, count, where)
-    body, size = content[end.end() :], count * sum(field.width for field in fields)
+    body = content[end.end() :]
+    size = count * sum(field.width for field in fields)
     if end[1] == b"ascii":
         return to_arrays(from_text(body.decode("latin-1"), fields, count, where))
     if end[1] == b"binary_compressed":
         return to_arrays(_from_columns(_decompressed(body, size, where), fields, count))
     if end[1] != b"binary":
-        raise DataError(f"{where} holds {end[1].decode('latin-1')!r} data", "ascii, binary or binary_compressed")
+        raise DataError(
+            f"{where} holds {end[1].decode('latin-1')!r} data", "ascii, binary or binary_compressed"
+        )
     check_size(body, size, where)
     return to_arrays(from_records(body, fields, count))
 
@@ -91,37 +106,61 @@ def read_pcd_description(path: Path) -> Description | None:
 
 
 def _header(text: str, where: str) -> tuple[list[Field], int]:
-    """Parse the fields and the number of points, after checking that all lines exist once and agree."""
+    """Parse the fields and the number of points, after checking that all lines exist once and
+    agree."""
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     header = {row[0]: row[1:] for row in rows}
     fault = f"{where}: its header cannot be read"
     expected = "one line each of FIELDS, SIZE, TYPE, WIDTH, HEIGHT and POINTS"
-    if len(header) < len(rows) or not {"FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS"} <= set(header):
-        raise DataError(f"{fault} (it has {[row[0][:20] for row in rows][:20]})", expected, SKIP_HINT)
+    if len(header) < len(rows) or not {
+        "FIELDS",
+        "SIZE",
+        "TYPE",
+        "WIDTH",
+        "HEIGHT",
+        "POINTS",
+    } <= set(header):
+        raise DataError(
+            f"{fault} (it has {[row[0][:20] for row in rows][:20]})", expected, SKIP_HINT
+        )
     header.setdefault("COUNT", ["1"] * len(header["FIELDS"]))
     if len({len(header[key]) for key in _PER_FIELD}) > 1:
         raise DataError(
-            f"{fault} ({ {key: len(header[key]) for key in _PER_FIELD} })", "one value per field", SKIP_HINT
+            f"{fault} ({ {key: len(header[key]) for key in _PER_FIELD} })",
+            "one value per field",
+            SKIP_HINT,
         )
     single = [header[key] for key in ("WIDTH", "HEIGHT", "POINTS")]
     numbers = sum(single, [*header["SIZE"], *header["COUNT"]])
-    if any(len(row) != 1 for row in single) or any(not re.fullmatch("[0-9]{1,12}", number) for number in numbers):
-        raise DataError(f"{fault}: invalid sizes", "integers, one each for WIDTH, HEIGHT and POINTS", SKIP_HINT)
+    if any(len(row) != 1 for row in single) or any(
+        not re.fullmatch("[0-9]{1,12}", number) for number in numbers
+    ):
+        raise DataError(
+            f"{fault}: invalid sizes", "integers, one each for WIDTH, HEIGHT and POINTS", SKIP_HINT
+        )
     width, height, points = (int(number) for [number] in single)
     if width * height != points:
-        raise DataError(f"{where}: WIDTH {width}, HEIGHT {height} and POINTS {points}", "WIDTH x HEIGHT = POINTS")
+        raise DataError(
+            f"{where}: WIDTH {width}, HEIGHT {height} and POINTS {points}",
+            "WIDTH x HEIGHT = POINTS",
+        )
     fields = []
     for name, size, kind, count in zip(*(header[key] for key in _PER_FIELD), strict=True):
         if size not in _SIZES.get(kind, "") or int(count) < 1:
-            given = f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
-            raise DataError(given, "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value", SKIP_HINT)
+            given = (
+                f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
+            )
+            raise DataError(
+                given, "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value", SKIP_HINT
+            )
         fields.append(Field(name, f"<{kind.lower()}{size}", int(count)))
     return fields, points
 
 
 def _from_columns(body: bytes, fields: list[Field], count: int) -> dict[str, NDArray[Any]]:
     """{name: values} of fields that are stored one after another, as in compressed files."""
-    arrays, offset = {}, 0
+    arrays = {}
+    offset = 0
     for field in fields:
         arrays[field.name] = np.frombuffer(body, field.type, count * field.count, offset)
         offset += count * field.width
@@ -133,7 +172,9 @@ def _decompressed(body: bytes, size: int, where: str) -> bytes:
     packed, plain = (int.from_bytes(body[i : i + 4], "little") for i in (0, 4))
     if plain != size or size > MOST_EXPANSION * packed:
         raise DataError(
-            f"{where} declares {plain} bytes in {packed} compressed ones", f"{size}, by its header", SKIP_HINT
+            f"{where} declares {plain} bytes in {packed} compressed ones",
+            f"{size}, by its header",
+            SKIP_HINT,
         )
     check_size(body, 8 + packed, where)
     target = np.empty(size, np.uint8)

@@ -1,7 +1,7 @@
 """PLY files (http://paulbourke.net/dataformats/ply): their vertices as points. Lossless for a scan.
 
-The package reads ``ascii`` and both binary byte orders and writes ``binary_little_endian``. As with PCD, the header is
-compared with the file before any value is read.
+The package reads ``ascii`` and both binary byte orders and writes ``binary_little_endian``. As with
+PCD, the header is compared with the file before any value is read.
 """
 
 import os
@@ -33,17 +33,31 @@ LONGEST_HEADER = 1 << 16
 """Maximum length of a header in bytes."""
 
 TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
 
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 @dataclass
 class Element:
-    """One element of the file: ``count`` records of ``fields``; ``lists`` if a field has no fixed length."""
+    """One element of the file: ``count`` records of ``fields``; ``lists`` if a field has no fixed
+    length."""
 
     name: str
     count: int
@@ -76,7 +90,8 @@ def vertex_header(records: NDArray[np.void], comments: Iterable[str] = ()) -> by
 
 
 def map_vertices(path: Path) -> NDArray[np.void]:
-    """All properties of the vertices of a large binary ``.ply`` file, mapped into memory instead of read.
+    """All properties of the vertices of a large binary ``.ply`` file, mapped into memory instead of
+    read.
 
     Returns:
         (N,) records, read-only; N may be 0.
@@ -94,8 +109,12 @@ def map_vertices(path: Path) -> NDArray[np.void]:
         raise unreadable(path, error, "a PLY file") from error
     encoding, elements, offset = _parse(start, where)
     if encoding == "ascii" or len(elements) != 1 or elements[0].lists:
-        raise DataError(f"{where} is not a list of binary points", "a binary PLY file with only the element vertex")
-    fields, count = elements[0].fields, elements[0].count
+        raise DataError(
+            f"{where} is not a list of binary points",
+            "a binary PLY file with only the element vertex",
+        )
+    fields = elements[0].fields
+    count = elements[0].count
     if size - offset != elements[0].size:
         raise cut(where, size - offset, elements[0].size)
     if len({f.name for f in fields}) < len(fields):
@@ -113,11 +132,15 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
         FileError: if it cannot be read.
         DataError: if its header is invalid or does not match the file, or it holds no points.
     """
-    content, where = read_file(path), str(path)
+    content = read_file(path)
+    where = str(path)
     encoding, elements, offset = _parse(content[:LONGEST_HEADER], where)
     [(position, vertex)] = [(i, e) for i, e in enumerate(elements) if e.name == "vertex"]
     if vertex.lists or (encoding != "ascii" and any(e.lists for e in elements[:position])):
-        raise DataError(f"{where} has lists in its points or before them", "the element vertex first, without lists")
+        raise DataError(
+            f"{where} has lists in its points or before them",
+            "the element vertex first, without lists",
+        )
     check_fields(vertex.fields, vertex.count, where)
     body = content[offset:]
     if encoding == "ascii":
@@ -125,7 +148,11 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
         if len(lines) != (wanted := sum(e.count for e in elements)):
             raise cut(where, len(lines), wanted, "lines")
         start = sum(e.count for e in elements[:position])
-        return to_arrays(from_text("\n".join(lines[start : start + vertex.count]), vertex.fields, vertex.count, where))
+        return to_arrays(
+            from_text(
+                "\n".join(lines[start : start + vertex.count]), vertex.fields, vertex.count, where
+            )
+        )
     size = sum(e.size for e in elements)  # a lower bound if there are lists
     check_size(body, size, where, more=any(e.lists for e in elements))
     start = sum(e.size for e in elements[:position])
@@ -140,7 +167,9 @@ def read_ply_description(path: Path) -> Description | None:
         DataError: on a damaged description.
     """
     lines = read_start(path, LONGEST_HEADER).split("\nend_header", 1)[0].splitlines()
-    return from_comments((line.removeprefix("comment") for line in lines if line.startswith("comment")), str(path))
+    return from_comments(
+        (line.removeprefix("comment") for line in lines if line.startswith("comment")), str(path)
+    )
 
 
 def _parse(start: bytes, where: str) -> tuple[str, list[Element], int]:
@@ -153,7 +182,8 @@ def _parse(start: bytes, where: str) -> tuple[str, list[Element], int]:
 
 def _header(text: str, where: str) -> tuple[str, list[Element]]:
     """Parse the encoding and the elements in order; exactly one of them is ``vertex``."""
-    encodings, elements = [], []
+    encodings = []
+    elements = []
     for line in text.splitlines()[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
@@ -162,13 +192,19 @@ def _header(text: str, where: str) -> tuple[str, list[Element]]:
                 encodings.append(name)
             case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count) and encodings:
                 elements.append(Element(name, int(count)))
-            case ["property", "list", length, kind, _] if length in TYPES and kind in TYPES and elements:
+            case ["property", "list", length, kind, _] if (
+                length in TYPES and kind in TYPES and elements
+            ):
                 elements[-1].fields.append(Field("", TYPES[length]))
                 elements[-1].lists = True
             case ["property", kind, name] if kind in TYPES and elements:
                 elements[-1].fields.append(Field(name, ORDERS[encodings[0]] + TYPES[kind]))
             case _:
-                raise DataError(f"{where}: its header cannot be read ({line[:100]!r})", "a PLY file", SKIP_HINT)
+                raise DataError(
+                    f"{where}: its header cannot be read ({line[:100]!r})", "a PLY file", SKIP_HINT
+                )
     if len(encodings) != 1 or [e.name for e in elements].count("vertex") != 1:
-        raise DataError(f"{where}: its header cannot be read", "one format and one element vertex", SKIP_HINT)
+        raise DataError(
+            f"{where}: its header cannot be read", "one format and one element vertex", SKIP_HINT
+        )
     return encodings[0], elements

@@ -4,11 +4,15 @@ Layout::
 
     range/NAME.png          16 bit grey: range in steps of ``scale`` metres, 0 = no return
     reflectance/NAME.png    16 bit grey: reflectance * 65535
-    label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only with labels
+    label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only
+    with labels
 
-``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of sensors.yaml), ``id`` and
-``domain``. The format is lossy: rounding errors are at most half a step, 0.61 mm for a maximum range of 80 m, and 8e-6
-for reflectance; instances, the dataset's own labels, confidence, boxes and pose are not stored. Labels are exact.
+``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of
+    sensors.yaml), ``id`` and
+``domain``. The format is lossy: rounding errors are at most half a step, 0.61 mm for a maximum
+    range of 80 m, and 8e-6
+for reflectance; instances, the dataset's own labels, confidence, boxes and pose are not stored.
+Labels are exact.
 """
 
 import json
@@ -42,7 +46,8 @@ CHANNELS = ("range", "reflectance", "label")
 
 
 class RangePNG(ScanFiles):
-    """Range images as PNG: <root>/range/*.png with the folders reflectance and label, or one file of range.
+    """Range images as PNG: <root>/range/*.png with the folders reflectance and label, or one file
+    of range.
 
     Args:
         root: the folder that holds ``range``, or one PNG in ``range``.
@@ -54,7 +59,13 @@ class RangePNG(ScanFiles):
         DataError: if it holds no image.
     """
 
-    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
         root = Path(root)
         paths = [root] if root.is_file() else list_files(root / "range", ".png")
         base = root.absolute().parents[1] if root.is_file() else root
@@ -73,19 +84,27 @@ class RangePNG(ScanFiles):
     def read(self, index: int) -> Scan:
         image, facts = self._decode(index)
         scan = unproject(image)
-        scan.id, scan.domain = self.ids[index], int(facts["domain"])
+        scan.id = self.ids[index]
+        scan.domain = int(facts["domain"])
         scan.provenance = facts.get("provenance", {})
         check_scan(scan, str(channel_path(self.root, "range", self.ids[index])))
         return scan
 
     def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any]]:
-        path, reflectance, label = (channel_path(self.root, name, self.ids[index]) for name in CHANNELS)
+        path, reflectance, label = (
+            channel_path(self.root, name, self.ids[index]) for name in CHANNELS
+        )
         steps, text = read_png(path)
-        facts = parse_json(text.get(TEXT, ""), f"{path}: its text", "a range image written by this package")
+        facts = parse_json(
+            text.get(TEXT, ""), f"{path}: its text", "a range image written by this package"
+        )
         try:
-            sensor, scale = Sensor.from_dict(facts["sensor"]), float(facts["scale"])
+            sensor = Sensor.from_dict(facts["sensor"])
+            scale = float(facts["scale"])
             if self._given is not None and sensor.shape != self._given.shape:
-                raise ValueError(f"it was made for sensor {sensor.name!r}, not for {self._given.name!r}")
+                raise ValueError(
+                    f"it was made for sensor {sensor.name!r}, not for {self._given.name!r}"
+                )
             if facts["domain"] not in (REAL, SYNTHETIC) or not 0 < scale < 1:
                 raise ValueError(f"domain {facts['domain']!r} and scale {scale}")
             check_provenance(facts.get("provenance", {}))
@@ -93,14 +112,19 @@ class RangePNG(ScanFiles):
             if label.is_file():
                 channels["label"] = read_png(label)[0]
                 if channels["label"].dtype != np.uint8:
-                    raise ValueError(f"{label.name} of its labels is {channels['label'].dtype}, not uint8")
-            return range_image(_steps(path, steps) * np.float32(scale), sensor, channels, str(path)), facts
+                    raise ValueError(
+                        f"{label.name} of its labels is {channels['label'].dtype}, not uint8"
+                    )
+            return range_image(
+                _steps(path, steps) * np.float32(scale), sensor, channels, str(path)
+            ), facts
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{path}: {error}", "a range image written by this package") from error
 
 
 def _stored_sensor(path: Path) -> Sensor | None:
-    """The sensor that a file names; None if it cannot be read, so that reading the scan raises the error."""
+    """The sensor that a file names; None if it cannot be read, so that reading the scan raises the
+    error."""
     try:
         facts = parse_json(read_png(path)[1].get(TEXT, ""), str(path))
         return Sensor.from_dict(facts["sensor"])
@@ -112,12 +136,17 @@ def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
     """The values of a 16-bit grey image."""
     values = read_png(path)[0] if values is None else values
     if values.dtype.kind not in "iu" or values.ndim != 2 or (values.size and values.max() > STEPS):
-        raise DataError(f"{path} holds {values.dtype} of shape {values.shape}", "a picture of 16-bit grey", SKIP_HINT)
+        raise DataError(
+            f"{path} holds {values.dtype} of shape {values.shape}",
+            "a picture of 16-bit grey",
+            SKIP_HINT,
+        )
     return values
 
 
 class PNGWriter(Writer):
-    """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and ``label`` PNG files."""
+    """Writes the scan, projected onto its sensor's grid, as ``range``, ``reflectance`` and
+    ``label`` PNG files."""
 
     keeps = frozenset({"label"})
 
@@ -125,15 +154,25 @@ class PNGWriter(Writer):
         # One flat folder per channel, which other programs can read as a list of images.
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         image = projected(scan)
         scale = image.sensor.range_max / STEPS
-        facts = {"scale": scale, "sensor": image.sensor.to_dict(), "id": scan.id, "domain": scan.domain}
+        facts = {
+            "scale": scale,
+            "sensor": image.sensor.to_dict(),
+            "id": scan.id,
+            "domain": scan.domain,
+        }
         facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
         if image.label is not None:
             write_png(channel_path(self.root, "label", path.stem), image.label, palette=True)
         reflectance = image.channels["reflectance"] * STEPS
-        write_png(channel_path(self.root, "reflectance", path.stem), np.rint(reflectance).astype(np.uint16))
+        write_png(
+            channel_path(self.root, "reflectance", path.stem),
+            np.rint(reflectance).astype(np.uint16),
+        )
         steps = np.where(image.mask, np.clip(np.rint(image.range / scale), 1, STEPS), 0)
         write_png(path, steps.astype(np.uint16), text=json.dumps(facts))
 

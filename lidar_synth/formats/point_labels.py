@@ -1,7 +1,8 @@
 """Labels of points on disk: one unsigned 32-bit value per point.
 
-The encoding is that of SemanticKITTI (http://www.semantic-kitti.org/dataset.html): the lower 16 bits are the dataset's
-class id, the upper 16 bits the instance. KITTI-360's labels use the same packing with that dataset's class ids.
+The encoding is that of SemanticKITTI (http://www.semantic-kitti.org/dataset.html): the lower 16
+bits are the dataset's class id, the upper 16 bits the instance. KITTI-360's labels use the same
+packing with that dataset's class ids.
 """
 
 from pathlib import Path
@@ -27,7 +28,8 @@ def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dic
 
     Raises:
         FileError: if the file cannot be read.
-        DataError: if the numbers of labels and points differ; on a class id that the dataset does not define.
+        DataError: if the numbers of labels and points differ; on a class id that the dataset does
+            not define.
     """
     if not path.is_file():
         raise FileError(
@@ -46,12 +48,14 @@ def mismatch(path: Path, labels: int, points: Path, count: int) -> DataError:
     return DataError(
         f"{path} has {labels} labels, {points} has {count} points",
         "one label per point",
-        "One of the two belongs to another scan or is truncated: copy both again, or skip the scan with on_bad='skip'.",
+        "One of the two belongs to another scan or is truncated: copy both again, or skip the "
+        "scan with on_bad='skip'.",
     )
 
 
 def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> dict[str, Any]:
-    """Decode the values of a label file to ``label``, ``raw_label`` and ``instance``; the inverse of ``encode_labels``.
+    """Decode the values of a label file to ``label``, ``raw_label`` and ``instance``; the inverse
+    of ``encode_labels``.
 
     Raises:
         DataError: on a class id that the dataset does not define.
@@ -66,9 +70,10 @@ def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> di
 def encode_labels(scan: Scan, taxonomy: Taxonomy) -> NDArray[np.uint32]:
     """(N,) values to write for a scan's labels.
 
-    ``raw_label`` is written unchanged, bit for bit, if it decodes to ``label`` in this taxonomy. Otherwise (ids of
-    another dataset, a label that was changed since, or no ``raw_label``), the values are the taxonomy's static class of
-    ``label`` and ``instance`` in the upper bits. A scan without labels gets 0 = unlabelled for every point.
+    ``raw_label`` is written unchanged, bit for bit, if it decodes to ``label`` in this taxonomy.
+    Otherwise (ids of another dataset, a label that was changed since, or no ``raw_label``), the
+    values are the taxonomy's static class of ``label`` and ``instance`` in the upper bits. A scan
+    without labels gets 0 = unlabelled for every point.
 
     Raises:
         DataError: on a train id or an instance that the file cannot hold.

@@ -26,7 +26,8 @@ _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
 def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> NDArray[np.float32]:
-    """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no header.
+    """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no
+    header.
 
     Args:
         path: the file.
@@ -52,7 +53,10 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
         hint = ""
         if fits:
             n = fits[0]
-            hint = f"The size fits {n} floats per point: pass fields={n} (--fields {n}) if it holds them. "
+            hint = (
+                f"The size fits {n} floats per point: pass fields={n} (--fields {n}) if it holds "
+                "them. "
+            )
         raise DataError(
             f"{path} is {size} bytes long",
             f"a multiple of {4 * fields}: {fields} float32 for each point",
@@ -64,7 +68,8 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
 
 
 def write_points(path: Path, scan: Scan) -> None:
-    """Write the points of a scan as KITTI's ``.bin``, four floats each; the inverse of ``read_points``.
+    """Write the points of a scan as KITTI's ``.bin``, four floats each; the inverse of
+    ``read_points``.
 
     Raises:
         FileError: if it cannot be written.
@@ -73,7 +78,10 @@ def write_points(path: Path, scan: Scan) -> None:
 
 
 def check_points(
-    points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str, reflectance_max: float = 1.0
+    points: NDArray[np.float32],
+    reflectance: NDArray[np.float32],
+    where: str,
+    reflectance_max: float = 1.0,
 ) -> None:
     """Refuse impossible values of points.
 
@@ -84,18 +92,21 @@ def check_points(
         reflectance_max: maximum of the reflectance; the minimum is 0.
 
     Raises:
-        DataError: on no points, NaN, infinity, coordinates beyond ``FARTHEST``, or reflectance out of its interval.
+        DataError: on no points, NaN, infinity, coordinates beyond ``FARTHEST``, or reflectance out
+            of its interval.
     """
     if _bad_points_kept.get():
         good = finite(points, reflectance)
-        points, reflectance = points[good], reflectance[good]
+        points = points[good]
+        reflectance = reflectance[good]
     if len(points) == 0:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
     # One pass over the memory detects bad values; they are searched only if there are any.
     flat = points.reshape(-1)
     with np.errstate(over="ignore", invalid="ignore"):
         suspicious = not float(np.dot(flat, flat)) < FARTHEST**2
-    low, high = float(reflectance.min()), float(reflectance.max())
+    low = float(reflectance.min())
+    high = float(reflectance.max())
     if suspicious or not np.isfinite(high - low):
         _find_bad_value(points, reflectance, where)
     scale = 255 if high <= 255 else int(np.ceil(high))
@@ -103,8 +114,10 @@ def check_points(
         raise DataError(
             f"{where}: its reflectance (the fourth value of a point) runs from {low:g} to {high:g}",
             f"values in [0, {reflectance_max:g}]",
-            f"Either it holds intensities on another scale (--reflectance-max {scale}, in Python reflectance_max="
-            f"{scale}{_FOR_ALL if scale > 255 else ''}), or another number of floats per point (--fields 5, fields=5; "
+            f"Either it holds intensities on another scale (--reflectance-max {scale}, in Python "
+            "reflectance_max="
+            f"{scale}{_FOR_ALL if scale > 255 else ''}), or another number of floats per point "
+            "(--fields 5, fields=5; "
             "nuScenes has 5), or it is damaged.",
         )
 
@@ -125,13 +138,18 @@ def without_bad_points(scan: Scan) -> Scan:
     if good.all():
         return scan
     if not good.any():
-        raise DataError(f"scan {scan.id!r}: all {len(scan)} points are NaN or infinite", "finite points", SKIP_HINT)
+        raise DataError(
+            f"scan {scan.id!r}: all {len(scan)} points are NaN or infinite",
+            "finite points",
+            SKIP_HINT,
+        )
     return scan[good]
 
 
 @contextmanager
 def bad_points_kept() -> Iterator[None]:
-    """Let readers return points that are NaN or infinite within this context, for callers that drop them."""
+    """Let readers return points that are NaN or infinite within this context, for callers that drop
+    them."""
     before = _bad_points_kept.set(True)
     try:
         yield
@@ -143,15 +161,23 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
     """Check the points of a scan, and its labels, confidence, times and pose.
 
     Raises:
-        DataError: as ``check_points``; on labels that are not train ids, a confidence outside [0, 1], times beyond
-            ``LONGEST``, and a pose that is not rigid.
+        DataError: as ``check_points``; on labels that are not train ids, a confidence outside [0,
+            1], times beyond ``LONGEST``, and a pose that is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
     if scan.label is not None and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any():
-        raise DataError(f"{where}: labels {np.unique(scan.label)[-8:].tolist()}", "train ids 0..18, or 255 = ignore")
+        raise DataError(
+            f"{where}: labels {np.unique(scan.label)[-8:].tolist()}",
+            "train ids 0..18, or 255 = ignore",
+        )
     if scan.confidence is not None and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all():
-        raise DataError(f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}", "0 to 1")
-    if scan.time is not None and not (np.abs(scan.time[finite(scan.points, scan.reflectance)]) <= LONGEST).all():
+        raise DataError(
+            f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}", "0 to 1"
+        )
+    if (
+        scan.time is not None
+        and not (np.abs(scan.time[finite(scan.points, scan.reflectance)]) <= LONGEST).all()
+    ):
         raise DataError(
             f"{where}: times from {scan.time.min():g} to {scan.time.max():g}",
             f"seconds from the moment of the pose, within {LONGEST:g}",
@@ -160,11 +186,14 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
         check_rigid(scan.pose, f"{where}: its pose")
 
 
-def _find_bad_value(points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str) -> None:
+def _find_bad_value(
+    points: NDArray[np.float32], reflectance: NDArray[np.float32], where: str
+) -> None:
     bad = np.flatnonzero(~finite(points, reflectance))
     if len(bad):
         raise DataError(
-            f"{where}: {len(bad)} of {len(points)} points are NaN or infinite, the first is point {bad[0]}",
+            f"{where}: {len(bad)} of {len(points)} points are NaN or infinite, the first is "
+            f"point {bad[0]}",
             "finite float32 values",
             f"{SKIP_HINT} on_bad='drop-points' (--on-bad drop-points) drops only these points.",
         )

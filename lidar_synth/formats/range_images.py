@@ -1,11 +1,13 @@
 """Sets of range images: the package's own ``.npz``, and arrays that other code projected.
 
-- ``.npz`` with ``range`` and ``sensor``: the package's own, see npz.py. Lossless for a scan that fits the grid.
+- ``.npz`` with ``range`` and ``sensor``: the package's own, see npz.py. Lossless for a scan that
+  fits the grid.
 - ``.npy`` of shape (H, W), range in metres, or (2, H, W), range and reflectance; 0 = no return.
-- ``.npz`` with ``image``, or ``.npy``, of shape (H, W, 6): x, y, z, reflectance, range, class per cell, as used by
-  several segmentation codes. ``CONVENTIONS`` defines their frames and classes.
+- ``.npz`` with ``image``, or ``.npy``, of shape (H, W, 6): x, y, z, reflectance, range, class per
+  cell, as used by several segmentation codes. ``CONVENTIONS`` defines their frames and classes.
 
-As a source of scans, a set has one point per return: on the ray through the cell's centre, or at x, y, z if the file
+As a source of scans, a set has one point per return: on the ray through the cell's centre, or at x,
+    y, z if the file
 holds them. ``image`` returns the range image itself.
 """
 
@@ -45,7 +47,8 @@ class Convention:
     Args:
         sensor: the preset of the grid.
         reflectance_max: maximum of the reflectance.
-        learning_classes: whether the class is one of SemanticKITTI's 0..19 (0 = unlabelled); otherwise it is ignored.
+        learning_classes: whether the class is one of SemanticKITTI's 0..19 (0 = unlabelled);
+            otherwise it is ignored.
         turned: whether x is right and y forward, with the first column to the left.
     """
 
@@ -67,8 +70,8 @@ class RangeImages(ScanFiles):
     Args:
         root: the folder or the file.
         sensor: the sensor of the grid; the package's own files store it.
-        convention: ``kitti`` or ``nuscenes``, the meaning of the values of an (H, W, 6) array; by default that of the
-            sensor, or else ``kitti``.
+        convention: ``kitti`` or ``nuscenes``, the meaning of the values of an (H, W, 6) array; by
+            default that of the sensor, or else ``kitti``.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -90,7 +93,8 @@ class RangeImages(ScanFiles):
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
         stored = stored_sensor(paths[0])
         super().__init__(root, ids, sensor if stored is None else None, on_bad, stored=stored)
-        self._suffix, self._given = paths[0].suffix, None if sensor is None else load_sensor(sensor)
+        self._suffix = paths[0].suffix
+        self._given = None if sensor is None else load_sensor(sensor)
         said = None if self.description is None else self.description.sensor
         named = any(known is not None for known in (self._given, stored, said))
         if convention is None:
@@ -143,38 +147,52 @@ class RangeImages(ScanFiles):
         if array.ndim == 3 and array.shape[2] == 6:
             return decode_stack(array, self._convention, self.sensor, str(path))
         if array.ndim == 3 and len(array) != 2:
-            raise DataError(f"{path} holds an array of shape {array.shape}", "(H, W), (2, H, W) or (H, W, 6)")
+            raise DataError(
+                f"{path} holds an array of shape {array.shape}", "(H, W), (2, H, W) or (H, W, 6)"
+            )
         channels = {"reflectance": array[1]} if array.ndim == 3 else {}
-        return range_image(array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)), {}, None
+        return (
+            range_image(array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)),
+            {},
+            None,
+        )
 
 
 def decode_stack(
     stack: NDArray[np.float32], convention: Convention, sensor: Sensor, where: str
 ) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32]]:
-    """The range image of an (H, W, 6) array, no further facts, and the (H, W, 3) points of its cells.
+    """The range image of an (H, W, 6) array, no further facts, and the (H, W, 3) points of its
+    cells.
 
     Raises:
         DataError: if x, y, z and range do not agree, or a value contradicts the convention.
     """
     if not stack.size:
-        raise DataError(f"{where} holds an array of shape {stack.shape}", f"{(*sensor.shape, 6)} for {sensor.name!r}")
+        raise DataError(
+            f"{where} holds an array of shape {stack.shape}",
+            f"{(*sensor.shape, 6)} for {sensor.name!r}",
+        )
     distance = stack[..., 4]
     error = np.abs(np.linalg.norm(stack[..., :3], axis=-1) - distance).max()
     if not error < 1e-3:
         raise DataError(
-            f"{where}: x, y, z and range of a cell differ by {error:g} m", "x, y, z, reflectance, range, class"
+            f"{where}: x, y, z and range of a cell differ by {error:g} m",
+            "x, y, z, reflectance, range, class",
         )
     if stack[..., 3].max() > convention.reflectance_max:
         raise DataError(
             f"{where}: reflectance up to {stack[..., 3].max():g}",
             f"at most {convention.reflectance_max:g}",
-            f"Another convention may fit: pass sensor='hdl32e_nuscenes', or one of {', '.join(CONVENTIONS)}.",
+            "Another convention may fit: pass sensor='hdl32e_nuscenes', or one of "
+            f"{', '.join(CONVENTIONS)}.",
         )
     channels = {"reflectance": stack[..., 3] / np.float32(convention.reflectance_max)}
     if convention.learning_classes:
         classes = stack[..., 5]
         if not np.isin(classes, np.arange(20)).all():
-            raise DataError(f"{where}: classes up to {classes.max():g}", "SemanticKITTI's 0..19, 0 = unlabelled")
+            raise DataError(
+                f"{where}: classes up to {classes.max():g}", "SemanticKITTI's 0..19, 0 = unlabelled"
+            )
         channels["label"] = (classes.astype(np.int16) - 1).astype(np.uint8)
     points = stack[..., :3]
     if convention.turned:
@@ -186,10 +204,13 @@ def decode_stack(
 
 
 class RangeWriter(FileWriter):
-    """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with all its fields."""
+    """Writes the package's own ``NAME.npz``: the scan projected onto its sensor's grid, with all
+    its fields."""
 
     suffix = ".npz"
     keeps = frozenset(DETAILS) - {"image_path"}
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         write_range_image(path, projected(scan), scan)

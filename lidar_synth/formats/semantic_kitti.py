@@ -3,11 +3,10 @@
 Layout (http://www.semantic-kitti.org/dataset.html)::
 
     sequences/NN/velodyne/FFFFFF.bin     float32 x, y, z, reflectance; sensor frame
-    sequences/NN/labels/FFFFFF.label     uint32 per point: class below, instance in the upper 16 bits
-    sequences/NN/image_2/FFFFFF.png      left colour camera
-    sequences/NN/calib.txt               P0..P3 and Tr: rectified camera 0 from velodyne
-    sequences/NN/poses.txt               line F: camera 0 at frame F to world, 12 numbers
-    sequences/NN/times.txt               line F: seconds
+    sequences/NN/labels/FFFFFF.label     uint32 per point: class below, instance in the upper 16
+    bits sequences/NN/image_2/FFFFFF.png      left colour camera sequences/NN/calib.txt
+    P0..P3 and Tr: rectified camera 0 from velodyne sequences/NN/poses.txt               line F:
+    camera 0 at frame F to world, 12 numbers sequences/NN/times.txt               line F: seconds
 
 The pose of a ``Scan`` is sensor to world: Tr^-1 pose Tr.
 """
@@ -36,7 +35,15 @@ from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneou
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import LABELS, Picture, Writer, clear_notes, read_notes, write_image, write_note
+from lidar_synth.formats.writer import (
+    LABELS,
+    Picture,
+    Writer,
+    clear_notes,
+    read_notes,
+    write_image,
+    write_note,
+)
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -49,24 +56,27 @@ SPLITS: dict[str, tuple[str, ...] | None] = {
 """Sequences of each split of the benchmark; None = all existing sequences."""
 
 KITTI_CAMERA = ideal_camera(718.856, (1241, 376))
-"""The camera that is written if none is known: the odometry camera's image size and focal length, at the sensor."""
+"""The camera that is written if none is known: the odometry camera's image size and focal length,
+at the sensor."""
 
 SIDE_FILES = ("calib.txt", "poses.txt", "times.txt")
 """Files of a sequence besides its scans."""
 
 
 class SemanticKITTI(ScanFiles):
-    """SemanticKITTI's sequences: <root>/sequences/NN/velodyne/*.bin with labels, calib.txt, poses.txt, image_2.
+    """SemanticKITTI's sequences: <root>/sequences/NN/velodyne/*.bin with labels, calib.txt,
+    poses.txt, image_2.
 
-    ``raw_label`` keeps the uint32 values of the file, with moving classes and instances. The scans of a sequence
-    without a ``labels`` folder (the test set) have no labels.
+    ``raw_label`` keeps the uint32 values of the file, with moving classes and instances. The scans
+    of a sequence without a ``labels`` folder (the test set) have no labels.
 
     Args:
         root: the folder that holds ``sequences``.
         split: ``train``, ``val``, ``test`` or ``all``.
-        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says (``scans.json``), or
-            else ``hdl64e_semantic_kitti``.
-        taxonomy: the class ids of the labels, for datasets in this layout with classes of their own.
+        sensor: a preset's name, a YAML file or a ``Sensor``; by default what the folder says
+            (``scans.json``), or else ``hdl64e_semantic_kitti``.
+        taxonomy: the class ids of the labels, for datasets in this layout with classes of their
+            own.
         on_bad: see ``ScanFiles``.
 
     Raises:
@@ -100,10 +110,15 @@ class SemanticKITTI(ScanFiles):
         sequences = [s for s in existing if wanted is None or s in wanted]
         if not sequences:
             raise DataError(
-                f"{root} has no sequence of split {split!r} (it has {', '.join(existing) or 'none at all'})",
+                f"{root} has no sequence of split {split!r} (it has "
+                f"{', '.join(existing) or 'none at all'})",
                 "sequences/NN/velodyne/*.bin",
             )
-        ids = [f"{s}/{p.stem}" for s in sequences for p in list_files(root / "sequences" / s / "velodyne", ".bin")]
+        ids = [
+            f"{s}/{p.stem}"
+            for s in sequences
+            for p in list_files(root / "sequences" / s / "velodyne", ".bin")
+        ]
         super().__init__(root, ids, sensor, on_bad)
         self._labelled = {s for s in sequences if (root / "sequences" / s / "labels").is_dir()}
         self._cameras = {s: read_calibration(root / "sequences" / s) for s in sequences}
@@ -116,7 +131,9 @@ class SemanticKITTI(ScanFiles):
         points = read_points(path)
         labels = {}
         if sequence in self._labelled:
-            labels = read_labels(folder / "labels" / f"{frame}.label", path, len(points), self.taxonomy)
+            labels = read_labels(
+                folder / "labels" / f"{frame}.label", path, len(points), self.taxonomy
+            )
         image = folder / "image_2" / f"{frame}.png"
         return Scan(
             points[:, :3],
@@ -133,12 +150,14 @@ class SemanticKITTI(ScanFiles):
 
 
 class SemanticKITTIWriter(Writer):
-    """Writes SemanticKITTI's folders, always with labels; unlabelled points and ignored classes are 0.
+    """Writes SemanticKITTI's folders, always with labels; unlabelled points and ignored classes are
+    0.
 
-    Sequence and frame of an id ``NN/FFFFFF`` are kept, and those of KITTI-360's drives (drive 0003 is sequence 03);
-    all other scans go into ``sequence``, numbered by index. ``poses.txt`` has one line for every frame up to the last,
-    with ``nan`` for unknown poses. ``times.txt`` is not written, because a scan has no time. ``carry`` copies the
-    existing ones of these three files from sequences of SemanticKITTI.
+    Sequence and frame of an id ``NN/FFFFFF`` are kept, and those of KITTI-360's drives (drive 0003
+    is sequence 03); all other scans go into ``sequence``, numbered by index. ``poses.txt`` has one
+    line for every frame up to the last, with ``nan`` for unknown poses. ``times.txt`` is not
+    written, because a scan has no time. ``carry`` copies the existing ones of these three files
+    from sequences of SemanticKITTI.
 
     Args:
         root: output folder.
@@ -149,23 +168,32 @@ class SemanticKITTIWriter(Writer):
     keeps = LABELS | {"pose", "image_path"}
     always_labels = True
 
-    def __init__(self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None
+    ) -> None:
         super().__init__(root, calibration=calibration)
         self.sequence = sequence
         self._carried: set[str] = set()
 
     def _place(self, index: int, name: str | None) -> str:
         # Six digits, as the dataset has: poses.txt has a line for every frame up to the last.
-        match = re.fullmatch(r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,6})", name or "")
+        match = re.fullmatch(
+            r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,6})", name or ""
+        )
         sequence, frame = (match[1], int(match[2])) if match else (self.sequence, index)
         return f"sequences/{sequence}/velodyne/{frame:06d}.bin"
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
-        folder, frame = path.parents[1], path.stem
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
+        folder = path.parents[1]
+        frame = path.stem
         if folder.name not in self._carried:
             if not (folder / "calib.txt").is_file():
                 write_calibration(folder, camera or KITTI_CAMERA)
-            write_note(folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()})
+            write_note(
+                folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()}
+            )
         if picture is not None:
             write_image(folder / "image_2" / f"{frame}.png", picture)
         write_labels(folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI))
@@ -176,8 +204,12 @@ class SemanticKITTIWriter(Writer):
             return ["times.txt: the times of the scans are unknown"]
         missing = []
         for sequence in sorted({name.split("/")[0] for name in source.ids}):
-            if not all(self._keeps(i, n) for i, n in enumerate(source.ids) if n.startswith(f"{sequence}/")):
-                missing.append(f"calibration, poses and times of sequence {sequence}: its scans are renumbered")
+            if not all(
+                self._keeps(i, n) for i, n in enumerate(source.ids) if n.startswith(f"{sequence}/")
+            ):
+                missing.append(
+                    f"calibration, poses and times of sequence {sequence}: its scans are renumbered"
+                )
                 continue
             self._carried.add(sequence)
             for name in SIDE_FILES:
@@ -197,7 +229,9 @@ class SemanticKITTIWriter(Writer):
         for folder in sorted((self.root / "sequences").glob("*")):
             notes = read_notes(folder)
             camera = read_calibration(folder)
-            poses = {f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None}
+            poses = {
+                f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None
+            }
             if notes and camera is not None:
                 write_poses(folder, camera, poses, frames=1 + max(notes))
             clear_notes(folder)
@@ -212,19 +246,24 @@ def read_calibration(folder: Path) -> Calibration | None:
         return None
     size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
     with naming(folder / "calib.txt"):
-        return Calibration(matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices)
+        return Calibration(
+            matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices
+        )
 
 
 def write_calibration(folder: Path, camera: Calibration) -> None:
-    """The inverse of ``read_calibration``: SemanticKITTI's own matrices unchanged; another camera as all four."""
+    """The inverse of ``read_calibration``: SemanticKITTI's own matrices unchanged; another camera
+    as all four."""
     own = {"Tr", "P0", "P1", "P2", "P3"} <= set(camera.matrices)
-    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {"Tr": camera.camera_from_sensor[:3]}
+    lines = dict.fromkeys(("P0", "P1", "P2", "P3"), camera.projection) | {
+        "Tr": camera.camera_from_sensor[:3]
+    }
     write_named_matrices(folder / "calib.txt", camera.matrices if own else lines)
 
 
 def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
-    """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration. A line of ``nan`` is a frame
-    without a pose.
+    """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration. A line of
+    ``nan`` is a frame without a pose.
 
     Raises:
         DataError: on a line without 12 numbers, or a pose that is not rigid.
@@ -240,8 +279,11 @@ def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np
     return dict(zip(known.tolist(), poses, strict=True))
 
 
-def write_poses(folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int) -> None:
-    """The inverse of ``read_poses``, for at least this number of frames; writes nothing if no pose is known.
+def write_poses(
+    folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int
+) -> None:
+    """The inverse of ``read_poses``, for at least this number of frames; writes nothing if no pose
+    is known.
 
     Poses of other frames in the file stay as they are, since reading a pose rounds it.
     """

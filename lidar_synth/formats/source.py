@@ -1,4 +1,5 @@
-"""``ScanFiles``, the base class of all readers: names of scans, reading by index, and the handling of bad scans."""
+"""``ScanFiles``, the base class of all readers: names of scans, reading by index, and the handling
+of bad scans."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -16,12 +17,13 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 OnBad = Literal["error", "skip", "drop-points"]
-"""The handling of bad scans: raise an error on a scan that cannot be read, skip it with a warning, or drop points that
-are NaN or infinite and count them."""
+"""The handling of bad scans: raise an error on a scan that cannot be read, skip it with a warning,
+or drop points that are NaN or infinite and count them."""
 
 _TRIED = 8  # scans of which the first readable one is compared with the sensor
 _NAME_IT = (
-    "Name the sensor that recorded the scans, even if it is this one: --sensor NAME|FILE.yaml (sensor=...), or "
+    "Name the sensor that recorded the scans, even if it is this one: --sensor NAME|FILE.yaml "
+    "(sensor=...), or "
     f'{{"format": "{FORMAT}", "sensor": "NAME"}} in {NAME} in their folder. If no preset fits: lidar-synth sensor fit.'
 )
 
@@ -32,21 +34,24 @@ class ScanFiles(ABC):
     Args:
         root: the folder of the files.
         ids: the scans' names, unique in the source, in order.
-        sensor: the sensor that the user names: a preset's name, a YAML file or a ``Sensor``; None to take the one that
-            the files name, or else ``default_sensor``.
-        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"``, ``source[i]`` is the next readable
-            scan (after the last, the first one), iteration skips bad scans, and ``skipped`` lists them. With
-            ``"drop-points"``, points that are NaN or infinite are dropped with their labels, and ``dropped`` counts
-            them; any other fault raises.
-        stored: the sensor that the files themselves name; None to read what stands beside them (``description.py``).
+        sensor: the sensor that the user names: a preset's name, a YAML file or a ``Sensor``; None
+            to take the one that the files name, or else ``default_sensor``.
+        on_bad: ``"error"`` raises on a scan that cannot be read. With ``"skip"``, ``source[i]`` is
+            the next readable scan (after the last, the first one), iteration skips bad scans, and
+            ``skipped`` lists them. With ``"drop-points"``, points that are NaN or infinite are
+            dropped with their labels, and ``dropped`` counts them; any other fault raises.
+        stored: the sensor that the files themselves name; None to read what stands beside them
+            (``description.py``).
 
-    If the user names another sensor than the files, the user's is taken, with a warning. If the files name none, the
-    first scan that is read is compared with the sensor (``check_sensor``).
+    If the user names another sensor than the files, the user's is taken, with a warning. If the
+    files name none, the first scan that is read is compared with the sensor (``check_sensor``).
 
     Attributes:
         default_sensor: of the layout.
-        plain: whether scans lie in folders of any name, all of which ``scans.json`` above them describes.
-        description: what stands beside the files about all of their scans; None if there is nothing.
+        plain: whether scans lie in folders of any name, all of which ``scans.json`` above them
+            describes.
+        description: what stands beside the files about all of their scans; None if there is
+            nothing.
         skipped: {id: reason} of the scans that this process could not read.
         dropped: {id: number of points} that this process has dropped.
 
@@ -70,7 +75,9 @@ class ScanFiles(ABC):
         if on_bad not in get_args(OnBad):
             raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}")
         if not ids:
-            raise DataError(f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip("."))
+            raise DataError(
+                f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip(".")
+            )
         self.root = root
         self.ids = tuple(ids)
         self.description = read_description(root, self.plain) if stored is None else None
@@ -79,7 +86,8 @@ class ScanFiles(ABC):
         self.sensor = self._given or named or load_sensor(self.default_sensor)
         if named is not None and not same_grid(self.sensor, named):
             warnings.warn(
-                f"{root} says that its scans are of sensor {named.name!r}; they are read as those of "
+                f"{root} says that its scans are of sensor {named.name!r}; they are read as those "
+                "of "
                 f"{self.sensor.name!r}, which was given",
                 stacklevel=3,
             )
@@ -107,7 +115,8 @@ class ScanFiles(ABC):
 
         Args:
             index: 0 <= index < len.
-            drop_points: whether to drop bad points; by default whether ``on_bad`` is ``"drop-points"``.
+            drop_points: whether to drop bad points; by default whether ``on_bad`` is
+                ``"drop-points"``.
 
         Raises:
             DataError, FileError: as ``read``; also if all points are dropped.
@@ -126,13 +135,15 @@ class ScanFiles(ABC):
         return scan if self.description is None else self.description.origin.apply(scan)
 
     def check_sensor(self) -> None:
-        """Compare the first readable scan with the sensor, if the files name no sensor and no scan was read before.
+        """Compare the first readable scan with the sensor, if the files name no sensor and no scan
+        was read before.
 
-        Points beside the beams are reported by a warning, as is everything about a sensor that the user named.
+        Points beside the beams are reported by a warning, as is everything about a sensor that the
+        user named.
 
         Raises:
-            ConfigError: if the sensor is the layout's own, and more than ``agreement.MOST_OUTSIDE`` of the points lie
-                outside of its field of view or its range limits.
+            ConfigError: if the sensor is the layout's own, and more than ``agreement.MOST_OUTSIDE``
+                of the points lie outside of its field of view or its range limits.
         """
         for index in range(min(len(self), _TRIED)):
             if not self._unchecked:
@@ -141,14 +152,18 @@ class ScanFiles(ABC):
                 self._compare(self.read(index))
 
     def skip_sensor_check(self) -> None:
-        """Do not compare any scan with the sensor, because it is not known yet: rings keep the file's numbers."""
+        """Do not compare any scan with the sensor, because it is not known yet: rings keep the
+        file's numbers."""
         self._unchecked = False
         self._unknown = True
 
     def _compare(self, scan: Scan) -> None:
         shares = agreement(scan.points, self.sensor)
         if faults := shares.faults(self.sensor):
-            given = f"scan {scan.id} of {self.root}, read as one of sensor {self.sensor.name!r}: {'; '.join(faults)}"
+            given = (
+                f"scan {scan.id} of {self.root}, read as one of sensor {self.sensor.name!r}: "
+                f"{'; '.join(faults)}"
+            )
             if self._given is None and shares.outside > MOST_OUTSIDE:
                 raise ConfigError(given, "points of that sensor", _NAME_IT)
             warnings.warn(f"{given}. {_NAME_IT}", stacklevel=4)
@@ -163,7 +178,10 @@ class ScanFiles(ABC):
 
     def __repr__(self) -> str:
         names = f"{len(self)} scans, {self.ids[0]!r} to {self.ids[-1]!r}"
-        return f"{type(self).__name__}({str(self.root)!r}): {names}\n  sensor {self.sensor.grid_text()}"
+        return (
+            f"{type(self).__name__}({str(self.root)!r}): {names}\n  sensor "
+            f"{self.sensor.grid_text()}"
+        )
 
     def __getitem__(self, index: int) -> Scan:
         if not -len(self) <= index < len(self):
@@ -176,7 +194,8 @@ class ScanFiles(ABC):
                 return scan
         reason = next(iter(self.skipped.values()))
         raise DataError(
-            f"none of the {len(self)} scans of {self.root} can be read ({reason})", "at least one readable scan"
+            f"none of the {len(self)} scans of {self.root} can be read ({reason})",
+            "at least one readable scan",
         )
 
     def __iter__(self) -> Iterator[Scan]:

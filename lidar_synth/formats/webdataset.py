@@ -1,18 +1,21 @@
 """WebDataset: scans in tar files for sequential reading (https://github.com/webdataset/webdataset).
 
-The members of a scan are stored consecutively; their names begin with its key, the scan's id with dots and % encoded
-as %2E and %25::
+The members of a scan are stored consecutively; their names begin with its key, the scan's id with
+dots and % encoded as %2E and %25::
 
     scans-000000.tar          the first 1000 scans, and so on
-      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also
-                              provenance, pose (4 x 4, sensor to world) and names of the boxes
+      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml);
+                              if known also provenance, pose (4 x 4, sensor to world) and names of
+                              the boxes
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
-      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys,
-                              with "labelled": false in KEY.json if the scan has no labels
+      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples
+                              have the same keys, with "labelled": false in KEY.json if the scan has
+                              no labels
       KEY.confidence.npy      and other known fields per point: raw_label, instance, ring
       KEY.boxes.npy           (M, 7) float32, if there are boxes: x, y, z, l, w, h, yaw
 
-WebDataset's own ``decode()`` converts them to arrays and a dictionary. The same scans give the same bytes.
+WebDataset's own ``decode()`` converts them to arrays and a dictionary. The same scans give the same
+bytes.
 """
 
 import json
@@ -60,24 +63,33 @@ class WebDataset(ScanFiles):
         DataError: if there is no scan, or a file is not a tar file.
     """
 
-    def __init__(self, root: str | Path, *, sensor: str | Path | Sensor | None = None, on_bad: OnBad = "error") -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
         root = Path(root)
         paths = [root] if root.is_file() else list_files(root, SUFFIX)
         self._places = [(path, *place) for path in paths for place in _scans(path)]
         stored = None
         with suppress(DataError):  # reading the scan will raise it
             stored = _decode(*self._places[0], None).sensor if self._places else None
-        super().__init__(root, [unquote(key) for _, key, _ in self._places], sensor, on_bad, stored=stored)
+        super().__init__(
+            root, [unquote(key) for _, key, _ in self._places], sensor, on_bad, stored=stored
+        )
 
     def read(self, index: int) -> Scan:
         return _decode(*self._places[index], self._given)
 
 
 class WebDatasetWriter(Writer):
-    """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges them in order.
+    """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges
+    them in order.
 
-    Scans that a later run adds, because they could not be read before, are appended to their file, and so are
-    those that are written again, in place of the old ones.
+    Scans that a later run adds, because they could not be read before, are appended to their file,
+    and so are those that are written again, in place of the old ones.
 
     Args:
         root: output folder.
@@ -90,7 +102,9 @@ class WebDatasetWriter(Writer):
 
     keeps = frozenset(DETAILS) - {"image_path"}
 
-    def __init__(self, root: str | Path, *, shard_size: int = 1000, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, root: str | Path, *, shard_size: int = 1000, calibration: Calibration | None = None
+    ) -> None:
         super().__init__(root, calibration=calibration)
         if shard_size < 1:
             raise ConfigError(f"{shard_size} scans in a tar file", "at least 1")
@@ -109,7 +123,9 @@ class WebDatasetWriter(Writer):
             self._there = {key for path in self.root.glob(f"*{SUFFIX}") for key, _ in _scans(path)}
         return _key(index, name) in self._there or super().complete(index, name)
 
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         write_file(path, lambda file: _write_tar(file, _encode(self._key_of(path), scan)))
 
     def _key_of(self, path: Path) -> str:
@@ -158,7 +174,9 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
             contents = {name: _content(file, *place) for name, place in members.items()}
     except OSError as error:
         raise unreadable(path, error) from error
-    facts = parse_json(contents.pop("json", b""), f"{where}: its json", "the members that this package writes")
+    facts = parse_json(
+        contents.pop("json", b""), f"{where}: its json", "the members that this package writes"
+    )
     arrays = {
         name.removesuffix(".npy"): parse_npy(content, f"{where}: {name}")
         for name, content in contents.items()
@@ -170,13 +188,20 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
         if "labelled" in facts and facts["labelled"] is False:
             del arrays["label"]
-        texts = {name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts}
+        texts = {
+            name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts
+        }
         arrays |= {name: np.array(text) for name, text in texts.items()}
-        arrays |= {name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts}
+        arrays |= {
+            name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts
+        }
     except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
-        raise DataError(f"{where}: {error!r}", "the members that this package writes", SKIP_HINT) from error
+        raise DataError(
+            f"{where}: {error!r}", "the members that this package writes", SKIP_HINT
+        ) from error
     scan = decode_scan(arrays, where, sensor)
-    scan.boxes, scan.id = boxes, unquote(key)
+    scan.boxes = boxes
+    scan.id = unquote(key)
     check_scan(scan, where)
     return scan
 
@@ -205,10 +230,17 @@ def _scans(path: Path) -> Iterator[tuple[str, Members]]:
             if member.isdir():
                 continue
             if not member.isreg() or member.issparse():
-                raise DataError(f"{path}: {shorten(member.name, 100)!r} is not a plain file", "a file of a WebDataset")
+                raise DataError(
+                    f"{path}: {shorten(member.name, 100)!r} is not a plain file",
+                    "a file of a WebDataset",
+                )
             members = scans.setdefault(key, {})
             if kind in members:
-                raise DataError(f"{path} holds {shorten(member.name, 100)!r} twice", "each member once", SKIP_HINT)
+                raise DataError(
+                    f"{path} holds {shorten(member.name, 100)!r} twice",
+                    "each member once",
+                    SKIP_HINT,
+                )
             members[kind] = (member.offset_data, member.size)
     yield from scans.items()
 
@@ -221,7 +253,8 @@ def _key_in(name: str) -> tuple[str, str]:
 
 
 def _merge(shard: Path, new: dict[str, Path]) -> Iterator[tuple[str, bytes]]:
-    """The members of a shard, with those of new scans in the place of older ones with their key, or at the end."""
+    """The members of a shard, with those of new scans in the place of older ones with their key, or
+    at the end."""
     left = dict(new)
     there = _members([shard]) if shard.is_file() else ()
     for key, members in groupby(there, lambda member: _key_in(member[0])[0]):
@@ -242,7 +275,8 @@ def _members(paths: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
 
 
 class _Bounded(BufferedReader):
-    """A file that never allocates more memory than its own size, whatever size its headers declare."""
+    """A file that never allocates more memory than its own size, whatever size its headers
+    declare."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         length = os.fstat(self.fileno()).st_size
@@ -250,8 +284,8 @@ class _Bounded(BufferedReader):
 
 
 class _Member(tarfile.TarInfo):
-    """A tar member with a checked size: older versions of tarfile loop for ever on a negative size (CVE-2025-8194), and
-    no version can seek beyond 2^63."""
+    """A tar member with a checked size: older versions of tarfile loop for ever on a negative size
+    (CVE-2025-8194), and no version can seek beyond 2^63."""
 
     def _block(self, count: int) -> int:
         if not 0 <= count < 1 << 62:

@@ -1,8 +1,10 @@
-"""``Writer``, the base class of all writers: paths of scans, complete scans, and files of the whole folder.
+"""``Writer``, the base class of all writers: paths of scans, complete scans, and files of the whole
+folder.
 
-``write`` writes the files of one scan, and last the file that marks it as complete. Scans can therefore be written in
-any order and by several processes, and an interrupted run can be resumed. Data for files of the whole folder (poses,
-boxes, lists of frames) are noted beside each scan and gathered by ``finish``, which one process calls at the end.
+``write`` writes the files of one scan, and last the file that marks it as complete. Scans can
+therefore be written in any order and by several processes, and an interrupted run can be resumed.
+Data for files of the whole folder (poses, boxes, lists of frames) are noted beside each scan and
+gathered by ``finish``, which one process calls at the end.
 """
 
 import json
@@ -16,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import inside, list_files, read_file, read_text, refuse_links, write_file
+from lidar_synth.files.disk import (
+    inside,
+    list_files,
+    read_file,
+    read_text,
+    refuse_links,
+    write_file,
+)
 from lidar_synth.files.parsing import parse_json, read_picture
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import (
@@ -54,8 +63,8 @@ class Writer(ABC):
 
     Args:
         root: the folder; it is created.
-        calibration: the camera, for layouts with a calibration; by default an ideal camera at the sensor that faces
-            forward.
+        calibration: the camera, for layouts with a calibration; by default an ideal camera at the
+            sensor that faces forward.
 
     Attributes:
         keeps: those of ``DETAILS`` that the layout can hold.
@@ -81,8 +90,8 @@ class Writer(ABC):
 
         Args:
             index: the scan's index in the source.
-            name: its id in the source; a layout keeps its parts as far as it can (frame number, drive) and otherwise
-                uses the index.
+            name: its id in the source; a layout keeps its parts as far as it can (frame number,
+                drive) and otherwise uses the index.
 
         Raises:
             DataError: on a name that cannot be a path under ``root``.
@@ -129,7 +138,8 @@ class Writer(ABC):
         self._put(scan, self.path(index, name), picture, calibration or self.calibration)
 
     def require_grid(self, sensor: Sensor) -> None:
-        """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another grid.
+        """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another
+        grid.
 
         Raises:
             ConfigError: if it is.
@@ -141,7 +151,8 @@ class Writer(ABC):
             require_grid(self.root, self._description, sensor)
 
     def _write_points(self, path: Path, scan: Scan) -> None:
-        """Write the points of a scan as ``.bin``, which has no room for a description: it is recorded beside them."""
+        """Write the points of a scan as ``.bin``, which has no room for a description: it is
+        recorded beside them."""
         origin = Origin.of(scan)
         if self._description is None or origin not in self._description.origins:
             self._description = record(self.root, scan.sensor, origin)
@@ -149,10 +160,14 @@ class Writer(ABC):
 
     def loses(self, scan: Scan) -> list[str]:
         """What the scan has, but the layout cannot hold; names of ``DETAILS``."""
-        return [name for name in DETAILS if name not in self.keeps and getattr(scan, name) is not None]
+        return [
+            name for name in DETAILS if name not in self.keeps and getattr(scan, name) is not None
+        ]
 
     @abstractmethod
-    def _put(self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None) -> None:
+    def _put(
+        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+    ) -> None:
         """Write the files of a scan, ``path`` last."""
 
     def complete(self, index: int, name: str | None = None) -> bool:
@@ -163,7 +178,8 @@ class Writer(ABC):
         """Copy a source's files that belong to no single scan, before its scans are written.
 
         Returns:
-            Descriptions of the files that the layout supports but the source does not have; they are left out.
+            Descriptions of the files that the layout supports but the source does not have; they
+            are left out.
 
         Raises:
             FileError: if it cannot be read or written.
@@ -194,7 +210,9 @@ def check_facts(scan: Scan, where: str) -> None:
         if scan.pose is not None:
             check_pose(scan.pose)
         if scan.domain not in (REAL, SYNTHETIC):
-            raise ValueError(f"domain is {scan.domain}, not {REAL} (real) or {SYNTHETIC} (synthetic)")
+            raise ValueError(
+                f"domain is {scan.domain}, not {REAL} (real) or {SYNTHETIC} (synthetic)"
+            )
     except ValueError as error:
         raise DataError(f"{where}: {error}", "what files can hold") from error
 
@@ -213,7 +231,8 @@ def projected(scan: Scan) -> RangeImage:
 
 
 def write_image(path: Path, picture: Picture) -> None:
-    """Write a PNG from (H, W, 3) uint8 values or from another image file; a PNG is copied unchanged.
+    """Write a PNG from (H, W, 3) uint8 values or from another image file; a PNG is copied
+    unchanged.
 
     Raises:
         FileError: if it cannot be read or written.
@@ -247,7 +266,9 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
         try:
             notes[int(path.stem)] = parse_json(read_text(path), str(path))
         except ValueError as error:
-            raise DataError(f"{path} is not a note of this package ({error})", hint=f"Remove {path.parent}.") from error
+            raise DataError(
+                f"{path} is not a note of this package ({error})", hint=f"Remove {path.parent}."
+            ) from error
     return notes
 
 

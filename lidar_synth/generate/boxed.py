@@ -1,4 +1,5 @@
-"""Boxes of generated scans: those of the layout that conditioned a scan, and the instances of its points."""
+"""Boxes of generated scans: those of the layout that conditioned a scan, and the instances of its
+points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +20,8 @@ FIELDS = frozenset(("boxes", "instance"))
 
 
 def boxes_of(given: Any, count: int) -> list[Boxes] | None:
-    """The boxes of the layouts of ``count`` scans; None where conditions are images, which do not tell them.
+    """The boxes of the layouts of ``count`` scans; None where conditions are images, which do not
+    tell them.
 
     Args:
         given: the argument ``condition`` of ``Generator.range_images``.
@@ -34,14 +36,15 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
 
 
 def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
-    """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns in the first of
-    them, and so on; 0 = none. Returns of the ground belong to no box."""
+    """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns
+    in the first of them, and so on; 0 = none. Returns of the ground belong to no box."""
     scan = unproject(image)
     inside = boxes.enlarged(TOLERANCE).contain(scan.points)
     if scan.label is not None:
         inside &= ~GROUND[scan.label]
     held = inside.any(1)
-    kept, inside = boxes[held], inside[held]
+    kept = boxes[held]
+    inside = inside[held]
     kept = replace(kept, instance=np.arange(1, len(kept) + 1, dtype=np.int32))
     instance = np.zeros(image.range.shape, np.int32)
     if len(kept):

@@ -1,25 +1,31 @@
-"""Checkpoints, "lidar-synth-checkpoint/2": one ``.safetensors`` file with weights and a JSON header.
+"""Checkpoints, "lidar-synth-checkpoint/2": one ``.safetensors`` file with weights and a JSON
+header.
 
-The header is stored in the file's metadata under ``lidar_synth`` and contains everything that generation needs::
+The header is stored in the file's metadata under ``lidar_synth`` and contains everything that
+generation needs::
 
     format          "lidar-synth-checkpoint/2"; "/1" can be read too, other versions are refused
     convention      "t=1 noise, t=0 data, v=noise-data": the convention of times and velocities
-    networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
-                    model (the only part of an autoencoder's checkpoint), "condition" the encoder of a condition
+    networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the
+                    autoencoder of a latent model (the only part of an autoencoder's checkpoint),
+                    "condition" the encoder of a condition
     sensor          the sensor, as in sensors.yaml
     normalisation   the normalisation of the range
     channels        channels of the network's data, in order, each a key of ``normalize.CHANNELS``
     label_encoding  the encoding of labels in channels, or null
-    conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
-                    blank conditions in training; ``image``, rows and columns of the camera's images
+    conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options:
+                    ``dropout``, share of blank conditions in training; ``image``, rows and columns
+                    of the camera's images
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
     other_grids     those for other numbers of steps, if there are any
-    provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
-    weights         sha256 of all tensors
-    checksum        sha256 of all other keys, as JSON with sorted keys
+    provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher,
+    recipe, metrics weights         sha256 of all tensors checksum        sha256 of all other keys,
+    as JSON with sorted keys
 
-A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its checksum, which covers
-the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256 of the header's
+A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its
+checksum, which covers
+the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256
+    of the header's
 text, so that damage to its header can go unnoticed. Nothing is ever unpickled.
 """
 
@@ -47,11 +53,15 @@ from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-checkpoint/2"
 WITHOUT_CHECKSUM = "lidar-synth-checkpoint/1"
-"""The older format, which has no checksum of the header. It can be read, but is no longer written."""
+"""The older format, which has no checksum of the header. It can be read, but is no longer
+written."""
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"
 LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = no label"
-VELOCITY, CODEC, ENCODER = "velocity", "codec", "condition"
-"""Names of the parts: the flow's velocity network, the autoencoder, the encoder of the condition."""
+VELOCITY = "velocity"
+CODEC = "codec"
+ENCODER = "condition"
+"""Names of the parts: the flow's velocity network, the autoencoder, the encoder of the
+condition."""
 
 _MOST_DIMENSIONS = 8  # torch computes with up to 64
 
@@ -82,12 +92,24 @@ class Header:
 
     def __post_init__(self) -> None:
         if not {VELOCITY, CODEC} & set(self.networks):
-            raise ConfigError(f"networks {sorted(self.networks)}", f"{VELOCITY!r} or {CODEC!r} among them")
+            raise ConfigError(
+                f"networks {sorted(self.networks)}", f"{VELOCITY!r} or {CODEC!r} among them"
+            )
         for grid in (self.time_grid, *self.other_grids):
-            if len(grid) < 2 or (grid[0], grid[-1]) != (1, 0) or any(a <= b for a, b in pairwise(grid)):
-                raise ConfigError(f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)")
-        if missing := [k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)]:
-            raise ConfigError(f"a provenance without {', '.join(missing)}", "data, data_licence and licence")
+            if (
+                len(grid) < 2
+                or (grid[0], grid[-1]) != (1, 0)
+                or any(a <= b for a, b in pairwise(grid))
+            ):
+                raise ConfigError(
+                    f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)"
+                )
+        if missing := [
+            k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)
+        ]:
+            raise ConfigError(
+                f"a provenance without {', '.join(missing)}", "data, data_licence and licence"
+            )
         if unknown := sorted(set(self.conditioning) - set(CONDITIONS)):
             raise ConfigError(f"conditioning on {unknown}", f"some of {', '.join(CONDITIONS)}")
         shape = (self.tensors.size, *self.sensor.shape)
@@ -106,7 +128,8 @@ class Header:
         return TensorFormat(self.channels, self.normalisation)
 
     def grid(self, steps: int | None) -> tuple[float, ...]:
-        """The time grid of a number of steps, None = ``time_grid``; uniform where the weights know none.
+        """The time grid of a number of steps, None = ``time_grid``; uniform where the weights know
+        none.
 
         Raises:
             ConfigError: on fewer than one step.
@@ -128,7 +151,9 @@ class Header:
             "time_grid": list(self.time_grid),
             "provenance": self.provenance,
         }
-        return values | ({"other_grids": [list(grid) for grid in self.other_grids]} if self.other_grids else {})
+        return values | (
+            {"other_grids": [list(grid) for grid in self.other_grids]} if self.other_grids else {}
+        )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Header":
@@ -139,7 +164,11 @@ class Header:
         """
         values = dict(values)
         if (given := values.pop("format", None)) not in (FORMAT, WITHOUT_CHECKSUM):
-            raise ConfigError(f"format {given!r}", repr(FORMAT), "Use the version of lidar_synth that wrote the file.")
+            raise ConfigError(
+                f"format {given!r}",
+                repr(FORMAT),
+                "Use the version of lidar_synth that wrote the file.",
+            )
         try:
             header = cls(
                 networks={name: NetworkSpec(**part) for name, part in values["networks"].items()},
@@ -149,12 +178,16 @@ class Header:
                 time_grid=tuple(map(float, values["time_grid"])),
                 provenance=dict(values["provenance"]),
                 conditioning=dict(values["conditioning"]),
-                other_grids=tuple(tuple(map(float, grid)) for grid in values.get("other_grids", ())),
+                other_grids=tuple(
+                    tuple(map(float, grid)) for grid in values.get("other_grids", ())
+                ),
             )
         except KeyError as error:
             raise ConfigError(f"a header without {error}", "all keys of the format") from error
         except (TypeError, AttributeError) as error:
-            raise ConfigError(f"a header with invalid values ({error})", "the values of the format") from error
+            raise ConfigError(
+                f"a header with invalid values ({error})", "the values of the format"
+            ) from error
         expected = header.to_dict()
         if unknown := sorted(set(values) - set(expected)):
             raise ConfigError(f"header keys {unknown}", f"those of {FORMAT}")
@@ -165,7 +198,8 @@ class Header:
 
 
 def join(networks: Mapping[str, nn.Module]) -> nn.Module:
-    """The flow of a checkpoint's networks as one v(y, t, c), which takes conditions as they are stored."""
+    """The flow of a checkpoint's networks as one v(y, t, c), which takes conditions as they are
+    stored."""
     velocity = networks[VELOCITY]
     return Conditioned(velocity, networks[ENCODER]) if ENCODER in networks else velocity
 
@@ -194,7 +228,8 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(
     path: Path, header: Header, networks: Mapping[str, nn.Module], dtype: torch.dtype | None = None
 ) -> str:
-    """Write a checkpoint to a temporary file, then rename it; the same content gives the same bytes.
+    """Write a checkpoint to a temporary file, then rename it; the same content gives the same
+    bytes.
 
     Args:
         path: path that ends in ``.safetensors``.
@@ -214,7 +249,9 @@ def save_checkpoint(
     if path.suffix != ".safetensors":
         raise ConfigError(f"checkpoint {path}", "a name that ends in .safetensors")
     if set(networks) != set(header.networks):
-        raise ConfigError(f"networks {sorted(networks)}", f"those of the header: {sorted(header.networks)}")
+        raise ConfigError(
+            f"networks {sorted(networks)}", f"those of the header: {sorted(header.networks)}"
+        )
     tensors = {}
     for name, network in networks.items():
         state = {k: v.detach().cpu() for k, v in network.state_dict().items()}
@@ -227,7 +264,9 @@ def save_checkpoint(
     try:
         checksum = _checksum(values)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"a header with a value that JSON cannot store ({error})", "plain, finite values") from error
+        raise ConfigError(
+            f"a header with a value that JSON cannot store ({error})", "plain, finite values"
+        ) from error
     text = json.dumps({**values, "checksum": checksum}, sort_keys=True)
     write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
     return checksum
@@ -243,20 +282,27 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
     Raises:
         ConfigError: on an unavailable device.
         FileError: if the file cannot be read.
-        DataError: on a file that is not a checkpoint of this version, is truncated or damaged, or whose weights do not
-            match its header.
+        DataError: on a file that is not a checkpoint of this version, is truncated or damaged, or
+            whose weights do not match its header.
     """
     device = checked_device(device)
     _, header, digest, weights, tensors = _read(Path(path))
     if weights != weights_hash(tensors):
         raise DataError(
-            f"{path}: the weights do not match their checksum in the header", "an intact file", "Copy it again."
+            f"{path}: the weights do not match their checksum in the header",
+            "an intact file",
+            "Copy it again.",
         )
     _check_finite(tensors, str(path))
     networks = {}
     for name, part in header.networks.items():
-        # Copies are aligned in memory; the file's buffer is not, which changes the last bits of matrix products.
-        state = {k.removeprefix(f"{name}."): v.clone() for k, v in tensors.items() if k.startswith(f"{name}.")}
+        # Copies are aligned in memory; the file's buffer is not, which changes the last bits of
+        # matrix products.
+        state = {
+            k.removeprefix(f"{name}."): v.clone()
+            for k, v in tensors.items()
+            if k.startswith(f"{name}.")
+        }
         networks[name] = assemble(*part, state, f"{path}: the network {name!r}", device)
     if unknown := [k for k in tensors if k.partition(".")[0] not in header.networks]:
         raise DataError(f"{path}: tensors {unknown}", f"those of {sorted(header.networks)} only")
@@ -281,7 +327,8 @@ def has_checksum(path: Path) -> bool:
 
 
 class _Content(NamedTuple):
-    """The content of a checkpoint file; ``weights`` is the checksum of the tensors by the header."""
+    """The content of a checkpoint file; ``weights`` is the checksum of the tensors by the
+    header."""
 
     format: str
     header: Header
@@ -296,12 +343,15 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         with path.open("rb") as file:
             start = file.read(2)
     except OSError as error:
-        raise FileError(f"checkpoint {path} cannot be read ({error.strerror})", "a .safetensors file") from error
+        raise FileError(
+            f"checkpoint {path} cannot be read ({error.strerror})", "a .safetensors file"
+        ) from error
     if start in (b"PK", b"\x80\x02"):
         raise DataError(
             f"{path} is a PyTorch pickle",
             "a .safetensors checkpoint",
-            f"A pickle can run code and is never loaded as a checkpoint. To convert weights of R2Flow or LiDM: "
+            "A pickle can run code and is never loaded as a checkpoint. To convert weights of "
+            "R2Flow or LiDM: "
             f"lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
         )
     try:
@@ -310,7 +360,9 @@ def _read(path: Path, tensors: bool = True) -> _Content:
             stored = {key: content.get_tensor(key) for key in content.keys()} if tensors else {}  # noqa: SIM118
     except SafetensorError as error:
         raise DataError(
-            f"{path} is truncated, damaged or no .safetensors file ({error})", "an intact file", "Copy it again."
+            f"{path} is truncated, damaged or no .safetensors file ({error})",
+            "an intact file",
+            "Copy it again.",
         ) from error
     if text is None:
         raise DataError(f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}")
@@ -325,10 +377,13 @@ def _read(path: Path, tensors: bool = True) -> _Content:
 
 
 def _verified(values: dict[str, Any]) -> str:
-    """Remove the checksum from a header's values and return it; raise a ConfigError if it does not match."""
+    """Remove the checksum from a header's values and return it; raise a ConfigError if it does not
+    match."""
     checksum = values.pop("checksum", None)
     if values.get("format") == FORMAT and checksum != _checksum(values):
-        raise ConfigError("a header that does not match its checksum", "an intact file", "Copy it again.")
+        raise ConfigError(
+            "a header that does not match its checksum", "an intact file", "Copy it again."
+        )
     return str(checksum)
 
 
@@ -338,10 +393,15 @@ def _checksum(values: Mapping[str, Any]) -> str:
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
-    """Raise a DataError on values that are complex, or not finite in float32, or of too many dimensions."""
+    """Raise a DataError on values that are complex, or not finite in float32, or of too many
+    dimensions."""
     if deep := [k for k, v in tensors.items() if v.dim() > _MOST_DIMENSIONS]:
-        raise DataError(f"{what} has tensors of more than {_MOST_DIMENSIONS} dimensions: {deep}", "weights")
-    if bad := [k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())]:
+        raise DataError(
+            f"{what} has tensors of more than {_MOST_DIMENSIONS} dimensions: {deep}", "weights"
+        )
+    if bad := [
+        k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())
+    ]:
         raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
 
 

@@ -1,7 +1,9 @@
-"""Mapping between range images and the states of a flow: the identity for pixel models, an autoencoder for latent ones.
+"""Mapping between range images and the states of a flow: the identity for pixel models, an
+autoencoder for latent ones.
 
-Everything after the codec (path, solver, selection, distillation, sampling) is the same for both. A tensor (B, C, H, W)
-contains range images encoded by ``TensorFormat``; a state is what the flow generates.
+Everything after the codec (path, solver, selection, distillation, sampling) is the same for both. A
+tensor (B, C, H, W) contains range images encoded by ``TensorFormat``; a state is what the flow
+generates.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +22,8 @@ class Codec(Protocol):
 
     Attributes:
         shape: channels, rows and columns of a state.
-        draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
+        draws: number of random numbers per cell for sampling an image; 0 if decoding is
+            deterministic.
     """
 
     @property
@@ -34,10 +37,14 @@ class Codec(Protocol):
         ...
 
     def decode(
-        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+        self,
+        y: Tensor,
+        uniform_noise: Tensor | None = None,
+        given: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0, 1); None = the
-        mode. With {name of a condition: values (B, ...)}, autoencoders that can follow them exactly."""
+        """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0,
+        1); None = the mode. With {name of a condition: values (B, ...)}, autoencoders that can
+        follow them exactly."""
         ...
 
 
@@ -48,7 +55,8 @@ class Autoencoder(Protocol):
         channels: number of channels of an image.
         resolution: rows and columns of an image.
         latent_shape: channels, rows and columns of a latent.
-        draws: number of random numbers per cell for sampling an image; 0 if decoding is deterministic.
+        draws: number of random numbers per cell for sampling an image; 0 if decoding is
+            deterministic.
         decodes_given: the conditions that ``decode`` takes, see ``models.network.Network``.
     """
 
@@ -83,7 +91,10 @@ class Identity:
         return x
 
     def decode(
-        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+        self,
+        y: Tensor,
+        uniform_noise: Tensor | None = None,
+        given: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """(B, C, H, W), unchanged."""
         return y
@@ -113,39 +124,57 @@ class Latent:
 
     @torch.no_grad()
     def encode(self, x: Tensor) -> Tensor:
-        """Tensors (B, C, H, W) to latents before the codebook, float32, mean 0 and variance 1 per channel."""
+        """Tensors (B, C, H, W) to latents before the codebook, float32, mean 0 and variance 1 per
+        channel."""
         return self.network.encode(x).float()
 
     @torch.no_grad()
     def decode(
-        self, y: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+        self,
+        y: Tensor,
+        uniform_noise: Tensor | None = None,
+        given: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Latents (B, *shape), quantised if there is a codebook, to tensors (B, C, H, W).
 
         Args:
             y: latents.
             uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; None = the mode.
-            given: {name of a condition: values (B, ...)}; those not among the autoencoder's ``decodes_given`` are not
-                used.
+            given: {name of a condition: values (B, ...)}; those not among the autoencoder's
+                ``decodes_given`` are not used.
 
         Raises:
             DataError: on latents of another shape.
         """
         if y.shape[1:] != self.shape:
-            raise DataError(f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})")
+            raise DataError(
+                f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})"
+            )
         decode: Callable[..., Tensor] = self.network.decode
-        taken = {name: values for name, values in (given or {}).items() if name in self.network.decodes_given}
+        taken = {
+            name: values
+            for name, values in (given or {}).items()
+            if name in self.network.decodes_given
+        }
         return expected(decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors)
 
 
 def expected(output: Tensor, tensors: TensorFormat) -> Tensor:
-    """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits, become tanh(x / 2) in
-    (-1, 1); other channels are unchanged."""
+    """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits,
+    become tanh(x / 2) in (-1, 1); other channels are unchanged."""
     parts = torch.split(output, [CHANNELS[name] for name in tensors.channels], 1)
-    return torch.cat([(p / 2).tanh() if n == "label" else p for n, p in zip(tensors.channels, parts, strict=True)], 1)
+    return torch.cat(
+        [
+            (p / 2).tanh() if n == "label" else p
+            for n, p in zip(tensors.channels, parts, strict=True)
+        ],
+        1,
+    )
 
 
-def make_codec(network: nn.Module | None, tensors: TensorFormat, resolution: tuple[int, int]) -> Codec:
+def make_codec(
+    network: nn.Module | None, tensors: TensorFormat, resolution: tuple[int, int]
+) -> Codec:
     """The codec of a model.
 
     Args:
@@ -159,7 +188,10 @@ def make_codec(network: nn.Module | None, tensors: TensorFormat, resolution: tup
     if network is None:
         return Identity((tensors.size, *resolution))
     codec = cast(Autoencoder, network)
-    given, wanted = (codec.channels, *codec.resolution), (tensors.size, *resolution)
+    given = (codec.channels, *codec.resolution)
+    wanted = (tensors.size, *resolution)
     if given != wanted:
-        raise DataError(f"an autoencoder for images of shape {given}", f"{wanted} for {tensors.channels}")
+        raise DataError(
+            f"an autoencoder for images of shape {given}", f"{wanted} for {tensors.channels}"
+        )
     return Latent(codec, tensors)

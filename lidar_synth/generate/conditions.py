@@ -2,16 +2,19 @@
 
 A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provides it::
 
-    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
-    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the image at
+    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor
+    (``RangeImage.label``) camera     (3, h, w) uint8 red, green, blue, of the size that the model's
+    encoder takes; or the image at
                ``Scan.image_path``, which is resized
-    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``); a scan with boxes
-               provides its own layout
+    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``);
+               a scan with boxes provides its own layout
 
-An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of that network. A model
-that was also trained with blank conditions (``dropout``) can be guided: see ``flow.path.guided``.
+An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of
+that network. A model that was also trained with blank conditions (``dropout``) can be guided: see
+``flow.path.guided``.
 
-To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in ``models.NETWORKS``.
+To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in
+    ``models.NETWORKS``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +38,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image as PILImage
 
 HEIGHT_TOLERANCE = 0.35
-"""Metres between the heights of two sensors above the ground, up to which the layout of one suits the other."""
+"""Metres between the heights of two sensors above the ground, up to which the layout of one suits
+the other."""
 
 GAP = 2
 """Cells of a gap in the labels of a scan that is closed."""
@@ -60,7 +64,9 @@ class Condition(Protocol):
         """The shape of one condition."""
         ...
 
-    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
+    def read(
+        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+    ) -> NDArray[np.uint8]:
         """The condition that a real scan provides, with the given shape."""
         ...
 
@@ -69,15 +75,17 @@ class Condition(Protocol):
         ...
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
-        """Conditions (B, ...) that tell less, for training: u (B,) uniform numbers, ``views`` of a camera image."""
+        """Conditions (B, ...) that tell less, for training: u (B,) uniform numbers, ``views`` of a
+        camera image."""
         ...
 
 
 def bridged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row take the nearer one.
+    """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row
+    take the nearer one.
 
-    Lasers of a sensor that moves, or of another one, leave such gaps on a model's grid. To a model, they would be rays
-    without a return, as through a hedge. Columns wrap around.
+    Lasers of a sensor that moves, or of another one, leave such gaps on a model's grid. To a model,
+    they would be rays without a return, as through a hedge. Columns wrap around.
 
     Args:
         labels: (H, W) uint8 train ids, 255 = unknown.
@@ -86,7 +94,8 @@ def bridged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     for width in range(1, GAP + 1):
         for left in range(1, width + 1):
             right = width + 1 - left
-            before, after = np.roll(labels, left, 1), np.roll(labels, -right, 1)
+            before = np.roll(labels, left, 1)
+            after = np.roll(labels, -right, 1)
             gap = (out == IGNORE) & (before != IGNORE) & (after != IGNORE)
             out[gap] = (before if left <= right else after)[gap]
     return out
@@ -104,8 +113,11 @@ class SemanticMap:
         """(H, W)."""
         return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has a resolution
 
-    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
-        """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see ``bridged``.
+    def read(
+        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+    ) -> NDArray[np.uint8]:
+        """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see
+        ``bridged``.
 
         Raises:
             DataError: on a scan without labels.
@@ -125,7 +137,8 @@ class SemanticMap:
             raise DataError(
                 f"a label map with ids {sorted(set(wrong.tolist()))[:8]}",
                 "train ids 0..18, or 255 = unknown",
-                "lidar_synth.datasets.classes.SEMANTIC_KITTI.decode converts SemanticKITTI's file ids to train ids.",
+                "lidar_synth.datasets.classes.SEMANTIC_KITTI.decode converts SemanticKITTI's "
+                "file ids to train ids.",
             )
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
@@ -145,18 +158,25 @@ class CameraImage:
         """(3, h, w)."""
         return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
 
-    def read(self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]) -> NDArray[np.uint8]:
+    def read(
+        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+    ) -> NDArray[np.uint8]:
         """The image taken with the scan, see ``resized``.
 
         Raises:
             DataError: on a scan without an image, one that cannot be read, or of another size.
         """
         if scan.image_path is None:
-            raise DataError(f"scan {scan.id!r} has no camera image", "a scan with an image_path, to condition on")
+            raise DataError(
+                f"scan {scan.id!r} has no camera image",
+                "a scan with an image_path, to condition on",
+            )
         try:
             image = read_picture(scan.image_path)
         except FileError as error:
-            raise DataError(f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG") from error
+            raise DataError(
+                f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG"
+            ) from error
         return resized(image, shape, options, f"the image {scan.image_path}")
 
     def check(self, values: Tensor) -> None:
@@ -175,8 +195,9 @@ def resized(
     Args:
         image: of the camera.
         shape: (3, h, w) of the condition.
-        options: of the condition; ``options["image"]`` are the rows and columns that the image must have. They identify
-            the camera of the training; an image with another field of view would mislead the model.
+        options: of the condition; ``options["image"]`` are the rows and columns that the image must
+            have. They identify the camera of the training; an image with another field of view
+            would mislead the model.
         what: the image, in an error's words.
 
     Returns:
@@ -211,13 +232,18 @@ class LayoutImage:
         return (len(CHANNELS), *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
 
     def read(
-        self, scan: Scan | Layout, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+        self,
+        scan: Scan | Layout,
+        sensor: Sensor,
+        shape: tuple[int, ...],
+        options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The image of a layout, or of the layout of a scan with boxes, on ``sensor``.
 
         Raises:
-            DataError: on a scan without boxes, boxes out of the sensor's range, or the layout of a sensor that is
-                mounted at another height than that of the training, ``options["height"]`` (metres).
+            DataError: on a scan without boxes, boxes out of the sensor's range, or the layout of a
+                sensor that is mounted at another height than that of the training,
+                ``options["height"]`` (metres).
         """
         layout = layout_of(scan) if isinstance(scan, Scan) else scan
         height = float(options.get("height") or -layout.ground[0])
@@ -243,23 +269,33 @@ class LayoutImage:
         """
         codes = values[..., 0, :, :]
         if len(wrong := codes[codes >= len(CODES)]):
-            raise DataError(f"a layout image with codes {sorted(set(wrong.tolist()))[:8]}", f"0..{len(CODES) - 1}")
+            raise DataError(
+                f"a layout image with codes {sorted(set(wrong.tolist()))[:8]}",
+                f"0..{len(CODES) - 1}",
+            )
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
-        """Without outlines, and with the ground up to a distance that u tells, as most users' files are."""
-        code, ground = values[:, :1], CODES["ground"]
+        """Without outlines, and with the ground up to a distance that u tells, as most users' files
+        are."""
+        code = values[:, :1]
+        ground = CODES["ground"]
         depth = depths_of(values)[:, None]
         reach = 5 * 16 ** u.to(depth).view(-1, 1, 1, 1)  # 5 to 80 m
         kept = (code >= CODES["Car"]) | ((code == ground) & (depth < reach))
         return torch.where(kept, values, 0)
 
 
-CONDITIONS: dict[str, Condition] = {"semantic": SemanticMap(), "camera": CameraImage(), "layout": LayoutImage()}
+CONDITIONS: dict[str, Condition] = {
+    "semantic": SemanticMap(),
+    "camera": CameraImage(),
+    "layout": LayoutImage(),
+}
 """Conditions by name."""
 
 
 class Conditioned(nn.Module):
-    """A velocity network together with the encoder of its condition: v(y, t, c) with c as stored, uint8.
+    """A velocity network together with the encoder of its condition: v(y, t, c) with c as stored,
+    uint8.
 
     Args:
         velocity: the velocity network, which takes the output of ``encoder``.
@@ -268,7 +304,8 @@ class Conditioned(nn.Module):
 
     def __init__(self, velocity: nn.Module, encoder: nn.Module) -> None:
         super().__init__()
-        self.velocity, self.encoder = velocity, encoder
+        self.velocity = velocity
+        self.encoder = encoder
 
     @property
     def ends(self) -> bool:
@@ -276,7 +313,8 @@ class Conditioned(nn.Module):
         return bool(getattr(self.velocity, "ends", False))
 
     def forward(self, y: Tensor, t: Tensor, cond: Tensor, *end: Tensor) -> Tensor:
-        """(B, ...) states, times and conditions, and ends of steps if it takes them, to velocities (B, ...)."""
+        """(B, ...) states, times and conditions, and ends of steps if it takes them, to velocities
+        (B, ...)."""
         out: Tensor = self.velocity(y, t, self.encoder(cond), *end)
         return out
 
@@ -287,22 +325,30 @@ def blank(name: str, values: Tensor) -> Tensor:
 
 
 def one_view(image: Tensor, views: int) -> Tensor:
-    """Images (B, 3, h, w) with all views but the one right of the middle blank, as LiDM drops views in training."""
-    width, kept = image.shape[3] // views, views // 2
+    """Images (B, 3, h, w) with all views but the one right of the middle blank, as LiDM drops views
+    in training."""
+    width = image.shape[3] // views
+    kept = views // 2
     out = torch.zeros_like(image)
     out[..., kept * width : (kept + 1) * width] = image[..., kept * width : (kept + 1) * width]
     return out
 
 
 def batch_of(
-    name: str, given: Any, count: int, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+    name: str,
+    given: Any,
+    count: int,
+    sensor: Sensor,
+    shape: tuple[int, ...],
+    options: Mapping[str, Any],
 ) -> Tensor:
     """Convert a user's conditions of several scans to one tensor.
 
     Args:
         name: name of the model's condition.
-        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or ``Layout`` or a sequence of them,
-            or a dictionary with one of these under ``name``, as a bank stores it.
+        given: a condition for all, or one for each: an array or tensor, a ``Scan`` or ``Layout`` or
+            a sequence of them, or a dictionary with one of these under ``name``, as a bank stores
+            it.
         count: B.
         sensor: the model's sensor.
         shape: shape of one condition.
@@ -323,19 +369,26 @@ def batch_of(
     readable = (Scan, Layout) if name == "layout" else Scan
     if isinstance(given, readable):
         given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]  # a layout for layouts only
-    elif isinstance(given, Sequence) and given and all(isinstance(scan, readable) for scan in given):
+    elif (
+        isinstance(given, Sequence) and given and all(isinstance(scan, readable) for scan in given)
+    ):
         given = np.stack([condition.read(scan, sensor, shape, options) for scan in given])
     if not isinstance(given, Tensor | np.ndarray):
-        raise ConfigError(f"a condition of type {type(given).__name__}", "an array, a Scan, or a list of Scans")
+        raise ConfigError(
+            f"a condition of type {type(given).__name__}", "an array, a Scan, or a list of Scans"
+        )
     values = torch.as_tensor(given)
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
         raise DataError(f"a {name} condition of {values.dtype}", "whole numbers, uint8")
     if values.shape not in (shape, (count, *shape)):
         raise DataError(
-            f"a {name} condition of shape {tuple(values.shape)}", f"{shape} for all scans, or {(count, *shape)}"
+            f"a {name} condition of shape {tuple(values.shape)}",
+            f"{shape} for all scans, or {(count, *shape)}",
         )
     if values.numel() and not 0 <= int(values.min()) <= int(values.max()) <= 255:
-        raise DataError(f"a {name} condition from {int(values.min())} to {int(values.max())}", "0..255")
+        raise DataError(
+            f"a {name} condition from {int(values.min())} to {int(values.max())}", "0..255"
+        )
     values = values.to(torch.uint8)
     condition.check(values)
     return values.expand(count, *shape)

@@ -11,7 +11,9 @@ def available_devices() -> list[str]:
     names = ["cpu"]
     for kind in ("cuda", "xpu"):
         module = getattr(torch, kind)
-        names += [f"{kind}:{i}" for i in range(module.device_count())] if module.is_available() else []
+        names += (
+            [f"{kind}:{i}" for i in range(module.device_count())] if module.is_available() else []
+        )
     return [*names, "mps"] if torch.backends.mps.is_available() else names
 
 
@@ -19,14 +21,17 @@ def checked_device(device: str | torch.device) -> torch.device:
     """The device with a name; a type without an index is the current device of that type.
 
     Raises:
-        ConfigError: on an unknown name or an unavailable device; the message lists the available ones.
+        ConfigError: on an unknown name or an unavailable device; the message lists the available
+            ones.
     """
     try:
         given = torch.device(device)
     except (RuntimeError, TypeError) as error:  # an unknown name, or not a string
         raise _missing(device, available_devices()) from error
     if given.type == "cpu" and not given.index:
-        return given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
+        return (
+            given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
+        )
     available = available_devices()
     kinds = {name.partition(":")[0] for name in available}
     if str(given) not in available and (given.type not in kinds or given.index is not None):
@@ -35,16 +40,21 @@ def checked_device(device: str | torch.device) -> torch.device:
 
 
 def _missing(device: object, available: list[str]) -> ConfigError:
-    hint = "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows what is installed."
+    hint = (
+        "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows "
+        "what is installed."
+    )
     return ConfigError(f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint)
 
 
 def refuse_worker(device: torch.device | str) -> None:
-    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would need a context."""
+    """Refuse CUDA in DataLoader workers: a forked process cannot use it, and each spawned one would
+    need a context."""
     if str(device).startswith("cuda") and get_worker_info() is not None:
         raise ConfigError(
             "a generator on the GPU inside a DataLoader worker",
-            "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling bank that one spawned "
+            "one of three ways: (A) bake a bank first and read it in the workers, (B) a rolling "
+            "bank that one spawned "
             "process fills, (C) mix in the main process, on the training device",
             "On the CPU, load_generator(..., device='cpu') works in workers too.",
         )

@@ -1,7 +1,7 @@
 """Generation of scans from a checkpoint.
 
-A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans of its batch,
-their order and the device change only float rounding.
+A scan is a function of (checkpoint, condition, time grid and solver, seed, index). The other scans
+of its batch, their order and the device change only float rounding.
 """
 
 from collections import OrderedDict
@@ -37,11 +37,11 @@ class SamplingOptions(TypedDict, total=False):
     """Options of ``Generator.range_images``, ``scans`` and ``samples``.
 
     Attributes:
-        steps: number of steps, on the times that the checkpoint has for it, else on a uniform grid; None, the default,
-            uses the checkpoint's own number.
+        steps: number of steps, on the times that the checkpoint has for it, else on a uniform grid;
+            None, the default, uses the checkpoint's own number.
         solver: a key of ``SOLVERS``, by default "euler".
-        guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale follows the
-            condition more closely; any scale but 1 doubles the computation.
+        guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale
+            follows the condition more closely; any scale but 1 doubles the computation.
     """
 
     steps: int | None
@@ -60,7 +60,8 @@ class Generator:
         hash: the checkpoint's hash; "" for weights without a checkpoint.
         batch: number of scans computed at a time; it affects only memory and speed.
         autoencoder: the autoencoder of a latent model; None for a pixel model.
-        columns: of the scans, where the autoencoder decodes to several widths; None = the checkpoint's.
+        columns: of the scans, where the autoencoder decodes to several widths; None = the
+            checkpoint's.
 
     Example:
         >>> from lidar_synth import Generator, load_generator
@@ -84,7 +85,9 @@ class Generator:
         own = self.header.sensor.columns
         widths = getattr(self.autoencoder, "widths", (own,))
         if self.columns is not None and self.columns not in widths:
-            raise ConfigError(f"{self.columns} columns of {self.name!r}", f"one of {', '.join(map(str, widths))}")
+            raise ConfigError(
+                f"{self.columns} columns of {self.name!r}", f"one of {', '.join(map(str, widths))}"
+            )
 
     def __repr__(self) -> str:
         size = f"{sum(p.numel() for p in self.network.parameters()) / 1e6:.1f} M parameters"
@@ -109,21 +112,26 @@ class Generator:
 
     @property
     def variant(self) -> str:
-        """A text of what else than the checkpoint determines the scans: columns and precision; "" for its own."""
+        """A text of what else than the checkpoint determines the scans: columns and precision; ""
+        for its own."""
         dtype = next(self.network.parameters()).dtype
         columns = "" if self.sensor == self.header.sensor else f":{self.columns} columns"
         return columns + ("" if dtype == torch.float32 else f":{dtype}")
 
     @property
     def condition(self) -> str | None:
-        """The name of the model's condition, a key of ``conditions.CONDITIONS``; None for an unconditional model."""
+        """The name of the model's condition, a key of ``conditions.CONDITIONS``; None for an
+        unconditional model."""
         return next(iter(self.header.conditioning), None)
 
     @property
     def fields(self) -> frozenset[str]:
-        """The fields of its scans: some of "reflectance", "label", "confidence", "instance" and "boxes"."""
+        """The fields of its scans: some of "reflectance", "label", "confidence", "instance" and
+        "boxes"."""
         labelled = "label" in self.header.channels or self.condition == "semantic"
-        fields = set(self.header.channels) - {"range"} | (boxed.FIELDS if self.condition == "layout" else set())
+        fields = set(self.header.channels) - {"range"} | (
+            boxed.FIELDS if self.condition == "layout" else set()
+        )
         return frozenset(fields | {"label", "confidence"} if labelled else fields)
 
     @property
@@ -136,56 +144,85 @@ class Generator:
         return Generated(self, seed)
 
     def range_images(
-        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Any = None,
+        **options: Unpack[SamplingOptions],
     ) -> list[RangeImage]:
         """Generate range images.
 
         Args:
             seed: seed of the noise, 0 <= seed < 2^64.
             indices: indices of B scans, 0 <= index < 2^63, in any order.
-            condition: one condition for all scans, or B of them; None for an unconditional model. A semantic map is a
-                (H, W) uint8 array of train ids, 255 = unknown, such as the ``label`` of a range image on the model's
-                sensor; a camera image is (3, h, w) uint8; a layout is a ``Layout``. A real ``Scan``, or a list of B,
-                provides the condition itself: its projected labels, the image at its ``image_path``, or its layout. In
-                a dictionary of conditions, the one with the condition's name is used. See ``conditions``.
+            condition: one condition for all scans, or B of them; None for an unconditional model. A
+                semantic map is a (H, W) uint8 array of train ids, 255 = unknown, such as the
+                ``label`` of a range image on the model's sensor; a camera image is (3, h, w) uint8;
+                a layout is a ``Layout``. A real ``Scan``, or a list of B, provides the condition
+                itself: its projected labels, the image at its ``image_path``, or its layout. In a
+                dictionary of conditions, the one with the condition's name is used. See
+                ``conditions``.
             options: ``steps``, ``solver`` and ``guidance``; see ``SamplingOptions``.
 
         Returns:
-            B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its ``confidence`` in
-            [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no return. If a
-            model conditioned on semantic maps does not generate labels, ``label`` is the map's where there is a
-            return, with confidence 1 where the map's label is known. The autoencoder of "town-semantic" gives returns
-            the map's labels too, with their probabilities as confidence. A model conditioned on a ``Layout`` or on
-            the layout of a scan gives the image the boxes that hold a return, and their numbers in ``instance``.
+            B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its
+                ``confidence`` in
+            [0, 1] if the checkpoint has them. They are empty (0, 255 = ignore, 0) where there is no
+            return. If a model conditioned on semantic maps does not generate labels, ``label`` is
+            the map's where there is a return, with confidence 1 where the map's label is known. The
+            autoencoder of "town-semantic" gives returns the map's labels too, with their
+            probabilities as confidence. A model conditioned on a ``Layout`` or on the layout of a
+            scan gives the image the boxes that hold a return, and their numbers in ``instance``.
 
         Raises:
-            ConfigError: on an invalid seed, index, number of steps or solver, a condition for an unconditional model,
-                guidance of a model that was trained without blank conditions, or CUDA in a DataLoader worker.
-            DataError: on a condition of another shape or with invalid values, or if a condition is missing.
+            ConfigError: on an invalid seed, index, number of steps or solver, a condition for an
+                unconditional model, guidance of a model that was trained without blank conditions,
+                or CUDA in a DataLoader worker.
+            DataError: on a condition of another shape or with invalid values, or if a condition is
+                missing.
         """
         given = self._condition(condition, len(indices))
         images = []
         for tensor in self.samples(seed, indices, given, **options):
             images += self.tensors.to_images(tensor, self.sensor)
-        if self.condition == "semantic" and "label" in self.fields - set(self.header.channels) and given is not None:
+        if (
+            self.condition == "semantic"
+            and "label" in self.fields - set(self.header.channels)
+            and given is not None
+        ):
             for image, labels in zip(images, given.cpu().numpy(), strict=True):
                 image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
-                image.channels["confidence"] = (image.channels["label"] != IGNORE).astype(np.float32)
+                image.channels["confidence"] = (image.channels["label"] != IGNORE).astype(
+                    np.float32
+                )
         boxes = boxed.boxes_of(condition, len(indices)) if self.condition == "layout" else None
-        return images if boxes is None else [boxed.with_boxes(*pair) for pair in zip(images, boxes, strict=True)]
+        return (
+            images
+            if boxes is None
+            else [boxed.with_boxes(*pair) for pair in zip(images, boxes, strict=True)]
+        )
 
     def scans(
-        self, seed: int, indices: Sequence[int], condition: Any = None, **options: Unpack[SamplingOptions]
+        self,
+        seed: int,
+        indices: Sequence[int],
+        condition: Any = None,
+        **options: Unpack[SamplingOptions],
     ) -> list[Scan]:
         """Generate scans: the returns of ``range_images`` through the centres of their cells.
 
-        Arguments and errors are those of ``range_images``. The ``id`` of a scan is ``<checkpoint>/<seed>/<index>``,
-        and its ``domain`` is ``SYNTHETIC``.
+        Arguments and errors are those of ``range_images``. The ``id`` of a scan is
+        ``<checkpoint>/<seed>/<index>``, and its ``domain`` is ``SYNTHETIC``.
         """
         images = self.range_images(seed, indices, condition, **options)
         made = made_by_model(self.name, self.hash, seed)
         return [
-            replace(unproject(image), id=f"{self.name}/{seed}/{index}", domain=SYNTHETIC, provenance=made)
+            replace(
+                unproject(image),
+                id=f"{self.name}/{seed}/{index}",
+                domain=SYNTHETIC,
+                provenance=made,
+            )
             for index, image in zip(indices, images, strict=True)
         ]
 
@@ -199,7 +236,8 @@ class Generator:
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> Iterator[Tensor]:
-        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most ``batch``.
+        """Yield the normalised tensors behind ``range_images``: (b, C, H, W) each, with b at most
+        ``batch``.
 
         Arguments and errors are those of ``range_images``.
         """
@@ -209,19 +247,29 @@ class Generator:
         noise_shape = (codec.draws, *self.sensor.shape)
         grid = self.header.grid(steps)
         if solver != "euler" and getattr(self.network, "ends", False):
-            raise ConfigError(f"solver {solver!r} for {self.name!r}", "'euler': it predicts mean velocities of steps")
+            raise ConfigError(
+                f"solver {solver!r} for {self.name!r}",
+                "'euler': it predicts mean velocities of steps",
+            )
         for first in range(0, len(indices), self.batch):
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
-            uniform_noise = uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
+            uniform_noise = (
+                uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
+            )
             with torch.inference_mode():
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)
-                yield codec.decode(state, uniform_noise, None if own is None else {str(self.condition): own})
+                yield codec.decode(
+                    state, uniform_noise, None if own is None else {str(self.condition): own}
+                )
 
-    def _flow(self, condition: Tensor | None, guidance: float, grid: Sequence[float]) -> tuple[Velocity, Tensor | None]:
-        """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at every step."""
+    def _flow(
+        self, condition: Tensor | None, guidance: float, grid: Sequence[float]
+    ) -> tuple[Velocity, Tensor | None]:
+        """The velocity to solve on a grid, and its encoded condition: it is encoded once, not at
+        every step."""
         options = self.header.conditioning.get(str(self.condition), {})
         if guidance != 1 and (condition is None or not options.get("dropout")):
             raise ConfigError(
@@ -232,8 +280,12 @@ class Generator:
         if condition is None or not isinstance(self.network, Conditioned):
             return towards(self.network, grid), condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
-        unconditional = encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
-        return guided(towards(self.network.velocity, grid), guidance, unconditional), encode(condition)
+        unconditional = (
+            encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
+        )
+        return guided(towards(self.network.velocity, grid), guidance, unconditional), encode(
+            condition
+        )
 
     def _condition(self, given: Any, count: int) -> Tensor | None:
         """The conditions (B, ...) as the network takes them, on its device."""
@@ -242,30 +294,41 @@ class Generator:
         if self.condition is None:
             raise ConfigError(f"a condition for {self.name!r}", "none: the model is unconditional")
         if given is None:
-            raise DataError(f"no condition for {self.name!r}", f"condition=... ({self.condition}), or real scans")
+            raise DataError(
+                f"no condition for {self.name!r}",
+                f"condition=... ({self.condition}), or real scans",
+            )
         if not isinstance(self.network, Conditioned):
-            raise ConfigError(f"{self.name!r} without the encoder of its condition", "a checkpoint with all its parts")
+            raise ConfigError(
+                f"{self.name!r} without the encoder of its condition",
+                "a checkpoint with all its parts",
+            )
         options = self.header.conditioning[self.condition]
         shape = CONDITIONS[self.condition].shape(self.network.encoder)
-        return batch_of(self.condition, given, count, self.header.sensor, shape, options).to(self.device)
+        return batch_of(self.condition, given, count, self.header.sensor, shape, options).to(
+            self.device
+        )
 
 
 class Generated:
     """Scans that a generator makes on access, in the process that accesses them.
 
     Args:
-        generator: the model. On the CPU it also works in DataLoader workers. On a GPU it works in the main process
-            only; in a worker it raises an error that names the three ways to use a GPU's scans.
+        generator: the model. On the CPU it also works in DataLoader workers. On a GPU it works in
+            the main process only; in a worker it raises an error that names the three ways to use a
+            GPU's scans.
         seed: of the scans; the number of a scan is its index.
-        condition: for a conditional model, an indexable source of conditions, such as the real scans. Scan n is
-            conditioned on entry n modulo the source's length; ``Generator.range_images`` lists the kinds of entries.
-        cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x 1024), which saves
-            time if a process accesses a scan again: with ``reuse``, an epoch later.
+        condition: for a conditional model, an indexable source of conditions, such as the real
+            scans. Scan n is conditioned on entry n modulo the source's length;
+            ``Generator.range_images`` lists the kinds of entries.
+        cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x
+            1024), which saves time if a process accesses a scan again: with ``reuse``, an epoch
+            later.
         sampling: steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:
-        ConfigError: on a negative cache, a conditional model without conditions, or conditions for an unconditional
-            model.
+        ConfigError: on a negative cache, a conditional model without conditions, or conditions for
+            an unconditional model.
 
     Example:
         >>> from lidar_synth import load_generator, open_scans
@@ -281,18 +344,29 @@ class Generated:
     """Reading the first scan would start the network."""
 
     def __init__(
-        self, generator: Generator, seed: int = 0, *, condition: Any = None, cache: int = 0, **sampling: Any
+        self,
+        generator: Generator,
+        seed: int = 0,
+        *,
+        condition: Any = None,
+        cache: int = 0,
+        **sampling: Any,
     ) -> None:
         if cache < 0:
             raise ConfigError(f"cache={cache}", "a number of scans")
         if (condition is None) != (generator.condition is None):
             raise ConfigError(
                 f"{'no conditions' if condition is None else 'conditions'} for {generator.name!r}",
-                f"a source of conditions ({generator.condition})" if generator.condition else "none",
+                f"a source of conditions ({generator.condition})"
+                if generator.condition
+                else "none",
                 "Generated(generator, condition=real) conditions it on the scans of a source.",
             )
-        self.generator, self.seed, self.condition = generator, seed, condition
-        self._sampling, self._cache_size = sampling, cache
+        self.generator = generator
+        self.seed = seed
+        self.condition = condition
+        self._sampling = sampling
+        self._cache_size = cache
         self._cached: OrderedDict[int, Scan] = OrderedDict()
 
     @property
@@ -326,7 +400,11 @@ class Generated:
 
     def scans(self, numbers: Sequence[int]) -> list[Scan]:
         """Several scans at once, which is faster on a GPU."""
-        condition = None if self.condition is None else [self.condition[n % len(self.condition)] for n in numbers]
+        condition = (
+            None
+            if self.condition is None
+            else [self.condition[n % len(self.condition)] for n in numbers]
+        )
         return self.generator.scans(self.seed, numbers, condition, **self._sampling)
 
     def __repr__(self) -> str:

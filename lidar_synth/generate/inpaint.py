@@ -1,7 +1,9 @@
-"""Part of a range image drawn again by a generator: known cells are kept, the cells of a hole are sampled.
+"""Part of a range image drawn again by a generator: known cells are kept, the cells of a hole are
+sampled.
 
-In every step the state outside the hole is the known one at that time, y_t = (1 - t) y0 + t y1 with y0 the encoded
-image; only the state inside the hole follows the flow (Lugmayr et al., "RePaint", CVPR 2022, for a rectified flow).
+In every step the state outside the hole is the known one at that time, y_t = (1 - t) y0 + t y1 with
+y0 the encoded image; only the state inside the hole follows the flow (Lugmayr et al., "RePaint",
+CVPR 2022, for a rectified flow).
 """
 
 from collections.abc import Sequence
@@ -24,7 +26,8 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
 START = 0.6
-"""Latest time of the noise from which a hole is sampled: the provisional content keeps its large shapes."""
+"""Latest time of the noise from which a hole is sampled: the provisional content keeps its large
+shapes."""
 
 
 def inpaint(
@@ -39,16 +42,18 @@ def inpaint(
 
     Args:
         generator: an unconditional model.
-        images: B images on the model's grid with provisional content in the holes. Missing labels are ignored ones,
-            missing reflectance is 0.
+        images: B images on the model's grid with provisional content in the holes. Missing labels
+            are ignored ones, missing reflectance is 0.
         holes: (H, W) each, True for cells to draw.
         seed: seed of the noise, 0 <= seed < 2^64.
         indices: B indices of the noise, 0 <= index < 2^63.
-        start: time in (0, 1] from which the flow starts: 1 ignores the provisional content, less keeps its large
-            shapes. The steps are those of the model's time grid from the last time at or below it.
+        start: time in (0, 1] from which the flow starts: 1 ignores the provisional content, less
+            keeps its large shapes. The steps are those of the model's time grid from the last time
+            at or below it.
 
     Returns:
-        B images: outside the holes the given values, inside those of the model, with ``confidence`` if it has labels.
+        B images: outside the holes the given values, inside those of the model, with ``confidence``
+            if it has labels.
 
     Raises:
         ConfigError: on a conditional model, or a start outside (0, 1].
@@ -76,19 +81,24 @@ def inpaint(
 
 
 def check_model(generator: Generator, given: Sensor) -> None:
-    """Check that a model fills holes in scans of a sensor; names and range limits of sensors may differ.
+    """Check that a model fills holes in scans of a sensor; names and range limits of sensors may
+    differ.
 
     Raises:
         ConfigError: on a conditional model.
         DataError: on different rows or columns.
     """
     if generator.condition is not None:
-        raise ConfigError(f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
-                          "an unconditional model", "Use model='town', or no model.")  # fmt: skip
+        raise ConfigError(
+            f"{generator.name!r}, a model conditioned on {generator.condition!r}, to fill holes",
+            "an unconditional model",
+            "Use model='town', or no model.",
+        )
     wanted = generator.sensor
     if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
         raise DataError(
-            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of {wanted.name!r} "
+            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model "
+            f"of {wanted.name!r} "
             f"({wanted.shape[0]} x {wanted.shape[1]})",
             "scans on the model's grid",
             "Use model=None, or a model that was trained for this sensor.",
@@ -103,27 +113,42 @@ def _batch(
     indices: Sequence[int],
     start: float,
 ) -> list[RangeImage]:
-    codec, device = generator.codec, generator.device
-    known = codec.encode(generator.tensors.from_images([_complete(image) for image in images]).to(device))
+    codec = generator.codec
+    device = generator.device
+    known = codec.encode(
+        generator.tensors.from_images([_complete(image) for image in images]).to(device)
+    )
     mask = torch.from_numpy(np.stack(holes)).to(device, torch.float32)[:, None]
     inside = adaptive_max_pool2d(mask, codec.shape[1:]) > 0
     noise = gaussian(seed, indices, codec.shape, device)
-    draws = uniform(seed, indices, (codec.draws, *generator.sensor.shape), device) if codec.draws else None
+    draws = (
+        uniform(seed, indices, (codec.draws, *generator.sensor.shape), device)
+        if codec.draws
+        else None
+    )
     with torch.inference_mode():
         state = codec.decode(_sample(generator, known, noise, inside, start), draws)
     results = []
-    for image, hole, new in zip(images, holes, generator.tensors.to_images(state, generator.sensor), strict=True):
+    for image, hole, new in zip(
+        images, holes, generator.tensors.to_images(state, generator.sensor), strict=True
+    ):
         channels = {n: np.where(hole, v, image.channels.get(n, v)) for n, v in new.channels.items()}
         results.append(RangeImage(np.where(hole, new.range, image.range), image.sensor, channels))
     return results
 
 
-def _sample(generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, start: float) -> Tensor:
+def _sample(
+    generator: Generator, known: Tensor, noise: Tensor, inside: Tensor, start: float
+) -> Tensor:
     """The states (B, *shape) at time 0, which are the known ones outside the hole."""
     grid = [t for t in generator.header.time_grid if t <= start]
     if len(grid) < 2:
-        raise ConfigError(f"start={start} for the time grid {tuple(generator.header.time_grid)}", "a later time in it")
-    y, velocity = (1 - grid[0]) * known + grid[0] * noise, towards(generator.network, grid)
+        raise ConfigError(
+            f"start={start} for the time grid {tuple(generator.header.time_grid)}",
+            "a later time in it",
+        )
+    y = (1 - grid[0]) * known + grid[0] * noise
+    velocity = towards(generator.network, grid)
     for t, t_next in pairwise(grid):
         y = solve(velocity, y, (t, t_next))
         y = torch.where(inside, y, (1 - t_next) * known + t_next * noise)

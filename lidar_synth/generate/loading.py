@@ -8,7 +8,14 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError, DataError, suggest
-from lidar_synth.generate.checkpoint import CODEC, VELOCITY, has_checksum, join, load_checkpoint, read_header
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    VELOCITY,
+    has_checksum,
+    join,
+    load_checkpoint,
+    read_header,
+)
 from lidar_synth.generate.devices import checked_device, refuse_worker
 from lidar_synth.generate.generator import BATCH, Generator
 
@@ -33,14 +40,15 @@ def load_generator(
         model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
         device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
         dtype: dtype of the network's computations; states stay float32.
-        compile: whether to compile the velocity network and the decoder of a latent model with ``torch.compile``; the
-            first scan then takes long.
+        compile: whether to compile the velocity network and the decoder of a latent model with
+            ``torch.compile``; the first scan then takes long.
         batch: number of scans computed at a time; by default it depends on the device.
-        columns: of the scans; a dense model generates half of its columns at about half of the decoder's cost.
+        columns: of the scans; a dense model generates half of its columns at about half of the
+            decoder's cost.
 
     Raises:
-        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a number of columns that
-            the model cannot generate.
+        ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a
+            number of columns that the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
 
     Example:
@@ -55,22 +63,27 @@ def load_generator(
     path = find_model(model)
     checkpoint = load_checkpoint(path, device)
     if VELOCITY not in checkpoint.networks:
-        raise DataError(f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}.")
+        raise DataError(
+            f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}."
+        )
     for network in checkpoint.networks.values():
         network.to(dtype).requires_grad_(False)
     if compile:
         _compile(checkpoint.networks)
-    flow, autoencoder = join(checkpoint.networks), checkpoint.networks.get(CODEC)
+    flow = join(checkpoint.networks)
+    autoencoder = checkpoint.networks.get(CODEC)
     size = batch or BATCH.get(device.type, 1)
-    return Generator(path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns)
+    return Generator(
+        path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns
+    )
 
 
 def _compile(networks: dict[str, nn.Module]) -> None:
     """Compile the velocity network and the decoder, in place."""
     networks[VELOCITY].compile()
     if (autoencoder := networks.get(CODEC)) is not None:
-        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for two widths at once,
-        # it gives infinite values (torch 2.13).
+        # ``Module.compile`` compiles ``forward``, but a codec is called by ``decode``. Compiled for
+        # two widths at once, it gives infinite values (torch 2.13).
         codec: Any = autoencoder
         codec.decode = torch.compile(codec.decode, dynamic=False)
 
@@ -92,7 +105,9 @@ def find_model(model: str | Path) -> Path:
     if (name := str(model)) in shipped:
         if not has_checksum(shipped[name]) and read_header(shipped[name])[1] != SHIPPED.get(name):
             raise DataError(
-                f"{shipped[name]} is not the {name!r} of this version", "an intact file", "Install it again."
+                f"{shipped[name]} is not the {name!r} of this version",
+                "an intact file",
+                "Install it again.",
             )
         return shipped[name]
     path = Path(model)

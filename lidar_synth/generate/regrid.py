@@ -1,8 +1,10 @@
 """A model moved to the grid of another sensor, as the start of a training on its scans.
 
-Nearly all weights are convolutions and attention, which have no place. What belongs to places is interpolated: learned
-biases by row (of a beam's elevation, which on a road gives the range), and the table of positions, whose columns wrap
-around. Ray angles are those of the new sensor. The moved model generates no good scans until it has been trained.
+Nearly all weights are convolutions and attention, which have no place. What belongs to places is
+    interpolated: learned
+biases by row (of a beam's elevation, which on a road gives the range), and the table of positions,
+whose columns wrap around. Ray angles are those of the new sensor. The moved model generates no good
+scans until it has been trained.
 """
 
 from collections.abc import Mapping
@@ -16,7 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Checkpoint, Header, NetworkSpec
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Checkpoint,
+    Header,
+    NetworkSpec,
+)
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import Sensor
@@ -26,7 +35,8 @@ ANGLES = "angles.cells"
 
 
 class Axes(NamedTuple):
-    """Which axes of a weight are the rows and the columns of a grid; None where it does not depend on them."""
+    """Which axes of a weight are the rows and the columns of a grid; None where it does not depend
+    on them."""
 
     rows: int
     columns: int | None = None
@@ -38,27 +48,32 @@ PLACED: dict[str, dict[str, Axes]] = {
     "denoiser": {"position.table": Axes(0, 1)},
     "semantic_map": {},
 }
-"""{architecture: its weights that belong to places}. A model of other architectures is not moved."""
+"""{architecture: its weights that belong to places}. A model of other architectures is not
+moved."""
 CONDITIONS = ("semantic",)
 """Conditions of the models that are moved."""
 
 
 def fitting(sensor: Sensor, header: Header) -> Sensor:
-    """The grid of a sensor on which a model can be trained: with as many columns as its networks can have, and within
-    the model's range limits.
+    """The grid of a sensor on which a model can be trained: with as many columns as its networks
+    can have, and within the model's range limits.
 
     Raises:
-        ConfigError: on rows that the networks cannot have, or range limits without anything in common.
+        ConfigError: on rows that the networks cannot have, or range limits without anything in
+            common.
     """
     rows, columns = unit_of(header)
     if sensor.shape[0] % rows:
-        raise ConfigError(f"sensor {sensor.name!r} with {sensor.shape[0]} rows", f"a multiple of {rows} rows")
+        raise ConfigError(
+            f"sensor {sensor.name!r} with {sensor.shape[0]} rows", f"a multiple of {rows} rows"
+        )
     near = max(sensor.range_min, header.normalisation.range_min)
     far = min(sensor.range_max, header.normalisation.range_max)
     if near >= far:
         raise ConfigError(
             f"sensor {sensor.name!r} from {sensor.range_min} to {sensor.range_max} m",
-            f"some of {header.normalisation.range_min} to {header.normalisation.range_max} m, the model's ranges",
+            f"some of {header.normalisation.range_min} to {header.normalisation.range_max} m, "
+            "the model's ranges",
         )
     wanted = columns * max(1, round(sensor.columns / columns))
     return replace(sensor, columns=wanted, range_min=near, range_max=far)
@@ -67,7 +82,8 @@ def fitting(sensor: Sensor, header: Header) -> Sensor:
 def unit_of(header: Header) -> tuple[int, int]:
     """Rows and columns of which a sensor needs a multiple, for the networks of a model."""
     velocity = header.networks[VELOCITY].arguments
-    levels, patch = len(velocity.get("depths", (3, 3, 3, 3))), velocity.get("patch", (1, 4))
+    levels = len(velocity.get("depths", (3, 3, 3, 3)))
+    patch = velocity.get("patch", (1, 4))
     state = velocity["resolution"]
     rows, columns = (header.sensor.shape[i] // state[i] * patch[i] << (levels - 1) for i in (0, 1))
     return rows, columns
@@ -81,8 +97,8 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
         sensor: as ``fitting`` gives it.
 
     Raises:
-        ConfigError: on an autoencoder alone, a model with another condition, or one of an architecture that is not in
-            ``PLACED``.
+        ConfigError: on an autoencoder alone, a model with another condition, or one of an
+            architecture that is not in ``PLACED``.
     """
     check_movable(model.header)
     networks: dict[str, nn.Module] = {}
@@ -107,7 +123,9 @@ def check_movable(header: Header) -> None:
     if not set(header.conditioning) <= set(CONDITIONS):
         wanted = f"an unconditional model, or the condition {', '.join(CONDITIONS)}"
         raise ConfigError(f"a model with the condition {', '.join(header.conditioning)}", wanted)
-    if unknown := [part.architecture for part in header.networks.values() if part.architecture not in PLACED]:
+    if unknown := [
+        part.architecture for part in header.networks.values() if part.architecture not in PLACED
+    ]:
         raise ConfigError(
             f"a model with the architecture {', '.join(unknown)}",
             f"architectures among {', '.join(PLACED)}: those that can be moved to another sensor",
@@ -124,23 +142,35 @@ def _moved(network: nn.Module, part: NetworkSpec, old: Sensor, new: Sensor) -> n
     if ANGLES in state:
         shape = made.state_dict()[ANGLES].shape[1:]
         angles = torch.from_numpy(new.ray_angles())
-        state[ANGLES] = F.avg_pool2d(angles[None], (new.shape[0] // shape[0], new.shape[1] // shape[1]))[0]
+        state[ANGLES] = F.avg_pool2d(
+            angles[None], (new.shape[0] // shape[0], new.shape[1] // shape[1])
+        )[0]
     made.load_state_dict(state)
     return made.eval()
 
 
-def _interpolated(weight: Tensor, axes: Axes, shape: torch.Size, old: Sensor, new: Sensor) -> Tensor:
-    before, after = _elevations(old, weight.shape[axes.rows]), _elevations(new, shape[axes.rows])
-    weight = _along(weight, axes.rows, np.interp(after, before[::-1], np.arange(len(before))[::-1]), wraps=False)
+def _interpolated(
+    weight: Tensor, axes: Axes, shape: torch.Size, old: Sensor, new: Sensor
+) -> Tensor:
+    before = _elevations(old, weight.shape[axes.rows])
+    after = _elevations(new, shape[axes.rows])
+    weight = _along(
+        weight, axes.rows, np.interp(after, before[::-1], np.arange(len(before))[::-1]), wraps=False
+    )
     if axes.columns is not None:
-        count, wanted = weight.shape[axes.columns], shape[axes.columns]
-        weight = _along(weight, axes.columns, (np.arange(wanted) + 0.5) * count / wanted - 0.5, wraps=True)
+        count = weight.shape[axes.columns]
+        wanted = shape[axes.columns]
+        weight = _along(
+            weight, axes.columns, (np.arange(wanted) + 0.5) * count / wanted - 0.5, wraps=True
+        )
     return weight
 
 
 def _elevations(sensor: Sensor, groups: int) -> NDArray[np.float64]:
     """(groups,) mean elevation of equal groups of rows, highest first."""
-    means: NDArray[np.float64] = sensor.row_elevations().astype(np.float64).reshape(groups, -1).mean(1)
+    means: NDArray[np.float64] = (
+        sensor.row_elevations().astype(np.float64).reshape(groups, -1).mean(1)
+    )
     return means
 
 
@@ -149,13 +179,18 @@ def _along(weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool) 
     count = weight.shape[axis]
     low = np.floor(places)
     share = torch.from_numpy(places - low).to(weight.dtype)
-    first, second = (i.astype(np.int64) % count if wraps else i.astype(np.int64).clip(0, count - 1)
-                     for i in (low, low + 1))  # fmt: skip
+    first, second = (
+        i.astype(np.int64) % count if wraps else i.astype(np.int64).clip(0, count - 1)
+        for i in (low, low + 1)
+    )
     share = share.view(*(-1 if i == axis else 1 for i in range(weight.ndim)))
     one, other = (weight.index_select(axis, torch.from_numpy(i)) for i in (first, second))
     return torch.lerp(one, other, share)
 
 
-def with_codec(flow: Mapping[str, nn.Module], codec: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
-    """The flow of one model, with what encodes its condition, and the autoencoder of another one."""
+def with_codec(
+    flow: Mapping[str, nn.Module], codec: Mapping[str, nn.Module]
+) -> dict[str, nn.Module]:
+    """The flow of one model, with what encodes its condition, and the autoencoder of another
+    one."""
     return {**flow, CODEC: codec[CODEC]}

@@ -1,11 +1,15 @@
 """Do points come from the sensor that they are said to come from?
 
-A file of points names no sensor, and a wrong one loses points in silence: they fall into rows that are not theirs, or
-outside of the field of view. ``agreement`` counts the points and the beams that contradict a sensor.
+A file of points names no sensor, and a wrong one loses points in silence: they fall into rows that
+    are not theirs, or
+outside of the field of view. ``agreement`` counts the points and the beams that contradict a
+sensor.
 
-Recorded scans contradict their own sensor a little: they tilt by up to one degree against the table of beams, motion
-compensation moves near points by 0.3 m, and the lasers of some sensors start up to 0.2 m above the origin. Therefore
-angles are compared only beyond ``NEAR`` metres, for each sector of azimuth at the tilt that fits best.
+Recorded scans contradict their own sensor a little: they tilt by up to one degree against the table
+    of beams, motion
+compensation moves near points by 0.3 m, and the lasers of some sensors start up to 0.2 m above the
+origin. Therefore angles are compared only beyond ``NEAR`` metres, for each sector of azimuth at the
+tilt that fits best.
 """
 
 from typing import NamedTuple
@@ -15,20 +19,26 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 
-NEAR, FAR = 5.0, 15.0
+NEAR = 5.0
+FAR = 15.0
 """Metres beyond which points are compared with the field of view, and with single beams."""
 
 TILT = 1.0
 """Degrees by which a scan may tilt without a point counting as outside of the field of view."""
 
-MOST_OUTSIDE, MOST_GAPS, MOST_UNUSED, MOST_BETWEEN = 0.04, 0.15, 0.55, 0.43
-"""The largest shares that are accepted. Recorded scans reach 0.02, 0.04, 0.42 and 0.37 with their own sensor; points
-that are anywhere between the beams reach 0.44 to 0.60 in the last one, since the tilt is fitted."""
+MOST_OUTSIDE = 0.04
+MOST_GAPS = 0.15
+MOST_UNUSED = 0.55
+MOST_BETWEEN = 0.43
+"""The largest shares that are accepted. Recorded scans reach 0.02, 0.04, 0.42 and 0.37 with their
+own sensor; points that are anywhere between the beams reach 0.44 to 0.60 in the last one, since the
+tilt is fitted."""
 
 _COMPARED = 20_000  # points; more change the shares by less than 0.01
 _FEWEST = 1000  # points without which nothing can be said
 _PER_LASER = 15  # points of an average laser, without which nothing can be said about lasers
-_SECTORS, _PER_SECTOR = 36, 60
+_SECTORS = 36
+_PER_SECTOR = 60
 _BIN = 0.02  # degrees
 _SHIFTS = np.arange(-30, 31, 2)  # bins: tilts of up to 0.6 degrees in one sector
 _COARSE = 0.3  # degrees by which the rows of a linear grid may miss the beams that they stand for
@@ -38,12 +48,13 @@ class Agreement(NamedTuple):
     """Shares of points and beams that contradict a sensor, each in [0, 1].
 
     Args:
-        above, below: points outside of the vertical field of view, by more than half a beam's spacing and the tilt.
+        above, below: points outside of the vertical field of view, by more than half a beam's
+            spacing and the tilt.
         near, far: points outside of the range limits, by more than half a metre (far: and 2 %).
         gaps: beams without points, of those between the highest and the lowest beam with points.
         unused: beams without points, of all.
-        between: points between the beams, farther than a quarter of their spacing from one, where the sensor's table
-            is fine enough to tell. It is 0.5 for points at random elevations.
+        between: points between the beams, farther than a quarter of their spacing from one, where
+            the sensor's table is fine enough to tell. It is 0.5 for points at random elevations.
     """
 
     above: float = 0.0
@@ -60,7 +71,8 @@ class Agreement(NamedTuple):
         return self.above + self.below + self.near + self.far
 
     def faults(self, sensor: Sensor) -> list[str]:
-        """What contradicts the sensor, one text for each share that is too large; [] if nothing does."""
+        """What contradicts the sensor, one text for each share that is too large; [] if nothing
+        does."""
         found = []
         if self.outside > MOST_OUTSIDE:
             places = {
@@ -69,10 +81,17 @@ class Agreement(NamedTuple):
                 f"nearer than {sensor.range_min:g} m": self.near,
                 f"farther than {sensor.range_max:g} m": self.far,
             }
-            found.append(", ".join(f"{_percent(v)} of the points lie {k}" for k, v in places.items() if v >= 0.005))
+            found.append(
+                ", ".join(
+                    f"{_percent(v)} of the points lie {k}" for k, v in places.items() if v >= 0.005
+                )
+            )
         rows = sensor.shape[0]
         if self.gaps > MOST_GAPS:
-            found.append(f"{_percent(self.gaps)} of the {rows} beams have no points though beams around them have")
+            found.append(
+                f"{_percent(self.gaps)} of the {rows} beams have no points though beams around "
+                "them have"
+            )
         elif self.unused > MOST_UNUSED:
             found.append(f"{_percent(self.unused)} of the {rows} beams have no points")
         if self.between > MOST_BETWEEN:
@@ -84,11 +103,13 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
     """Compare points with a sensor; takes a few milliseconds.
 
     Args:
-        points: (N, 3) metres, sensor frame. Points at the origin are firings without a return, and are not counted.
+        points: (N, 3) metres, sensor frame. Points at the origin are firings without a return, and
+            are not counted.
         sensor: the sensor that they are said to come from.
 
     Returns:
-        The shares that contradict the sensor; shares about which too few points tell anything are 0.
+        The shares that contradict the sensor; shares about which too few points tell anything are
+        0.
 
     Example:
         >>> from lidar_synth import Town, load_sensor
@@ -102,7 +123,8 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
     some = points[:: max(1, len(points) // (2 * _COMPARED))].astype(np.float64)
     some = some[np.isfinite(some).all(axis=1)]
     distance = np.sqrt(np.einsum("ij,ij->i", some, some))
-    some, distance = some[distance > 0.05], distance[distance > 0.05]
+    some = some[distance > 0.05]
+    distance = distance[distance > 0.05]
     if len(some) < _FEWEST:
         return Agreement()
     near = float((distance < sensor.range_min - 0.5).mean())
@@ -110,7 +132,8 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
     some = some[distance > NEAR]
     if len(some) < _FEWEST:
         return Agreement(near=near, far=far)
-    # Points may lie on the sensor's lasers, or on the rows of its grid if they come from a range image.
+    # Points may lie on the sensor's lasers, or on the rows of its grid if they come from a range
+    # image.
     rows = np.degrees(sensor.row_elevations().astype(np.float64))
     tables = [(rows, np.zeros(len(rows)))]
     if sensor.beams is not None or sensor.heights is not None:
@@ -123,9 +146,13 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
 
 
 def _compare(
-    points: NDArray[np.float64], beams: NDArray[np.float64], heights: NDArray[np.float64], exact: bool
+    points: NDArray[np.float64],
+    beams: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    exact: bool,
 ) -> tuple[float, float, float, float, float]:
-    """``above``, ``below``, ``gaps``, ``unused`` and ``between`` for beams at these elevations, lowest first."""
+    """``above``, ``below``, ``gaps``, ``unused`` and ``between`` for beams at these elevations,
+    lowest first."""
     flat = np.hypot(points[:, 0], points[:, 1])
     elevation = np.degrees(np.arctan2(points[:, 2], flat))
     elevation = np.degrees(np.arctan2(points[:, 2] - np.interp(elevation, beams, heights), flat))
@@ -134,18 +161,27 @@ def _compare(
     below = float((elevation < beams[0] - step[0] / 2 - TILT).mean())
     gaps = unused = 0.0
     if len(points) >= _PER_LASER * len(beams):
-        count = np.bincount(np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation), minlength=len(beams))
+        count = np.bincount(
+            np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation), minlength=len(beams)
+        )
         used = np.flatnonzero(count > 0.03 * np.median(count[count > 0]))
-        gaps, unused = 1 - len(used) / (used[-1] - used[0] + 1), 1 - len(used) / len(beams)
+        gaps = 1 - len(used) / (used[-1] - used[0] + 1)
+        unused = 1 - len(used) / len(beams)
     seen = flat > FAR
-    sector = ((np.arctan2(points[seen, 1], points[seen, 0]) / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
+    sector = ((np.arctan2(points[seen, 1], points[seen, 0]) / (2 * np.pi) + 0.5) * _SECTORS).astype(
+        int
+    ) % _SECTORS
     return above, below, gaps, unused, _between(elevation[seen], sector, beams, exact)
 
 
 def _between(
-    elevation: NDArray[np.float64], sector: NDArray[np.intp], beams: NDArray[np.float64], exact: bool
+    elevation: NDArray[np.float64],
+    sector: NDArray[np.intp],
+    beams: NDArray[np.float64],
+    exact: bool,
 ) -> float:
-    """Share of points between the beams, with the tilt of each sector that leaves the fewest there."""
+    """Share of points between the beams, with the tilt of each sector that leaves the fewest
+    there."""
     step = np.diff(beams)
     width = np.minimum(np.r_[step[0], step], np.r_[step, step[-1]]) / 4  # on either side of a beam
     width = width if exact else np.maximum(width, _COARSE)
@@ -155,7 +191,9 @@ def _between(
     on_beam = (np.abs(places - beams[nearest]) <= width[nearest]).astype(np.float32)
     cell = ((elevation - low) / _BIN).astype(int)
     inside = (elevation > low) & (cell < len(places))
-    counts = np.bincount(sector[inside] * len(places) + cell[inside], minlength=_SECTORS * len(places))
+    counts = np.bincount(
+        sector[inside] * len(places) + cell[inside], minlength=_SECTORS * len(places)
+    )
     image = counts.reshape(_SECTORS, -1).astype(np.float32)
     total = image.sum(axis=1)
     told = total >= _PER_SECTOR

@@ -15,7 +15,8 @@ class Assigned(NamedTuple):
 
     Args:
         ring: (N,) int16 the nearest beam, 0 = highest.
-        firing: (N,) int32 its firing, 0 = behind the sensor, clockwise; -1 on a beam of unknown azimuth offset.
+        firing: (N,) int32 its firing, 0 = behind the sensor, clockwise; -1 on a beam of unknown
+            azimuth offset.
         off: (N,) float32 degrees by which the point lies above its beam.
     """
 
@@ -32,7 +33,8 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
         sensor: by default the scan's own. Its lasers point and start as ``Sensor.optics`` says.
 
     Returns:
-        The ring and firing of each point, and its distance from the beam: points that lie far off are not from this
+        The ring and firing of each point, and its distance from the beam: points that lie far off
+            are not from this
         sensor, or not in its frame.
 
     Example:

@@ -12,18 +12,21 @@ Floats = NDArray[np.float64]
 
 
 EXTENSION = 1.5
-"""Segments beyond the first and the last pose for which a trajectory holds: the turn before the first pose is one."""
+"""Segments beyond the first and the last pose for which a trajectory holds: the turn before the
+first pose is one."""
 
 
 class Trajectory:
-    """The poses of a sensor over time: positions are interpolated linearly, rotations at constant speed (slerp).
+    """The poses of a sensor over time: positions are interpolated linearly, rotations at constant
+    speed (slerp).
 
     Args:
         times: (K,) seconds, increasing, K >= 2.
         poses: (K, 4, 4) of the frame in which the points are given, to the world, metres.
 
     Raises:
-        DataError: on shapes that do not match, times that do not increase, or poses that are not rigid.
+        DataError: on shapes that do not match, times that do not increase, or poses that are not
+            rigid.
 
     Example:
         >>> import numpy as np
@@ -35,16 +38,24 @@ class Trajectory:
     """
 
     def __init__(self, times: ArrayLike, poses: ArrayLike) -> None:
-        self.times, self.poses = np.asarray(times, np.float64), np.asarray(poses, np.float64)
+        self.times = np.asarray(times, np.float64)
+        self.poses = np.asarray(poses, np.float64)
         count = len(self.times) if self.times.ndim == 1 else 0
         if count < 2 or self.poses.shape != (count, 4, 4):
             given = f"times of shape {self.times.shape} and poses of shape {self.poses.shape}"
             raise DataError(given, "(K,) and (K, 4, 4), K >= 2")
         if not np.isfinite(self.times).all() or not (np.diff(self.times) > 0).all():
-            raise DataError("times of poses that do not increase", "finite seconds, one after the other")
+            raise DataError(
+                "times of poses that do not increase", "finite seconds, one after the other"
+            )
         turn = self.poses[:, :3, :3]
-        if not np.isfinite(self.poses).all() or not np.allclose(turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4):
-            raise DataError("poses whose upper left 3 x 3 part is not a rotation", "rigid poses, sensor to world")
+        if not np.isfinite(self.poses).all() or not np.allclose(
+            turn @ turn.swapaxes(1, 2), np.eye(3), atol=1e-4
+        ):
+            raise DataError(
+                "poses whose upper left 3 x 3 part is not a rotation",
+                "rigid poses, sensor to world",
+            )
         self._steps = rotation_vectors(turn[:-1].swapaxes(1, 2) @ turn[1:])
 
     def at(self, time: float) -> Floats:
@@ -52,7 +63,9 @@ class Trajectory:
         pose = np.eye(4)
         segment, fraction = self._segments(np.array([time]))
         pose[:3, 3] = self._positions(segment, fraction)[0]
-        turned = rotate(np.eye(3), np.broadcast_to(self._steps[segment] * fraction[:, None], (3, 3)))
+        turned = rotate(
+            np.eye(3), np.broadcast_to(self._steps[segment] * fraction[:, None], (3, 3))
+        )
         pose[:3, :3] = self.poses[segment[0], :3, :3] @ turned.T
         return pose
 
@@ -71,11 +84,13 @@ class Trajectory:
         return np.asarray(turned + self._positions(segment, fraction))
 
     def _positions(self, segment: NDArray[np.intp], fraction: Floats) -> Floats:
-        start, end = self.poses[segment, :3, 3], self.poses[segment + 1, :3, 3]
+        start = self.poses[segment, :3, 3]
+        end = self.poses[segment + 1, :3, 3]
         return np.asarray(start + fraction[:, None] * (end - start))
 
     def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
-        """The segment of each time and the fraction of it; the first and the last one extend by 1.5 lengths."""
+        """The segment of each time and the fraction of it; the first and the last one extend by 1.5
+        lengths."""
         segment = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
         fraction = (times - self.times[segment]) / (self.times[segment + 1] - self.times[segment])
         if len(times) and not (fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION):
@@ -86,7 +101,8 @@ class Trajectory:
 
 
 def reskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
-    """Undo motion compensation: each point as the sensor measured it, in the frame of its own moment.
+    """Undo motion compensation: each point as the sensor measured it, in the frame of its own
+    moment.
 
     Args:
         scan: N points with ``time``, all of them in the frame of the moment of ``scan.pose``.
@@ -114,7 +130,8 @@ def reskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
 
 
 def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
-    """Motion compensation: all points in the frame of one moment, as if the sensor had measured them at once.
+    """Motion compensation: all points in the frame of one moment, as if the sensor had measured
+    them at once.
 
     The arguments and errors are those of ``reskew``, its inverse.
 
@@ -141,11 +158,19 @@ def _times(scan: Scan, moment: float) -> Floats:
 
 def rotation_vectors(turns: Floats) -> Floats:
     """(K, 3) axis times angle, radians, of rotations (K, 3, 3) by less than half a turn."""
-    skew = np.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]],
-                    1)  # fmt: skip
+    skew = np.stack(
+        [
+            turns[:, 2, 1] - turns[:, 1, 2],
+            turns[:, 0, 2] - turns[:, 2, 0],
+            turns[:, 1, 0] - turns[:, 0, 1],
+        ],
+        1,
+    )
     sine = np.linalg.norm(skew, axis=1) / 2
     angle = np.arctan2(sine, (np.trace(turns, axis1=1, axis2=2) - 1) / 2)
-    return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)[:, None])
+    return np.asarray(
+        skew * np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)[:, None]
+    )
 
 
 def rotate(points: Floats, vectors: Floats) -> Floats:
@@ -154,4 +179,6 @@ def rotate(points: Floats, vectors: Floats) -> Floats:
     axis = vectors / np.maximum(angle, 1e-12)
     along = np.sum(axis * points, -1, keepdims=True)
     cosine = np.cos(angle)
-    return np.asarray(points * cosine + np.cross(axis, points) * np.sin(angle) + axis * along * (1 - cosine))
+    return np.asarray(
+        points * cosine + np.cross(axis, points) * np.sin(angle) + axis * along * (1 - cosine)
+    )

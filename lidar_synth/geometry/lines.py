@@ -1,9 +1,11 @@
 """The joint fit of beams, mounting and motion.
 
-A laser with elevation e at height h above the sensor's origin measures points with z = h + rho tan(e), where rho is the
-horizontal distance from the axis: a line per beam. A tilt or an offset of the given frame, and the motion during a turn
-that motion compensation has added, bend these lines; both are linear in the residual while they are small, so
-Gauss-Newton steps with robust (Cauchy) weights find them together with the beams.
+A laser with elevation e at height h above the sensor's origin measures points with z = h + rho
+tan(e), where rho is the
+horizontal distance from the axis: a line per beam. A tilt or an offset of the given frame, and the
+    motion during a turn
+that motion compensation has added, bend these lines; both are linear in the residual while they are
+small, so Gauss-Newton steps with robust (Cauchy) weights find them together with the beams.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +23,11 @@ STEPS = 12
 CAP = np.radians(0.1)
 """Residuals count up to this in the comparison of models, radians."""
 
-PRIOR_HEIGHT, PRIOR_SPEED, PRIOR_TURN = 0.03, 20.0, 2.0
-"""Standard deviations of heights about their median (metres), speeds (m/s) and turn rates (rad/s)."""
+PRIOR_HEIGHT = 0.03
+PRIOR_SPEED = 20.0
+PRIOR_TURN = 2.0
+"""Standard deviations of heights about their median (metres), speeds (m/s) and turn rates
+(rad/s)."""
 PRIOR_HEIGHT_STEP = 0.0002
 """Scale of the differences between the heights of neighbouring beams, metres."""
 
@@ -75,7 +80,8 @@ class Model:
 
 def residuals(points: Floats, ring: Integers, tangents: Floats, heights: Floats) -> Floats:
     """(N,) angle between each point and its beam, radians; upward is positive."""
-    rho, above = np.hypot(points[:, 0], points[:, 1]), points[:, 2] - heights[ring]
+    rho = np.hypot(points[:, 0], points[:, 1])
+    above = points[:, 2] - heights[ring]
     return np.asarray(np.arctan2(above, rho) - np.arctan(tangents[ring]))
 
 
@@ -91,13 +97,18 @@ def nearest_beams(points: Floats, tangents: Floats, heights: Floats) -> Integers
     for start in range(0, len(points), CHUNK):
         part = points[start : start + CHUNK].astype(np.float32)
         rho = np.hypot(part[:, 0], part[:, 1])
-        # The distance from the line; with the same point in each row, it orders beams as the angle does.
-        gap = (part[:, 2:] - rho[:, None] * tangents.astype(np.float32) - heights.astype(np.float32)) * cosines
+        # The distance from the line; with the same point in each row, it orders beams as the angle
+        # does.
+        gap = (
+            part[:, 2:] - rho[:, None] * tangents.astype(np.float32) - heights.astype(np.float32)
+        ) * cosines
         ring[start : start + CHUNK] = np.abs(gap).argmin(1)
     return ring
 
 
-def refine(cloud: Cloud, model: Model, free: frozenset[str], steps: int = STEPS) -> tuple[Model, Cloud]:
+def refine(
+    cloud: Cloud, model: Model, free: frozenset[str], steps: int = STEPS
+) -> tuple[Model, Cloud]:
     """Fit the model to a cloud.
 
     Args:
@@ -118,18 +129,21 @@ def refine(cloud: Cloud, model: Model, free: frozenset[str], steps: int = STEPS)
 
 
 def _step(cloud: Cloud, points: Floats, model: Model, free: frozenset[str]) -> Model:
-    beams, scans = len(model.tangents), len(model.motion)
+    beams = len(model.tangents)
+    scans = len(model.motion)
     residual = residuals(points, cloud.ring, model.tangents, model.heights)
     spread = _spread_of_scans(residual, cloud.scan, scans)
     scale = float(spread.min())
     jacobian = _jacobian(points, cloud, model)
     weight = (scale / spread[cloud.scan]) ** 2 / (1 + (residual / spread[cloud.scan]) ** 2)
     size = 2 * beams + 6 + 6 * scans
-    normal, right = np.zeros((size, size)), np.zeros(size)
+    normal = np.zeros((size, size))
+    right = np.zeros(size)
     key = cloud.scan * beams + cloud.ring
     order = np.argsort(key, kind="stable")
     for block in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-        ring, scan = int(cloud.ring[block[0]]), int(cloud.scan[block[0]])
+        ring = int(cloud.ring[block[0]])
+        scan = int(cloud.scan[block[0]])
         own = 2 * beams + 6 + 6 * scan
         index = np.r_[2 * ring, 2 * ring + 1, 2 * beams : 2 * beams + 6, own : own + 6]
         part = jacobian[block]
@@ -142,7 +156,8 @@ def _step(cloud: Cloud, points: Floats, model: Model, free: frozenset[str]) -> M
 
 
 def _spread_of_scans(residual: Floats, scan: Integers, scans: int) -> Floats:
-    """(S,) scale of the robust weights, radians: a scan that is still bent by motion keeps a wide one."""
+    """(S,) scale of the robust weights, radians: a scan that is still bent by motion keeps a wide
+    one."""
     spread = np.full(scans, np.inf)
     for number in np.unique(scan):
         spread[number] = max(2.0 * float(np.median(np.abs(residual[scan == number]))), 1e-7)
@@ -150,33 +165,42 @@ def _spread_of_scans(residual: Floats, scan: Integers, scans: int) -> Floats:
 
 
 def _jacobian(points: Floats, cloud: Cloud, model: Model) -> Floats:
-    """(N, 14) change of the residual per tangent, height, mounting (offset, tilt) and motion (the same, times time)."""
+    """(N, 14) change of the residual per tangent, height, mounting (offset, tilt) and motion (the
+    same, times time)."""
     x, y, z = points.T
     rho = np.maximum(np.hypot(x, y), 1e-3)
     tangent = model.tangents[cloud.ring]
     # residual = (z - h - rho tan e) rho / (rho^2 + (z - h)^2), to first order
     gain = rho / (rho**2 + (z - model.heights[cloud.ring]) ** 2)
     lever = 1 + tangent * z / rho
-    shift = np.stack([tangent * x / rho, tangent * y / rho, -np.ones_like(x), -y * lever, x * lever, 0 * x], 1)
+    shift = np.stack(
+        [tangent * x / rho, tangent * y / rho, -np.ones_like(x), -y * lever, x * lever, 0 * x], 1
+    )
     columns = [-rho[:, None], -np.ones((len(x), 1)), shift, shift * cloud.time[:, None]]
     return np.asarray(np.concatenate(columns, 1) * gain[:, None])
 
 
 def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> None:
-    beams, scans = len(model.tangents), len(model.motion)
+    beams = len(model.tangents)
+    scans = len(model.motion)
     sigma = np.full(len(right), np.inf)
     now = np.zeros(len(right))
-    sigma[1 : 2 * beams : 2], now[1 : 2 * beams : 2] = PRIOR_HEIGHT, model.heights - np.median(model.heights)
+    sigma[1 : 2 * beams : 2], now[1 : 2 * beams : 2] = (
+        PRIOR_HEIGHT,
+        model.heights - np.median(model.heights),
+    )
     motion = slice(2 * beams + 6, None)
     sigma[motion] = np.tile(np.repeat([PRIOR_SPEED, PRIOR_TURN], 3), scans)
     now[motion] = model.motion.ravel()
     strength = (scale / sigma) ** 2
     normal[np.diag_indices_from(normal)] += strength
     right -= strength * now
-    # Lasers of one block stand at nearly the same height; robust, because there can be several blocks.
+    # Lasers of one block stand at nearly the same height; robust, because there can be several
+    # blocks.
     step = np.diff(model.heights)
     alike = (scale / PRIOR_HEIGHT_STEP) ** 2 / (1 + (step / PRIOR_HEIGHT_STEP) ** 2)
-    upper, lower = 2 * np.arange(beams - 1) + 1, 2 * np.arange(beams - 1) + 3
+    upper = 2 * np.arange(beams - 1) + 1
+    lower = 2 * np.arange(beams - 1) + 3
     normal[upper, upper] += alike
     normal[lower, lower] += alike
     normal[upper, lower] -= alike
@@ -186,7 +210,8 @@ def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> No
 
 
 def _active(beams: int, scans: int, free: frozenset[str]) -> NDArray[np.bool_]:
-    """Which unknowns are fitted. A turn about the vertical axis changes no elevation; heights include a common one."""
+    """Which unknowns are fitted. A turn about the vertical axis changes no elevation; heights
+    include a common one."""
     beam = [True, "heights" in free]
     mount = np.array([True, True, "heights" not in free, True, True, False]) & ("mount" in free)
     motion = np.array([True, True, True, True, True, False]) & ("motion" in free)
@@ -205,7 +230,8 @@ def _solve(normal: Floats, right: Floats, active: NDArray[np.bool_]) -> Floats:
 def _moved(model: Model, step: Floats) -> Model:
     """The model after a step; the mounting moves in the sensor's frame."""
     beams = len(model.tangents)
-    shift, tilt = step[2 * beams : 2 * beams + 3], step[2 * beams + 3 : 2 * beams + 6]
+    shift = step[2 * beams : 2 * beams + 3]
+    tilt = step[2 * beams + 3 : 2 * beams + 6]
     turned = rotate(np.eye(3), np.broadcast_to(tilt, (3, 3))).T
     motion = model.motion + step[2 * beams + 6 :].reshape(-1, 6)
     return Model(

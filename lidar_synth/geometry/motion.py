@@ -1,7 +1,8 @@
-"""The motion of a sensor during a scan: poses interpolated at the times of points, and points in the frames of poses.
+"""The motion of a sensor during a scan: poses interpolated at the times of points, and points in
+the frames of poses.
 
-A rotating sensor measures a scan over 0.1 s, in which a car drives one or two metres. With poses before and after, each
-point has a pose of its own, the one at the time of its measurement.
+A rotating sensor measures a scan over 0.1 s, in which a car drives one or two metres. With poses
+before and after, each point has a pose of its own, the one at the time of its measurement.
 """
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 
 FARTHEST = 1.0
-"""Maximum time in seconds before the first pose or after the last one for which a pose is extrapolated."""
+"""Maximum time in seconds before the first pose or after the last one for which a pose is
+extrapolated."""
 
 
 def interpolate_poses(
@@ -29,8 +31,8 @@ def interpolate_poses(
         (N, 4, 4) float64.
 
     Raises:
-        DataError: on times that do not increase or do not fit the poses, fewer than two poses, or a time more than
-            ``FARTHEST`` outside.
+        DataError: on times that do not increase or do not fit the poses, fewer than two poses, or a
+            time more than ``FARTHEST`` outside.
 
     Example:
         >>> import numpy as np
@@ -41,11 +43,15 @@ def interpolate_poses(
         array([2.5, 0. , 0. ])
     """
     if len(times) < 2 or poses.shape != (len(times), 4, 4) or not (np.diff(times) > 0).all():
-        raise DataError(f"{len(times)} times for {len(poses)} poses", "two or more poses with increasing times")
+        raise DataError(
+            f"{len(times)} times for {len(poses)} poses", "two or more poses with increasing times"
+        )
     if len(at) and not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST:
         raise DataError(
-            f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first pose",
-            f"-{FARTHEST:g} s to {times[-1] - times[0] + FARTHEST:g} s: poses of the same recording",
+            f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first "
+            "pose",
+            f"-{FARTHEST:g} s to {times[-1] - times[0] + FARTHEST:g} s: poses of the same "
+            "recording",
         )
     start = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     fraction = (at - times[start]) / np.diff(times)[start]
@@ -53,7 +59,9 @@ def interpolate_poses(
     axes, angles = _axes_and_angles(steps)
     result = np.tile(np.eye(4), (len(at), 1, 1))
     result[:, :3, :3] = poses[start, :3, :3] @ _rotations(axes[start], fraction * angles[start])
-    result[:, :3, 3] = poses[start, :3, 3] + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
+    result[:, :3, 3] = (
+        poses[start, :3, 3] + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
+    )
     return result
 
 
@@ -71,16 +79,26 @@ def from_world(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArr
     return np.asarray(np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64)
 
 
-def _axes_and_angles(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between poses."""
+def _axes_and_angles(
+    rotations: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(P, 3) unit axes and (P,) angles in [0, pi], radians, of (P, 3, 3) rotations between
+    poses."""
     twice_sine = np.stack(
-        [rotations[:, 2, 1] - rotations[:, 1, 2], rotations[:, 0, 2] - rotations[:, 2, 0],
-         rotations[:, 1, 0] - rotations[:, 0, 1]], -1
-    )  # fmt: skip
+        [
+            rotations[:, 2, 1] - rotations[:, 1, 2],
+            rotations[:, 0, 2] - rotations[:, 2, 0],
+            rotations[:, 1, 0] - rotations[:, 0, 1],
+        ],
+        -1,
+    )
     length = np.linalg.norm(twice_sine, axis=1)
     angles = np.arctan2(length, np.trace(rotations, axis1=1, axis2=2) - 1)
     if (angles > 3).any():
-        raise DataError("poses that turn by half a circle from one to the next", "poses at least ten times a second")
+        raise DataError(
+            "poses that turn by half a circle from one to the next",
+            "poses at least ten times a second",
+        )
     return twice_sine / np.maximum(length, 1e-300)[:, None], angles
 
 
@@ -89,5 +107,6 @@ def _rotations(axes: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArra
     cross = np.zeros((len(axes), 3, 3))
     cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T
     cross -= cross.swapaxes(-1, -2)
-    sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
+    sine = np.sin(angles)[:, None, None]
+    versine = (1 - np.cos(angles))[:, None, None]
     return np.eye(3) + sine * cross + versine * (cross @ cross)

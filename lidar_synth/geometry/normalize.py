@@ -1,4 +1,5 @@
-"""Range images to tensors in [-1, 1] and back, in the scales that the peers' networks were trained on.
+"""Range images to tensors in [-1, 1] and back, in the scales that the peers' networks were trained
+on.
 
 encode and decode are exact inverses up to float32 rounding for every range inside the open interval
 (range_min, range_max); everything outside decodes to 0 = no return.
@@ -58,18 +59,32 @@ class Normalisation:
     def __post_init__(self) -> None:
         if self.kind not in ("log", "linear", "inverse"):
             raise ConfigError(f"normalisation {self.kind!r}", "log, linear or inverse")
-        numbers = (self.range_min, self.range_max, self.offset, 1.0 if self.scale is None else self.scale)
-        if not all(isinstance(n, int | float) and abs(n) < 1e30 for n in numbers) or min(numbers[2:]) <= 0:
-            raise ConfigError(f"normalisation {numbers}", "finite numbers, with a scale and an offset above 0")
+        numbers = (
+            self.range_min,
+            self.range_max,
+            self.offset,
+            1.0 if self.scale is None else self.scale,
+        )
+        if (
+            not all(isinstance(n, int | float) and abs(n) < 1e30 for n in numbers)
+            or min(numbers[2:]) <= 0
+        ):
+            raise ConfigError(
+                f"normalisation {numbers}", "finite numbers, with a scale and an offset above 0"
+            )
         if not 0 <= self.range_min < self.range_max:
-            raise ConfigError(f"range limits {self.range_min}, {self.range_max} m", "0 <= range_min < range_max")
+            raise ConfigError(
+                f"range limits {self.range_min}, {self.range_max} m", "0 <= range_min < range_max"
+            )
 
     @property
     def divisor(self) -> float:
         """The divisor: ``scale``, or its default."""
         if self.scale is not None:
             return self.scale
-        return float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
+        return (
+            float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
+        )
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
         """Whether each range (any shape, metres) is a return, that is, inside the limits."""
@@ -82,11 +97,14 @@ class Normalisation:
             unit = torch.where(inside, self.range_min / torch.where(inside, distance, 1.0), 0.0)
         else:
             distance = torch.where(inside, distance, 0.0)
-            unit = (torch.log2(distance + self.offset) if self.kind == "log" else distance) / self.divisor
+            unit = (
+                torch.log2(distance + self.offset) if self.kind == "log" else distance
+            ) / self.divisor
         return (2 * unit - 1).clamp(-1, 1)
 
     def decode(self, x: torch.Tensor) -> torch.Tensor:
-        """Map values (any shape) to ranges in metres, 0 = no return; values outside [-1, 1] are clamped."""
+        """Map values (any shape) to ranges in metres, 0 = no return; values outside [-1, 1] are
+        clamped."""
         unit = ((x + 1) / 2).clamp(0, 1)
         if self.kind == "log":
             distance = torch.exp2(unit * self.divisor) - self.offset
@@ -95,7 +113,8 @@ class Normalisation:
         return torch.where(self.inside(distance), distance, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """The arguments as plain values for a checkpoint's header; ``Normalisation(**values)`` is the inverse."""
+        """The arguments as plain values for a checkpoint's header; ``Normalisation(**values)`` is
+        the inverse."""
         return asdict(self)
 
 
@@ -120,7 +139,8 @@ def decode_reflectance(x: torch.Tensor) -> torch.Tensor:
 
 
 def encode_labels(label: torch.Tensor) -> torch.Tensor:
-    """Labels as analog bits (Chen et al. 2023, "Analog Bits"): 5 channels of -1 and 1, highest bit first.
+    """Labels as analog bits (Chen et al. 2023, "Analog Bits"): 5 channels of -1 and 1, highest bit
+    first.
 
     Args:
         label: (B, H, W) uint8 train ids 0..18, 255 = ignore, which becomes code 19.
@@ -133,7 +153,10 @@ def encode_labels(label: torch.Tensor) -> torch.Tensor:
     """
     code = torch.where(label == IGNORE, NO_LABEL, label.long())
     if bool((code > NO_LABEL).any()):
-        raise DataError(f"train ids {sorted(set(label[code > NO_LABEL].tolist()))[:8]}", "0..18, or 255 = ignore")
+        raise DataError(
+            f"train ids {sorted(set(label[code > NO_LABEL].tolist()))[:8]}",
+            "0..18, or 255 = ignore",
+        )
     return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(LABEL_BITS))], 1)
 
 
@@ -144,16 +167,21 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         bits: (B, 5, H, W) float.
 
     Returns:
-        (B, H, W) uint8 train ids, 255 = ignore, and (B, H, W) float32 confidence: 1 on the code, falling
-        with the distance (in the maximum norm) to 0 where a bit is no nearer to its value than to the other.
+        (B, H, W) uint8 train ids, 255 = ignore, and (B, H, W) float32 confidence: 1 on the code,
+        falling with the distance (in the maximum norm) to 0 where a bit is no nearer to its value
+        than to the other.
     """
     nearest = torch.zeros_like(bits[:, 0], dtype=torch.uint8)
     for bit in bits.unbind(1):
         nearest = 2 * nearest + (bit > 0)
     gap = (bits.abs() - 1).abs().amax(1)
-    if bool((unused := nearest > NO_LABEL).any()):  # all codes have the same norm: the nearest has the largest product
+    if bool(
+        (unused := nearest > NO_LABEL).any()
+    ):  # all codes have the same norm: the nearest has the largest product
         powers = 1 << torch.arange(LABEL_BITS, device=bits.device).flip(0)
-        corners = (torch.arange(NO_LABEL + 1, device=bits.device)[:, None] & powers).sign() * 2.0 - 1.0
+        corners = (
+            torch.arange(NO_LABEL + 1, device=bits.device)[:, None] & powers
+        ).sign() * 2.0 - 1.0
         those = bits.movedim(1, -1)[unused].float()
         code = (those @ corners.T).argmax(1)
         nearest[unused] = code.to(torch.uint8)
@@ -163,12 +191,14 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 CHANNELS = {"range": 1, "reflectance": 1, "label": LABEL_BITS}
-"""The channels that a network's tensor can contain: {name of a range image's channel: number of tensor channels}."""
+"""The channels that a network's tensor can contain: {name of a range image's channel: number of
+tensor channels}."""
 
 
 @dataclass(frozen=True)
 class TensorFormat:
-    """The layout of a network's tensor: the channels of a range image that it contains, and the range normalisation.
+    """The layout of a network's tensor: the channels of a range image that it contains, and the
+    range normalisation.
 
     Args:
         channels: names of ``CHANNELS``, in the tensor's order; "range" must be one of them.
@@ -185,7 +215,9 @@ class TensorFormat:
         object.__setattr__(self, "channels", tuple(self.channels))
         unknown = [name for name in self.channels if name not in CHANNELS]
         if unknown or "range" not in self.channels or len(set(self.channels)) < len(self.channels):
-            raise ConfigError(f"channels {self.channels}", f"range and some of {tuple(CHANNELS)}, each once")
+            raise ConfigError(
+                f"channels {self.channels}", f"range and some of {tuple(CHANNELS)}, each once"
+            )
 
     @property
     def size(self) -> int:
@@ -196,8 +228,8 @@ class TensorFormat:
         """Encode the fields of range images as a tensor.
 
         Args:
-            fields: (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in [0, 1];
-                "label" uint8 train ids, 255 = ignore; further fields are ignored.
+            fields: (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in
+                [0, 1]; "label" uint8 train ids, 255 = ignore; further fields are ignored.
 
         Returns:
             (B, C, H, W) float32 in [-1, 1].
@@ -222,23 +254,31 @@ class TensorFormat:
             x: (B, C, H, W) floating point.
 
         Returns:
-            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1]. A cell without a
-            return has reflectance 0, label 255 (ignore) and confidence 0.
+            (B, H, W) each, as for ``encode``; with "label" also "confidence" float32 in [0, 1]. A
+            cell without a return has reflectance 0, label 255 (ignore) and confidence 0.
 
         Raises:
             DataError: on a wrong number of channels, NaN or infinity.
         """
         if x.ndim != 4 or x.shape[1] != self.size:
-            raise DataError(f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}")
+            raise DataError(
+                f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}"
+            )
         if not bool(x.abs().amax().isfinite()):
             raise DataError(f"a tensor for {self.channels} with NaN or infinity", "finite values")
         part = dict(
-            zip(self.channels, torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1), strict=True)
+            zip(
+                self.channels,
+                torch.split(x.float(), [CHANNELS[name] for name in self.channels], 1),
+                strict=True,
+            )
         )
         fields = {"range": self.normalisation.decode(part["range"][:, 0])}
         empty = fields["range"] == 0
         if "reflectance" in part:
-            fields["reflectance"] = decode_reflectance(part["reflectance"][:, 0]).masked_fill_(empty, 0)
+            fields["reflectance"] = decode_reflectance(part["reflectance"][:, 0]).masked_fill_(
+                empty, 0
+            )
         if "label" in part:
             label, confidence = decode_labels(part["label"])
             fields["label"] = label.masked_fill_(empty, IGNORE)
@@ -247,13 +287,20 @@ class TensorFormat:
 
     def from_images(self, images: Sequence[RangeImage]) -> torch.Tensor:
         """Encode B range images of one shape as a tensor (B, C, H, W); see ``encode``."""
-        values: list[dict[str, Any]] = [{**image.channels, "range": image.range} for image in images]
+        values: list[dict[str, Any]] = [
+            {**image.channels, "range": image.range} for image in images
+        ]
         if missing := [name for name in self.channels if any(name not in v for v in values)]:
             raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
-        return self.encode({n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels})
+        return self.encode(
+            {n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels}
+        )
 
     def to_images(self, x: torch.Tensor, sensor: Sensor) -> list[RangeImage]:
         """Decode a tensor (B, C, H, W) to B range images on the sensor's grid; see ``decode``."""
         fields = {name: values.cpu().numpy() for name, values in self.decode(x).items()}
         distance = fields.pop("range")
-        return [RangeImage(d, sensor, {n: v[i] for n, v in fields.items()}) for i, d in enumerate(distance)]
+        return [
+            RangeImage(d, sensor, {n: v[i] for n, v in fields.items()})
+            for i, d in enumerate(distance)
+        ]

@@ -1,4 +1,5 @@
-"""The data that the package passes around: a ``Scan`` of points, its ``Boxes``, and the ``RangeImage``.
+"""The data that the package passes around: a ``Scan`` of points, its ``Boxes``, and the
+``RangeImage``.
 
 All of them are in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
 """
@@ -15,7 +16,8 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.geometry.sensor import Sensor
 
-REAL, SYNTHETIC = 0, 1
+REAL = 0
+SYNTHETIC = 1
 """Values of ``Scan.domain``."""
 
 FARTHEST = 1e5
@@ -36,11 +38,12 @@ class Boxes:
         image_box: (M, 4) float32 left, top, right, bottom in pixels; -1 = not known.
         instance: (M,) int32, the id of the object's track over frames; -1 = not known.
         alpha: (M,) float32 radians, the observation angle in KITTI's label file; -10 = not known.
-        dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no box.
+        dont_care: (K, 4) float32 image rectangles of KITTI's ``DontCare`` regions, which have no
+            box.
 
     Raises:
-        DataError: on shapes that do not match each other, non-finite values, sizes that are not positive, or values
-            beyond ``FARTHEST``.
+        DataError: on shapes that do not match each other, non-finite values, sizes that are not
+            positive, or values beyond ``FARTHEST``.
 
     Example:
         >>> import numpy as np
@@ -83,10 +86,18 @@ class Boxes:
             raise DataError(f"boxes: {len(self.names)} names for {count} boxes", "one name per box")
         self.dont_care = np.asarray(self.dont_care, np.float32).reshape(-1, 4)
         known = (self.values, self.truncation, self.image_box, self.alpha, self.dont_care)
-        if not all(np.isfinite(values).all() for values in known) or (self.values[:, 3:6] <= 0).any():
-            raise DataError("boxes with a non-finite value or a size that is not positive", "metres and radians")
+        if (
+            not all(np.isfinite(values).all() for values in known)
+            or (self.values[:, 3:6] <= 0).any()
+        ):
+            raise DataError(
+                "boxes with a non-finite value or a size that is not positive", "metres and radians"
+            )
         if (np.abs(self.values) > FARTHEST).any():
-            raise DataError(f"boxes with a value of {np.abs(self.values).max():g}", f"metres within {FARTHEST:g}")
+            raise DataError(
+                f"boxes with a value of {np.abs(self.values).max():g}",
+                f"metres within {FARTHEST:g}",
+            )
 
     def __len__(self) -> int:
         return len(self.values)
@@ -94,7 +105,11 @@ class Boxes:
     def __getitem__(self, keep: Any) -> "Boxes":
         """The boxes that a mask or an index array selects; ``dont_care`` is kept."""
         keep = np.arange(len(self))[keep].reshape(-1)
-        picked = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("names", "dont_care")}
+        picked = {
+            f.name: getattr(self, f.name)[keep]
+            for f in fields(self)
+            if f.name not in ("names", "dont_care")
+        }
         return replace(self, names=tuple(self.names[i] for i in keep), **picked)
 
     def enlarged(self, margin: float) -> "Boxes":
@@ -103,12 +118,17 @@ class Boxes:
         return replace(self, values=self.values + added)
 
     def corners(self) -> NDArray[np.float32]:
-        """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left, then the top's."""
+        """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left,
+        then the top's."""
         unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
-        unit = np.concatenate([np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]).astype(np.float32)
+        unit = np.concatenate([np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]).astype(
+            np.float32
+        )
         local = unit[None] * self.values[:, None, 3:6]
-        c, s = np.cos(self.values[:, 6:7]), np.sin(self.values[:, 6:7])
-        x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+        c = np.cos(self.values[:, 6:7])
+        s = np.sin(self.values[:, 6:7])
+        x = local[..., 0] * c - local[..., 1] * s
+        y = local[..., 0] * s + local[..., 1] * c
         return (np.stack([x, y, local[..., 2]], -1) + self.values[:, None, :3]).astype(np.float32)
 
     def contain(self, points: NDArray[np.float32], above_floor: float = 0.0) -> NDArray[np.bool_]:
@@ -116,13 +136,18 @@ class Boxes:
 
         Args:
             points: (N, 3) metres, in the boxes' frame.
-            above_floor: metres; points less than this above a box's bottom (the road) count as outside.
+            above_floor: metres; points less than this above a box's bottom (the road) count as
+                outside.
         """
         inside = np.zeros((len(self), len(points)), bool)
         for i, (x, y, z, length, width, height, yaw) in enumerate(self.values):
-            dx, dy, dz = points[:, 0] - x, points[:, 1] - y, points[:, 2] - z
-            c, s = np.cos(yaw), np.sin(yaw)
-            along, across = dx * c + dy * s, dy * c - dx * s
+            dx = points[:, 0] - x
+            dy = points[:, 1] - y
+            dz = points[:, 2] - z
+            c = np.cos(yaw)
+            s = np.sin(yaw)
+            along = dx * c + dy * s
+            across = dy * c - dx * s
             inside[i] = (abs(along) <= length / 2) & (abs(across) <= width / 2) & (dz <= height / 2)
             inside[i] &= dz >= above_floor - height / 2
         return inside
@@ -137,8 +162,8 @@ class Scan:
         reflectance: (N,) float32 in [0, 1].
         sensor: the sensor that recorded the scan, or that a synthetic scan imitates.
         label: (N,) uint8 train ids 0..18, 255 = ignore.
-        raw_label: (N,) uint32 as in the file (SemanticKITTI: class in the lower 16 bits, instance in the upper),
-            kept so that the scan can be written back without loss.
+        raw_label: (N,) uint32 as in the file (SemanticKITTI: class in the lower 16 bits, instance
+            in the upper), kept so that the scan can be written back without loss.
         instance: (N,) int32 instance ids, 0 = none.
         ring: (N,) int16 ring numbers if the file has them, 0 = highest.
         confidence: (N,) float32 in [0, 1], the confidence of ``label``.
@@ -148,9 +173,9 @@ class Scan:
         image_path: the camera image taken with the scan.
         id: a name that is unique in its source.
         domain: ``REAL`` (0) or ``SYNTHETIC`` (1).
-        provenance: what made a synthetic scan, as short texts and numbers: ``made_by`` (``"model"`` or ``"town"``),
-            ``seed``, and for a model its name ``model`` and ``checkpoint``; empty if it is not known. Scans of one
-            origin have the same.
+        provenance: what made a synthetic scan, as short texts and numbers: ``made_by`` (``"model"``
+            or ``"town"``), ``seed``, and for a model its name ``model`` and ``checkpoint``; empty
+            if it is not known. Scans of one origin have the same.
 
     Raises:
         DataError: on shapes that do not match each other.
@@ -184,17 +209,24 @@ class Scan:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise DataError(f"scan {self.id!r}: points of shape {self.points.shape}", "(N, 3): x, y, z in metres")
+            raise DataError(
+                f"scan {self.id!r}: points of shape {self.points.shape}",
+                "(N, 3): x, y, z in metres",
+            )
         for name in POINT_FIELDS:
             values = getattr(self, name)
             if values is not None and values.shape != (len(self),):
-                raise DataError(f"scan {self.id!r}: {name} has shape {values.shape}", f"({len(self)},), one per point")
+                raise DataError(
+                    f"scan {self.id!r}: {name} has shape {values.shape}",
+                    f"({len(self)},), one per point",
+                )
 
     def __len__(self) -> int:
         return len(self.points)
 
     def __getitem__(self, keep: Any) -> "Scan":
-        """The scan with the points that a mask or an index array selects; everything else is kept."""
+        """The scan with the points that a mask or an index array selects; everything else is
+        kept."""
         if isinstance(keep, np.ndarray) and keep.dtype == bool and keep.shape == (len(self),):
             keep = np.flatnonzero(keep)  # several times as fast as masks for points
         picked = {n: getattr(self, n)[keep] for n in POINT_FIELDS if getattr(self, n) is not None}
@@ -228,8 +260,9 @@ class RangeImage:
     Args:
         range: (H, W) float32 metres, Euclidean distance; 0 = no return.
         sensor: the sensor that defines the rows and columns.
-        channels: {name: (H, W)}, further values of each cell. Channels named in ``POINT_FIELDS`` become fields of the
-            scan when the image is unprojected. A cell without a return holds 0, and 255 (ignore) in ``label``.
+        channels: {name: (H, W)}, further values of each cell. Channels named in ``POINT_FIELDS``
+            become fields of the scan when the image is unprojected. A cell without a return holds
+            0, and 255 (ignore) in ``label``.
         boxes: of the objects, which become those of the scan.
 
     Raises:
@@ -291,7 +324,8 @@ class Source(Protocol):
 
 
 def identity_of(source: Any) -> str:
-    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its scans' names."""
+    """A text that identifies a source: its ``identity``, or its class, its length and a hash of its
+    scans' names."""
     if own := getattr(source, "identity", ""):
         return str(own)
     names = hash_of_names(map(str, getattr(source, "ids", ())))

@@ -1,9 +1,11 @@
 """Augmentations of a scan: points, labels and boxes together.
 
-An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never changes its input.
-``functools.partial`` sets its options, and ``compose`` makes one augmentation of several.
+An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never
+changes its input. ``functools.partial`` sets its options, and ``compose`` makes one augmentation of
+several.
 
-``yaw``, the flips and ``scale`` move points and boxes together, and remove the scan's pose and camera image.
+``yaw``, the flips and ``scale`` move points and boxes together, and remove the scan's pose and
+camera image.
 
 Example:
     >>> import numpy as np
@@ -55,7 +57,8 @@ def _each(steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator)
 
 
 def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
-    """Rotate the scan about the vertical axis by a random angle of up to ``limit`` degrees to either side."""
+    """Rotate the scan about the vertical axis by a random angle of up to ``limit`` degrees to
+    either side."""
     if not 0 <= limit <= 180:
         raise ConfigError(f"limit={limit}", "0..180 degrees")
     return rotated(scan, float(np.radians(rng.uniform(-limit, limit))))
@@ -78,13 +81,17 @@ def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float =
     return scaled(scan, float(rng.uniform(low, high)))
 
 
-def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectance: float = 0.02) -> Scan:
-    """Add noise along the rays and to the reflectance; a return that would enter or leave a box is not moved.
+def jitter(
+    scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectance: float = 0.02
+) -> Scan:
+    """Add noise along the rays and to the reflectance; a return that would enter or leave a box is
+    not moved.
 
     Args:
         scan: N points.
         rng: source of the noise.
-        spread: standard deviation of the range, metres; the noise is clipped at three standard deviations.
+        spread: standard deviation of the range, metres; the noise is clipped at three standard
+            deviations.
         reflectance: standard deviation of the reflectance, which stays in [0, 1].
     """
     if spread < 0 or reflectance < 0:
@@ -96,7 +103,9 @@ def jitter(scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectan
         crossed = (scan.boxes.contain(scan.points) != scan.boxes.contain(points)).any(0)
         points[crossed] = scan.points[crossed]
     brightness = np.clip(scan.reflectance + reflectance * noise[1], 0, 1)
-    return replace(scan, points=points.astype(np.float32), reflectance=brightness.astype(np.float32))
+    return replace(
+        scan, points=points.astype(np.float32), reflectance=brightness.astype(np.float32)
+    )
 
 
 def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
@@ -111,7 +120,9 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
     return _subset(scan, ~np.isin(row, dropped))
 
 
-def range_drop(scan: Scan, rng: np.random.Generator, share: float = 0.3, power: float = 2.0) -> Scan:
+def range_drop(
+    scan: Scan, rng: np.random.Generator, share: float = 0.3, power: float = 2.0
+) -> Scan:
     """Drop returns with a probability that increases with their range.
 
     Args:
@@ -136,7 +147,8 @@ def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
     """Mirror the scan: change the sign of x (front and back) or of y (left and right)."""
     if axis not in ("x", "y"):
         raise ConfigError(f"axis={axis!r}", "'x' or 'y'")
-    column, boxes = "xy".index(axis), None
+    column = "xy".index(axis)
+    boxes = None
     points = scan.points.copy()
     points[:, column] *= -1
     if scan.boxes is not None:

@@ -3,14 +3,15 @@
 Arrays of the file (numpy's format, never pickled), for M objects with P points in total::
 
     format                       "lidar-synth-objects/1"
-    sensor                       JSON, the keys of sensors.yaml: the sensor that recorded the objects
+    sensor                       JSON, the keys of sensors.yaml: the sensor that recorded the
+        objects
     scan                         (M,) text, id of the scan that contains the object
     number                       (M,) int32, index of its box in that scan
-    ground                       (M,) float32, metres: height of the ground under it, in that scan's frame
-    box_values, box_names ...    the fields of ``Boxes``, in that scan's frame
-    start                        (M + 1,) int64, object i has the points start[i] to start[i + 1]
-    points                       (P, 3) float32, metres from the box's centre, axes of the sensor
-    reflectance, label           (P,) float32 in [0, 1]; (P,) uint8 train ids
+    ground                       (M,) float32, metres: height of the ground under it, in that scan's
+    frame box_values, box_names ...    the fields of ``Boxes``, in that scan's frame start
+    (M + 1,) int64, object i has the points start[i] to start[i + 1] points
+    (P, 3) float32, metres from the box's centre, axes of the sensor reflectance, label
+    (P,) float32 in [0, 1]; (P,) uint8 train ids
 """
 
 import json
@@ -43,7 +44,8 @@ class ObjectBank:
     """Objects cut out of many scans; the module's docstring describes the arrays.
 
     Raises:
-        DataError: on shapes that do not match each other, other types, and values that no scan may hold.
+        DataError: on shapes that do not match each other, other types, and values that no scan may
+            hold.
 
     Example:
         >>> from lidar_synth import ObjectBank, Town
@@ -66,7 +68,8 @@ class ObjectBank:
     label: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        count, total = len(self.boxes), len(self.points)
+        count = len(self.boxes)
+        total = len(self.points)
         rising = len(self.start) == count + 1 and self.start[0] == 0 and self.start[-1] == total
         if not (rising and (np.diff(self.start) > 0).all()) or self.points.shape != (total, 3):
             raise DataError(
@@ -81,23 +84,45 @@ class ObjectBank:
             "label": total,
         }.items():
             if getattr(self, name).shape != (size,):
-                raise DataError(f"objects: {name} has shape {getattr(self, name).shape}", f"({size},)")
+                raise DataError(
+                    f"objects: {name} has shape {getattr(self, name).shape}", f"({size},)"
+                )
         self._check_values()
 
     def _check_values(self) -> None:
-        types = {"start": "i8", "number": "i4", "ground": "f4", "points": "f4", "reflectance": "f4", "label": "u1"}
-        if wrong := {n: str(getattr(self, n).dtype) for n, kind in types.items() if getattr(self, n).dtype != kind}:
+        types = {
+            "start": "i8",
+            "number": "i4",
+            "ground": "f4",
+            "points": "f4",
+            "reflectance": "f4",
+            "label": "u1",
+        }
+        if wrong := {
+            n: str(getattr(self, n).dtype)
+            for n, kind in types.items()
+            if getattr(self, n).dtype != kind
+        }:
             raise DataError(f"objects: {wrong}", f"{types}")
         for name in ("ground", "points"):
             if not (np.abs(getattr(self, name)) <= FARTHEST).all():  # NaN is not
-                raise DataError(f"objects: {name} not finite, or too large", f"metres within {FARTHEST:g}")
+                raise DataError(
+                    f"objects: {name} not finite, or too large", f"metres within {FARTHEST:g}"
+                )
         if not ((self.reflectance >= 0) & (self.reflectance <= 1)).all():
-            raise DataError(f"objects: reflectance {self.reflectance.min()} to {self.reflectance.max()}", "0 to 1")
+            raise DataError(
+                f"objects: reflectance {self.reflectance.min()} to {self.reflectance.max()}",
+                "0 to 1",
+            )
         if ((self.label >= len(NAMES)) & (self.label != IGNORE)).any():
-            raise DataError(f"objects: labels up to {self.label.max()}", "train ids 0..18, or 255 = ignore")
+            raise DataError(
+                f"objects: labels up to {self.label.max()}", "train ids 0..18, or 255 = ignore"
+            )
 
     @classmethod
-    def from_scans(cls, source: Source, scans: Iterable[int] | None = None, least: int = 5) -> "ObjectBank":
+    def from_scans(
+        cls, source: Source, scans: Iterable[int] | None = None, least: int = 5
+    ) -> "ObjectBank":
         """Collect the objects in the boxes of a source's scans.
 
         Args:
@@ -116,10 +141,13 @@ class ObjectBank:
                 objects += objects_of(scan, least).items()
         if not objects:
             raise DataError(
-                f"no box with {least} points in {len(chosen)} scans", "scans with boxes, such as KITTI's or the town's"
+                f"no box with {least} points in {len(chosen)} scans",
+                "scans with boxes, such as KITTI's or the town's",
             )
         if len(sensors := {o.scan.sensor for _, o in objects}) > 1:
-            raise DataError(f"objects of the sensors {sorted(s.name for s in sensors)}", "one sensor")
+            raise DataError(
+                f"objects of the sensors {sorted(s.name for s in sensors)}", "one sensor"
+            )
         return cls._of(objects)
 
     @classmethod
@@ -132,7 +160,9 @@ class ObjectBank:
             number=np.array([n for n, _ in objects], np.int32),
             ground=np.array([o.ground for _, o in objects], np.float32),
             start=np.cumsum([0, *map(len, parts)], dtype=np.int64),
-            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]).astype(np.float32),
+            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]).astype(
+                np.float32
+            ),
             reflectance=np.concatenate([p.reflectance for p in parts]).astype(np.float32),
             label=np.concatenate([p.fields()["label"] for p in parts]),
         )
@@ -163,9 +193,14 @@ class ObjectBank:
         Raises:
             FileError: if it cannot be written.
         """
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")}
+        arrays = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")
+        }
         arrays |= {f"box_{f.name}": np.asarray(getattr(self.boxes, f.name)) for f in fields(Boxes)}
-        arrays |= {"format": np.array(FORMAT), "sensor": np.array(json.dumps(self.sensor.to_dict()))}
+        arrays |= {
+            "format": np.array(FORMAT),
+            "sensor": np.array(json.dumps(self.sensor.to_dict())),
+        }
         write_arrays(Path(path), arrays, compressed=True)
 
     def __len__(self) -> int:
@@ -178,7 +213,8 @@ class ObjectBank:
         """Object ``index`` at the place where it was recorded."""
         if not 0 <= index < len(self):
             raise IndexError(f"object {index} of {len(self)}")
-        box, part = self.boxes[[index]], slice(self.start[index], self.start[index + 1])
+        box = self.boxes[[index]]
+        part = slice(self.start[index], self.start[index + 1])
         scan = Scan(
             self.points[part] + box.values[0, :3],
             self.reflectance[part].copy(),

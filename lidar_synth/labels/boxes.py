@@ -12,10 +12,14 @@ _CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
 
 
 def box_frame(points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its centre."""
+    """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its
+    centre."""
     offset = points - box[:3]
-    c, s = np.cos(box[6]), np.sin(box[6])
-    return np.stack([offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s, offset[:, 2]], 1)
+    c = np.cos(box[6])
+    s = np.sin(box[6])
+    return np.stack(
+        [offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s, offset[:, 2]], 1
+    )
 
 
 def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -28,10 +32,13 @@ def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.f
 
 
 def moved(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
-    """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in [-pi, pi)."""
+    """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in
+    [-pi, pi)."""
     values = values.astype(np.float32)
     values[:, 6] = (values[:, 6] + np.pi) % (2 * np.pi) - np.pi
-    return Boxes(values, boxes.names, occlusion=boxes.occlusion.copy(), instance=boxes.instance.copy())
+    return Boxes(
+        values, boxes.names, occlusion=boxes.occlusion.copy(), instance=boxes.instance.copy()
+    )
 
 
 def turned(boxes: Boxes, angle: float) -> Boxes:
@@ -44,7 +51,8 @@ def turned(boxes: Boxes, angle: float) -> Boxes:
 
 def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
     """(N, 2 or 3) points turned about the sensor, counter-clockwise by an angle in radians."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     out = points.copy()
     out[:, 0], out[:, 1] = points[:, 0] * c - points[:, 1] * s, points[:, 0] * s + points[:, 1] * c
     return out
@@ -53,25 +61,33 @@ def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float
 def joined(several: Sequence[Boxes]) -> Boxes:
     """Concatenate boxes, in this order."""
     names = tuple(name for boxes in several for name in boxes.names)
-    arrays = {f.name: np.concatenate([getattr(b, f.name) for b in several]) for f in fields(Boxes) if f.name != "names"}
+    arrays = {
+        f.name: np.concatenate([getattr(b, f.name) for b in several])
+        for f in fields(Boxes)
+        if f.name != "names"
+    }
     return Boxes(names=names, **arrays)
 
 
 def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
 
-    Separating axis theorem: two rectangles are disjoint if a side of one of them separates their corners.
+    Separating axis theorem: two rectangles are disjoint if a side of one of them separates their
+        corners.
     """
     far: NDArray[np.bool_] = (
-        np.hypot(*(others[:, :2] - box[:2]).T) > (np.hypot(*others[:, 3:5].T) + np.hypot(*box[3:5])) / 2
+        np.hypot(*(others[:, :2] - box[:2]).T)
+        > (np.hypot(*others[:, 3:5].T) + np.hypot(*box[3:5])) / 2
     )
     if far.all():
         return ~far
     corners = _footprints(np.concatenate([box[None], others]))
-    own, other = corners[0], corners[1:]
+    own = corners[0]
+    other = corners[1:]
     axes = np.stack([corners[:, 0] - corners[:, 1], corners[:, 1] - corners[:, 2]], 1)
     ours = np.concatenate([np.broadcast_to(axes[0], (len(others), 2, 2)), axes[1:]], 1)
-    a, b = ours @ own.T, ours @ other.transpose(0, 2, 1)
+    a = ours @ own.T
+    b = ours @ other.transpose(0, 2, 1)
     apart = (a.max(2) < b.min(2)) | (b.max(2) < a.min(2))
     return np.asarray(~apart.any(1))
 
@@ -79,8 +95,10 @@ def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArra
 def _footprints(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """(M, 4, 2) corners in the ground plane."""
     local = _CORNERS * values[:, None, 3:5]
-    c, s = np.cos(values[:, 6:]), np.sin(values[:, 6:])
-    x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+    c = np.cos(values[:, 6:])
+    s = np.sin(values[:, 6:])
+    x = local[..., 0] * c - local[..., 1] * s
+    y = local[..., 0] * s + local[..., 1] * c
     return np.asarray(np.stack([x, y], -1) + values[:, None, :2], np.float32)
 
 
@@ -90,5 +108,10 @@ def widened(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
 
 
 def unseen(boxes: Boxes) -> Boxes:
-    """The boxes without their place in the camera image, which is unknown after they were raised or lowered."""
-    return replace(boxes, image_box=np.full((len(boxes), 4), -1, np.float32), dont_care=np.zeros((0, 4), np.float32))
+    """The boxes without their place in the camera image, which is unknown after they were raised or
+    lowered."""
+    return replace(
+        boxes,
+        image_box=np.full((len(boxes), 4), -1, np.float32),
+        dont_care=np.zeros((0, 4), np.float32),
+    )

@@ -1,8 +1,9 @@
 """Parts exchanged between two scans of one grid: sectors of azimuth, and bands of elevation.
 
-Sectors follow PolarMix (Xiao et al., "PolarMix: A General Data Augmentation Technique for LiDAR Point Clouds", NeurIPS
-2022), bands LaserMix (Kong et al., "LaserMix for Semi-Supervised LiDAR Semantic Segmentation", CVPR 2023). Here both
-end at the edges of cells, so that no cell contains returns of two scans.
+Sectors follow PolarMix (Xiao et al., "PolarMix: A General Data Augmentation Technique for LiDAR
+Point Clouds", NeurIPS 2022), bands LaserMix (Kong et al., "LaserMix for Semi-Supervised LiDAR
+Semantic Segmentation", CVPR 2023). Here both end at the edges of cells, so that no cell contains
+returns of two scans.
 """
 
 from dataclasses import replace
@@ -37,8 +38,10 @@ def thinned(scan: Scan, sensor: Sensor) -> Scan:
 def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
     """Replace a sector of columns of a scan by those of another scan.
 
-    Boxes that an edge of the sector cuts are removed with their objects. The other boxes contain only returns of their
-    own scan, and all returns of their instance: a box is enlarged by some centimetres if noise or tilt puts a return
+    Boxes that an edge of the sector cuts are removed with their objects. The other boxes contain
+    only returns of their
+    own scan, and all returns of their instance: a box is enlarged by some centimetres if noise or
+        tilt puts a return
     outside.
 
     Args:
@@ -47,16 +50,20 @@ def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
         start: first column of the sector.
         width: number of columns of the sector, 0..W; they wrap around.
     """
-    scan, other = holding(scan), holding(other)
+    scan = holding(scan)
+    other = holding(other)
     columns = scan.sensor.columns
     cell, cell_other = (locate(s.points, scan.sensor).cell for s in (scan, other))
     first = _without_cut_objects(scan, (cell >= 0) & ((cell - start) % columns >= width))
-    second = _without_cut_objects(other, (cell_other >= 0) & ((cell_other - start) % columns < width))
+    second = _without_cut_objects(
+        other, (cell_other >= 0) & ((cell_other - start) % columns < width)
+    )
     return merged(*_separated(first, second))
 
 
 def swap_bands(scan: Scan, other: Scan, bands: int, odd: bool) -> Scan:
-    """Replace every other band of rows by those of another scan, and drop all boxes, as few objects fit into a band.
+    """Replace every other band of rows by those of another scan, and drop all boxes, as few objects
+    fit into a band.
 
     Args:
         scan: the scan that keeps the bands 0, 2, ... from the top, or 1, 3, ... if ``odd``.
@@ -83,7 +90,10 @@ def _without_cut_objects(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
 
 
 def _without(
-    scan: Scan, removed: NDArray[np.bool_], inside: NDArray[np.bool_], keep: NDArray[np.bool_] | bool = True
+    scan: Scan,
+    removed: NDArray[np.bool_],
+    inside: NDArray[np.bool_],
+    keep: NDArray[np.bool_] | bool = True,
 ) -> Scan:
     """The scan without some of its M boxes and the points (M, N) that belong to them."""
     assert scan.boxes is not None
@@ -92,8 +102,10 @@ def _without(
 
 
 def _separated(first: Scan, second: Scan) -> tuple[Scan, list[Scan]]:
-    """Both scans with boxes that share neither ground nor returns; objects of the first scan take precedence."""
-    a, b = first.boxes, second.boxes
+    """Both scans with boxes that share neither ground nor returns; objects of the first scan take
+    precedence."""
+    a = first.boxes
+    b = second.boxes
     if a is not None and b is not None and len(a) and len(b):
         clash = np.array([overlapping(box, a.values).any() for box in b.values])
         second = _without(second, clash, standing(second, b))

@@ -1,4 +1,5 @@
-"""The ground under an object, a plane fitted to the ground returns in and around its box, and the returns above it."""
+"""The ground under an object, a plane fitted to the ground returns in and around its box, and the
+returns above it."""
 
 from typing import NamedTuple
 
@@ -13,14 +14,17 @@ from lidar_synth.labels.boxes import box_frame
 LEAST = 5
 """Minimum number of returns of a plane."""
 ROUGH = 0.15
-"""Maximum distance of a ground return from the plane, metres: half a kerb, or the unevenness of a lawn."""
+"""Maximum distance of a ground return from the plane, metres: half a kerb, or the unevenness of a
+lawn."""
 STEEP = 0.2
 """Maximum slope of the ground under an upright box, rise per metre."""
 FLOOR = 0.25
-"""Height above the ground, metres, below which a return counts as ground and neither blocks nor hides an object."""
+"""Height above the ground, metres, below which a return counts as ground and neither blocks nor
+hides an object."""
 CLEARANCE = 0.2
 """Minimum distance between an object and its surroundings, metres."""
-_STACK = 0.3  # height above the lowest return, metres, below which returns count as ground if there are no labels
+# height above the lowest return, metres, below which returns count as ground if there are no labels
+_STACK = 0.3
 _SIDES = 16  # number of directions in which ground must lie to enclose a box
 _NO_LABELS = np.empty(0, np.uint8)
 
@@ -31,8 +35,8 @@ class Ground(NamedTuple):
     Args:
         height: height of the plane at the box's centre, above the sensor's origin, metres.
         along, across: rise per metre along and across the box.
-        encloses: whether ground returns lie on all sides of the centre, so that the box is neither in nor behind a
-            wall.
+        encloses: whether ground returns lie on all sides of the centre, so that the box is neither
+            in nor behind a wall.
         free: whether there are no other returns in or beside the box.
     """
 
@@ -45,12 +49,15 @@ class Ground(NamedTuple):
     def above(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float64]:
         """(N,) height of points (N, 3) above the plane, metres."""
         local = box_frame(points, box).astype(np.float64)
-        heights: NDArray[np.float64] = local @ (-self.along, -self.across, 1.0) + (float(box[2]) - self.height)
+        heights: NDArray[np.float64] = local @ (-self.along, -self.across, 1.0) + (
+            float(box[2]) - self.height
+        )
         return heights
 
 
 def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
-    """The ground under a box, found by the labels around it, or by the lowest returns if there are no labels.
+    """The ground under a box, found by the labels around it, or by the lowest returns if there are
+    no labels.
 
     Args:
         scan: N points.
@@ -61,16 +68,25 @@ def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
     """
     sensor = scan.sensor
     # A little more than the gap between two rings at this distance, for a sensor on a car's roof.
-    gap = 1.5 * np.radians(sensor.up - sensor.down) / sensor.shape[0] * (box[0] ** 2 + box[1] ** 2) / 1.7
+    gap = (
+        1.5
+        * np.radians(sensor.up - sensor.down)
+        / sensor.shape[0]
+        * (box[0] ** 2 + box[1] ** 2)
+        / 1.7
+    )
     labels = _NO_LABELS if scan.label is None else scan.label
-    known, along, across, height, sides, free = _survey(scan.points, labels, GROUND, box, min(max(gap, 1.0), 5.0))
+    known, along, across, height, sides, free = _survey(
+        scan.points, labels, GROUND, box, min(max(gap, 1.0), 5.0)
+    )
     if not known or np.hypot(along, across) > STEEP:
         return None
     return Ground(height, along, across, sides == _SIDES, free)
 
 
 def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
-    """(M, N) True for points that belong to a box: those inside that are not ground, and those of its instance."""
+    """(M, N) True for points that belong to a box: those inside that are not ground, and those of
+    its instance."""
     inside = boxes.contain(scan.points)
     low = scan.points[:, 2] < (boxes.values[:, 2] - boxes.values[:, 5] / 2 + FLOOR)[:, None]
     if scan.label is not None:
@@ -82,10 +98,11 @@ def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
 
 @numba.njit(cache=True)
 def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-def]
-    """Fit the ground: (whether there is any, rise along, rise across, height at the centre, number of directions with
-    ground returns, whether the box is free)."""
+    """Fit the ground: (whether there is any, rise along, rise across, height at the centre, number
+    of directions with ground returns, whether the box is free)."""
     near, local = _around(points, box, reach)
-    ground, labelled = np.zeros(len(near), np.bool_), False
+    ground = np.zeros(len(near), np.bool_)
+    labelled = False
     for k in range(len(near) if len(labels) else 0):
         labelled |= labels[near[k]] != IGNORE
         ground[k] = is_ground[labels[near[k]]]
@@ -95,10 +112,13 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
             ground[k] = local[k, 2] < lowest + _STACK
     total = ground.sum()
     along, across, height = _plane(local, ground, box)
-    # Without labels the first plane lies slightly too high, because it includes the lowest returns of objects.
+    # Without labels the first plane lies slightly too high, because it includes the lowest returns
+    # of objects.
     upper = ROUGH if labelled else ROUGH / 2
     for k in range(len(near)):
-        ground[k] &= -ROUGH < local[k, 2] - height - along * local[k, 0] - across * local[k, 1] < upper
+        ground[k] &= (
+            -ROUGH < local[k, 2] - height - along * local[k, 0] - across * local[k, 1] < upper
+        )
     if ground.sum() < max(LEAST, 0.7 * total if labelled else 0.0):
         return False, 0.0, 0.0, 0.0, 0, False
     along, across, height = _plane(local, ground, box)
@@ -111,16 +131,20 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
 
 @numba.njit(cache=True)
 def _around(points, box, reach):  # type: ignore[no-untyped-def]
-    """Indices (n,) of the points within reach of the box, and their coordinates (n, 3) float64: along and across the
-    box, and above the sensor."""
-    c, s = np.cos(box[6]), np.sin(box[6])
+    """Indices (n,) of the points within reach of the box, and their coordinates (n, 3) float64:
+    along and across the box, and above the sensor."""
+    c = np.cos(box[6])
+    s = np.sin(box[6])
     half = np.sqrt(box[3] ** 2 + box[4] ** 2) / 2 + reach
-    near, local = np.empty(len(points), np.int64), np.empty((len(points), 3), np.float64)
+    near = np.empty(len(points), np.int64)
+    local = np.empty((len(points), 3), np.float64)
     count = 0
     for i in range(len(points)):
-        x, y = points[i, 0] - box[0], points[i, 1] - box[1]
+        x = points[i, 0] - box[0]
+        y = points[i, 1] - box[1]
         if abs(x) <= half and abs(y) <= half:
-            along, across = x * c + y * s, y * c - x * s
+            along = x * c + y * s
+            across = y * c - x * s
             if abs(along) <= box[3] / 2 + reach and abs(across) <= box[4] / 2 + reach:
                 near[count] = i
                 local[count, 0], local[count, 1], local[count, 2] = along, across, points[i, 2]
@@ -131,7 +155,9 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True)
 def _third_lowest(local):  # type: ignore[no-untyped-def]
     """The third lowest height, because up to two stray returns may lie below the ground."""
-    first, second, third = np.inf, np.inf, np.inf
+    first = np.inf
+    second = np.inf
+    third = np.inf
     for k in range(len(local)):
         z = local[k, 2]
         if z < first:
@@ -148,7 +174,8 @@ def _sides(local, ground):  # type: ignore[no-untyped-def]
     """Number of directions from the centre in which there is ground."""
     count = 0
     for side in range(_SIDES):
-        x, y = np.cos(2 * np.pi * side / _SIDES), np.sin(2 * np.pi * side / _SIDES)
+        x = np.cos(2 * np.pi * side / _SIDES)
+        y = np.sin(2 * np.pi * side / _SIDES)
         for k in range(len(local)):
             if ground[k] and local[k, 0] * x + local[k, 1] * y > 0:
                 count += 1
@@ -158,21 +185,39 @@ def _sides(local, ground):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _plane(local, ground, box):  # type: ignore[no-untyped-def]
-    """Weighted least squares: near returns weigh more, and regularisation makes a plane of few returns level."""
+    """Weighted least squares: near returns weigh more, and regularisation makes a plane of few
+    returns level."""
     weight = np.zeros(len(local))
-    total, x, y, z = 1e-9, 0.0, 0.0, 0.0
+    total = 1e-9
+    x = 0.0
+    y = 0.0
+    z = 0.0
     for k in range(len(local)):
         if ground[k]:
             gap = max(abs(local[k, 0]) - box[3] / 2, abs(local[k, 1]) - box[4] / 2, 0.0)
             weight[k] = 1 / (1 + gap * gap)
             total += weight[k]
-            x, y, z = x + weight[k] * local[k, 0], y + weight[k] * local[k, 1], z + weight[k] * local[k, 2]
-    x, y, z = x / total, y / total, z / total
-    xx, xy, yy, xz, yz = 1.0, 0.0, 1.0, 0.0, 0.0
+            x = x + weight[k] * local[k, 0]
+            y = y + weight[k] * local[k, 1]
+            z = z + weight[k] * local[k, 2]
+    x = x / total
+    y = y / total
+    z = z / total
+    xx = 1.0
+    xy = 0.0
+    yy = 1.0
+    xz = 0.0
+    yz = 0.0
     for k in range(len(local)):
-        u, v, w = local[k, 0] - x, local[k, 1] - y, local[k, 2] - z
-        xx, xy, yy = xx + weight[k] * u * u, xy + weight[k] * u * v, yy + weight[k] * v * v
-        xz, yz = xz + weight[k] * u * w, yz + weight[k] * v * w
+        u = local[k, 0] - x
+        v = local[k, 1] - y
+        w = local[k, 2] - z
+        xx = xx + weight[k] * u * u
+        xy = xy + weight[k] * u * v
+        yy = yy + weight[k] * v * v
+        xz = xz + weight[k] * u * w
+        yz = yz + weight[k] * v * w
     scale = xx * yy - xy * xy
-    along, across = (xz * yy - yz * xy) / scale, (yz * xx - xz * xy) / scale
+    along = (xz * yy - yz * xy) / scale
+    across = (yz * xx - xz * xy) / scale
     return along, across, z - along * x - across * y

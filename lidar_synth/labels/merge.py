@@ -18,10 +18,11 @@ from lidar_synth.labels.objects import belonging
 def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
     """Append the points, labels and boxes of other scans to a scan.
 
-    The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of the first scan.
-    Labels, confidence (1 for labels of scans without confidence) and instances (those of their boxes, if points have
-    none) are always set; instances of the other scans are renumbered. Rings are set if the first scan has them, as
-    lasers of its sensor; boxes if any scan has them; times are dropped, as each scan has its own moment.
+    The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of
+    the first scan. Labels, confidence (1 for labels of scans without confidence) and instances
+    (those of their boxes, if points have none) are always set; instances of the other scans are
+    renumbered. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan
+    has them; times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -32,10 +33,17 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
     if scan.ring is not None:
         parts = [_with_rings(p, scan.sensor) for p in parts]
         names.append("ring")
-    together: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)}
+    together: dict[str, Any] = {
+        n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)
+    }
     boxes = [p.boxes for p in parts if p.boxes is not None]
     return replace(
-        scan, **together, raw_label=None, time=None, boxes=joined(boxes) if boxes else None, domain=SYNTHETIC
+        scan,
+        **together,
+        raw_label=None,
+        time=None,
+        boxes=joined(boxes) if boxes else None,
+        domain=SYNTHETIC,
     )
 
 
@@ -45,7 +53,8 @@ def same_lasers(one: Sensor, other: Sensor) -> bool:
 
 
 def _with_rings(part: Scan, sensor: Sensor) -> Scan:
-    """The scan with the rings of a sensor: its own if they are of the same lasers, else the nearest."""
+    """The scan with the rings of a sensor: its own if they are of the same lasers, else the
+    nearest."""
     if part.ring is not None and same_lasers(part.sensor, sensor):
         return part
     return replace(part, ring=assign_beams(part, sensor).ring)
@@ -53,13 +62,16 @@ def _with_rings(part: Scan, sensor: Sensor) -> Scan:
 
 def _complete(scan: Scan) -> Scan:
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
-    confidence = (label != IGNORE).astype(np.float32) if scan.confidence is None else scan.confidence
+    confidence = (
+        (label != IGNORE).astype(np.float32) if scan.confidence is None else scan.confidence
+    )
     instance = _of_tracks(scan) if scan.instance is None else scan.instance
     return replace(scan, label=label, confidence=confidence, instance=instance)
 
 
 def _of_tracks(scan: Scan) -> NDArray[np.int32]:
-    """(N,) the instances of points that have none, by the boxes of tracks; without it these would lose their points."""
+    """(N,) the instances of points that have none, by the boxes of tracks; without it these would
+    lose their points."""
     instance = np.zeros(len(scan), np.int32)
     if scan.boxes is not None:
         for number in np.flatnonzero(scan.boxes.instance > 0):
@@ -79,12 +91,15 @@ def _last_instance(scan: Scan) -> int:
 
 
 def _renumbered(scan: Scan, used: int) -> Scan:
-    """Renumber the scan's instances as used + 1, used + 2, ...; 0 and below, which mean none, are kept."""
+    """Renumber the scan's instances as used + 1, used + 2, ...; 0 and below, which mean none, are
+    kept."""
     old = np.unique(np.concatenate(_numbers(scan)))
     old = old[old > 0]
 
     def new(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        return np.where(numbers > 0, np.searchsorted(old, numbers) + used + 1, numbers).astype(np.int32)
+        return np.where(numbers > 0, np.searchsorted(old, numbers) + used + 1, numbers).astype(
+            np.int32
+        )
 
     assert scan.instance is not None
     boxes: Boxes | None = scan.boxes

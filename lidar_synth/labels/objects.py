@@ -12,11 +12,23 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grown, turned, turned_points
 from lidar_synth.labels.ground import ground_under
 
-THINGS = len(("car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist"))
+THINGS = len(
+    (
+        "car",
+        "bicycle",
+        "motorcycle",
+        "truck",
+        "other-vehicle",
+        "person",
+        "bicyclist",
+        "motorcyclist",
+    )
+)
 """Train ids below this one have instances."""
 
 LOWEST = 0.1
-"""Minimum height above the ground, metres, of an object's returns if the scan has neither labels nor instances."""
+"""Minimum height above the ground, metres, of an object's returns if the scan has neither labels
+nor instances."""
 
 NOISE = 0.15
 """Maximum distance of an instance's returns from its box, metres."""
@@ -43,14 +55,17 @@ class Object(NamedTuple):
         """The object turned about the sensor, counter-clockwise by an angle in radians."""
         assert self.scan.boxes is not None
         points = turned_points(self.scan.points, angle)
-        return self._replace(scan=replace(self.scan, points=points, boxes=turned(self.scan.boxes, angle)))
+        return self._replace(
+            scan=replace(self.scan, points=points, boxes=turned(self.scan.boxes, angle))
+        )
 
 
 def objects_of(scan: Scan, least: int = 5) -> dict[int, Object]:
     """The objects in a scan's boxes, as ``{index of the box: object}``.
 
-    If boxes and points have instances, an object's points are those of its instance; its box is enlarged by some
-    centimetres if noise or tilt puts points outside. Otherwise its points are those in the box above the ground.
+    If boxes and points have instances, an object's points are those of its instance; its box is
+    enlarged by some centimetres if noise or tilt puts points outside. Otherwise its points are
+    those in the box above the ground.
 
     Args:
         scan: a scan with boxes.
@@ -70,27 +85,37 @@ def objects_of(scan: Scan, least: int = 5) -> dict[int, Object]:
 
 
 def instances_of(scan: Scan, least: int = 5) -> list[Object]:
-    """The objects of a scan with instances but without boxes; their boxes are the extents of their points.
+    """The objects of a scan with instances but without boxes; their boxes are the extents of their
+    points.
 
     Raises:
         DataError: if the scan has no instances or no labels.
     """
     if scan.instance is None or scan.label is None:
-        raise DataError(f"scan {scan.id!r} has no instances", "labels and instances, as in SemanticKITTI")
+        raise DataError(
+            f"scan {scan.id!r} has no instances", "labels and instances, as in SemanticKITTI"
+        )
     things = np.flatnonzero((scan.instance > 0) & (scan.label < THINGS))
     keys = scan.instance[things].astype(np.int64) * THINGS + scan.label[things]
     which = np.unique(keys, return_inverse=True)[1]
     objects = []
-    for part in np.split(things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]):
+    for part in np.split(
+        things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]
+    ):
         if len(part) >= least:
-            low, high = scan.points[part].min(0), scan.points[part].max(0)
-            box = grown(np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32), scan.points[part])
+            low = scan.points[part].min(0)
+            high = scan.points[part].max(0)
+            box = grown(
+                np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
+                scan.points[part],
+            )
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
     return objects
 
 
 def holding(scan: Scan) -> Scan:
-    """The scan with boxes enlarged by some centimetres, so that they contain all returns of their instance."""
+    """The scan with boxes enlarged by some centimetres, so that they contain all returns of their
+    instance."""
     if scan.boxes is None or scan.instance is None:
         return scan
     values = scan.boxes.values.copy()
@@ -100,7 +125,8 @@ def holding(scan: Scan) -> Scan:
 
 
 def belonging(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
-    """(N,) True for the returns of the object in one box: those of its instance, or those above the ground."""
+    """(N,) True for the returns of the object in one box: those of its instance, or those above the
+    ground."""
     has_instance = scan.instance is not None and box.instance[0] > 0
     return _instance(scan, box) if has_instance else _standing(scan, box)
 
@@ -108,14 +134,18 @@ def belonging(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for points of a box's instance that lie within it or within ``NOISE`` of it."""
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
-    return np.asarray(Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0]))
+    return np.asarray(
+        Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0])
+    )
 
 
 def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object in one box; None if it contains no points."""
     mine = np.flatnonzero(belonging(scan, box))
     return (
-        _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None])) if len(mine) else None
+        _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None]))
+        if len(mine)
+        else None
     )
 
 

@@ -1,7 +1,7 @@
 """Policies that need no other scans: they keep the labels of the synthetic scan, or remove them.
 
-They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_label``, which would contradict the
-labels that they set.
+They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_label``, which would
+contradict the labels that they set.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,8 @@ class Unlabelled:
 
 @dataclass(frozen=True)
 class Ignored:
-    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample keeps its keys.
+    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample
+    keeps its keys.
 
     Args:
         boxed: whether the scan keeps its boxes.
@@ -34,9 +35,16 @@ class Ignored:
     boxed: bool = False
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        label, confidence = np.full(len(scan), IGNORE, np.uint8), np.zeros(len(scan), np.float32)
-        return replace(scan, label=label, raw_label=None, instance=None, confidence=confidence,
-                       boxes=scan.boxes if self.boxed else None)  # fmt: skip
+        label = np.full(len(scan), IGNORE, np.uint8)
+        confidence = np.zeros(len(scan), np.float32)
+        return replace(
+            scan,
+            label=label,
+            raw_label=None,
+            instance=None,
+            confidence=confidence,
+            boxes=scan.boxes if self.boxed else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,8 @@ class Own:
 
     Args:
         threshold: minimum confidence, 0 to 1; labels below it become 255 = ignore.
-        kept: whether to keep the scan's confidence; otherwise it becomes 1 for every labelled point.
+        kept: whether to keep the scan's confidence; otherwise it becomes 1 for every labelled
+            point.
     """
 
     threshold: float = 0.0
@@ -53,12 +62,17 @@ class Own:
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if scan.label is None:
-            raise DataError(f"scan {scan.id!r} has no labels", "a label for each point", "Use labels='ignore'.")
+            raise DataError(
+                f"scan {scan.id!r} has no labels", "a label for each point", "Use labels='ignore'."
+            )
         return trusted(scan, scan.label, scan.confidence if self.kept else None, self.threshold)
 
 
 def trusted(
-    scan: Scan, label: NDArray[np.uint8], confidence: NDArray[np.float32] | None, threshold: float = 0.0
+    scan: Scan,
+    label: NDArray[np.uint8],
+    confidence: NDArray[np.float32] | None,
+    threshold: float = 0.0,
 ) -> Scan:
     """Set the labels of a scan, and ignore those with a confidence below a threshold.
 
@@ -81,8 +95,11 @@ class OwnBoxes:
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if scan.boxes is None:
-            raise DataError(f"synthetic scan {scan.id!r} has no boxes", "boxes, for a detector",
-                            "labels='mix' pastes objects with their boxes.")  # fmt: skip
+            raise DataError(
+                f"synthetic scan {scan.id!r} has no boxes",
+                "boxes, for a detector",
+                "labels='mix' pastes objects with their boxes.",
+            )
         return scan
 
 
@@ -94,7 +111,8 @@ def boxes(real: Source | None, fields: frozenset[str]) -> OwnBoxes:
     """
     if "boxes" not in fields:
         raise ConfigError(
-            f"labels='boxes', but besides points the synthetic scans only have {sorted(fields) or 'no fields'}",
+            "labels='boxes', but besides points the synthetic scans only have "
+            f"{sorted(fields) or 'no fields'}",
             "scans with boxes, such as the town's or those of a layout model",
             "Other models generate none: labels='mix' pastes objects with their boxes.",
         )
@@ -119,7 +137,9 @@ def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.
     """
     _require_label("generated", fields)
     if threshold and "confidence" not in fields:
-        raise ConfigError(f"threshold {threshold} for synthetic scans without confidence", "threshold=0")
+        raise ConfigError(
+            f"threshold {threshold} for synthetic scans without confidence", "threshold=0"
+        )
     return Own(checked_share("threshold", threshold))
 
 
@@ -147,7 +167,9 @@ def checked_share(name: str, value: float) -> float:
 def _require_label(policy: str, fields: frozenset[str]) -> None:
     if "label" not in fields:
         raise ConfigError(
-            f"labels={policy!r}, but besides points the synthetic scans only have {sorted(fields) or 'no fields'}",
+            f"labels={policy!r}, but besides points the synthetic scans only have "
+            f"{sorted(fields) or 'no fields'}",
             "a model or bank with labels",
-            "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or 'mix' with real scans.",
+            "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or "
+            "'mix' with real scans.",
         )

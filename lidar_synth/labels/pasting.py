@@ -1,9 +1,12 @@
 """Objects pasted into a scan at their recorded range, with occlusion as the sensor would see it.
 
-An object is raised or lowered to the ground at its place, and skipped if there is no ground or the place is occupied.
-In each cell of the range image the nearest return then wins: objects are hidden by what is in front of them, and hide
-everything behind their outline, including the gaps between their returns. A box therefore contains only the returns of
-its object and, at its floor, of the ground, and there are no returns in its shadow.
+An object is raised or lowered to the ground at its place, and skipped if there is no ground or the
+place is occupied.
+In each cell of the range image the nearest return then wins: objects are hidden by what is in front
+    of them, and hide
+everything behind their outline, including the gaps between their returns. A box therefore contains
+only the returns of its object and, at its floor, of the ground, and there are no returns in its
+shadow.
 """
 
 from collections.abc import Iterable
@@ -20,26 +23,31 @@ from lidar_synth.labels.objects import Object
 from lidar_synth.labels.view import View, VisibleReturns, refuse_coarser
 
 LIFT = 1.0
-"""Maximum height by which an object is raised or lowered, metres; beyond it the sensor would see another side."""
+"""Maximum height by which an object is raised or lowered, metres; beyond it the sensor would see
+another side."""
 OCCLUSION = ((0.80, 0), (0.45, 1), (0.0, 2))
-"""(minimum visible share, KITTI's occlusion level): 0 fully visible, 1 partly occluded, 2 largely occluded."""
+"""(minimum visible share, KITTI's occlusion level): 0 fully visible, 1 partly occluded, 2 largely
+occluded."""
 
 
-def paste(scan: Scan, objects: Iterable[Object], *, count: int | None = None, least: int = 5) -> Scan:
+def paste(
+    scan: Scan, objects: Iterable[Object], *, count: int | None = None, least: int = 5
+) -> Scan:
     """Paste objects into a scan.
 
     Args:
         scan: N points; the ground is found by its labels, or by the lowest returns if it has none.
-        objects: candidates, in the order in which they are tried; those without a suitable place are skipped. Their
-            returns are thinned to one per cell of the scan's sensor.
+        objects: candidates, in the order in which they are tried; those without a suitable place
+            are skipped. Their returns are thinned to one per cell of the scan's sensor.
         count: maximum number of objects to place; by default all that fit.
-        least: minimum number of visible returns of an object. It also applies to the scan's own objects: a box that
-            falls below it by occlusion is removed, with its returns.
+        least: minimum number of visible returns of an object. It also applies to the scan's own
+            objects: a box that falls below it by occlusion is removed, with its returns.
 
     Returns:
-        A new scan, which always has boxes. The pasted points are appended, with their label, confidence 1 and a new
-        instance; their boxes are appended from near to far. The occlusion of a pasted object is that of its recording
-        or, if greater, that in this scan. If the former is unknown, the result is a lower bound.
+        A new scan, which always has boxes. The pasted points are appended, with their label,
+        confidence 1 and a new instance; their boxes are appended from near to far. The occlusion of
+        a pasted object is that of its recording or, if greater, that in this scan. If the former is
+        unknown, the result is a lower bound.
 
     Raises:
         DataError: on objects recorded by a coarser sensor.
@@ -67,7 +75,11 @@ def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
     if taken and overlapping(widened(box, CLEARANCE), np.array(taken)).any():
         return None
     ground = ground_under(scan, box)
-    if ground is None or not (ground.encloses and ground.free) or abs(ground.height - candidate.ground) > LIFT:
+    if (
+        ground is None
+        or not (ground.encloses and ground.free)
+        or abs(ground.height - candidate.ground) > LIFT
+    ):
         return None
     return _raised(candidate, ground.height)
 
@@ -96,13 +108,16 @@ def _own(scan: Scan, seen: NDArray[np.bool_], least: int) -> Scan:
     return replace(scan[remaining], boxes=boxes)
 
 
-def still_visible(scan: Scan, seen: NDArray[np.bool_], least: int) -> tuple[NDArray[np.bool_], Boxes]:
+def still_visible(
+    scan: Scan, seen: NDArray[np.bool_], least: int
+) -> tuple[NDArray[np.bool_], Boxes]:
     """What remains of a scan behind new objects.
 
     Args:
         scan: N points.
         seen: (N,) True for points that are still visible.
-        least: minimum number of returns of an object; one that falls below it is removed with its box.
+        least: minimum number of returns of an object; one that falls below it is removed with its
+            box.
 
     Returns:
         (N,) True for the remaining points, and the remaining boxes with their occlusion updated.
@@ -110,14 +125,16 @@ def still_visible(scan: Scan, seen: NDArray[np.bool_], least: int) -> tuple[NDAr
     if scan.boxes is None:
         return seen, Boxes(np.zeros((0, 7), np.float32), ())
     inside = standing(scan, scan.boxes)
-    before, after = inside.sum(1), (inside & seen).sum(1)
+    before = inside.sum(1)
+    after = (inside & seen).sum(1)
     removed = (after < before) & (after < least)
     share = after / np.maximum(before, 1) + (before == 0)
     return seen & ~inside[removed].any(0), occluded(scan.boxes, share)[~removed]
 
 
 def occluded(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
-    """The boxes with occlusion levels updated by the shares (M,) of their returns that are still visible."""
+    """The boxes with occlusion levels updated by the shares (M,) of their returns that are still
+    visible."""
     level = np.select([share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION])
     # Good visibility here does not exclude earlier occlusion: unknown (-1 or 3) stays unknown.
     keep = (level == 0) | (boxes.occlusion >= level)

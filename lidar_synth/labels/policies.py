@@ -1,4 +1,5 @@
-"""The label policies by name. A policy is ``(scan, rng) -> scan``, a function of its two arguments alone."""
+"""The label policies by name. A policy is ``(scan, rng) -> scan``, a function of its two arguments
+alone."""
 
 from collections.abc import Callable
 from inspect import signature
@@ -16,12 +17,17 @@ LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
 """Sets the labels of a synthetic scan; it returns a new scan and never changes its input."""
 
 KINDS: dict[str, Callable[..., LabelPolicy]] = {
-    "objects": objects, "polar": polar, "laser": laser, "exchange": exchange,
-}  # fmt: skip
+    "objects": objects,
+    "polar": polar,
+    "laser": laser,
+    "exchange": exchange,
+}
 """Builders of the kinds of ``mix``: ``(real, fields, **options) -> LabelPolicy``."""
 
 
-def mix(real: Source | None, fields: frozenset[str], kind: str = "objects", **options: Any) -> LabelPolicy:
+def mix(
+    real: Source | None, fields: frozenset[str], kind: str = "objects", **options: Any
+) -> LabelPolicy:
     """Make the policy ``mix``: labelled parts of real scans are inserted into the synthetic scan.
 
     Raises:
@@ -45,14 +51,19 @@ POLICIES: dict[str, Callable[..., LabelPolicy]] = {
 
 
 def make_policy(
-    labels: str | LabelPolicy, *, real: Source | None = None, fields: frozenset[str] = frozenset(), **options: Any
+    labels: str | LabelPolicy,
+    *,
+    real: Source | None = None,
+    fields: frozenset[str] = frozenset(),
+    **options: Any,
 ) -> LabelPolicy:
     """Make a label policy by name.
 
     Args:
         labels: a name of ``POLICIES``, or a policy, which is returned as it is.
         real: the real labelled scans, for policies that draw from them.
-        fields: the fields of ``POINT_FIELDS`` that the synthetic scans have, and "boxes" if they have boxes.
+        fields: the fields of ``POINT_FIELDS`` that the synthetic scans have, and "boxes" if they
+            have boxes.
         options: of the policy.
 
     Raises:
@@ -69,7 +80,9 @@ def make_policy(
     """
     if not isinstance(labels, str):
         if options:
-            raise ConfigError(f"options {sorted(options)} for a policy that is a function", "a policy's name")
+            raise ConfigError(
+                f"options {sorted(options)} for a policy that is a function", "a policy's name"
+            )
         return labels
     if labels not in POLICIES:
         expected = f"one of {', '.join(map(repr, POLICIES))}, or a function (scan, rng)"
@@ -78,11 +91,17 @@ def make_policy(
 
 
 def _build(
-    build: Callable[..., LabelPolicy], where: str, real: Source | None, fields: frozenset[str], options: dict[str, Any]
+    build: Callable[..., LabelPolicy],
+    where: str,
+    real: Source | None,
+    fields: frozenset[str],
+    options: dict[str, Any],
 ) -> LabelPolicy:
     try:
         signature(build).bind(real, fields, **options)
     except TypeError as error:
         known = list(signature(build).parameters)[2:]
-        raise ConfigError(f"{where}: {error}", f"options {known}" if known else "no options") from error
+        raise ConfigError(
+            f"{where}: {error}", f"options {known}" if known else "no options"
+        ) from error
     return build(real, fields, **options)

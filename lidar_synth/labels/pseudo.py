@@ -12,7 +12,8 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.own import checked_share, trusted
 
 Teacher = Callable[[Scan], Any]
-"""``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with labels."""
+"""``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with
+labels."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,16 @@ class Pseudo:
             )
         label, confidence = (None if values is None else np.asarray(values) for values in answer)
         assert label is not None
-        bad = label.shape != (len(scan),) or ((label != IGNORE) & ((label < 0) | (label >= len(NAMES)))).any()
+        bad = (
+            label.shape != (len(scan),)
+            or ((label != IGNORE) & ((label < 0) | (label >= len(NAMES)))).any()
+        )
         if confidence is not None:
-            bad = bad or confidence.shape != label.shape or not ((confidence >= 0) & (confidence <= 1)).all()
+            bad = (
+                bad
+                or confidence.shape != label.shape
+                or not ((confidence >= 0) & (confidence <= 1)).all()
+            )
             confidence = confidence.astype(np.float32)
         if bad:
             raise DataError(
@@ -56,7 +64,10 @@ class Pseudo:
 
 
 def pseudo(
-    real: Source | None, fields: frozenset[str], teacher: Teacher | None = None, threshold: float = 0.9
+    real: Source | None,
+    fields: frozenset[str],
+    teacher: Teacher | None = None,
+    threshold: float = 0.9,
 ) -> Pseudo:
     """Make the policy ``pseudo``: a teacher's confident predictions.
 
@@ -65,6 +76,7 @@ def pseudo(
     """
     if not callable(teacher):
         raise ConfigError(
-            f"labels='pseudo' with teacher={teacher!r}", "a function scan -> (labels, confidence), or scan -> scan"
+            f"labels='pseudo' with teacher={teacher!r}",
+            "a function scan -> (labels, confidence), or scan -> scan",
         )
     return Pseudo(teacher, checked_share("threshold", threshold))

@@ -54,17 +54,23 @@ class View:
         self._front = np.full(point.shape, np.inf, np.float32)
         self._height = np.zeros(point.shape, np.float32)
         height = scan.points[:, 2]
-        if scan.label is not None:  # returns labelled as other classes than ground occlude at any height
-            height = np.where(GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf))
+        if (
+            scan.label is not None
+        ):  # returns labelled as other classes than ground occlude at any height
+            height = np.where(
+                GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf)
+            )
         self._front[~empty], self._height[~empty] = distance[point[~empty]], height[point[~empty]]
         _close_gaps(self._front, self._height)
 
     def add(self, placed: Object, least: int) -> bool:
-        """Add an object to the view, or return False if fewer than ``least`` of its returns are visible."""
+        """Add an object to the view, or return False if fewer than ``least`` of its returns are
+        visible."""
         cell, distance, shown = locate(placed.scan.points, self.sensor)
         nearest = shown[shown >= 0]
         row, column = np.divmod(cell[nearest], self.sensor.columns)
-        # A return at the height of the object's floor belongs to the ground in front of it, and does not occlude it.
+        # A return at the height of the object's floor belongs to the ground in front of it, and
+        # does not occlude it.
         stands = self._height[row, column] > placed.ground + FLOOR
         seen = ~(stands & (self._front[row, column] < distance[nearest]))
         if seen.sum() < least:
@@ -72,7 +78,9 @@ class View:
         outline = _outline(row, column, distance[nearest], self.sensor.columns)
         limit = np.full(self.sensor.shape, np.inf, np.float32)
         limit[outline[0], outline[1]] = outline[2]
-        limit[row[seen], column[seen]] = 0  # no other return shares a cell with it, not even ground just in front
+        limit[row[seen], column[seen]] = (
+            0  # no other return shares a cell with it, not even ground just in front
+        )
         for part in self.parts:
             part.seen &= (part.range <= limit.reshape(-1)[part.cell]) | (part.cell < 0)
         self._stand(*outline, top=placed.box[2] + placed.box[5] / 2)
@@ -82,7 +90,11 @@ class View:
         return True
 
     def _stand(
-        self, row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], top: np.float32
+        self,
+        row: NDArray[np.intp],
+        column: NDArray[np.intp],
+        depth: NDArray[np.float32],
+        top: np.float32,
     ) -> None:
         nearer = depth < self._front[row, column]
         self._front[row[nearer], column[nearer]] = depth[nearer]
@@ -90,10 +102,12 @@ class View:
 
 
 def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
-    """Refuse returns of a sensor that is coarser than another: they can be thinned to its grid, but not densified.
+    """Refuse returns of a sensor that is coarser than another: they can be thinned to its grid, but
+    not densified.
 
     Raises:
-        DataError: if the given sensor has fewer rows per degree, or fewer columns, than the wanted one.
+        DataError: if the given sensor has fewer rows per degree, or fewer columns, than the wanted
+            one.
     """
     rows = [s.shape[0] / (s.up - s.down) for s in (given, wanted)]
     if rows[0] < 0.9 * rows[1] or given.columns < 0.9 * wanted.columns:
@@ -104,9 +118,11 @@ def refuse_coarser(given: Sensor, wanted: Sensor) -> None:
 
 
 def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None:
-    """Fill each empty cell (inf) between two returns, vertically or horizontally, with the farther one."""
+    """Fill each empty cell (inf) between two returns, vertically or horizontally, with the farther
+    one."""
     for axis in (0, 1):
-        before, after = np.roll(front, 1, axis), np.roll(front, -1, axis)
+        before = np.roll(front, 1, axis)
+        after = np.roll(front, -1, axis)
         if axis == 0:
             before[0], after[-1] = np.inf, np.inf
         farther = np.maximum(before, after)
@@ -118,25 +134,31 @@ def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None
 def _outline(
     row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], columns: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """The cells of an object's outline: between its upper and lower returns, in all columns from its first to its last.
+    """The cells of an object's outline: between its upper and lower returns, in all columns from
+    its first to its last.
 
     Args:
         row, column, depth: (n,) cells and ranges of its returns.
         columns: number of columns of the range image.
 
     Returns:
-        (m,) rows, columns, and ranges: that of the object's nearest return in the column, interpolated in columns
-        without returns.
+        (m,) rows, columns, and ranges: that of the object's nearest return in the column,
+        interpolated in columns without returns.
     """
     middle = column[0]
     offset = (column - middle + columns // 2) % columns - columns // 2
     order = np.lexsort((row, offset))
     known, first = np.unique(offset[order], return_index=True)
-    top, bottom = row[order][first], np.maximum.reduceat(row[order], first)
+    top = row[order][first]
+    bottom = np.maximum.reduceat(row[order], first)
     near = np.minimum.reduceat(depth[order], first)
     across = np.arange(known[0], known[-1] + 1)
     upper = np.rint(np.interp(across, known, top)).astype(np.intp)
     heights = np.rint(np.interp(across, known, bottom)).astype(np.intp) - upper + 1
     within = np.arange(heights.sum()) - np.repeat(np.cumsum(heights) - heights, heights)
     nearest = np.repeat(np.interp(across, known, near).astype(np.float32), heights)
-    return np.repeat(upper, heights) + within, np.repeat((across + middle) % columns, heights), nearest
+    return (
+        np.repeat(upper, heights) + within,
+        np.repeat((across + middle) % columns, heights),
+        nearest,
+    )

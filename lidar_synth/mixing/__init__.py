@@ -1,6 +1,7 @@
 """Real and synthetic scans in one torch dataset, at an exact ratio.
 
-The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, batch sampler and stream follow it.
+The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, batch sampler and
+stream follow it.
 """
 
 from lidar_synth.generate.generator import Generated

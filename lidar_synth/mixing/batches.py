@@ -1,7 +1,7 @@
 """``MixedBatches``: an epoch divided into steps, and each step into one batch for each rank.
 
-Steps follow one another along the plan. After any step, the remaining samples are the rest of the plan, so that
-training can resume there with another number of ranks and workers.
+Steps follow one another along the plan. After any step, the remaining samples are the rest of the
+plan, so that training can resume there with another number of ranks and workers.
 """
 
 import warnings
@@ -67,7 +67,8 @@ class CutSteps(Sequence[range]):
     def __getitem__(self, number: slice) -> Sequence[range]: ...
 
     def __getitem__(self, number: int | slice) -> range | Sequence[range]:
-        """The positions of a step; the last step takes all remaining positions, even if they exceed its size."""
+        """The positions of a step; the last step takes all remaining positions, even if they exceed
+        its size."""
         if isinstance(number, slice):
             return [self[i] for i in range(*number.indices(self.total))]
         if not -self.total <= number < self.total:
@@ -78,13 +79,19 @@ class CutSteps(Sequence[range]):
 
 
 def cut_steps(
-    start: int, end: int, batch_size: int, world_size: int = 1, drop_last: bool = False, join: bool = True
+    start: int,
+    end: int,
+    batch_size: int,
+    world_size: int = 1,
+    drop_last: bool = False,
+    join: bool = True,
 ) -> CutSteps:
     """Divide the positions start .. end - 1 into steps of all ranks together.
 
-    Each step holds ``batch_size`` samples for each rank. The remainder becomes a smaller step, or is added to the last
-    step if it has fewer samples than there are ranks. All ranks thus take the same number of steps, and no rank waits
-    for another for ever. ``drop_last`` drops the remainder; ``join=False`` never adds it to the last step.
+    Each step holds ``batch_size`` samples for each rank. The remainder becomes a smaller step, or
+    is added to the last step if it has fewer samples than there are ranks. All ranks thus take the
+    same number of steps, and no rank waits for another for ever. ``drop_last`` drops the remainder;
+    ``join=False`` never adds it to the last step.
     """
     size = batch_size * world_size
     full, rest = divmod(max(end - start, 0), size)
@@ -97,7 +104,8 @@ def cut_steps(
 def rank_share(step: range, rank: int, world_size: int) -> range:
     """The positions of one rank in a step.
 
-    They are consecutive, so that a balanced plan is balanced for each rank; sizes differ by one at most.
+    They are consecutive, so that a balanced plan is balanced for each rank; sizes differ by one at
+    most.
     """
     size, larger = divmod(len(step), world_size)
     start = step.start + rank * size + min(rank, larger)
@@ -107,20 +115,26 @@ def rank_share(step: range, rank: int, world_size: int) -> range:
 def go_to(dataset: Epochs, epoch: int, position: int) -> None:
     """Set the dataset to the epoch of a loaded state.
 
-    A ``StatefulDataLoader`` loads its state when it begins to iterate, which is after ``set_epoch``. If the state marks
-    the end of an epoch and the trainer has set the next epoch already, that epoch is kept.
+    A ``StatefulDataLoader`` loads its state when it begins to iterate, which is after
+    ``set_epoch``. If the state marks the end of an epoch and the trainer has set the next epoch
+    already, that epoch is kept.
     """
     if not (dataset.epoch == epoch + 1 and position >= len(dataset)):
         dataset.set_epoch(epoch)
 
 
 class MixedBatches(Sampler[list[int]]):
-    """A batch sampler in the order of the plan, for one rank or several, that can resume from any step.
+    """A batch sampler in the order of the plan, for one rank or several, that can resume from any
+    step.
 
-    Pass it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is yielded once. Each position
-    carries the epoch in which iteration began, so that ``set_epoch`` may be called at any time: it takes effect with
-    the next pass. If a library divides batch samplers among ranks itself, use ``rank=0, world_size=1``; Accelerate's
-    ``prepare`` does so too, and repeats samples: use ``lidar_synth.integrations.accelerate.prepare``.
+    Pass it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is yielded once.
+    Each position
+    carries the epoch in which iteration began, so that ``set_epoch`` may be called at any time: it
+        takes effect with
+    the next pass. If a library divides batch samplers among ranks itself, use ``rank=0,
+    world_size=1``; Accelerate's
+    ``prepare`` does so too, and repeats samples: use
+        ``lidar_synth.integrations.accelerate.prepare``.
 
     Args:
         dataset: a ``MixedScans``.
@@ -129,8 +143,8 @@ class MixedBatches(Sampler[list[int]]):
         drop_last: whether to drop the samples that do not fill a batch on every rank.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks where an
-            ``Accelerator`` is set up for several processes.
+        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks
+            where an ``Accelerator`` is set up for several processes.
     """
 
     def __init__(
@@ -144,13 +158,18 @@ class MixedBatches(Sampler[list[int]]):
     ) -> None:
         if batch_size < 1:
             raise ConfigError(f"batch_size={batch_size}", "at least 1")
-        self.dataset, self.batch_size, self.drop_last = dataset, batch_size, drop_last
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.drop_last = drop_last
         self.rank, self.world_size = place(rank, world_size)
         self._by_default = rank is None
         self._start = (0, 0)  # epoch and position of the loaded state
         self._taken = (0, 0)  # epoch, and number of its batches taken so far
         self._warned = False
-        self._fetched = (0, 0)  # samples that the dataset fetched before the latest complete pass, and in that pass
+        self._fetched = (
+            0,
+            0,
+        )  # samples that the dataset fetched before the latest complete pass, and in that pass
 
     def __len__(self) -> int:
         """Number of batches in a pass."""
@@ -159,16 +178,22 @@ class MixedBatches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         self._check()
-        steps, epoch = self._steps(), self.dataset.epoch
+        steps = self._steps()
+        epoch = self.dataset.epoch
         if steps and len(steps[-1]) < self.world_size:
-            warnings.warn(f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none", stacklevel=2)
+            warnings.warn(
+                f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none",
+                stacklevel=2,
+            )
         if self.dataset.current.passed.get(self.rank) == (epoch, steps.start) and not self._warned:
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         before, yielded = self._fetched
         fetched = self.dataset.fetched - before
         if self.world_size > 1 and 0 < fetched < yielded * 2 / 3:
-            warnings.warn(SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched), stacklevel=2)
+            warnings.warn(
+                SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched), stacklevel=2
+            )
         self._fetched = (0, 0)
         return self._batches(epoch, steps)
 
@@ -182,21 +207,26 @@ class MixedBatches(Sampler[list[int]]):
         The keys are described in ``lidar_synth.mixing.state``.
 
         Args:
-            done: number of batches that this rank has trained on since it began to iterate. The default, the batches
-                taken from this sampler, is correct without workers and in torchdata's ``StatefulDataLoader``. In a
-                ``DataLoader`` with workers it would include the prefetched batches.
+            done: number of batches that this rank has trained on since it began to iterate. The
+                default, the batches taken from this sampler, is correct without workers and in
+                torchdata's ``StatefulDataLoader``. In a ``DataLoader`` with workers it would
+                include the prefetched batches.
 
         Raises:
             ConfigError: on more batches than the epoch has.
         """
-        steps, epoch = self._steps(), self.dataset.epoch
+        steps = self._steps()
+        epoch = self.dataset.epoch
         taken = self._taken[1] if self._taken[0] == epoch else 0
         if not 0 <= (number := taken if done is None else done) <= len(steps):
-            raise ConfigError(f"{number} batches done of {len(steps)}", "a number of batches of this epoch")
+            raise ConfigError(
+                f"{number} batches done of {len(steps)}", "a number of batches of this epoch"
+            )
         if number < len(steps):
             position = steps[number].start
         elif done is None:
-            # Not the next epoch yet: a trainer that resumes here still has to see the end of this one.
+            # Not the next epoch yet: a trainer that resumes here still has to see the end of this
+            # one.
             position = len(self.dataset)
         else:
             epoch, position = after_epoch(self.dataset.mixture, epoch)
@@ -214,14 +244,21 @@ class MixedBatches(Sampler[list[int]]):
         go_to(self.dataset, *self._start)
 
     def _batches(self, epoch: int, steps: CutSteps) -> Iterator[list[int]]:
-        announced, number, yielded, before = 0, 0, 0, self.dataset.fetched
+        announced = 0
+        number = 0
+        yielded = 0
+        before = self.dataset.fetched
         for done, step in enumerate(steps):
             if done * steps.size >= announced:
-                rest = (rank_share(steps[i], self.rank, self.world_size) for i in range(done, len(steps)))
+                rest = (
+                    rank_share(steps[i], self.rank, self.world_size)
+                    for i in range(done, len(steps))
+                )
                 self.dataset.expect(epoch, chain.from_iterable(rest))
                 announced = done * steps.size + AHEAD * self.world_size // 2
             if share := rank_share(step, self.rank, self.world_size):
-                number, yielded = number + 1, yielded + len(share)
+                number = number + 1
+                yielded = yielded + len(share)
                 self._taken = (epoch, number)
                 yield [Position(position, epoch) for position in share]
         self.dataset.current.passed[self.rank] = (epoch, steps.start)

@@ -1,4 +1,5 @@
-"""Batches of plain PyTorch items: concatenated points with offsets, padded points, or range images."""
+"""Batches of plain PyTorch items: concatenated points with offsets, padded points, or range
+images."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,21 +30,24 @@ Unlabelled = Literal["error", "allow"]
 class Collate:
     """A ``collate_fn`` that makes a batch of B items.
 
-    Every batch has ``boxes`` (ΣM, 7) float32 with ``box_offsets`` (B + 1,) int64, ``names`` (B tuples), ``domain``
-    (B,) int64 and ``id`` (B names). The other keys depend on the form:
+    Every batch has ``boxes`` (ΣM, 7) float32 with ``box_offsets`` (B + 1,) int64, ``names`` (B
+    tuples), ``domain`` (B,) int64 and ``id`` (B names). The other keys depend on the form:
 
-    - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32, the concatenation
-      of all scans; ``offsets`` (B + 1,) int64: scan b is ``points[offsets[b]:offsets[b + 1]]``.
-    - ``padded``: ``points`` (B, N, 4), ``label`` (B, N), ``confidence`` (B, N), and ``mask`` (B, N) bool, True for
-      points; padding is 0, with label 255.
-    - ``range``: ``range`` (B, H, W) float32 metres, 0 = no return; ``reflectance``, ``label`` int64, ``confidence``
-      (B, H, W) of the nearest returns; ``mask`` (B, H, W) bool, True for cells with a return.
+    - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32,
+      the concatenation of all scans; ``offsets`` (B + 1,) int64: scan b is
+      ``points[offsets[b]:offsets[b + 1]]``.
+    - ``padded``: ``points`` (B, N, 4), ``label`` (B, N), ``confidence`` (B, N), and ``mask`` (B, N)
+      bool, True for points; padding is 0, with label 255.
+    - ``range``: ``range`` (B, H, W) float32 metres, 0 = no return; ``reflectance``, ``label``
+      int64, ``confidence`` (B, H, W) of the nearest returns; ``mask`` (B, H, W) bool, True for
+      cells with a return.
 
     Args:
         form: one of these.
         sensor: defines the grid of range images.
-        unlabelled: ``"error"`` refuses a batch that has neither a valid label nor a box, ``"allow"`` returns it. The
-            mean loss over no label is NaN, and one optimiser step with it makes all weights NaN.
+        unlabelled: ``"error"`` refuses a batch that has neither a valid label nor a box,
+            ``"allow"`` returns it. The mean loss over no label is NaN, and one optimiser step with
+            it makes all weights NaN.
 
     Raises:
         ConfigError: on an unknown form, or no sensor for range images.
@@ -56,7 +60,9 @@ class Collate:
     def __post_init__(self) -> None:
         for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
             if getattr(self, name) not in get_args(kind):
-                raise ConfigError(f"{name}={getattr(self, name)!r} of batches", f"one of {get_args(kind)}")
+                raise ConfigError(
+                    f"{name}={getattr(self, name)!r} of batches", f"one of {get_args(kind)}"
+                )
         if self.form == "range" and self.sensor is None:
             raise ConfigError("range images without a sensor", "a sensor, which defines their grid")
 
@@ -74,19 +80,26 @@ class Collate:
             "domain": torch.tensor([item["domain"] for item in items]),
             "id": [item["id"] for item in items],
         }
-        if self.unlabelled == "error" and not len(batch["boxes"]) and not bool((batch["label"] != IGNORE).any()):
+        if (
+            self.unlabelled == "error"
+            and not len(batch["boxes"])
+            and not bool((batch["label"] != IGNORE).any())
+        ):
             raise DataError(
                 f"a batch without any valid label or box (scans {batch['id'][:4]})",
                 "at least one, because the loss over no label is NaN",
-                "Use larger batches with balanced=True, so that each holds labelled scans; labels='generated' or "
-                "another policy that gives labels; labels='none' for an unlabelled pool; or unlabelled='allow' and "
+                "Use larger batches with balanced=True, so that each holds labelled scans; "
+                "labels='generated' or "
+                "another policy that gives labels; labels='none' for an unlabelled pool; or "
+                "unlabelled='allow' and "
                 "skip such batches in the training loop.",
             )
         return batch
 
 
 def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
-    """What ``DataLoader`` does to items without a ``collate_fn``, which fails for scans of different sizes.
+    """What ``DataLoader`` does to items without a ``collate_fn``, which fails for scans of
+    different sizes.
 
     Raises:
         ConfigError: on such scans.
@@ -101,7 +114,9 @@ def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
         ) from error
 
 
-default_collate_fn_map[Item] = collate_by_default  # as torch's documentation of default_collate says
+default_collate_fn_map[Item] = (
+    collate_by_default  # as torch's documentation of default_collate says
+)
 
 
 def _offset_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:
@@ -120,7 +135,9 @@ def _padded_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Te
         "points": pad_sequence(points, batch_first=True),
         "label": pad_sequence(label, batch_first=True, padding_value=IGNORE),
         "confidence": pad_sequence(confidence, batch_first=True),
-        "mask": pad_sequence([torch.ones(len(p), dtype=torch.bool) for p in points], batch_first=True),
+        "mask": pad_sequence(
+            [torch.ones(len(p), dtype=torch.bool) for p in points], batch_first=True
+        ),
     }
 
 
@@ -130,13 +147,19 @@ def _range_images(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Ten
     for item in items:
         points = item["points"].numpy()
         scan = Scan(
-            points[:, :3], np.ascontiguousarray(points[:, 3]), sensor,
-            label=item["label"].numpy().astype(np.uint8), confidence=item["confidence"].numpy(), id=item["id"],
-        )  # fmt: skip
+            points[:, :3],
+            np.ascontiguousarray(points[:, 3]),
+            sensor,
+            label=item["label"].numpy().astype(np.uint8),
+            confidence=item["confidence"].numpy(),
+            id=item["id"],
+        )
         images.append(project(scan))
     distance = torch.from_numpy(np.stack([image.range for image in images]))
     names = ("reflectance", "label", "confidence")
-    channels = {n: torch.from_numpy(np.stack([image.channels[n] for image in images])) for n in names}
+    channels = {
+        n: torch.from_numpy(np.stack([image.channels[n] for image in images])) for n in names
+    }
     return {"range": distance, **channels, "label": channels["label"].long(), "mask": distance > 0}
 
 
@@ -148,7 +171,11 @@ _FORMS: dict[str, Callable[[Sequence[Item], Sensor | None], dict[str, Any]]] = {
 
 
 def _columns(items: Sequence[Item]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-    return [i["points"] for i in items], [i["label"] for i in items], [i["confidence"] for i in items]
+    return (
+        [i["points"] for i in items],
+        [i["label"] for i in items],
+        [i["confidence"] for i in items],
+    )
 
 
 def _offsets(parts: Sequence[Tensor]) -> Tensor:

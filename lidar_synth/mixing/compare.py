@@ -1,6 +1,7 @@
 """Comparison of a synthetic sample with a real one of a trainer's dataset, before training.
 
-A collate function may silently accept samples of different forms: torch's takes the keys of a batch's first sample and
+A collate function may silently accept samples of different forms: torch's takes the keys of a
+    batch's first sample and
 drops all other keys of the others.
 """
 
@@ -57,16 +58,21 @@ USUAL_IGNORE = (-100, -1, 254, 255, 65535)
 
 
 def check_alike(
-    real: Sequence[Any], synthetic: Sequence[Synthetic], finish: Callable[[int, Scan, np.random.Generator], Any]
+    real: Sequence[Any],
+    synthetic: Sequence[Synthetic],
+    finish: Callable[[int, Scan, np.random.Generator], Any],
 ) -> None:
-    """Compare a trainer's first sample with one synthetic sample of each source, then what several samples mean.
+    """Compare a trainer's first sample with one synthetic sample of each source, then what several
+    samples mean.
 
-    The meaning (meaning.py) is compared for points and images of ``LEAST_POINTS`` or more with their labels,
-    over up to ``SEARCHED`` samples. What is certainly wrong is refused; what is unusual is logged as a warning.
+    The meaning (meaning.py) is compared for points and images of ``LEAST_POINTS`` or more with
+    their labels, over up to ``SEARCHED`` samples. What is certainly wrong is refused; what is
+    unusual is logged as a warning.
 
-    The state of Python's, numpy's and torch's global random generators is preserved. Banks and existing scans are
-    represented by their first scan; a generator or a rolling bank, which would have to start first, by a made-up scan
-    with the same fields. If either sample cannot be read, nothing is compared, and a warning is logged.
+    The state of Python's, numpy's and torch's global random generators is preserved. Banks and
+    existing scans are represented by their first scan; a generator or a rolling bank, which would
+    have to start first, by a made-up scan with the same fields. If either sample cannot be read,
+    nothing is compared, and a warning is logged.
 
     Args:
         real: the trainer's datasets; the first sample of the first one is used.
@@ -74,8 +80,8 @@ def check_alike(
         finish: ``(source, scan, rng) -> sample``, what the mixture does to a scan of a source.
 
     Raises:
-        ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes, the height of the
-            ground, the scale of a column or the numbers of the classes.
+        ConfigError: if keys, types, dtypes, ranks or the value for "ignore" differ, or units, axes,
+            the height of the ground, the scale of a column or the numbers of the classes.
     """
     if not real or not synthetic:
         return
@@ -83,7 +89,9 @@ def check_alike(
     with _preserved_generators():
         expected = _try("real", dataset.__getitem__, 0)
         for number, source in enumerate(synthetic):
-            sample = _try("synthetic", lambda n, s: finish(n, _scan_of(s), keyed_rng(0)), number, source)
+            sample = _try(
+                "synthetic", lambda n, s: finish(n, _scan_of(s), keyed_rng(0)), number, source
+            )
             if expected is None or sample is None:
                 continue
             wrong = [*differences(expected, sample), *_unknown_values(dataset, expected, sample)]
@@ -91,15 +99,29 @@ def check_alike(
                 raise ConfigError(
                     f"synthetic samples unlike the real ones: {'; '.join(wrong[:4])}",
                     "the same keys, types, dtypes and ranks, and one value for ignored labels",
-                    "Change to_sample, or pass compare=False if the collate function expects them to differ.",
+                    "Change to_sample, or pass compare=False if the collate function expects "
+                    "them to differ.",
                 )
             if _tables(expected) and not _is_on_demand(source):
-                more = [_try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]]
+                more = [
+                    _try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]
+                ]
                 numbers = spread(source.length or SEARCHED, SEARCHED)
                 made = [
-                    _try("synthetic", lambda i, n, s: finish(n, s[i], keyed_rng(i)), i, number, source) for i in numbers
+                    _try(
+                        "synthetic",
+                        lambda i, n, s: finish(n, s[i], keyed_rng(i)),
+                        i,
+                        number,
+                        source,
+                    )
+                    for i in numbers
                 ]
-                report(compare_meaning([_tables(s) for s in (expected, *more)], [_tables(s) for s in made]))
+                report(
+                    compare_meaning(
+                        [_tables(s) for s in (expected, *more)], [_tables(s) for s in made]
+                    )
+                )
 
 
 def report(found: Sequence[Contradiction]) -> None:
@@ -111,9 +133,11 @@ def report(found: Sequence[Contradiction]) -> None:
     if any(each.certain for each in found):
         texts = [each.text for each in sorted(found, key=lambda each: not each.certain)]
         raise ConfigError(
-            f"synthetic samples that mean something else than the real ones: {'; '.join(texts[:4])}",
+            "synthetic samples that mean something else than the real ones: "
+            f"{'; '.join(texts[:4])}",
             "the same units, axes, origin, scales and classes",
-            "Change to_sample (lidar-synth check-mix shows the scans themselves), or pass compare=False.",
+            "Change to_sample (lidar-synth check-mix shows the scans themselves), or pass "
+            "compare=False.",
         )
     for each in found:
         log.warning("synthetic samples are unlike the real ones: %s", each.text)
@@ -125,7 +149,8 @@ def compare_meaning(
     """Compare the tables of points of real and synthetic samples.
 
     Args:
-        real, synthetic: {place: table} of each sample; tables of other places or columns are not compared.
+        real, synthetic: {place: table} of each sample; tables of other places or columns are not
+            compared.
     """
     found: dict[Contradiction, None] = {}
     for place, first in real[0].items():
@@ -141,18 +166,22 @@ def compare_meaning(
     return list(found)
 
 
-def differences(real: Any, synthetic: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[str]:
-    """Describe how a synthetic sample differs from a real one; lengths may differ, and None matches anything.
+def differences(
+    real: Any, synthetic: Any, place: str = "sample", depth: int = DEPTH
+) -> Iterator[str]:
+    """Describe how a synthetic sample differs from a real one; lengths may differ, and None matches
+    anything.
 
     Args:
-        real, synthetic: two samples: mappings, sequences, tensors, arrays, numbers, text, or objects, of which the
-            attributes that hold arrays are compared.
+        real, synthetic: two samples: mappings, sequences, tensors, arrays, numbers, text, or
+            objects, of which the attributes that hold arrays are compared.
         place: name of these values within the sample.
         depth: levels of nested containers to compare.
     """
     if real is None or synthetic is None or depth == 0:
         return
-    a, b = _kind(real), _kind(synthetic)
+    a = _kind(real)
+    b = _kind(synthetic)
     if a != b:
         yield f"{place} is {b} instead of {a}"
     elif isinstance(real, Mapping):
@@ -169,22 +198,33 @@ def differences(real: Any, synthetic: Any, place: str = "sample", depth: int = D
         elif real and synthetic:
             yield from differences(real[0], synthetic[0], f"{place}[0]", depth - 1)
     elif a.startswith("an object"):
-        x, y = _parts(real), _parts(synthetic)
-        yield from (f"{place} has no {name!r}" for name in x if name not in vars(synthetic) and _is_array(x[name]))
+        x = _parts(real)
+        y = _parts(synthetic)
+        yield from (
+            f"{place} has no {name!r}"
+            for name in x
+            if name not in vars(synthetic) and _is_array(x[name])
+        )
         for name in [n for n in x if n in y]:
             yield from differences(x[name], y[name], f"{place}.{name}", depth - 1)
 
 
 def _kind(value: Any) -> str:
-    """The type of a value in words, with dtype and rank for arrays; it must be the same for two values."""
+    """The type of a value in words, with dtype and rank for arrays; it must be the same for two
+    values."""
     if isinstance(value, torch.Tensor):
         return f"a tensor of {str(value.dtype).removeprefix('torch.')}, rank {value.ndim}"
     if isinstance(value, np.ndarray) and value.dtype.kind not in "OSU":
         return f"an array of {value.dtype}, rank {value.ndim}"
     for kinds, words in (
-        ((bool, np.bool_), "a truth value"), ((int, np.integer), "an integer"), ((float, np.floating), "a real number"),
-        (str, "text"), (bytes, "bytes"), (Mapping, "a mapping"), ((list, tuple), "a sequence"),
-    ):  # fmt: skip
+        ((bool, np.bool_), "a truth value"),
+        ((int, np.integer), "an integer"),
+        ((float, np.floating), "a real number"),
+        (str, "text"),
+        (bytes, "bytes"),
+        (Mapping, "a mapping"),
+        ((list, tuple), "a sequence"),
+    ):
         if isinstance(value, kinds):
             return words
     return f"an object of the type {type(value).__name__}"
@@ -197,17 +237,25 @@ def _is_array(value: Any) -> bool:
 def _parts(value: Any) -> dict[str, Any]:
     """The attributes of an object that may hold arrays."""
     members = getattr(value, "__dict__", {}).items()
-    return {k: v for k, v in members if _is_array(v) or isinstance(v, Mapping | list | tuple) or hasattr(v, "__dict__")}
+    return {
+        k: v
+        for k, v in members
+        if _is_array(v) or isinstance(v, Mapping | list | tuple) or hasattr(v, "__dict__")
+    }
 
 
 def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
-    """Describe label values of a synthetic sample that are no class and occur in none of the searched real samples."""
-    real_labels, labels = dict(_labels(real)), dict(_labels(synthetic))
+    """Describe label values of a synthetic sample that are no class and occur in none of the
+    searched real samples."""
+    real_labels = dict(_labels(real))
+    labels = dict(_labels(synthetic))
     for place in [p for p in labels if p in real_labels]:
         known = real_labels[place]
         unknown = _not_classes(place, labels[place], known)
         for other in range(1, min(len(dataset), SEARCHED) if unknown else 0):
-            known = known | dict(_labels(_try("real", dataset.__getitem__, other))).get(place, set())
+            known = known | dict(_labels(_try("real", dataset.__getitem__, other))).get(
+                place, set()
+            )
             unknown = _not_classes(place, unknown, known)
         if unknown:
             values = ", ".join(map(str, sorted(unknown)[:4]))
@@ -215,10 +263,12 @@ def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
 
 
 def _not_classes(place: str, values: set[int], known: set[int]) -> set[int]:
-    """The values that cannot be classes, given the known values of real labels: "ignore", or out of range."""
+    """The values that cannot be classes, given the known values of real labels: "ignore", or out of
+    range."""
     if not LABELS.search(place) or "inst" in place.lower():
         return {v for v in values - known if v in USUAL_IGNORE}
-    low, high = min(0, *known), max(len(NAMES) + 1, *known)
+    low = min(0, *known)
+    high = max(len(NAMES) + 1, *known)
     return {v for v in values - known if v in USUAL_IGNORE or not low <= v <= high}
 
 
@@ -230,14 +280,19 @@ def _labels(sample: Any) -> Iterator[tuple[str, set[int]]]:
 
 
 def _tables(sample: Any) -> dict[str, Table]:
-    """{place: points} of the arrays of real numbers that have many rows, with the labels that belong to them."""
+    """{place: points} of the arrays of real numbers that have many rows, with the labels that
+    belong to them."""
     arrays = dict(_arrays(sample))
     named = {p: a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)}
     found = {}
     for place, array in arrays.items():
         rows = _rows(array) if array.dtype.kind == "f" else None
         if rows is not None:
-            fitting = (a.ravel() for a in named.values() if a.size == len(rows) and len(np.unique(a)) <= FEW)
+            fitting = (
+                a.ravel()
+                for a in named.values()
+                if a.size == len(rows) and len(np.unique(a)) <= FEW
+            )
             label = next(fitting, None)
             reach = np.ptp(np.quantile(rows, (0.01, 0.99), axis=0), axis=0)
             spatial = array.ndim == 2 and len(reach) > 2 and bool((reach[:3] > (5, 5, 0.5)).all())
@@ -260,7 +315,9 @@ def _rows(array: NDArray[Any]) -> NDArray[np.float64] | None:
     return array.astype(np.float64) if fits and np.isfinite(array).all() else None
 
 
-def _arrays(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[tuple[str, NDArray[Any]]]:
+def _arrays(
+    value: Any, place: str = "sample", depth: int = DEPTH
+) -> Iterator[tuple[str, NDArray[Any]]]:
     """(place, array) of the arrays and tensors with at least one axis in a sample."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
@@ -279,7 +336,8 @@ def _arrays(value: Any, place: str = "sample", depth: int = DEPTH) -> Iterator[t
 
 
 def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
-    """A sample, or None if it cannot be read: training will raise the same error, or the dataset may skip it."""
+    """A sample, or None if it cannot be read: training will raise the same error, or the dataset
+    may skip it."""
     try:
         return fetch(*which)
     except Exception as error:  # a trainer's own code may raise anything

@@ -1,7 +1,8 @@
 """The epoch of a sample: the one in which iteration began, even if ``set_epoch`` was called since.
 
-``MixedBatches`` yields positions that carry their epoch. Other samplers yield plain integers, which refer to the
-dataset's current epoch. DataLoader workers fetch ahead, so that ``set_epoch`` after ``iter(loader)`` would mix two
+``MixedBatches`` yields positions that carry their epoch. Other samplers yield plain integers, which
+refer to the dataset's current epoch. DataLoader workers fetch ahead, so that ``set_epoch`` after
+``iter(loader)`` would mix two
 epochs: some scans would come twice and others never. Such a call therefore raises an error.
 """
 
@@ -21,12 +22,14 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.state import count_accelerated
 
 REPEATED = (
-    "epoch {} begins again, with the same scans in the same order as before. Make the mixture once, and call "
+    "epoch {} begins again, with the same scans in the same order as before. Make the mixture "
+    "once, and call "
     "set_epoch(epoch) before each pass."
 )
 
 SHARED_TWICE = (
-    "of {} samples for rank {} of {}, only {} were fetched. Another library may divide the batches among the processes "
+    "of {} samples for rank {} of {}, only {} were fetched. Another library may divide the "
+    "batches among the processes "
     "a second time; if so, call batches(...) with rank=0, world_size=1."
 )
 
@@ -54,9 +57,11 @@ class Position(int):
 
 
 def shared_integers(*values: int) -> Tensor:
-    """(n,) int64 in shared memory, so that all DataLoader workers see changes: forked, spawned and persistent ones.
+    """(n,) int64 in shared memory, so that all DataLoader workers see changes: forked, spawned and
+    persistent ones.
 
-    A plain attribute does not work, because persistent workers keep the copy of the dataset with which they started.
+    A plain attribute does not work, because persistent workers keep the copy of the dataset with
+    which they started.
     """
     tensor = torch.tensor(values, dtype=torch.int64)
     tensor.share_memory_()  # type: ignore[no-untyped-call]
@@ -64,17 +69,23 @@ def shared_integers(*values: int) -> Tensor:
 
 
 class CurrentEpoch:
-    """The current epoch of a dataset in all its processes, and the epochs in which passes over it began."""
+    """The current epoch of a dataset in all its processes, and the epochs in which passes over it
+    began."""
 
     def __init__(self) -> None:
-        # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is used
+        # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is
+        # used
         self._shared = shared_integers(0, -1, 0, 0)
         self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
-        self._own = 0  # the epoch that this process set, or the current epoch when this process started
+        self._own = (
+            0  # the epoch that this process set, or the current epoch when this process started
+        )
         self._process = os.getpid()
-        self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()  # {fetcher: epoch of its pass}
+        self._passes: WeakKeyDictionary[Any, int] = (
+            WeakKeyDictionary()
+        )  # {fetcher: epoch of its pass}
         self._followers: WeakSet[Any] = WeakSet()
 
     def __int__(self) -> int:
@@ -87,30 +98,36 @@ class CurrentEpoch:
 
     @property
     def at_start(self) -> int:
-        """The epoch that this process set, or that was current when it started: for a worker, at ``iter(loader)``."""
+        """The epoch that this process set, or that was current when it started: for a worker, at
+        ``iter(loader)``."""
         return self._own
 
     def set(self, epoch: int) -> None:
         """Set the epoch for all processes.
 
         Raises:
-            ConfigError: if Accelerate sets an epoch before the one that was set or resumed and never used.
+            ConfigError: if Accelerate sets an epoch before the one that was set or resumed and
+                never used.
         """
         unused = self._shared[3] == 0
         if epoch < self._own and unused and not self._followers and count_accelerated():
             raise ConfigError(
-                f"epoch {epoch} where epoch {self._own} was set or resumed: a loader of accelerator.prepare counts its "
+                f"epoch {epoch} where epoch {self._own} was set or resumed: a loader of "
+                "accelerator.prepare counts its "
                 "passes from 0",
                 "the epoch that was set or resumed",
-                "from lidar_synth.integrations.accelerate import prepare; loader = prepare(accelerator, loader).",
+                "from lidar_synth.integrations.accelerate import prepare; loader = "
+                "prepare(accelerator, loader).",
             )
-        self._shared[0], self._own = epoch, epoch
+        self._shared[0] = epoch
+        self._own = epoch
         self._shared[3] = 0
         for loader in self._followers:
             loader.iteration = epoch
 
     def follow(self, loader: Any) -> None:
-        """Keep the attribute ``iteration`` of a loader, the epoch of its next pass, at the current epoch."""
+        """Keep the attribute ``iteration`` of a loader, the epoch of its next pass, at the current
+        epoch."""
         self._followers.add(loader)
         loader.iteration = int(self)
 
@@ -118,14 +135,16 @@ class CurrentEpoch:
         """The epoch of an index that is being fetched.
 
         Raises:
-            ConfigError: if another epoch was set since the DataLoader's pass began, or if it loads a ``Subset``.
+            ConfigError: if another epoch was set since the DataLoader's pass began, or if it loads
+                a ``Subset``.
         """
         self._shared[3] = 1
         if isinstance(index, Position):
             worker = get_worker_info()
             self._fetched[worker.id % _COUNTERS if worker else 0] += 1
             return index.epoch
-        epoch, fetcher = int(self), _running_fetcher()
+        epoch = int(self)
+        fetcher = _running_fetcher()
         if fetcher is None:  # not within a DataLoader's pass
             return epoch
         forked = self._process != os.getpid()
@@ -140,7 +159,8 @@ class CurrentEpoch:
         return epoch
 
     def note_pass(self, epoch: int) -> None:
-        """Note that a pass begins, and warn once if the pass before had the same epoch; only worker 0 does this."""
+        """Note that a pass begins, and warn once if the pass before had the same epoch; only worker
+        0 does this."""
         self._shared[3] = 1
         worker = get_worker_info()
         if worker is not None and worker.id > 0:
@@ -161,7 +181,11 @@ class CurrentEpoch:
         self.passed = dict(other.passed)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_passes", "_followers")}
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in ("_passes", "_followers")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {"_passes": WeakKeyDictionary(), "_followers": WeakSet()}
@@ -177,8 +201,10 @@ def check_pass(begun: int, epoch: int) -> None:
         raise ConfigError(
             f"set_epoch({epoch}) while a DataLoader was iterating over epoch {begun}",
             "set_epoch before iter(loader), as the workers fetch ahead",
-            "Call set_epoch before the loop over the loader. If a trainer's hook runs later, pass the DataLoader "
-            "batch_sampler=train.batches(batch_size): its batches keep the epoch in which iteration began.",
+            "Call set_epoch before the loop over the loader. If a trainer's hook runs later, pass "
+            "the DataLoader "
+            "batch_sampler=train.batches(batch_size): its batches keep the epoch in which "
+            "iteration began.",
         )
 
 
@@ -190,7 +216,8 @@ def check_whole(dataset: Any) -> None:
     """
     if isinstance(dataset, Subset):
         raise ConfigError(
-            "a Subset of a mixture, of random_split for instance: its indices mean other scans in every epoch, so that "
+            "a Subset of a mixture, of random_split for instance: its indices mean other scans in "
+            "every epoch, so that "
             "held-out real scans would be trained on",
             "the real scans split, then mixed",
             "kept, held_out = random_split(real, [0.9, 0.1]); train = MixedScans(kept, synth, ...)",
@@ -198,7 +225,8 @@ def check_whole(dataset: Any) -> None:
 
 
 def _running_fetcher() -> Any:
-    """The fetcher of the DataLoader on the call stack, or None: torch makes one for each pass in each process."""
+    """The fetcher of the DataLoader on the call stack, or None: torch makes one for each pass in
+    each process."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         if frame.f_code is _MapDatasetFetcher.fetch.__code__:

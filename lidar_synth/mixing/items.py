@@ -17,8 +17,10 @@ class Item(dict[str, Any]):
     Keys:
         points: (N, 4) float32 x, y, z in metres, sensor frame, and reflectance in [0, 1].
         label: (N,) int64 train ids 0..18; 255 = ignore, or the scan has no labels.
-        confidence: (N,) float32 in [0, 1] of ``label``; if the scan has none, 1 for every labelled point.
-        boxes: (M, 7) float32 x, y, z of the centre of gravity, l, w, h in metres, yaw in radians; M = 0 without boxes.
+        confidence: (N,) float32 in [0, 1] of ``label``; if the scan has none, 1 for every labelled
+            point.
+        boxes: (M, 7) float32 x, y, z of the centre of gravity, l, w, h in metres, yaw in radians; M
+            = 0 without boxes.
         names: M class names in KITTI's spelling.
         domain: 0 real, 1 synthetic.
         id: the scan's name.
@@ -43,7 +45,9 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         DataError: on a label that is not a train id.
     """
     points = np.empty((len(scan), 4), np.float32)
-    for column, values in enumerate((*scan.points.T, scan.reflectance)):  # numpy is slow at rows of three
+    for column, values in enumerate(
+        (*scan.points.T, scan.reflectance)
+    ):  # numpy is slow at rows of three
         points[:, column] = values
     if scan.label is None:
         label = np.full(len(scan), IGNORE, np.int64)
@@ -51,9 +55,11 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         label = scan.label.astype(np.int64)
         wrong = (scan.label >= len(NAMES)) & (scan.label != IGNORE)
         if wrong.any():
-            raise DataError(f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",
-                            f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
-                            "Map the dataset's own ids when they are read (Taxonomy.decode).")  # fmt: skip
+            raise DataError(
+                f"scan {scan.id!r}: labels {np.unique(label[wrong])[:8].tolist()}",
+                f"train ids 0..{len(NAMES) - 1}, or {IGNORE} = ignore",
+                "Map the dataset's own ids when they are read (Taxonomy.decode).",
+            )
     own = scan.confidence
     confidence = (label != IGNORE).astype(np.float32) if own is None else np.array(own, np.float32)
     boxes: Any = np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()

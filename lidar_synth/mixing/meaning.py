@@ -1,8 +1,11 @@
-"""What the columns and classes of samples mean: statistics of real and synthetic ones, and how they contradict.
+"""What the columns and classes of samples mean: statistics of real and synthetic ones, and how they
+contradict.
 
-Two samples may have the same keys, types and shapes and still mean different things: centimetres, another axis, another
-numbering of classes. Their distributions tell. The limits of what is refused are far outside of what the public
-datasets, the town and the shipped models differ by among themselves (docs/how-to/mix.md).
+Two samples may have the same keys, types and shapes and still mean different things: centimetres,
+    another axis, another
+numbering of classes. Their distributions tell. The limits of what is refused are far outside of
+what the public datasets, the town and the shipped models differ by among themselves
+(docs/how-to/mix.md).
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,8 +34,10 @@ NAMES_OF_COLUMNS = ("x", "y", "z", "reflectance")
 VARIED = 8
 """Number of different values from which on a column counts as varied."""
 
-OTHER_UNIT, UNUSUAL_UNIT = 6.0, 3.0
-"""Ratios of median ranges: refused, and reported. Sensors are up to 2.8 apart, feet 3.3, centimetres 100."""
+OTHER_UNIT = 6.0
+UNUSUAL_UNIT = 3.0
+"""Ratios of median ranges: refused, and reported. Sensors are up to 2.8 apart, feet 3.3,
+centimetres 100."""
 
 OTHER_SIZE = 1.5
 """Ratio of numbers of points that is reported."""
@@ -40,23 +45,31 @@ OTHER_SIZE = 1.5
 OTHER_SCALE = 10.0
 """Ratio of the spread of a column that is refused."""
 
-OTHER_GROUND, UNUSUAL_GROUND = 1.0, 0.5
-"""Differences in metres between the heights of the ground, refused and reported: KITTI's is -1.7, PandaSet's -2.2."""
+OTHER_GROUND = 1.0
+UNUSUAL_GROUND = 0.5
+"""Differences in metres between the heights of the ground, refused and reported: KITTI's is -1.7,
+PandaSet's -2.2."""
 
-TURNED, SURE = 0.15, 2.5
-"""Least mean elongation along an axis, and least ratio to its standard error, for a road to have a direction."""
+TURNED = 0.15
+SURE = 2.5
+"""Least mean elongation along an axis, and least ratio to its standard error, for a road to have a
+direction."""
 
 OTHER_SHARES = 0.5
-"""Total variation distance between the shares of the classes; that of streets and motorways is up to 0.4."""
+"""Total variation distance between the shares of the classes; that of streets and motorways is up
+to 0.4."""
 
 EXPLAINED = 0.7
-"""Largest share of that distance which may remain with other numbers of the classes, if those explain it."""
+"""Largest share of that distance which may remain with other numbers of the classes, if those
+explain it."""
 
 LARGE = 0.03
 """Share of a class that is large enough to be recognised."""
 
-ALIKE, UNLIKE = 1.0, 1.6
-"""Costs of a match of two classes (``_cost``) below which they look alike, and above which they do not."""
+ALIKE = 1.0
+UNLIKE = 1.6
+"""Costs of a match of two classes (``_cost``) below which they look alike, and above which they do
+not."""
 
 
 class Table(NamedTuple):
@@ -82,7 +95,8 @@ class Contradiction(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassLook:
-    """A class: share of the labelled points, median height above the ground and median range in metres."""
+    """A class: share of the labelled points, median height above the ground and median range in
+    metres."""
 
     share: float
     height: float
@@ -96,9 +110,11 @@ class Meaning:
     Args:
         points: median number of rows.
         quantiles: (C, 3) quantiles of each column.
-        constant, varied: (C,) whether a column has one value, and whether it has more than ``VARIED``.
+        constant, varied: (C,) whether a column has one value, and whether it has more than
+            ``VARIED``.
         distance: median range in metres; NaN without coordinates.
-        ground, ceiling: median height of the lowest points, and of the highest ones, of small areas; NaN if unknown.
+        ground, ceiling: median height of the lowest points, and of the highest ones, of small
+            areas; NaN if unknown.
         along: for each sample, how much farther it reaches in x than in y (logarithm).
         classes: {label: its look}.
     """
@@ -126,7 +142,8 @@ def spread(length: int, count: int) -> list[int]:
 
 
 def rows_in_use(scans: Sequence[Scan]) -> int:
-    """The median number of rows of a scan's range image with returns in at least 2 % of their columns."""
+    """The median number of rows of a scan's range image with returns in at least 2 % of their
+    columns."""
     filled = [(project(scan).range > 0).mean(1) >= 0.02 for scan in scans]
     return int(np.median([rows.sum() for rows in filled]))
 
@@ -140,13 +157,23 @@ def measure_tables(tables: Sequence[Table], ignored: Sequence[int]) -> Meaning:
     """
     thin = [_thinned(table) for table in tables]
     columns = np.concatenate([table.columns for table in thin])
-    numbers = np.array([len(np.unique(column[:: max(1, len(columns) // 4000)])) for column in columns.T])
+    numbers = np.array(
+        [len(np.unique(column[:: max(1, len(columns) // 4000)])) for column in columns.T]
+    )
     spatial = tables[0].spatial
     grounds = [_floor_height(table.columns) for table in thin] if spatial else []
-    ceilings = [-_floor_height(table.columns * [1, 1, -1, *[1] * (columns.shape[1] - 3)]) for table in thin if spatial]
+    ceilings = [
+        -_floor_height(table.columns * [1, 1, -1, *[1] * (columns.shape[1] - 3)])
+        for table in thin
+        if spatial
+    ]
     distance = np.linalg.norm(columns[:, :3], axis=1) if spatial else np.full(len(columns), np.nan)
     ground = _median(grounds)
-    height = columns[:, 2] - (0 if np.isnan(ground) else ground) if spatial else np.full(len(columns), np.nan)
+    height = (
+        columns[:, 2] - (0 if np.isnan(ground) else ground)
+        if spatial
+        else np.full(len(columns), np.nan)
+    )
     return Meaning(
         points=float(np.median([len(table.columns) for table in tables])),
         quantiles=np.quantile(columns, QUANTILES, axis=0).T,
@@ -174,7 +201,8 @@ def _median(values: Sequence[float] | Floats) -> float:
 
 
 def _floor_height(points: Floats) -> float:
-    """The median over squares of 2 m, 3 to 25 m away, of the height of their lowest points; NaN if there are few."""
+    """The median over squares of 2 m, 3 to 25 m away, of the height of their lowest points; NaN if
+    there are few."""
     away = np.hypot(points[:, 0], points[:, 1])
     near = points[(away > 3) & (away < 25)]
     square = (np.floor(near[:, 0] / 2) * 1000 + np.floor(near[:, 1] / 2)).astype(np.int64)
@@ -186,7 +214,8 @@ def _floor_height(points: Floats) -> float:
 
 
 def _elongation(points: Floats) -> float:
-    """The logarithm of how much farther the points reach in x than in y: above 0 on most roads, which run along x."""
+    """The logarithm of how much farther the points reach in x than in y: above 0 on most roads,
+    which run along x."""
     reach = np.quantile(np.abs(points[:, :2]), 0.95, axis=0)
     return float(np.log(max(reach[0], 0.01) / max(reach[1], 0.01)))
 
@@ -217,7 +246,10 @@ def contradictions(real: Meaning, synthetic: Meaning, place: str = "") -> Iterat
     named = f"{place}: " if place else ""
     size = max(real.points, synthetic.points) / min(real.points, synthetic.points)
     if coordinates and size > OTHER_SIZE:
-        text = f"{named}{synthetic.points:,.0f} points instead of {real.points:,.0f}: density tells them apart"
+        text = (
+            f"{named}{synthetic.points:,.0f} points instead of {real.points:,.0f}: density tells "
+            "them apart"
+        )
         yield Contradiction(text, False)
     geometry = unit or [*_heights(real, synthetic), *_axes(real, synthetic)]
     for found in [*geometry, *_columns(real, synthetic, coordinates), *_classes(real, synthetic)]:
@@ -229,7 +261,8 @@ def _unit(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     factor = max(ratio, 1 / max(ratio, 1e-9))
     if factor > UNUSUAL_UNIT:
         text = (
-            f"the median distance of points is {synthetic.distance:.4g} instead of {real.distance:.4g}: "
+            f"the median distance of points is {synthetic.distance:.4g} instead of "
+            f"{real.distance:.4g}: "
             "coordinates in another unit, such as centimetres"
         )
         yield Contradiction(text, factor > OTHER_UNIT)
@@ -248,10 +281,12 @@ def _heights(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
 
 
 def _axes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
-    ours, theirs = _direction(synthetic.along), _direction(real.along)
+    ours = _direction(synthetic.along)
+    theirs = _direction(real.along)
     if ours * theirs < 0:
         text = (
-            f"roads run along {'x' if ours > 0 else 'y'} instead of {'x' if theirs > 0 else 'y'}: other axes, such as "
+            f"roads run along {'x' if ours > 0 else 'y'} instead of {'x' if theirs > 0 else 'y'}: "
+            "other axes, such as "
             "nuScenes' x to the right and y forward"
         )
         yield Contradiction(text, True)
@@ -261,17 +296,23 @@ def _direction(along: Sequence[float]) -> int:
     """1 if several samples are clearly elongated along x, -1 along y, 0 if neither is sure."""
     if len(along) < 4:
         return 0
-    mean, error = float(np.mean(along)), float(np.std(along, ddof=1)) / len(along) ** 0.5
+    mean = float(np.mean(along))
+    error = float(np.std(along, ddof=1)) / len(along) ** 0.5
     return int(np.sign(mean)) if abs(mean) > max(TURNED, SURE * error) else 0
 
 
 def _columns(real: Meaning, synthetic: Meaning, coordinates: int) -> Iterator[Contradiction]:
-    """Columns with another scale, or with one value only; of coordinates, ``_unit`` and ``_heights`` know more."""
+    """Columns with another scale, or with one value only; of coordinates, ``_unit`` and
+    ``_heights`` know more."""
     for number in range(coordinates, len(real.quantiles)):
         name = NAMES_OF_COLUMNS[number] if coordinates and number < 4 else f"column {number}"
         low, high = synthetic.quantiles[number, [0, 2]]
-        told = f"{low:.4g} to {high:.4g} instead of {real.quantiles[number, 0]:.4g} to {real.quantiles[number, 2]:.4g}"
-        spread, expected = high - low, np.ptp(real.quantiles[number])
+        told = (
+            f"{low:.4g} to {high:.4g} instead of {real.quantiles[number, 0]:.4g} to "
+            f"{real.quantiles[number, 2]:.4g}"
+        )
+        spread = high - low
+        expected = np.ptp(real.quantiles[number])
         if synthetic.constant[number] and real.varied[number]:
             yield Contradiction(f"{name} is always {low:.4g}, {told}", number < 4)
         elif real.constant[number] and synthetic.varied[number]:
@@ -281,7 +322,8 @@ def _columns(real: Meaning, synthetic: Meaning, coordinates: int) -> Iterator[Co
 
 
 def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
-    ours, theirs = synthetic.classes, real.classes
+    ours = synthetic.classes
+    theirs = real.classes
     if not ours or not theirs:
         return
     distance = _distance(ours, theirs)
@@ -299,7 +341,9 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     moved = sum(ours[value].share for value in pairs)
     text = f"classes differ for {distance:.0%} of the points"
     if pairs:
-        text = "; ".join(f"class {value} looks like your {other}" for value, other in list(pairs.items())[:4])
+        text = "; ".join(
+            f"class {value} looks like your {other}" for value, other in list(pairs.items())[:4]
+        )
     elif unseen > OTHER_SHARES:
         missing = sorted(set(ours) - set(theirs))[:4]
         text = f"classes {missing}, {unseen:.0%} of the points, are in no real sample"
@@ -309,7 +353,10 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
 def _renumberings() -> Iterator[tuple[str, dict[int, int]]]:
     """Usual mistakes: a reason and {synthetic class: real class}."""
     for step in (1, -1):
-        yield "the numbers of the classes are off by one", {value: value - step for value in range(256)}
+        yield (
+            "the numbers of the classes are off by one",
+            {value: value - step for value in range(256)},
+        )
     raw = dict(enumerate(SEMANTIC_KITTI.from_train or ()))
     reason = "SemanticKITTI's ids in files beside its 19 train ids"
     yield reason, {value: train for train, value in raw.items()}
@@ -323,8 +370,11 @@ def _distance(ours: dict[int, ClassLook], theirs: dict[int, ClassLook]) -> float
     return sum(abs(one - other) for one, other in share) / 2
 
 
-def _matches(real: dict[int, ClassLook], synthetic: dict[int, ClassLook]) -> Iterator[tuple[int, int]]:
-    """(synthetic class, real class) of large classes that look like another real class and unlike their own."""
+def _matches(
+    real: dict[int, ClassLook], synthetic: dict[int, ClassLook]
+) -> Iterator[tuple[int, int]]:
+    """(synthetic class, real class) of large classes that look like another real class and unlike
+    their own."""
     large = {value: look for value, look in real.items() if look.share > LARGE}
     for value, look in sorted(synthetic.items(), key=lambda pair: -pair[1].share):
         if look.share > LARGE and large:
@@ -337,5 +387,9 @@ def _matches(real: dict[int, ClassLook], synthetic: dict[int, ClassLook]) -> Ite
 def _cost(one: ClassLook, other: ClassLook) -> float:
     """How unlike two classes look: by height, share and range."""
     height = abs(one.height - other.height) / 0.7
-    parts = [height, abs(np.log(one.share / other.share)) / 1.2, abs(np.log(one.range / other.range)) / 0.7]
+    parts = [
+        height,
+        abs(np.log(one.share / other.share)) / 1.2,
+        abs(np.log(one.range / other.range)) / 0.7,
+    ]
     return float(np.nansum(parts))

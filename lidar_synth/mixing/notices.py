@@ -1,6 +1,7 @@
 """Messages about what would harm a training without an error; each is logged once per dataset.
 
-Objects without boxes, unlabelled real scans, numbers of points that tell real from synthetic, a bank used very often.
+Objects without boxes, unlabelled real scans, numbers of points that tell real from synthetic, a
+bank used very often.
 """
 
 import logging
@@ -30,10 +31,15 @@ def report_repeats(plan: MixingPlan) -> None:
     for source, count in sources:
         if source.length is not None and count > OFTEN * source.length:
             log.warning(
-                "the %d scans of a synthetic source (%s) come %.0f times each in an epoch: a network learns them by "
-                "heart. Bake more (lidar-synth bake OUT --count %d), use a generator, or a lower ratio.",
-                source.length, source.identity[:40], count / source.length, count // OFTEN,
-            )  # fmt: skip
+                "the %d scans of a synthetic source (%s) come %.0f times each in an epoch: a "
+                "network learns them by "
+                "heart. Bake more (lidar-synth bake OUT --count %d), use a generator, or a lower "
+                "ratio.",
+                source.length,
+                source.identity[:40],
+                count / source.length,
+                count // OFTEN,
+            )
 
 
 class Notices:
@@ -58,11 +64,14 @@ class Notices:
         self._count(0, scan)
 
     def _count(self, kind: int, scan: Scan) -> None:
-        """Compare the numbers of points of the first scans, and labelled synthetic scans with unlabelled real ones."""
+        """Compare the numbers of points of the first scans, and labelled synthetic scans with
+        unlabelled real ones."""
         if self._labelled and self._unlabelled is not None:
             self._warn(
-                "real scan %r has no labels: all its points are 255 = ignore, and only synthetic scans teach classes. "
-                "Open labelled scans (lidar-synth label kitti360 makes labels of KITTI-360), or leave it out.",
+                "real scan %r has no labels: all its points are 255 = ignore, and only synthetic "
+                "scans teach classes. "
+                "Open labelled scans (lidar-synth label kitti360 makes labels of KITTI-360), or "
+                "leave it out.",
                 self._unlabelled,
             )
             self._labelled = False
@@ -72,13 +81,17 @@ class Notices:
         self._sizes[kind].append(len(scan))
         real, synthetic = self._sizes
         if len(real) == len(synthetic) == FEW:
-            ours, theirs = median(synthetic), median(real)
+            ours = median(synthetic)
+            theirs = median(real)
             if max(ours, theirs) > OTHER_SIZE * min(ours, theirs):
                 self._warn(
-                    "a real scan has %d points, a synthetic one %d, on the same nominal grid: the density tells them "
-                    "apart. Use a model of that density (town-dense), as_sensor=, or collate='range'.",
-                    theirs, ours,
-                )  # fmt: skip
+                    "a real scan has %d points, a synthetic one %d, on the same nominal grid: the "
+                    "density tells them "
+                    "apart. Use a model of that density (town-dense), as_sensor=, or "
+                    "collate='range'.",
+                    theirs,
+                    ours,
+                )
 
     def _warn(self, message: str, *values: object) -> None:
         worker = get_worker_info()
@@ -86,7 +99,8 @@ class Notices:
             log.warning(message, *values)
 
     def synthetic(self, given: Scan, scan: Scan) -> None:
-        """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes where real ones do.
+        """Report the unboxed objects of a synthetic scan, or that synthetic scans have no boxes
+        where real ones do.
 
         Args:
             given: the scan before its label policy.
@@ -103,11 +117,16 @@ class Notices:
             return
         if scan.boxes is None:
             log.warning(
-                "real scans have boxes, synthetic ones have none: a detector would learn that their objects are "
-                "background. For a detector, use labels='mix' with objects, or labels='boxes' if the scans have boxes."
+                "real scans have boxes, synthetic ones have none: a detector would learn that "
+                "their objects are "
+                "background. For a detector, use labels='mix' with objects, or labels='boxes' if "
+                "the scans have boxes."
             )
         elif (found := measure([given])).objects:
             log.warning(
-                "synthetic scan %r: %s, which unboxed='close' removes; only their number is reported with "
-                "unboxed='keep'", given.id, found,
-            )  # fmt: skip
+                "synthetic scan %r: %s, which unboxed='close' removes; only their number is "
+                "reported with "
+                "unboxed='keep'",
+                given.id,
+                found,
+            )

@@ -1,9 +1,10 @@
 """Random permutations of any length whose entries are computed independently, in constant memory.
 
-``permute`` is a Feistel network over a grid with barely more cells than entries (Black and Rogaway, "Ciphers with
-arbitrary finite domains", CT-RSA 2002). Each round shifts a cell's row by a keyed hash of its column, or its column by
-a hash of its row, so that every round is a bijection. An entry that leaves the range passes through the network again
-until it is back in range ("cycle walking"), which keeps the map a bijection.
+``permute`` is a Feistel network over a grid with barely more cells than entries (Black and Rogaway,
+"Ciphers with arbitrary finite domains", CT-RSA 2002). Each round shifts a cell's row by a keyed
+hash of its column, or its column by a hash of its row, so that every round is a bijection. An entry
+that leaves the range passes through the network again until it is back in range ("cycle walking"),
+which keeps the map a bijection.
 """
 
 from functools import lru_cache
@@ -18,7 +19,11 @@ _ROUNDS = 10  # with fewer, the orders of a handful of entries are not equally f
 
 
 def permute(
-    entries: NDArray[np.int64], size: int, seed: int, stream: int, number: int | NDArray[np.int64] = 0
+    entries: NDArray[np.int64],
+    size: int,
+    seed: int,
+    stream: int,
+    number: int | NDArray[np.int64] = 0,
 ) -> NDArray[np.int64]:
     """Apply a keyed permutation of 0 .. size - 1 to some of its entries.
 
@@ -27,17 +32,19 @@ def permute(
         size: length of the permutation, below 2^62.
         seed: 0 <= seed < 2^64.
         stream: separates permutations of different use, 0 <= stream < 2^63.
-        number: number of the permutation, such as an epoch; one for all entries, or (N,). Permutations of different
-            numbers are independent.
+        number: number of the permutation, such as an epoch; one for all entries, or (N,).
+            Permutations of different numbers are independent.
 
     Returns:
-        (N,) 0 <= place < size; a bijection of the entries for each (size, seed, stream, number), the same on every
-        machine.
+        (N,) 0 <= place < size; a bijection of the entries for each (size, seed, stream, number),
+        the same on every machine.
     """
     if size <= 1 or not len(entries):
         return np.zeros(len(entries), np.int64)
     keys = _keys(seed, stream)
-    order = _mixed(np.broadcast_to(np.asarray(number, np.int64), (len(entries),)).astype(np.uint64) + keys[-1])
+    order = _mixed(
+        np.broadcast_to(np.asarray(number, np.int64), (len(entries),)).astype(np.uint64) + keys[-1]
+    )
     places = _once(entries.astype(np.uint64), size, keys, order)
     while len(outside := np.flatnonzero(places >= size)):
         places[outside] = _once(places[outside], size, keys, order[outside])
@@ -50,7 +57,8 @@ def _once(
     """One pass through all rounds of the network, over a grid of at least ``size`` cells."""
     rows = isqrt(size - 1) + 1
     columns = -(-size // rows)
-    row, column = cells // np.uint64(columns), cells % np.uint64(columns)
+    row = cells // np.uint64(columns)
+    column = cells % np.uint64(columns)
     for i, key in enumerate(keys[:-1]):
         if i % 2:
             column = _shifted(column, columns, row + key ^ order)
@@ -59,14 +67,20 @@ def _once(
     return row * np.uint64(columns) + column
 
 
-def _shifted(places: NDArray[np.uint64], size: int, keyed: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Each place, 0 .. size - 1 with size < 2^32, shifted cyclically by a hash of its keyed value."""
-    moved: NDArray[np.uint64] = places + ((_mixed(keyed) >> np.uint64(32)) * np.uint64(size) >> np.uint64(32))
+def _shifted(
+    places: NDArray[np.uint64], size: int, keyed: NDArray[np.uint64]
+) -> NDArray[np.uint64]:
+    """Each place, 0 .. size - 1 with size < 2^32, shifted cyclically by a hash of its keyed
+    value."""
+    moved: NDArray[np.uint64] = places + (
+        (_mixed(keyed) >> np.uint64(32)) * np.uint64(size) >> np.uint64(32)
+    )
     return moved - (moved >= size) * np.uint64(size)
 
 
 def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """SplitMix64's finaliser: flipping one input bit flips about half of the output bits. Products wrap."""
+    """SplitMix64's finaliser: flipping one input bit flips about half of the output bits. Products
+    wrap."""
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     mixed: NDArray[np.uint64] = values ^ (values >> np.uint64(31))

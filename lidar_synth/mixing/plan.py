@@ -1,13 +1,17 @@
-"""The plan of an epoch: which sample is at which position, as a pure function of the mixture and the epoch.
+"""The plan of an epoch: which sample is at which position, as a pure function of the mixture and
+the epoch.
 
-The sample at a position is computed from the position alone. A plan of any length therefore takes the same memory, and
-workers, ranks, batch size and resumption cannot change it.
+The sample at a position is computed from the position alone. A plan of any length therefore takes
+the same memory, and workers, ranks, batch size and resumption cannot change it.
 
-A permutation keyed by (seed, epoch) maps a position to a *rank*; the ranks are divided among the sources in order, by
-their quotas (quotas.py). Within its source, a sample has a running number that counts over all epochs. Real sources are
-permuted again each time they are exhausted: after any number of epochs, the numbers of uses of two real scans differ
-by at most one. Synthetic scans are numbered upwards, so that each is new. With ``reuse = k`` they come in laps whose
-length is the largest number that an epoch takes; every lap comes k times, in k epochs, before the next lap begins.
+A permutation keyed by (seed, epoch) maps a position to a *rank*; the ranks are divided among the
+sources in order, by their quotas (quotas.py). Within its source, a sample has a running number that
+counts over all epochs. Real sources are
+permuted again each time they are exhausted: after any number of epochs, the numbers of uses of two
+    real scans differ
+by at most one. Synthetic scans are numbered upwards, so that each is new. With ``reuse = k`` they
+come in laps whose length is the largest number that an epoch takes; every lap comes k times, in k
+epochs, before the next lap begins.
 """
 
 import hashlib
@@ -21,7 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.mixing.permutation import permute
-from lidar_synth.mixing.quotas import Mixture, PlannedSource, deal, quotas, running_counts, synthetic_before
+from lidar_synth.mixing.quotas import (
+    Mixture,
+    PlannedSource,
+    deal,
+    quotas,
+    running_counts,
+    synthetic_before,
+)
 from lidar_synth.mixing.schedules import share_of
 
 VERSION = "lidar-synth-plan/2"
@@ -36,8 +47,8 @@ _BLOCKS = 8  # number of blocks in the cache
 class MixingPlan:
     """The samples at the N positions of an epoch.
 
-    ``plan[position]`` is the number of the source (real sources in order, then synthetic ones) and the local index
-    within it. ``plan.at(positions)`` returns both for many positions at once.
+    ``plan[position]`` is the number of the source (real sources in order, then synthetic ones) and
+    the local index within it. ``plan.at(positions)`` returns both for many positions at once.
 
     Args:
         mixture: the sources and the settings.
@@ -158,9 +169,12 @@ class MixingPlan:
         return permute(positions, len(self), self.mixture.seed, _ORDER, self.epoch)
 
     def _balanced(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Ranks with synthetic samples spread evenly over the epoch, and synthetic sources among them."""
-        before, after = self._synthetic_up_to(positions), self._synthetic_up_to(positions + 1)
-        synthetic, seed = after > before, self.mixture.seed
+        """Ranks with synthetic samples spread evenly over the epoch, and synthetic sources among
+        them."""
+        before = self._synthetic_up_to(positions)
+        after = self._synthetic_up_to(positions + 1)
+        synthetic = after > before
+        seed = self.mixture.seed
         rank = np.empty(len(positions), np.int64)
         real = (positions - before)[~synthetic]
         rank[~synthetic] = permute(real, len(self) - self.synthetics, seed, _REALS, self.epoch)
@@ -169,20 +183,27 @@ class MixingPlan:
             source, number = deal(self.mixture.synthetic_weights, before[synthetic] + earlier)
             dealt = np.empty(len(source), np.int64)
             for each, start in enumerate(self._starts.tolist()[self.reals :]):
-                here, total = source == each, self.reals + each
+                here = source == each
+                total = self.reals + each
                 own = number[here] - self.before[total]
-                dealt[here] = start + permute(own, self.counts[total], seed, _SOURCES + total, self.epoch)
+                dealt[here] = start + permute(
+                    own, self.counts[total], seed, _SOURCES + total, self.epoch
+                )
             rank[synthetic] = dealt
         return rank
 
     def _synthetic_up_to(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Number of synthetic samples among the first ``positions`` of the epoch: the exact number, rounded up.
+        """Number of synthetic samples among the first ``positions`` of the epoch: the exact number,
+        rounded up.
 
-        The exact number counts from the first epoch on, so that at the end of an epoch the result equals its quota.
+        The exact number counts from the first epoch on, so that at the end of an epoch the result
+        equals its quota.
         """
         p, q = share_of(self.mixture.ratio, self.epoch).as_integer_ratio()
         exact = synthetic_before(self.mixture, self.epoch)
-        ahead = floor((ceil(exact) - exact) * q)  # surplus from rounding up so far, in units of 1 / q
+        ahead = floor(
+            (ceil(exact) - exact) * q
+        )  # surplus from rounding up so far, in units of 1 / q
         return -((ahead - positions * p) // q)
 
     def _local(self, source: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -190,7 +211,9 @@ class MixingPlan:
         mixture = self.mixture
         if source < self.reals:
             length = mixture.real[source].length or 0
-            return permute(number % length, length, mixture.seed, _SOURCES + source, number // length)
+            return permute(
+                number % length, length, mixture.seed, _SOURCES + source, number // length
+            )
         planned = mixture.synthetic[source - self.reals]
         if mixture.reuse > 1:
             lap = mixture.laps[source - self.reals]

@@ -1,15 +1,17 @@
 """The number of samples from each source in an epoch, and in all epochs before it.
 
-Every epoch of a mixture has the same length, because samplers and datasets that wrap another one ask for its length
-once. With ``epoch_size="add"`` that is the number of real scans and of the synthetic ones that the largest share of the
-schedule adds to them, rounded up; each epoch's share of it is rounded up too. Otherwise exact shares, which are
-fractions, are added up over the epochs and only the sum is rounded: after any number of epochs, the number of synthetic
+Every epoch of a mixture has the same length, because samplers and datasets that wrap another one
+ask for its length once. With ``epoch_size="add"`` that is the number of real scans and of the
+synthetic ones that the largest share of the schedule adds to them, rounded up; each epoch's share
+of it is rounded up too. Otherwise exact shares, which are
+fractions, are added up over the epochs and only the sum is rounded: after any number of epochs, the
+    number of synthetic
 samples is the exact number, rounded up.
 
-Several sources of a kind divide its samples by their weights in the same way. The sources are the leaves of a binary
-tree, and each node sends ``round(m * share)`` of its first m samples to the left and the rest to the right. Both
-numbers increase monotonically with m, so that both the counts after m samples and the source of sample m follow from m
-alone.
+Several sources of a kind divide its samples by their weights in the same way. The sources are the
+leaves of a binary tree, and each node sends ``round(m * share)`` of its first m samples to the left
+and the rest to the right. Both numbers increase monotonically with m, so that both the counts after
+m samples and the source of sample m follow from m alone.
 """
 
 from collections.abc import Sequence
@@ -27,12 +29,15 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing.schedules import Schedule, settled, share_of, to_integer
 
 EpochSize = Literal["add", "replace"] | int
-"""The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach the ratio, or the
-largest ratio of a schedule (where the ratio is smaller, real scans are used more often, all equally); ``"replace"`` has
-as many samples as there are real scans, some of them synthetic; a number is the length itself."""
+"""The length of all epochs: ``"add"`` uses every real scan once and adds synthetic ones to reach
+the ratio, or the largest ratio of a schedule (where the ratio is smaller, real scans are used more
+often, all equally); ``"replace"`` has as many samples as there are real scans, some of them
+synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
-_FIRST_EPOCHS = 100  # number of epochs of a changing schedule that determine lengths of epochs and laps
+_FIRST_EPOCHS = (
+    100  # number of epochs of a changing schedule that determine lengths of epochs and laps
+)
 
 
 @dataclass(frozen=True)
@@ -41,8 +46,8 @@ class PlannedSource:
 
     Args:
         length: number of scans; None = endless.
-        weight: the source's share among the sources of its kind is proportional to its weight. None: the length of a
-            real source, the same weight for all synthetic ones.
+        weight: the source's share among the sources of its kind is proportional to its weight.
+            None: the length of a real source, the same weight for all synthetic ones.
         identity: text that distinguishes it from other sources; part of the plan's hash.
     """
 
@@ -62,9 +67,10 @@ class Mixture:
         seed: seed of the order, 0 <= seed < 2^64.
         epoch_size: see ``EpochSize``.
         reuse: number of epochs in which each synthetic scan is used.
-        balanced: whether to spread synthetic samples evenly instead of shuffling them over the epoch. Any B
-            consecutive samples of an epoch then hold B * ratio synthetic ones, exactly if that is a whole number and
-            otherwise up to one, and every synthetic source's share of these up to two.
+        balanced: whether to spread synthetic samples evenly instead of shuffling them over the
+            epoch. Any B consecutive samples of an epoch then hold B * ratio synthetic ones, exactly
+            if that is a whole number and otherwise up to one, and every synthetic source's share of
+            these up to two.
 
     Raises:
         ConfigError: on values with which no epoch can be planned.
@@ -81,10 +87,14 @@ class Mixture:
 
     def __post_init__(self) -> None:
         size = self.epoch_size
-        if size not in ("add", "replace") and not (isinstance(size, int) and not isinstance(size, bool) and size > 0):
+        if size not in ("add", "replace") and not (
+            isinstance(size, int) and not isinstance(size, bool) and size > 0
+        ):
             raise ConfigError(f"epoch_size={size!r}", "'add', 'replace' or a number of samples")
         if to_integer(self.reuse, "reuse") < 1:
-            raise ConfigError(f"reuse={self.reuse}", "the number of epochs that use a synthetic scan, at least 1")
+            raise ConfigError(
+                f"reuse={self.reuse}", "the number of epochs that use a synthetic scan, at least 1"
+            )
         if not 0 <= self.seed < 2**64:
             raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
         for source in self.real + self.synthetic:
@@ -117,7 +127,8 @@ class Mixture:
 
     @cached_property
     def laps(self) -> tuple[int, ...]:
-        """For each synthetic source, the largest number of scans that an epoch takes from it, at least 1.
+        """For each synthetic source, the largest number of scans that an epoch takes from it, at
+        least 1.
 
         With ``reuse``, scans come in laps of this length, so that no epoch contains a scan twice.
         """
@@ -129,7 +140,8 @@ class Mixture:
         """Number of samples in an epoch, the same in all of them.
 
         Raises:
-            ConfigError: on ``epoch_size="add"`` with a ratio of 1, which no number of synthetic samples reaches.
+            ConfigError: on ``epoch_size="add"`` with a ratio of 1, which no number of synthetic
+                samples reaches.
         """
         if self.epoch_size != "add":
             return self.real_length if self.epoch_size == "replace" else int(self.epoch_size)
@@ -144,7 +156,8 @@ class Mixture:
 
     @cached_property
     def _deciding(self) -> tuple[int, ...]:
-        """The epochs that determine lengths: all until the schedule settles, the first hundred if it never does."""
+        """The epochs that determine lengths: all until the schedule settles, the first hundred if
+        it never does."""
         last = settled(self.ratio)
         epochs = [*range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)), last or 0]
         return tuple(takewhile(self._has_ratio, epochs))
@@ -169,9 +182,12 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
         ConfigError: if the sources cannot serve the ratio.
         DataError: if the ratio needs real scans and there are none.
     """
-    share, size = share_of(mixture.ratio, epoch), mixture.epoch_size
+    share = share_of(mixture.ratio, epoch)
+    size = mixture.epoch_size
     if share > 0 and not mixture.synthetic:
-        raise ConfigError(f"ratio {float(share):g} in epoch {epoch} without a synthetic source", "one, or ratio 0")
+        raise ConfigError(
+            f"ratio {float(share):g} in epoch {epoch} without a synthetic source", "one, or ratio 0"
+        )
     if not mixture.real_length and (share < 1 or not isinstance(size, int)):
         raise DataError(
             f"no real scans, with ratio {float(share):g} and epoch_size={size!r}",
@@ -183,38 +199,47 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
 
 
 def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
-    """The number of synthetic samples that all epochs before this one should have together, before rounding."""
+    """The number of synthetic samples that all epochs before this one should have together, before
+    rounding."""
     same_from = settled(mixture.ratio)
     changing = epoch if same_from is None else min(epoch, same_from)
     sums = mixture._sums
     for earlier in range(len(sums) - 1, changing):
         sums[earlier + 1] = sums[earlier] + exact_synthetic(mixture, earlier)
     total = sums[changing]
-    return total if epoch == changing else total + (epoch - changing) * exact_synthetic(mixture, changing)
+    return (
+        total
+        if epoch == changing
+        else total + (epoch - changing) * exact_synthetic(mixture, changing)
+    )
 
 
 def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """The number of samples from each source in all epochs before this one together, real sources first."""
+    """The number of samples from each source in all epochs before this one together, real sources
+    first."""
     synthetic = ceil(synthetic_before(mixture, epoch))
     reals = split(mixture.real_weights, epoch * mixture.length - synthetic)
     return reals + split(mixture.synthetic_weights, synthetic)
 
 
 def quotas(mixture: Mixture, epoch: int) -> tuple[int, ...]:
-    """The number of samples from each source in an epoch, real sources first; their sum is the epoch's length.
+    """The number of samples from each source in an epoch, real sources first; their sum is the
+    epoch's length.
 
     Raises:
         ConfigError: if the sources cannot serve the ratio.
         DataError: if the ratio needs real scans and there are none.
     """
     exact_synthetic(mixture, epoch)  # raises if the schedule has no such epoch
-    before, after = running_counts(mixture, epoch), running_counts(mixture, epoch + 1)
+    before = running_counts(mixture, epoch)
+    after = running_counts(mixture, epoch + 1)
     return tuple(b - a for a, b in zip(before, after, strict=True))
 
 
 @dataclass(frozen=True)
 class _Node:
-    """Sends ``round(m * p / q)`` of its first m samples to the left, the others right; a leaf is a source's number."""
+    """Sends ``round(m * p / q)`` of its first m samples to the left, the others right; a leaf is a
+    source's number."""
 
     p: int
     q: int
@@ -228,8 +253,9 @@ Number = TypeVar("Number", int, NDArray[np.int64])
 def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
     """Divide the first ``total`` samples among the sources.
 
-    The counts sum to ``total`` and increase monotonically with it. With up to four sources each is within one of its
-    exact share (the error at depth 2 is less than 1/2 + 1/2); with n sources, within ``log2(n) / 2`` rounded up.
+    The counts sum to ``total`` and increase monotonically with it. With up to four sources each is
+    within one of its exact share (the error at depth 2 is less than 1/2 + 1/2); with n sources,
+    within ``log2(n) / 2`` rounded up.
     """
     counts = [0] * len(weights)
 
@@ -246,7 +272,9 @@ def split(weights: Sequence[Fraction], total: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def deal(
+    weights: Sequence[Fraction], samples: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The source of each sample, and its number within that source; consistent with ``split``.
 
     Args:
@@ -256,11 +284,13 @@ def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArr
     Returns:
         (N,) sources, (N,) numbers within them.
     """
-    sources, numbers = np.empty_like(samples), np.empty_like(samples)
+    sources = np.empty_like(samples)
+    numbers = np.empty_like(samples)
 
     def walk(node: _Node | int, where: NDArray[np.intp], number: NDArray[np.int64]) -> None:
         if isinstance(node, int):
-            sources[where], numbers[where] = node, number
+            sources[where] = node
+            numbers[where] = number
         else:
             left = _left(node, number)
             goes_left = _left(node, number + 1) > left
@@ -273,12 +303,14 @@ def deal(weights: Sequence[Fraction], samples: NDArray[np.int64]) -> tuple[NDArr
 
 def _left(node: _Node, count: Number) -> Number:
     """``round(count * p / q)``, halves up."""
-    quotient, rest = count // node.q, count % node.q
+    quotient = count // node.q
+    rest = count % node.q
     return quotient * node.p + (2 * rest * node.p + node.q) // (2 * node.q)
 
 
 def _most(node: _Node | int, count: int) -> tuple[int, ...]:
-    """The largest number of samples that each source, in order, can get out of ``count`` consecutive ones."""
+    """The largest number of samples that each source, in order, can get out of ``count``
+    consecutive ones."""
     most: dict[int, int] = {}
 
     def walk(node: _Node | int, count: int) -> None:
@@ -294,12 +326,14 @@ def _most(node: _Node | int, count: int) -> tuple[int, ...]:
 
 @lru_cache(256)
 def _tree(weights: tuple[Fraction, ...]) -> _Node | int:
-    """A balanced binary tree, the heaviest sources first, because the first leaves have the fewest roundings."""
+    """A balanced binary tree, the heaviest sources first, because the first leaves have the fewest
+    roundings."""
 
     def grow(sources: Sequence[int]) -> _Node | int:
         if len(sources) == 1:
             return sources[0]
-        left, right = sources[: len(sources) // 2], sources[len(sources) // 2 :]
+        left = sources[: len(sources) // 2]
+        right = sources[len(sources) // 2 :]
         share = sum((weights[i] for i in left), Fraction(0)) / sum(weights[i] for i in sources)
         p, q = share.limit_denominator(_FINEST).as_integer_ratio()
         return _Node(p, q, grow(left), grow(right))

@@ -39,50 +39,59 @@ ToSample = Callable[[Scan, np.random.Generator], Any]
 """Makes a sample from a scan; the random generator is keyed by (seed, epoch, position)."""
 
 _LATEST: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""By the hash of epoch 0: the mixture that was made last. One that is made anew before each epoch repeats it."""
+"""By the hash of epoch 0: the mixture that was made last. One that is made anew before each epoch
+repeats it."""
 
 
 class MixedScans(Dataset[Any]):
-    """A dataset of real scans mixed with synthetic ones at an exact ratio; real scans stay unchanged.
+    """A dataset of real scans mixed with synthetic ones at an exact ratio; real scans stay
+    unchanged.
 
-    The order of an epoch is a pure function of the arguments and the epoch (plan.py) and is already shuffled: iterate
-    in order (a ``DataLoader`` without ``shuffle``), or use ``batches``, which also serves several ranks. Any other
-    sampler works too. Call ``set_epoch`` before each epoch; otherwise the same scans are repeated, with a warning.
-    ``set_epoch`` after ``iter(loader)`` raises an error; with ``batches`` it takes effect with the next pass.
+    The order of an epoch is a pure function of the arguments and the epoch (plan.py) and is already
+    shuffled: iterate in order (a ``DataLoader`` without ``shuffle``), or use ``batches``, which
+    also serves several ranks. Any other sampler works too. Call ``set_epoch`` before each epoch;
+    otherwise the same scans are repeated, with a warning. ``set_epoch`` after ``iter(loader)``
+    raises an error; with ``batches`` it takes effect with the next pass.
 
     Args:
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
         synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
-        ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch, ``{epoch: share}``,
-            ``Linear(first, last, epochs)`` or a function of the epoch.
-        labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a function.
+        ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch,
+            ``{epoch: share}``, ``Linear(first, last, epochs)`` or a function of the epoch.
+        labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a
+            function.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         label_options: keyword arguments of the label policy.
-        epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds synthetic ones, as many as
-            the largest ratio of a schedule needs; where the ratio is smaller, real scans are used more often.
-            ``"replace"`` has as many samples as there are real scans; a number is the length.
-        reuse: number of epochs in which each synthetic scan is used, with different random augmentations.
-        balanced: whether to spread synthetic samples evenly, so that every batch in the order of the plan holds its
-            exact share (up to one sample if that is not a whole number).
+        epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds
+            synthetic ones, as many as the largest ratio of a schedule needs; where the ratio is
+            smaller, real scans are used more often. ``"replace"`` has as many samples as there are
+            real scans; a number is the length.
+        reuse: number of epochs in which each synthetic scan is used, with different random
+            augmentations.
+        balanced: whether to spread synthetic samples evenly, so that every batch in the order of
+            the plan holds its exact share (up to one sample if that is not a whole number).
         augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
-        augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged, bit for bit.
-        to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py). The scan is a copy,
-            which it and the trainer may change in place.
-        collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"`` (collate.py), or
-            your own function.
-        unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it, which is always the
-            case with ``labels="none"``.
-        unboxed: what is done to objects without a box in synthetic scans with boxes: ``"close"`` removes them and fills
-            the holes, ``"keep"`` hands them out, ``"error"`` refuses the scan; or your own ``(scan) -> scan``. A
-            detector would learn that they are background. A scan without boxes is not changed.
-        as_sensor: turns every synthetic scan into one of this sensor, before the label policy and in the process that
-            loads the sample: a ``Transfer``, a preset's name, a YAML file or a ``Sensor``. So a bank of one sensor
-            serves the scans of another. Losses and noise are new for every position of an epoch. Real scans stay
-            unchanged; ``SeenAs(real, transfer)`` turns those into scans of another sensor.
-        real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but already have the
-            trainer's form; see ``wrap``.
-        compare: with ``real_as_is``, whether to compare the first real sample with a synthetic one at construction;
-            see ``check_alike``.
+        augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged,
+            bit for bit.
+        to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
+            The scan is a copy, which it and the trainer may change in place.
+        collate: how ``collate`` makes a batch of items: ``"offsets"``, ``"padded"`` or ``"range"``
+            (collate.py), or your own function.
+        unlabelled: ``"error"`` refuses a batch without any valid label; ``"allow"`` returns it,
+            which is always the case with ``labels="none"``.
+        unboxed: what is done to objects without a box in synthetic scans with boxes: ``"close"``
+            removes them and fills the holes, ``"keep"`` hands them out, ``"error"`` refuses the
+            scan; or your own ``(scan) -> scan``. A detector would learn that they are background. A
+            scan without boxes is not changed.
+        as_sensor: turns every synthetic scan into one of this sensor, before the label policy and
+            in the process that loads the sample: a ``Transfer``, a preset's name, a YAML file or a
+            ``Sensor``. So a bank of one sensor serves the scans of another. Losses and noise are
+            new for every position of an epoch. Real scans stay unchanged; ``SeenAs(real,
+            transfer)`` turns those into scans of another sensor.
+        real_as_is: whether real samples are returned unchanged, because they are not ``Scan`` but
+            already have the trainer's form; see ``wrap``.
+        compare: with ``real_as_is``, whether to compare the first real sample with a synthetic one
+            at construction; see ``check_alike``.
 
     Attributes:
         collate: the ``collate_fn``.
@@ -91,8 +100,8 @@ class MixedScans(Dataset[Any]):
         current: the current epoch, shared by all processes of this dataset.
 
     Raises:
-        ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy that a source
-            cannot support, or sizes that are impossible.
+        ConfigError: on a ratio outside [0, 1], sources of different sensors or classes, a policy
+            that a source cannot support, or sizes that are impossible.
         DataError: without real scans, unless ratio is 1.
 
     Example:
@@ -126,7 +135,8 @@ class MixedScans(Dataset[Any]):
         real_as_is: bool = False,
         compare: bool = True,
     ) -> None:
-        reals, seed = each(real), to_integer(seed, "seed")
+        reals = each(real)
+        seed = to_integer(seed, "seed")
         for source, _ in reals:
             if not hasattr(source, "__len__"):
                 raise ConfigError(
@@ -137,26 +147,50 @@ class MixedScans(Dataset[Any]):
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
-        self._transfer = as_sensor if isinstance(as_sensor, Transfer | None) else Transfer(load_sensor(as_sensor))
+        self._transfer = (
+            as_sensor
+            if isinstance(as_sensor, Transfer | None)
+            else Transfer(load_sensor(as_sensor))
+        )
         suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
         self.mixture = Mixture(
-            tuple(PlannedSource(len(source), weight, identity_of(source)) for source, weight in reals),
-            tuple(PlannedSource(source.length, weight, source.identity + suffix) for source, weight in synthetics),
-            make_schedule(ratio), seed, epoch_size, reuse, balanced,
-        )  # fmt: skip
+            tuple(
+                PlannedSource(len(source), weight, identity_of(source)) for source, weight in reals
+            ),
+            tuple(
+                PlannedSource(source.length, weight, source.identity + suffix)
+                for source, weight in synthetics
+            ),
+            make_schedule(ratio),
+            seed,
+            epoch_size,
+            reuse,
+            balanced,
+        )
         sources = self.synthetic if real_as_is else self.real + self.synthetic
         target = None if self._transfer is None else self._transfer.target
-        sensors = check_together(sources, [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics))
+        sensors = check_together(
+            sources, [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics)
+        )
         scans = None if real_as_is else real
         options = dict(label_options or {})
         rings = frozenset() if target is None else frozenset({"ring"})
-        self._policies = [make_policy(labels, real=scans, fields=s.fields | rings, **options) for s in self.synthetic]
+        self._policies = [
+            make_policy(labels, real=scans, fields=s.fields | rings, **options)
+            for s in self.synthetic
+        ]
         self._without_unboxed = make_handling(unboxed) if isinstance(unboxed, str) else unboxed
         self._notices = Notices(images=collate == "range")
-        self._augment, self._augment_real = augment, augment_real
-        self._to_sample, self._real_as_is = to_sample, real_as_is
+        self._augment = augment
+        self._augment_real = augment_real
+        self._to_sample = to_sample
+        self._real_as_is = real_as_is
         if isinstance(collate, str):
-            collate = Collate(collate, sensors[0] if sensors else None, "allow" if labels == "none" else unlabelled)
+            collate = Collate(
+                collate,
+                sensors[0] if sensors else None,
+                "allow" if labels == "none" else unlabelled,
+            )
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
         self._untold = False  # whether it is made as an earlier one was, and no epoch has been set
@@ -185,21 +219,23 @@ class MixedScans(Dataset[Any]):
     ) -> "MixedScans":
         """Mix synthetic samples into a trainer's own map-style dataset.
 
-        Its samples are passed on unchanged, with nothing added; ``domain(i)`` tells which samples are synthetic.
-        Other attributes that the trainer reads from its dataset (class names, a collate function) come from the
-        wrapped one.
+        Its samples are passed on unchanged, with nothing added; ``domain(i)`` tells which samples
+        are synthetic. Other attributes that the trainer reads from its dataset (class names, a
+        collate function) come from the wrapped one.
 
         Args:
             dataset: has ``__len__`` and ``__getitem__``; or ``Sources`` of several.
             synth, ratio: as for ``MixedScans``.
-            to_sample: ``(scan, rng) -> sample`` gives a synthetic scan the form of ``dataset``'s samples.
+            to_sample: ``(scan, rng) -> sample`` gives a synthetic scan the form of ``dataset``'s
+                samples.
             collate: the trainer's own collate function.
-            options: other arguments of ``MixedScans``. A label policy that draws from real scans has to be made
-                beforehand, by ``make_policy(..., real=scans)``.
+            options: other arguments of ``MixedScans``. A label policy that draws from real scans
+                has to be made beforehand, by ``make_policy(..., real=scans)``.
 
         Raises:
-            ConfigError, DataError: as above; also where a synthetic sample does not have the form of a real one (keys,
-                types, dtypes, ranks, the value of ignored labels), unless ``compare=False``.
+            ConfigError, DataError: as above; also where a synthetic sample does not have the form
+                of a real one (keys, types, dtypes, ranks, the value of ignored labels), unless
+                ``compare=False``.
 
         Example:
             >>> import torch
@@ -211,10 +247,13 @@ class MixedScans(Dataset[Any]):
             >>> [train[i].shape[1] for i in range(len(train))]
             [3, 3, 3, 3]
         """
-        return cls(dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options)
+        return cls(
+            dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options
+        )
 
     def __getattr__(self, name: str) -> Any:
-        # Called only for missing attributes. Names with double underscores are protocols (copy, __getitems__).
+        # Called only for missing attributes. Names with double underscores are protocols (copy,
+        # __getitems__).
         state = self.__dict__
         if name.startswith("__") or not state.get("_real_as_is") or len(state["real"]) != 1:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
@@ -236,10 +275,11 @@ class MixedScans(Dataset[Any]):
         return self.current.fetched
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, before a ``DataLoader`` begins to iterate; all its workers see it, persistent ones too.
+        """Set the epoch, before a ``DataLoader`` begins to iterate; all its workers see it,
+        persistent ones too.
 
-        If a loader is already iterating, its next sample raises an error; a loader with ``batches`` finishes the
-        epoch in which it began.
+        If a loader is already iterating, its next sample raises an error; a loader with ``batches``
+        finishes the epoch in which it began.
 
         Raises:
             ConfigError: on an epoch for which there is no ratio.
@@ -254,7 +294,8 @@ class MixedScans(Dataset[Any]):
             self.expect(epoch)
 
     def tell_sources(self, epoch: int) -> None:
-        """Set the epoch of the synthetic sources that have one, such as a ``RollingBank`` with ``refresh``."""
+        """Set the epoch of the synthetic sources that have one, such as a ``RollingBank`` with
+        ``refresh``."""
         for source in self.synthetic:
             if hasattr(source, "set_epoch"):
                 source.set_epoch(epoch)
@@ -268,8 +309,11 @@ class MixedScans(Dataset[Any]):
                 plan = self._planned[1]
                 log.info(
                     "epoch %d: %d samples, %d of them synthetic, plan %s",
-                    epoch, len(plan), plan.synthetics, plan.hash[:16],
-                )  # fmt: skip
+                    epoch,
+                    len(plan),
+                    plan.synthetics,
+                    plan.hash[:16],
+                )
         return self._planned[1]
 
     def expect(self, epoch: int, positions: Iterable[int] | None = None) -> None:
@@ -277,7 +321,8 @@ class MixedScans(Dataset[Any]):
 
         Args:
             epoch: the epoch of the positions.
-            positions: the positions in the order of their use, by default all; only the first ``AHEAD`` are announced.
+            positions: the positions in the order of their use, by default all; only the first
+                ``AHEAD`` are announced.
         """
         if any(hasattr(source, "expect") for source in self.synthetic):
             plan = self.plan(epoch)
@@ -289,9 +334,18 @@ class MixedScans(Dataset[Any]):
 
     def __repr__(self) -> str:
         plan = MixingPlan(self.mixture, self.epoch)
-        size = f"{len(plan)} samples in epoch {self.epoch}, {plan.synthetics} of them synthetic; seed {self.seed}"
-        kinds = [", ".join(type(source).__name__ for source in kind) for kind in (self.real, self.synthetic)]
-        return f"{type(self).__name__}: {size}\n  real: {kinds[0] or 'none'}; synthetic: {kinds[1] or 'none'}"
+        size = (
+            f"{len(plan)} samples in epoch {self.epoch}, {plan.synthetics} of them synthetic; "
+            f"seed {self.seed}"
+        )
+        kinds = [
+            ", ".join(type(source).__name__ for source in kind)
+            for kind in (self.real, self.synthetic)
+        ]
+        return (
+            f"{type(self).__name__}: {size}\n  real: {kinds[0] or 'none'}; synthetic: "
+            f"{kinds[1] or 'none'}"
+        )
 
     def __len__(self) -> int:
         return self.mixture.length
@@ -314,7 +368,9 @@ class MixedScans(Dataset[Any]):
             (3, 3)
         """
         plan = self.plan(index.epoch if isinstance(index, Position) else None)
-        return SYNTHETIC if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals else REAL
+        return (
+            SYNTHETIC if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals else REAL
+        )
 
     def epoch_of(self, index: int) -> int:
         """The epoch of an index that is being fetched: the one in which iteration began.
@@ -327,7 +383,8 @@ class MixedScans(Dataset[Any]):
         return self.current.of(index)
 
     def sample(self, epoch: int, position: int) -> Any:
-        """The sample at a position of an epoch, 0 <= position < length; ``self[i]`` is ``sample(epoch, i)``."""
+        """The sample at a position of an epoch, 0 <= position < length; ``self[i]`` is
+        ``sample(epoch, i)``."""
         plan = self.plan(epoch)
         source, index = plan[position]
         if source >= plan.reals:
@@ -345,7 +402,8 @@ class MixedScans(Dataset[Any]):
         return self._to_sample(real, rng)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
-        """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation, ``to_sample``.
+        """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation,
+        ``to_sample``.
 
         This is for callers that make the scan elsewhere, such as in the main process on a GPU.
         """
@@ -367,9 +425,15 @@ class MixedScans(Dataset[Any]):
         return self._to_sample(scan, rng)
 
     def batches(
-        self, batch_size: int, *, rank: int | None = None, world_size: int | None = None, drop_last: bool = False
+        self,
+        batch_size: int,
+        *,
+        rank: int | None = None,
+        world_size: int | None = None,
+        drop_last: bool = False,
     ) -> MixedBatches:
-        """Make a ``batch_sampler`` in the order of the plan, for one rank or several; see ``MixedBatches``.
+        """Make a ``batch_sampler`` in the order of the plan, for one rank or several; see
+        ``MixedBatches``.
 
         Example:
             >>> from torch.utils.data import DataLoader

@@ -1,8 +1,8 @@
 """The share of synthetic samples, epoch by epoch.
 
-A schedule is a function from the epoch to a share in [0, 1]. The schedules of this module have an attribute
-``settled``, the epoch from which on the share is constant, so that earlier samples can be counted without visiting
-every epoch.
+A schedule is a function from the epoch to a share in [0, 1]. The schedules of this module have an
+attribute ``settled``, the epoch from which on the share is constant, so that earlier samples can be
+counted without visiting every epoch.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,8 @@ from typing import Any
 from lidar_synth.errors import ConfigError, shorten
 
 Schedule = Callable[[int], float]
-"""``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0, 1]."""
+"""``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
+1]."""
 
 _FINEST = 10**6  # largest denominator of a share: products with positions stay within 64 bits
 
@@ -33,7 +34,11 @@ class Steps:
 
     def __post_init__(self) -> None:
         if not self.shares or self.shares[0][0] != 0:
-            raise ConfigError(f"a ratio schedule {self.shares}", "a ratio from epoch 0 on", "Write {0: 0.5, 10: 0.25}.")
+            raise ConfigError(
+                f"a ratio schedule {self.shares}",
+                "a ratio from epoch 0 on",
+                "Write {0: 0.5, 10: 0.25}.",
+            )
         for epoch, value in self.shares:
             _checked(value, epoch)
 
@@ -95,8 +100,8 @@ def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedul
     """Make a schedule from a user's argument.
 
     Args:
-        ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its epoch on;
-            ``Linear(first, last, epochs)``; or any function of the epoch.
+        ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its
+            epoch on; ``Linear(first, last, epochs)``; or any function of the epoch.
 
     Raises:
         ConfigError: on a share outside [0, 1], or no share for epoch 0.
@@ -104,7 +109,13 @@ def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedul
     if callable(ratio):
         return ratio
     if isinstance(ratio, Mapping):
-        return Steps(tuple(sorted((to_integer(epoch, "epoch of a ratio"), share) for epoch, share in ratio.items())))
+        return Steps(
+            tuple(
+                sorted(
+                    (to_integer(epoch, "epoch of a ratio"), share) for epoch, share in ratio.items()
+                )
+            )
+        )
     if isinstance(ratio, Sequence) and not isinstance(ratio, str):
         return Steps(tuple(enumerate(ratio)), length=len(ratio))
     return Steps(((0, ratio),))
@@ -132,7 +143,9 @@ def to_integer(value: Any, name: str) -> int:
             return index(value)
     except TypeError:
         pass
-    raise ConfigError(f"{name}={shorten(repr(value), 40)}", "an integer", "Write it without quotes or decimals.")
+    raise ConfigError(
+        f"{name}={shorten(repr(value), 40)}", "an integer", "Write it without quotes or decimals."
+    )
 
 
 def settled(schedule: Schedule) -> int | None:
@@ -147,4 +160,6 @@ def _checked(value: Any, epoch: int) -> Fraction:
             return Fraction(repr(float(value))).limit_denominator(_FINEST)
     except TypeError:
         pass
-    raise ConfigError(f"ratio {value!r} in epoch {epoch}", "the share of synthetic samples, a number from 0 to 1")
+    raise ConfigError(
+        f"ratio {value!r} in epoch {epoch}", "the share of synthetic samples, a number from 0 to 1"
+    )

@@ -17,7 +17,8 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing.scans import MixedScans
 
 VARIABLE = "LIDAR_SYNTH_MIX"
-"""Environment variable with the YAML file of settings, for trainers whose configuration allows no further keys."""
+"""Environment variable with the YAML file of settings, for trainers whose configuration allows no
+further keys."""
 
 OPTIONS = (
     "synthetic",
@@ -38,8 +39,9 @@ def open_synthetic(where: Any) -> Any:
     """Open the source of synthetic scans that a configuration names.
 
     Args:
-        where: a bank's folder or URL, a checkpoint (``.safetensors``), the name of a shipped model, or a folder of
-            scans in any layout that ``open_scans`` reads. Any other object is returned unchanged.
+        where: a bank's folder or URL, a checkpoint (``.safetensors``), the name of a shipped model,
+            or a folder of scans in any layout that ``open_scans`` reads. Any other object is
+            returned unchanged.
 
     Raises:
         ConfigError, FileError, DataError: if there is no such source.
@@ -49,7 +51,9 @@ def open_synthetic(where: Any) -> Any:
     if is_url(where):
         return Bank(where)
     if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
-        from lidar_synth.generate.loading import load_generator  # loads networks: only where a model is named
+        from lidar_synth.generate.loading import (
+            load_generator,
+        )  # loads networks: only where a model is named
 
         return load_generator(where)
     if is_bank(where):
@@ -63,7 +67,8 @@ def read_settings(given: Any = None) -> dict[str, Any]:
     """Read the settings of a mixture, with keys in lower case.
 
     Args:
-        given: the settings or a YAML file; by default the file in the environment variable ``LIDAR_SYNTH_MIX``.
+        given: the settings or a YAML file; by default the file in the environment variable
+            ``LIDAR_SYNTH_MIX``.
 
     Raises:
         ConfigError: if there are no settings.
@@ -83,11 +88,15 @@ def read_settings(given: Any = None) -> dict[str, Any]:
     if isinstance(options, Mapping):
         settings["label_options"] = {str(key).lower(): value for key, value in options.items()}
     elif options is not None:
-        raise ConfigError(f"label_options: {shorten(str(options), 40)}", "options by name, such as threshold: 0.5")
+        raise ConfigError(
+            f"label_options: {shorten(str(options), 40)}", "options by name, such as threshold: 0.5"
+        )
     return settings
 
 
-def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]) -> MixedScans:
+def mix(
+    real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]
+) -> MixedScans:
     """Make a mixture from settings, for a trainer that loads real samples itself.
 
     Args:
@@ -96,7 +105,8 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
         to_sample: ``(scan, rng) -> sample`` for synthetic scans.
 
     Returns:
-        A dataset whose real samples are only their numbers, 0 <= n < real, by which the trainer loads them.
+        A dataset whose real samples are only their numbers, 0 <= n < real, by which the trainer
+        loads them.
 
     Raises:
         ConfigError: on an unknown key, or settings that ``MixedScans`` refuses.
@@ -110,8 +120,13 @@ def mix(real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.ra
             "The adapters of lidar-bonnetal's family, Cylinder3D and Pointcept take others.",
         )
     if settings.get("synthetic") is None:
-        raise ConfigError("a mixture without synthetic scans", "synthetic: a bank's folder, a checkpoint or a folder")
+        raise ConfigError(
+            "a mixture without synthetic scans",
+            "synthetic: a bank's folder, a checkpoint or a folder",
+        )
     options = {key: value for key, value in settings.items() if key != "synthetic"}
     synthetic = open_synthetic(settings["synthetic"])
     options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
-    return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)  # numbers, no samples
+    return MixedScans.wrap(
+        range(real), synthetic, to_sample=to_sample, compare=False, **options
+    )  # numbers, no samples

@@ -16,8 +16,9 @@ class Sources:
 
     Args:
         sources: in order.
-        weights: one for each source; its number of samples in an epoch is proportional to its weight. By default the
-            weight of a real source is its length, and synthetic sources have equal weights.
+        weights: one for each source; its number of samples in an epoch is proportional to its
+            weight. By default the weight of a real source is its length, and synthetic sources have
+            equal weights.
 
     Raises:
         ConfigError: without a source, or on another number of weights.
@@ -33,11 +34,18 @@ class Sources:
     def __init__(self, *sources: Any, weights: Sequence[float] | None = None) -> None:
         if not sources or (weights is not None and len(weights) != len(sources)):
             raise ConfigError(
-                f"{len(sources)} sources with weights {weights}", "sources, and a weight for each or none"
+                f"{len(sources)} sources with weights {weights}",
+                "sources, and a weight for each or none",
             )
         self.sources = sources
-        plain = None if weights is None else [w.item() if isinstance(w, np.generic) else w for w in weights]
-        self.weights: tuple[float | None, ...] = (None,) * len(sources) if plain is None else tuple(plain)
+        plain = (
+            None
+            if weights is None
+            else [w.item() if isinstance(w, np.generic) else w for w in weights]
+        )
+        self.weights: tuple[float | None, ...] = (
+            (None,) * len(sources) if plain is None else tuple(plain)
+        )
 
     def __len__(self) -> int:
         return sum(map(len, self.sources))
@@ -82,10 +90,12 @@ def sensor_of(source: Any) -> Sensor:
 
 
 def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) -> list[Sensor]:
-    """Check that scans of several sources fit into one training set, and return the sensors of the samples.
+    """Check that scans of several sources fit into one training set, and return the sensors of the
+    samples.
 
-    Sensors agree if their rows and columns have the same directions; range limits and names may differ. A source's
-    attribute ``classes`` (names by train id) defines its labels; by default they are SemanticKITTI's 19 classes.
+    Sensors agree if their rows and columns have the same directions; range limits and names may
+    differ. A source's attribute ``classes`` (names by train id) defines its labels; by default they
+    are SemanticKITTI's 19 classes.
 
     Args:
         sources: the sources.
@@ -94,13 +104,16 @@ def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) 
     Raises:
         ConfigError: on different grids or classes.
     """
-    sensors = [wanted or sensor_of(source) for source, wanted in zip(sources, as_sensors, strict=True)]
+    sensors = [
+        wanted or sensor_of(source) for source, wanted in zip(sources, as_sensors, strict=True)
+    ]
     for sensor in sensors[1:]:
         if sensor.shape != sensors[0].shape or not np.array_equal(sensor.edges, sensors[0].edges):
             raise ConfigError(
                 f"sources of the sensors {sensors[0].grid_text()} and {sensor.grid_text()}",
                 "one grid for all real and synthetic scans",
-                "Turn the synthetic scans into scans of the real ones' sensor (as_sensor=real.sensor), or open the "
+                "Turn the synthetic scans into scans of the real ones' sensor "
+                "(as_sensor=real.sensor), or open the "
                 "real scans with the generator's sensor (sensor=generator.sensor).",
             )
     for source in sources:
@@ -109,6 +122,7 @@ def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) 
             raise ConfigError(
                 f"a source whose labels mean {classes[:4]}... ({type(source).__name__})",
                 f"SemanticKITTI's {len(NAMES)} train ids, {NAMES[:4]}...",
-                "Map its labels when they are read (Taxonomy.decode), then remove its attribute 'classes'.",
+                "Map its labels when they are read (Taxonomy.decode), then remove its attribute "
+                "'classes'.",
             )
     return sensors

@@ -1,7 +1,8 @@
 """The state of a training run, for resumption, and the rank of a process.
 
-A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``. ``plan`` is the hash of the epoch's plan,
-``mixture`` everything that determines the plan in readable form, so that an error can name what differs.
+A state is ``{"version", "seed", "epoch", "position", "plan", "mixture"}``. ``plan`` is the hash of
+the epoch's plan, ``mixture`` everything that determines the plan in readable form, so that an error
+can name what differs.
 """
 
 import os
@@ -24,8 +25,9 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """This process's rank and the number of ranks.
 
     Args:
-        rank, world_size: returned if given. The default is that of ``torch.distributed``, or before it is initialised
-            the environment variables of torchrun (``RANK``, ``WORLD_SIZE``), or else 0 of 1.
+        rank, world_size: returned if given. The default is that of ``torch.distributed``, or before
+            it is initialised the environment variables of torchrun (``RANK``, ``WORLD_SIZE``), or
+            else 0 of 1.
 
     Raises:
         ConfigError: on one without the other, or a rank out of range.
@@ -47,18 +49,22 @@ def count_accelerated() -> int:
 
 
 def check_unshared(what: str, rank: int, world_size: int) -> None:
-    """Refuse default ranks if an ``Accelerator`` may divide the batches among the same processes a second time.
+    """Refuse default ranks if an ``Accelerator`` may divide the batches among the same processes a
+    second time.
 
     Raises:
         ConfigError: if an ``Accelerator`` is set up for several processes.
     """
     if world_size > 1 and count_accelerated() > 1:
         raise ConfigError(
-            f"{what} with the default rank {rank} of {world_size} and an Accelerator, which divides prepared loaders "
+            f"{what} with the default rank {rank} of {world_size} and an Accelerator, which "
+            "divides prepared loaders "
             "among the same processes again: most samples would never be seen",
             "only one of the two to divide the samples",
-            "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, loader); if it is not "
-            f"prepared, call {what} with rank=accelerator.process_index, world_size=accelerator.num_processes.",
+            "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, "
+            "loader); if it is not "
+            f"prepared, call {what} with rank=accelerator.process_index, "
+            "world_size=accelerator.num_processes.",
         )
 
 
@@ -76,7 +82,8 @@ def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:
 
 
 def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
-    """Epoch and position after an epoch: the beginning of the next, or the same epoch's end if it was the last."""
+    """Epoch and position after an epoch: the beginning of the next, or the same epoch's end if it
+    was the last."""
     try:
         MixingPlan(mixture, epoch + 1)
     except ConfigError:
@@ -95,32 +102,44 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
         raise ConfigError(f"state {dict(state)}", "seed, epoch and position, integers of 0 or more")
     seed, epoch, position = (int(value or 0) for value in values)
     if seed != mixture.seed:
-        raise ConfigError(f"the state of seed {seed} for a mixture of seed {mixture.seed}", "the seed of the state")
+        raise ConfigError(
+            f"the state of seed {seed} for a mixture of seed {mixture.seed}",
+            "the seed of the state",
+        )
     plan = MixingPlan(mixture, epoch)
     if "plan" not in state:
         _check_old(state, position)
     elif state["plan"] != plan.hash:
         differences = list(_differences(state.get("mixture"), plan.facts, ""))
         raise ConfigError(
-            f"a state of another mixture: {'; '.join(differences[:4]) or 'its plan has another hash'}",
+            "a state of another mixture: "
+            f"{'; '.join(differences[:4]) or 'its plan has another hash'}",
             "the mixture with which the state was saved",
-            f"To start epoch {epoch} of this mixture from the beginning, call set_epoch({epoch}) and load no state.",
+            f"To start epoch {epoch} of this mixture from the beginning, call set_epoch({epoch}) "
+            "and load no state.",
         )
     if position > len(plan):
-        raise ConfigError(f"position {position} of an epoch of {len(plan)} samples", "a state of this mixture")
+        raise ConfigError(
+            f"position {position} of an epoch of {len(plan)} samples", "a state of this mixture"
+        )
     return epoch, position
 
 
 def _check_old(state: Mapping[str, Any], position: int) -> None:
-    """Check a state of version 1, which does not identify its mixture and whose order no longer exists."""
+    """Check a state of version 1, which does not identify its mixture and whose order no longer
+    exists."""
     if position:
         raise ConfigError(
-            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version has another order",
+            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version "
+            "has another order",
             "a state that this version saved",
-            "To start that epoch from the beginning, set the state's position to 0; to skip the rest of the epoch, "
+            "To start that epoch from the beginning, set the state's position to 0; to skip the "
+            "rest of the epoch, "
             "also add 1 to its epoch.",
         )
-    warnings.warn("a state without its plan: it cannot be checked against this mixture", stacklevel=4)
+    warnings.warn(
+        "a state without its plan: it cannot be checked against this mixture", stacklevel=4
+    )
 
 
 def _differences(then: Any, now: Any, name: str) -> Iterator[str]:

@@ -17,30 +17,32 @@ from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state,
 class MixedStream(IterableDataset[Any]):
     """The samples of a ``MixedScans`` as an iterable dataset, in the order of its plan.
 
-    Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B, num_workers=W)`` with the same B
-    yields the same batches in the same order for every W. Over all ranks and workers every sample is yielded once.
+    Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B,
+    num_workers=W)`` with the same B yields the same batches in the same order for every W. Over all
+    ranks and workers every sample is yielded once.
 
-    ``set_epoch`` takes effect with the next pass: a pass stays in the epoch in which it began. If persistent workers
+    ``set_epoch`` takes effect with the next pass: a pass stays in the epoch in which it began. If
+        persistent workers
     cannot determine that epoch, an error is raised.
 
-    The state (state.py) holds the position after the batches yielded so far. The state of a worker, which torchdata's
-    ``StatefulDataLoader`` saves, adds the number of samples that the worker has yielded since; it fits only the same
-    ranks and workers.
+    The state (state.py) holds the position after the batches yielded so far. The state of a worker,
+    which torchdata's ``StatefulDataLoader`` saves, adds the number of samples that the worker has
+    yielded since; it fits only the same ranks and workers.
 
     Args:
         scans: the mixed dataset; also one that ``MixedScans.wrap`` made.
         batch_size: that of the ``DataLoader``, on each rank.
-        endless: whether the next epoch follows without a pause; otherwise iterating ends with the epoch, and
-            ``set_epoch`` chooses the next one.
-        drop_last: without ``endless``, whether to drop the samples that do not fill a batch on every rank. If they are
-            kept, the last batches of the ranks differ in size and some ranks may have none, so that trainers whose
-            ranks wait for one another hang.
-        rank, world_size: rank of this process and number of ranks (see ``place`` for the defaults); they must be known
-            before workers start.
+        endless: whether the next epoch follows without a pause; otherwise iterating ends with the
+            epoch, and ``set_epoch`` chooses the next one.
+        drop_last: without ``endless``, whether to drop the samples that do not fill a batch on
+            every rank. If they are kept, the last batches of the ranks differ in size and some
+            ranks may have none, so that trainers whose ranks wait for one another hang.
+        rank, world_size: rank of this process and number of ranks (see ``place`` for the defaults);
+            they must be known before workers start.
 
     Raises:
-        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks where an
-            ``Accelerator`` is set up for several processes.
+        ConfigError: on a batch size below 1 or a rank out of range; on iterating with default ranks
+            where an ``Accelerator`` is set up for several processes.
 
     Example:
         >>> from torch.utils.data import DataLoader
@@ -64,15 +66,20 @@ class MixedStream(IterableDataset[Any]):
     ) -> None:
         if batch_size < 1:
             raise ConfigError(f"batch_size={batch_size}", "at least 1")
-        self.scans, self.batch_size, self.endless = scans, batch_size, endless
-        self.drop_last, self.collate = drop_last, scans.collate
+        self.scans = scans
+        self.batch_size = batch_size
+        self.endless = endless
+        self.drop_last = drop_last
+        self.collate = scans.collate
         self.rank, self.world_size = place(rank, world_size)
         self._by_default = rank is None
         self._process = os.getpid()  # the process that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
         self._given = 0  # samples that this process has yielded since it began to iterate
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
-        self._resume: dict[str, Any] = {}  # the state from which the process that loaded it has to resume
+        self._resume: dict[
+            str, Any
+        ] = {}  # the state from which the process that loaded it has to resume
         self._loaded_by = 0  # that process
 
     def __repr__(self) -> str:
@@ -96,7 +103,10 @@ class MixedStream(IterableDataset[Any]):
                 "state_dict(done=...) makes a state that fits any number of ranks and workers.",
             )
         again = self._process == os.getpid() and get_worker_info() is not None
-        self._begun, self._given, self._resume, self._process = (epoch, position), given, {}, os.getpid()
+        self._begun = (epoch, position)
+        self._given = given
+        self._resume = {}
+        self._process = os.getpid()
         self.scans.current.note_pass(epoch)
         return self._samples(epoch, position, again and not self.endless)
 
@@ -105,22 +115,31 @@ class MixedStream(IterableDataset[Any]):
 
         Args:
             begin, position: where to begin.
-            guarded: whether to refuse a change of the epoch. A later pass of a persistent worker may begin only after
-                ``iter(loader)`` returned, and would miss the change.
+            guarded: whether to refuse a change of the epoch. A later pass of a persistent worker
+                may begin only after ``iter(loader)`` returned, and would miss the change.
         """
-        worker, workers = self._place()["worker"], self._place()["workers"]
+        worker = self._place()["worker"]
+        workers = self._place()["workers"]
         batches = islice(self._batches(begin, position), worker, None, workers)
-        epoch, first, announced = begin, -position, 0  # first: the number of the epoch's first sample
+        epoch, first, announced = (
+            begin,
+            -position,
+            0,
+        )  # first: the number of the epoch's first sample
         for number in islice(chain.from_iterable(batches), self._given, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)
             while number >= (end := first + len(self.scans)):
-                epoch, first, announced = epoch + 1, end, 0
+                epoch = epoch + 1
+                first = end
+                announced = 0
                 if worker == 0:
                     self.scans.tell_sources(epoch)
             if worker == 0 and number >= announced:
                 ahead = chain.from_iterable(self._batches(begin, position, number))
-                self.scans.expect(epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number))
+                self.scans.expect(
+                    epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number)
+                )
                 announced = min(end, number + AHEAD * self.world_size // 2)
             self._given += 1
             yield self.scans.sample(epoch, number - first)
@@ -129,9 +148,9 @@ class MixedStream(IterableDataset[Any]):
         """The progress of training, from which it can be resumed.
 
         Args:
-            done: number of batches that this rank has trained on since it began to iterate; the state then fits any
-                number of ranks and workers. The default, the progress of this process, is correct without workers and
-                in a ``StatefulDataLoader``.
+            done: number of batches that this rank has trained on since it began to iterate; the
+                state then fits any number of ranks and workers. The default, the progress of this
+                process, is correct without workers and in a ``StatefulDataLoader``.
 
         Raises:
             ConfigError: on more batches than the epoch has.
@@ -142,10 +161,13 @@ class MixedStream(IterableDataset[Any]):
         done, part = divmod(given, self.batch_size)
         batch = next(self._batches(epoch, position, done * self.batch_size * self.world_size), ())
         if get_worker_info() is not None or part not in (0, len(batch)):
-            return make_state(self.scans.mixture, epoch, position) | self._place() | {"given": given}
+            return (
+                make_state(self.scans.mixture, epoch, position) | self._place() | {"given": given}
+            )
         after = self._after(epoch, position, done + (part > 0))
         if not self.endless and after[0] > epoch:
-            # Not the next epoch yet: a trainer that resumes here still has to see the end of this one.
+            # Not the next epoch yet: a trainer that resumes here still has to see the end of this
+            # one.
             after = epoch, len(self.scans)
         return make_state(self.scans.mixture, *after)
 
@@ -156,26 +178,35 @@ class MixedStream(IterableDataset[Any]):
             ConfigError: on an invalid state, or one of another mixture.
         """
         epoch, position = checked_state(state, self.scans.mixture)
-        self._begun, self._resume = None, {k: v for k, v in state.items() if k not in ("plan", "mixture")}
+        self._begun = None
+        self._resume = {k: v for k, v in state.items() if k not in ("plan", "mixture")}
         self._loaded_by = os.getpid()
         self.scans.current.forget_pass()
         if get_worker_info() is None:
-            # A worker does not write to shared memory, which the main process may have changed since.
-            self._start[0], self._start[1] = epoch, position
+            # A worker does not write to shared memory, which the main process may have changed
+            # since.
+            self._start[0] = epoch
+            self._start[1] = position
             go_to(self.scans, epoch, position)
 
     def _progress(self) -> tuple[int, int, int]:
-        """Epoch and position where iteration began, or would begin, and the number of samples yielded since."""
+        """Epoch and position where iteration began, or would begin, and the number of samples
+        yielded since."""
         in_worker = get_worker_info() is not None
         if self._begun is not None and (in_worker or self._begun[0] == self.scans.epoch):
             return *self._begun, self._given
         if in_worker and self._resume and self._loaded_by == os.getpid():
             return self._resume["epoch"], self._resume["position"], self._resume.get("given", 0)
-        # A worker that has just started begins in the epoch that the main process had at iter(loader).
+        # A worker that has just started begins in the epoch that the main process had at
+        # iter(loader).
         started = in_worker and self._process != os.getpid()
         epoch = self.scans.current.at_start if started else self.scans.epoch
         position = int(self._start[1]) if int(self._start[0]) == epoch else 0
-        return epoch, position, self._resume.get("given", 0) if self._resume.get("epoch") == epoch else 0
+        return (
+            epoch,
+            position,
+            self._resume.get("given", 0) if self._resume.get("epoch") == epoch else 0,
+        )
 
     def _place(self) -> dict[str, int]:
         """Rank, worker and batch size of this process."""
@@ -189,7 +220,8 @@ class MixedStream(IterableDataset[Any]):
         }
 
     def _batches(self, epoch: int, position: int, since: int = 0) -> Iterator[range]:
-        """This rank's batches for all workers, as ranges of sample numbers, from the step with number ``since`` on."""
+        """This rank's batches for all workers, as ranges of sample numbers, from the step with
+        number ``since`` on."""
         size = self.batch_size * self.world_size
         steps: Iterable[range] = (range(i * size, (i + 1) * size) for i in count(since // size))
         if not self.endless:
@@ -211,7 +243,8 @@ class MixedStream(IterableDataset[Any]):
         return self.__dict__
 
     def _steps(self, start: int, end: int) -> CutSteps:
-        # The loader's batches have a fixed size, so the remainder cannot be added to the last batch.
+        # The loader's batches have a fixed size, so the remainder cannot be added to the last
+        # batch.
         return cut_steps(start, end, self.batch_size, self.world_size, self.drop_last, join=False)
 
     def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:
@@ -219,7 +252,15 @@ class MixedStream(IterableDataset[Any]):
         if not self.endless:
             steps = self._steps(position, len(self.scans))
             if not 0 <= done <= len(steps):
-                raise ConfigError(f"{done} batches done of {len(steps)}", "a number of batches of this epoch")
-            return (epoch, steps[done].start) if done < len(steps) else after_epoch(self.scans.mixture, epoch)
-        epochs, position = divmod(position + done * self.batch_size * self.world_size, len(self.scans))
+                raise ConfigError(
+                    f"{done} batches done of {len(steps)}", "a number of batches of this epoch"
+                )
+            return (
+                (epoch, steps[done].start)
+                if done < len(steps)
+                else after_epoch(self.scans.mixture, epoch)
+            )
+        epochs, position = divmod(
+            position + done * self.batch_size * self.world_size, len(self.scans)
+        )
         return epoch + epochs, position

@@ -13,14 +13,16 @@ from lidar_synth.geometry.sensor import Sensor
 class Synthetic(Protocol):
     """A source of synthetic scans by number.
 
-    A source that works ahead may also have the methods ``set_epoch(epoch)`` and ``expect(numbers)``; ``MixedScans``
-    calls them. ``numbers`` are the scans that this process and its workers will request next, in order.
+    A source that works ahead may also have the methods ``set_epoch(epoch)`` and
+    ``expect(numbers)``; ``MixedScans`` calls them. ``numbers`` are the scans that this process and
+    its workers will request next, in order.
 
     Attributes:
         sensor: the sensor of the scans.
         fields: the fields of ``POINT_FIELDS`` that the scans have, and "boxes" if they have boxes.
         length: number of scans, numbered 0 .. length - 1; None = endless.
-        identity: text of everything that determines the scans, such as checkpoint and seed; part of the plan's hash.
+        identity: text of everything that determines the scans, such as checkpoint and seed; part of
+            the plan's hash.
     """
 
     @property
@@ -50,7 +52,9 @@ class Held:
     def __init__(self, source: Source) -> None:
         first = source[0]
         self.sensor: Sensor = getattr(source, "sensor", first.sensor)
-        self.fields = frozenset(first.fields()) | (frozenset() if first.boxes is None else {"boxes"})
+        self.fields = frozenset(first.fields()) | (
+            frozenset() if first.boxes is None else {"boxes"}
+        )
         self.length: int | None = len(source)
         self.identity = identity_of(source)
         self._source = source
@@ -60,7 +64,8 @@ class Held:
 
 
 def make_synthetic(source: Any, seed: int = 0) -> Synthetic:
-    """Make a synthetic source from a user's argument: a generator, a bank or another ``Synthetic``, or existing scans.
+    """Make a synthetic source from a user's argument: a generator, a bank or another ``Synthetic``,
+    or existing scans.
 
     Args:
         source: one of these.

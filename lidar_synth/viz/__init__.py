@@ -1,7 +1,7 @@
 """Visualisation of scans: pictures, sheets, an HTML page with a viewer, and a window.
 
-``write_view`` writes scans to a picture or page; the other functions are its parts. Only ``show`` needs a screen
-and OpenGL; nothing needs a network connection.
+``write_view`` writes scans to a picture or page; the other functions are its parts. Only ``show``
+needs a screen and OpenGL; nothing needs a network connection.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,18 +62,24 @@ def view_suffix(path: Path) -> str:
         ConfigError: on any other suffix than .png and .html.
     """
     if path.suffix not in _WRITERS:
-        raise ConfigError(f"cannot write a view to {path}", f"a file that ends in {' or '.join(_WRITERS)}")
+        raise ConfigError(
+            f"cannot write a view to {path}", f"a file that ends in {' or '.join(_WRITERS)}"
+        )
     return path.suffix
 
 
 def write_view(
-    path: str | Path, given: Sequence[Scan | RangeImage], *, title: str = "LiDAR scans", notes: str = ""
+    path: str | Path,
+    given: Sequence[Scan | RangeImage],
+    *,
+    title: str = "LiDAR scans",
+    notes: str = "",
 ) -> None:
     """Write a picture or a page of scans to a file.
 
     Args:
-        path: ``.png`` for a sheet with all views of one scan, or with several scans side by side; ``.html`` for
-            a page with an interactive viewer.
+        path: ``.png`` for a sheet with all views of one scan, or with several scans side by side;
+            ``.html`` for a page with an interactive viewer.
         given: scans or range images, at least one.
         title: the heading of a page, or of a sheet of several scans.
         notes: text for the page; an empty line starts a paragraph.

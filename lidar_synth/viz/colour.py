@@ -1,7 +1,7 @@
 """Colour scales: a table of 256 colours and a value range for each quantity.
 
-The same tables colour range images, rendered views, colour bars and (as a texture) the viewer of the HTML page, so
-that a colour has the same meaning everywhere.
+The same tables colour range images, rendered views, colour bars and (as a texture) the viewer of
+the HTML page, so that a colour has the same meaning everywhere.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,8 +38,8 @@ class Scale:
         table: (256, 3) uint8 colours.
         low: the value of the first colour, and of values below.
         high: the value of the last colour, and of values above.
-        gamma: position in the table = ((value - low) / (high - low)) ** gamma; a gamma below 1 spends more colours on
-            low values, where most points of a scan are.
+        gamma: position in the table = ((value - low) / (high - low)) ** gamma; a gamma below 1
+            spends more colours on low values, where most points of a scan are.
         classes: whether the values are indices of the table (0..255) instead of points on a scale.
     """
 
@@ -54,7 +54,9 @@ class Scale:
         """Index in the table of each value, any shape."""
         if self.classes:
             return values.astype(np.uint8)
-        unit: NDArray[np.float32] = np.clip((np.asarray(values, np.float32) - self.low) / (self.high - self.low), 0, 1)
+        unit: NDArray[np.float32] = np.clip(
+            (np.asarray(values, np.float32) - self.low) / (self.high - self.low), 0, 1
+        )
         places: NDArray[np.uint8] = np.rint(unit**self.gamma * 255).astype(np.uint8)
         return places
 
@@ -66,7 +68,8 @@ class Scale:
 
 @lru_cache(maxsize=8)
 def _colour_map(name: str, start: float, stop: float = 1.0) -> Rgb:
-    """A part of one of matplotlib's colour maps, chosen so that no colour is as dark as ``EMPTY``."""
+    """A part of one of matplotlib's colour maps, chosen so that no colour is as dark as
+    ``EMPTY``."""
     from matplotlib import colormaps
 
     colours: NDArray[np.float64] = colormaps[name](np.linspace(start, stop, 256))
@@ -88,21 +91,25 @@ VALUES: dict[str, Callable[[Scan], NDArray[Any] | None]] = {
     "confidence": lambda scan: scan.confidence,
     "domain": lambda scan: np.full(len(scan), scan.domain, np.uint8),
 }
-"""The quantities that can colour points: (N,) values of a scan, or None if the scan does not have them."""
+"""The quantities that can colour points: (N,) values of a scan, or None if the scan does not have
+them."""
 
 
 def scales(scans: Sequence[Scan]) -> dict[str, Scale]:
     """One ``Scale`` for each of ``VALUES``, shared by all scans of a sheet or page.
 
-    Heights are scaled between percentiles of all scans, because the height of the sensor above the ground is unknown;
-    ranges are scaled to the largest ``range_max`` of the sensors.
+    Heights are scaled between percentiles of all scans, because the height of the sensor above the
+    ground is unknown; ranges are scaled to the largest ``range_max`` of the sensors.
     """
     heights = [z for scan in scans for z in scan.points[:: max(1, len(scan) // 5000), 2].tolist()]
     low, high = np.percentile(heights, (2, 99)) if heights else (-2.0, 2.0)
     reach = max((scan.sensor.range_max for scan in scans), default=80.0)
     return {
         "height": Scale(
-            "height above the sensor (m)", _colour_map("viridis", 0.12), float(low), float(max(high, low + 4))
+            "height above the sensor (m)",
+            _colour_map("viridis", 0.12),
+            float(low),
+            float(max(high, low + 4)),
         ),
         "range": Scale("range (m)", _colour_map("plasma_r", 0.0, 0.97), 0.0, float(reach), 0.5),
         "reflectance": Scale("reflectance", _colour_map("bone", 0.25), 0.0, 1.0, 0.7),

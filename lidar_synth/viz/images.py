@@ -32,7 +32,10 @@ class View(NamedTuple):
         """(20,) number of points of each class, unlabelled points last; all zero without labels."""
         if self.scan.label is None:
             return np.zeros(len(NAMES) + 1, np.int64)
-        return np.bincount(np.where(self.scan.label == IGNORE, len(NAMES), self.scan.label), minlength=len(NAMES) + 1)
+        return np.bincount(
+            np.where(self.scan.label == IGNORE, len(NAMES), self.scan.label),
+            minlength=len(NAMES) + 1,
+        )
 
 
 def views(given: Sequence[Scan | RangeImage]) -> list[View]:

@@ -1,8 +1,9 @@
-"""A self-contained HTML page that shows scans, two of them side by side; it needs no network and no server.
+"""A self-contained HTML page that shows scans, two of them side by side; it needs no network and no
+server.
 
-The viewer (``camera.js``, ``draw.js``, ``page.js``) uses WebGL 2 without a library. The points of a scan are quantised
-and compressed (``pack``): the error of a coordinate is at most 1.3 mm if the farthest point is at 80 m, and a scan of
-57,000 points becomes 0.3 MB of text.
+The viewer (``camera.js``, ``draw.js``, ``page.js``) uses WebGL 2 without a library. The points of a
+scan are quantised and compressed (``pack``): the error of a coordinate is at most 1.3 mm if the
+farthest point is at 80 m, and a scan of 57,000 points becomes 0.3 MB of text.
 """
 
 import base64
@@ -37,15 +38,18 @@ def pack(scan: Scan) -> tuple[bytes, float]:
     """Compress the points of a scan by zlib.
 
     Returns:
-        The compressed bytes of these arrays, one after the other, and the length of a quantisation step in metres:
-        x, y and z, (N,) int16 each, in steps, as differences from the previous point (modulo 2**16);
-        reflectance * 255, (N,) uint8; label, (N,) uint8 train ids, 255 = ignore; and, if the scan has it,
-        confidence * 255, (N,) uint8.
+        The compressed bytes of these arrays, one after the other, and the length of a quantisation
+        step in metres: x, y and z, (N,) int16 each, in steps, as differences from the previous
+        point (modulo 2**16); reflectance * 255, (N,) uint8; label, (N,) uint8 train ids, 255 =
+        ignore; and, if the scan has it, confidence * 255, (N,) uint8.
     """
     metres = max(float(np.abs(scan.points).max(initial=0.0)), 1.0) / 32767
     places = np.rint(scan.points / metres).astype("<i2")
     columns = [np.diff(places[:, axis], prepend=np.int16(0)) for axis in range(3)]
-    columns += [_byte(scan.reflectance), np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label]
+    columns += [
+        _byte(scan.reflectance),
+        np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label,
+    ]
     columns += [] if scan.confidence is None else [_byte(scan.confidence)]
     return zlib.compress(b"".join(column.tobytes() for column in columns), 9), metres
 
@@ -65,8 +69,8 @@ def html_page(
 ) -> str:
     """The HTML text of a page with an interactive viewer and the range images of every scan.
 
-    Where there are real and synthetic scans, the viewer shows a real one on the left and a synthetic one on the right;
-    otherwise any two of them. Both are seen through one camera.
+    Where there are real and synthetic scans, the viewer shows a real one on the left and a
+    synthetic one on the right; otherwise any two of them. Both are seen through one camera.
 
     Args:
         given: scans, or range images, which are unprojected to points; at least one.
@@ -88,14 +92,18 @@ def html_page(
         "empty": EMPTY.tolist(),
         "domains": list(domains),
         "classes": [*NAMES, "unlabelled"],
-        "scales": {name: _scale_data(scale, row) for row, (name, scale) in enumerate(colours.items())},
+        "scales": {
+            name: _scale_data(scale, row) for row, (name, scale) in enumerate(colours.items())
+        },
         "table": _base64(np.concatenate([scale.table for scale in colours.values()]).tobytes()),
         "scans": [
             _scan_data(view, colours)
             for view in tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)
         ],
     }
-    paragraphs = (f"<p>{html.escape(part.strip())}</p>" for part in notes.split("\n\n") if part.strip())
+    paragraphs = (
+        f"<p>{html.escape(part.strip())}</p>" for part in notes.split("\n\n") if part.strip()
+    )
     parts = {
         "title": html.escape(title),
         "notes": "".join(paragraphs),
@@ -104,7 +112,9 @@ def html_page(
         "panels": "".join(panels),
         "script": "\n".join(_resource(name) for name in SCRIPTS),
     }
-    return re.sub("@(title|notes|data|panels|script)@", lambda mark: parts[mark[1]], _resource("page.html"))
+    return re.sub(
+        "@(title|notes|data|panels|script)@", lambda mark: parts[mark[1]], _resource("page.html")
+    )
 
 
 def _resource(name: str) -> str:
@@ -112,7 +122,13 @@ def _resource(name: str) -> str:
 
 
 def _scale_data(scale: Scale, row: int) -> dict[str, Any]:
-    return {"title": scale.title, "row": row, "low": scale.low, "high": scale.high, "gamma": scale.gamma}
+    return {
+        "title": scale.title,
+        "row": row,
+        "low": scale.low,
+        "high": scale.high,
+        "gamma": scale.gamma,
+    }
 
 
 def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
@@ -120,7 +136,11 @@ def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
     packed, metres = pack(scan)
     by = "label" if scan.label is not None else "height"
     pictures = [
-        {"title": colours[name].title, "uri": _data_uri(picture(view.image, name, colours[name])), "cells": True}
+        {
+            "title": colours[name].title,
+            "uri": _data_uri(picture(view.image, name, colours[name])),
+            "cells": True,
+        }
         for name in view.channels
     ]
     if scan.image_path is not None and scan.image_path.is_file():

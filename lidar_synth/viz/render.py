@@ -1,8 +1,8 @@
 """Software renderer for points: a z-buffer in numpy, which needs no graphics card and no screen.
 
-Every point is drawn as a disc whose size grows with range, like the gap between beams, so that surfaces look closed.
-The nearest disc fills a pixel. Eye-dome lighting (Boucheny 2009) shades by the depth of neighbouring pixels, which
-makes shapes visible although points have no normals.
+Every point is drawn as a disc whose size grows with range, like the gap between beams, so that
+surfaces look closed. The nearest disc fills a pixel. Eye-dome lighting (Boucheny 2009) shades by
+the depth of neighbouring pixels, which makes shapes visible although points have no normals.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ class Camera:
         eye: position of the camera.
         target: the point at the centre of the picture.
         up: the direction that is up in the picture.
-        field: vertical field of view in degrees; with ``parallel``, the height of the picture in metres.
+        field: vertical field of view in degrees; with ``parallel``, the height of the picture in
+            metres.
         parallel: orthographic projection instead of perspective.
     """
 
@@ -50,8 +51,9 @@ class Camera:
         """Project points (N, 3) into a picture of ``size`` (width, height) pixels.
 
         Returns:
-            (N, 2) pixel coordinates (x right, y down, from the upper left corner), (N,) depth in metres
-            along the viewing direction (negative: behind the camera), (N,) pixels per metre at that depth.
+            (N, 2) pixel coordinates (x right, y down, from the upper left corner), (N,) depth in
+            metres along the viewing direction (negative: behind the camera), (N,) pixels per metre
+            at that depth.
         """
         local = ((points - np.asarray(self.eye)) @ self.axes().T).astype(np.float32)
         depth = local[:, 2]
@@ -64,12 +66,14 @@ class Camera:
 
 
 class Orbit(NamedTuple):
-    """A camera position on a sphere around a target; increasing azimuths give a turntable animation.
+    """A camera position on a sphere around a target; increasing azimuths give a turntable
+    animation.
 
     The default view is from behind, slightly to the right, and above.
 
     Args:
-        azimuth: of the camera as seen from the target, degrees clockwise from straight ahead; 180 = behind.
+        azimuth: of the camera as seen from the target, degrees clockwise from straight ahead; 180 =
+            behind.
         elevation: degrees above the horizon.
         distance: metres from the target.
         field: vertical field of view, degrees.
@@ -84,14 +88,16 @@ class Orbit(NamedTuple):
 
     def camera(self) -> Camera:
         """The perspective camera at this position."""
-        a, e = np.radians(self.azimuth), np.radians(self.elevation)
+        a = np.radians(self.azimuth)
+        e = np.radians(self.elevation)
         away = self.distance * np.array([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)])
         x, y, z = (self.target + away).tolist()
         return Camera((x, y, z), self.target, field=self.field)
 
 
 def bird(extent: float = 50.0) -> Camera:
-    """An orthographic camera from above that shows ``extent`` metres on each side; straight ahead is up."""
+    """An orthographic camera from above that shows ``extent`` metres on each side; straight ahead
+    is up."""
     return Camera((0.0, 0.0, 100.0), up=(1.0, 0.0, 0.0), field=2 * extent, parallel=True)
 
 
@@ -102,7 +108,8 @@ def _splat(
     colours: Rgb,
     size: tuple[int, int],
 ) -> tuple[Rgb, NDArray[np.float32]]:
-    """Picture (h, w, 3) and depth buffer (h, w), inf = empty, of points drawn as discs; the nearest disc wins."""
+    """Picture (h, w, 3) and depth buffer (h, w), inf = empty, of points drawn as discs; the nearest
+    disc wins."""
     width, height = size
     buffer = np.full(width * height, np.inf, np.float32)
     owner = np.full(width * height, -1, np.int64)
@@ -111,10 +118,14 @@ def _splat(
     for reach in np.unique(steps):
         chosen = np.flatnonzero(steps == reach)
         span = np.arange(-reach, reach + 1)
-        for dy, dx in ((dy, dx) for dy in span for dx in span if dx * dx + dy * dy <= reach * reach + 0.5):
-            x, y = column[chosen] + dx, row[chosen] + dy
+        for dy, dx in (
+            (dy, dx) for dy in span for dx in span if dx * dx + dy * dy <= reach * reach + 0.5
+        ):
+            x = column[chosen] + dx
+            y = row[chosen] + dy
             visible = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            index, disc = y[visible] * width + x[visible], chosen[visible]
+            index = y[visible] * width + x[visible]
+            disc = chosen[visible]
             np.minimum.at(buffer, index, depth[disc])
             front = depth[disc] == buffer[index]
             owner[index[front]] = disc[front]
@@ -124,7 +135,8 @@ def _splat(
 
 
 def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) -> Rgb:
-    """Eye-dome lighting: darken a pixel by the log-depth differences to neighbours in front of it."""
+    """Eye-dome lighting: darken a pixel by the log-depth differences to neighbours in front of
+    it."""
     filled = np.isfinite(buffer)
     logs = np.log2(np.where(filled, np.maximum(buffer, 1e-3), 1.0)).astype(np.float32)
     logs[~filled] = np.inf
@@ -133,7 +145,8 @@ def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) ->
         padded = np.pad(logs, reach, constant_values=np.inf)
         for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             neighbour = padded[reach + dy :, reach + dx :][: buffer.shape[0], : buffer.shape[1]]
-            # Steps of more than 2 % in depth all count as edges; an empty neighbour does not darken.
+            # Steps of more than 2 % in depth all count as edges; an empty neighbour does not
+            # darken.
             behind += np.clip(np.where(filled, logs, 0) - neighbour, 0, 0.03)
     light = np.where(filled, np.exp(-strength * behind / 8), 1)
     return np.rint(EMPTY + (picture.astype(np.float32) - EMPTY) * light[..., None]).astype(np.uint8)
@@ -152,9 +165,13 @@ def _lines(
     ends, depth, _ = camera.look(segments.reshape(-1, 3), (width, height))
     in_front = (depth > 0.1).reshape(-1, 2)
     length = np.abs(np.diff(ends.reshape(-1, 2, 2), axis=1)).max((1, 2))
-    counts = np.where(in_front.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0).astype(np.int64)
+    counts = np.where(in_front.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0).astype(
+        np.int64
+    )
     which = np.repeat(np.arange(len(segments)), counts)
-    along = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.maximum(counts[which] - 1, 1)
+    along = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.maximum(
+        counts[which] - 1, 1
+    )
     points = segments[which, 0] * (1 - along[:, None]) + segments[which, 1] * along[:, None]
     pixels, depth, _ = camera.look(points, (width, height))
     for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -162,18 +179,25 @@ def _lines(
         visible = (x >= 0) & (x < width) & (y >= 0) & (y < height) & (depth > 0.1)
         clear = depth[visible] <= buffer[y[visible], x[visible]] + 0.15
         strength = np.zeros(buffer.shape, np.float32)
-        np.maximum.at(strength, (y[visible], x[visible]), np.where(clear, opacity, 0.25 * opacity).astype(np.float32))
+        np.maximum.at(
+            strength,
+            (y[visible], x[visible]),
+            np.where(clear, opacity, 0.25 * opacity).astype(np.float32),
+        )
         row, column = np.nonzero(strength)
         share = strength[row, column, None]
         picture[row, column] = picture[row, column] * (1 - share) + np.array(colour) * share
 
 
-EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
+EDGES = np.array(
+    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+)
 """The 12 edges of a box, as indices of ``Boxes.corners``."""
 
 
 def box_segments(boxes: Boxes) -> NDArray[np.float32]:
-    """(13 M, 2, 3) edges of the boxes, and for each box a line on its top from the centre to the front."""
+    """(13 M, 2, 3) edges of the boxes, and for each box a line on its top from the centre to the
+    front."""
     corners = boxes.corners()
     roof = corners[:, 4:].mean(1)
     nose = (corners[:, 4] + corners[:, 7]) / 2
@@ -225,7 +249,9 @@ def render(
     pixels, depth, per_metre = camera.look(scan.points, fine)
     in_front = depth > 0.1
     gap = 0.015 + 0.003 * np.linalg.norm(scan.points[in_front], axis=1)
-    picture, buffer = _splat(pixels[in_front], depth[in_front], gap * per_metre[in_front], colours[in_front], fine)
+    picture, buffer = _splat(
+        pixels[in_front], depth[in_front], gap * per_metre[in_front], colours[in_front], fine
+    )
     picture = _shade(picture, buffer)
     if rings:
         _lines(picture, buffer, ring_segments(scan), camera, (150, 160, 180), 0.35)

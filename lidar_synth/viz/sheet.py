@@ -1,4 +1,5 @@
-"""Figures with matplotlib: all views of one scan, several scans side by side, or histograms of many scans.
+"""Figures with matplotlib: all views of one scan, several scans side by side, or histograms of many
+scans.
 
 Figures are created without pyplot, so they change no global state and need no screen.
 """
@@ -27,7 +28,9 @@ BACK, INK, DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
 _DPI = 100
 
 
-def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: float = 50.0) -> Figure:
+def sheet(
+    given: Scan | RangeImage, *, camera: Camera | None = None, extent: float = 50.0
+) -> Figure:
     """All views of one scan: in perspective, from above, and every channel of its range image.
 
     Args:
@@ -45,9 +48,17 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
     heights = [6.2, *[1.45] * len(view.channels), legend]
     figure = new_figure(17.0, sum(heights) + 0.7)
     grid = figure.add_gridspec(
-        len(heights), 2, width_ratios=[2, 1], height_ratios=heights, hspace=0.34, wspace=0.1,
-        left=0.045, right=0.945, bottom=0.01, top=1 - 0.75 / (sum(heights) + 0.7),
-    )  # fmt: skip
+        len(heights),
+        2,
+        width_ratios=[2, 1],
+        height_ratios=heights,
+        hspace=0.34,
+        wspace=0.1,
+        left=0.045,
+        right=0.945,
+        bottom=0.01,
+        top=1 - 0.75 / (sum(heights) + 0.7),
+    )
     figure.text(
         0.045,
         1 - 0.28 / figure.get_figheight(),
@@ -67,16 +78,20 @@ def sheet(given: Scan | RangeImage, *, camera: Camera | None = None, extent: flo
 
 
 def contact_sheet(
-    given: Sequence[Scan | RangeImage], *, columns: int | None = None, by: str | None = None, title: str = ""
+    given: Sequence[Scan | RangeImage],
+    *,
+    columns: int | None = None,
+    by: str | None = None,
+    title: str = "",
 ) -> Figure:
-    """Several scans side by side: each one in perspective above its range image (and its label image, if labels
-    colour the points).
+    """Several scans side by side: each one in perspective above its range image (and its label
+    image, if labels colour the points).
 
     Args:
         given: scans or range images, at least one.
         columns: tiles per row; by default the sheet is about square.
-        by: the quantity that colours the points, one of ``colour.VALUES``; by default labels if all scans have them,
-            otherwise heights.
+        by: the quantity that colours the points, one of ``colour.VALUES``; by default labels if all
+            scans have them, otherwise heights.
         title: the title line.
 
     Raises:
@@ -95,23 +110,44 @@ def contact_sheet(
     height = (3.2 + 0.6 * len(strips)) * rows + 0.5 + legend
     figure = new_figure(width, height)
     grid = figure.add_gridspec(
-        rows, columns, hspace=0.11, wspace=0.03, left=0.01, right=0.99, bottom=legend / height, top=1 - 0.72 / height
+        rows,
+        columns,
+        hspace=0.11,
+        wspace=0.03,
+        left=0.01,
+        right=0.99,
+        bottom=legend / height,
+        top=1 - 0.72 / height,
     )
     _write_head(figure, title, 0.01, 1 - 0.25 / height)
-    for place, view in enumerate(tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)):
-        tile = grid[place].subgridspec(1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02)
+    for place, view in enumerate(
+        tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)
+    ):
+        tile = grid[place].subgridspec(
+            1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02
+        )
         above, *below = (figure.add_subplot(tile[row]) for row in range(1 + len(strips)))
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
-        above.set_title(caption(view.scan, short=True), color=DIM, fontsize=9, loc="left", pad=3, parse_math=False)
+        above.set_title(
+            caption(view.scan, short=True),
+            color=DIM,
+            fontsize=9,
+            loc="left",
+            pad=3,
+            parse_math=False,
+        )
     if by == "label":
         _legend(figure, all_views, colours[by].table)
     return figure
 
 
 def histograms(
-    values: Mapping[str, NDArray[np.floating]], meanings: Mapping[str, str], marked: NDArray[np.bool_], title: str = ""
+    values: Mapping[str, NDArray[np.floating]],
+    meanings: Mapping[str, str],
+    marked: NDArray[np.bool_],
+    title: str = "",
 ) -> Figure:
     """Histograms of measures of many scans, with some of the scans highlighted.
 
@@ -141,7 +177,9 @@ def histograms(
         colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
         axes.hist([numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours)
         axes.set_yscale("symlog", linthresh=1)  # keeps a single scan among thousands visible
-        style_axes(axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans")
+        style_axes(
+            axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans"
+        )
     return figure
 
 
@@ -180,15 +218,21 @@ def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
 
 def _colour_bar(axes: Any, scale: Scale) -> None:
     """A colour bar at the right edge of the axes."""
-    values = ScalarMappable(PowerNorm(scale.gamma, scale.low, scale.high), ListedColormap(scale.table / 255))
-    bar = axes.figure.colorbar(values, cax=axes.inset_axes((1.008, 0, 0.011, 1), transform=axes.transAxes))
+    values = ScalarMappable(
+        PowerNorm(scale.gamma, scale.low, scale.high), ListedColormap(scale.table / 255)
+    )
+    bar = axes.figure.colorbar(
+        values, cax=axes.inset_axes((1.008, 0, 0.011, 1), transform=axes.transAxes)
+    )
     bar.ax.tick_params(colors=DIM, labelsize=8, length=2)
     bar.outline.set_edgecolor("#3a3f4b")
 
 
 def _perspective(axes: Any, view: View, by: str, scale: Scale, camera: Camera | None) -> None:
     _show_pixels(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
-    axes.set_title(f"3-D, coloured by {scale.title}; circles every 10 m", color=INK, fontsize=11, loc="left")
+    axes.set_title(
+        f"3-D, coloured by {scale.title}; circles every 10 m", color=INK, fontsize=11, loc="left"
+    )
 
 
 def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
@@ -201,9 +245,11 @@ def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
 def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
     sensor = view.image.sensor
     axes.imshow(
-        picture(view.image, channel, scale), aspect="auto", interpolation="nearest",
+        picture(view.image, channel, scale),
+        aspect="auto",
+        interpolation="nearest",
         extent=(-180, 180, sensor.shape[0], 0),
-    )  # fmt: skip
+    )
     style_axes(axes, scale.title, "", "row")
     names = ["behind", "-135°", "left", "-45°", "ahead", "45°", "right", "135°", "behind"]
     axes.set_xticks(range(-180, 181, 45), names)
@@ -220,7 +266,14 @@ def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
         if count
     ]
     columns = min(max(1, len(entries)), _per_row(figure.get_figwidth()))
-    figure.legend(handles=entries, loc="lower center", ncols=columns, frameon=False, labelcolor=INK, fontsize=9)
+    figure.legend(
+        handles=entries,
+        loc="lower center",
+        ncols=columns,
+        frameon=False,
+        labelcolor=INK,
+        fontsize=9,
+    )
 
 
 def _per_row(width: float) -> int:

@@ -43,8 +43,12 @@ def has_screen() -> bool:
         return True
     if _can_connect("libX11.so.6", "XOpenDisplay", "XCloseDisplay"):
         return True
-    wayland = "XDG_RUNTIME_DIR" in os.environ  # without it, libwayland prints an error to the terminal
-    return wayland and _can_connect("libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect")
+    wayland = (
+        "XDG_RUNTIME_DIR" in os.environ
+    )  # without it, libwayland prints an error to the terminal
+    return wayland and _can_connect(
+        "libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect"
+    )
 
 
 def _can_connect(library: str, connect: str, disconnect: str) -> bool:
@@ -61,15 +65,16 @@ def _can_connect(library: str, connect: str, disconnect: str) -> bool:
 
 
 def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
-    """Show scans in a window until it is closed; the left and right arrow keys switch between scans.
+    """Show scans in a window until it is closed; the left and right arrow keys switch between
+    scans.
 
     Args:
         scans: at least one scan.
         title: the title of the window.
 
     Returns:
-        Whether a window was shown. False without a screen, without open3d or one of its system libraries, or without
-        OpenGL.
+        Whether a window was shown. False without a screen, without open3d or one of its system
+        libraries, or without OpenGL.
     """
     if not has_screen():
         return False
@@ -98,8 +103,10 @@ def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
         window.add_geometry(geometry)
     window.register_key_callback(_LEFT, turn(-1))
     window.register_key_callback(_RIGHT, turn(1))
-    options, view = window.get_render_option(), window.get_view_control()
-    options.background_color, options.point_size = EMPTY / 255, 2.0
+    options = window.get_render_option()
+    view = window.get_view_control()
+    options.background_color = EMPTY / 255
+    options.point_size = 2.0
     camera = Orbit().camera()
     view.set_lookat(camera.target)
     view.set_front(np.subtract(camera.eye, camera.target))
@@ -111,7 +118,8 @@ def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
 
 
 def geometries(scan: Scan, colours: dict[str, Scale]) -> list[Any]:
-    """The open3d geometries of a scan: its points, coloured by label (or by height without labels), and its boxes.
+    """The open3d geometries of a scan: its points, coloured by label (or by height without labels),
+    and its boxes.
 
     Args:
         scan: N points.

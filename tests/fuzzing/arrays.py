@@ -11,9 +11,25 @@ from fuzzing.mutators import FLOATS, INTEGERS, mutates
 from fuzzing.text import encoded, replace_number, replace_word
 
 TYPES = (
-    "<f4", ">f4", "<f2", "<f8", "<c8", "<c16", "|O", "<U4", "|S4", "|V4", "<M8[s]", "<m8[D]", "|b1", "|u1", "<i2",
-    "<u4", "<i8", "<u8",
-)  # fmt: skip
+    "<f4",
+    ">f4",
+    "<f2",
+    "<f8",
+    "<c8",
+    "<c16",
+    "|O",
+    "<U4",
+    "|S4",
+    "|V4",
+    "<M8[s]",
+    "<m8[D]",
+    "|b1",
+    "|u1",
+    "<i2",
+    "<u4",
+    "<i8",
+    "<u8",
+)
 """What an array may be of."""
 
 
@@ -22,7 +38,9 @@ def set_floats(content: bytes, rng: Random) -> bytes:
     """Some numbers become impossible, or unlikely, ones."""
     values = np.frombuffer(content[: len(content) // 4 * 4], "<f4").copy()
     for _ in range(rng.choice((1, 1, 2, 20))):
-        values[rng.randrange(len(values))] = rng.choice((*FLOATS, 0.5, 31.0, 1.0000001, 99_999.0, rng.uniform(-90, 90)))
+        values[rng.randrange(len(values))] = rng.choice(
+            (*FLOATS, 0.5, 31.0, 1.0000001, 99_999.0, rng.uniform(-90, 90))
+        )
     return values.tobytes()
 
 
@@ -31,7 +49,9 @@ def set_integers(content: bytes, rng: Random) -> bytes:
     """Some labels become other ones, or none."""
     values = np.frombuffer(content[: len(content) // 4 * 4], "<u4").copy()
     for _ in range(rng.choice((1, 1, 2, 20))):
-        values[rng.randrange(len(values))] = rng.choice((*INTEGERS, 10, 252 | 7 << 16, 39, 44, 45)) % 2**32
+        values[rng.randrange(len(values))] = (
+            rng.choice((*INTEGERS, 10, 252 | 7 << 16, 39, 44, 45)) % 2**32
+        )
     return values.tobytes()
 
 
@@ -39,7 +59,9 @@ def set_integers(content: bytes, rng: Random) -> bytes:
 def change_count(content: bytes, rng: Random) -> bytes:
     """More or fewer values, whole ones."""
     count = 4 * rng.choice((1, 2, 4, 5, 20, len(content) // 8))
-    return rng.choice((content[:-count], content[count:], content + content[:count], content * 2, b""))
+    return rng.choice(
+        (content[:-count], content[count:], content + content[:count], content * 2, b"")
+    )
 
 
 @mutates(".npy")
@@ -58,7 +80,11 @@ def change_values(content: bytes, rng: Random) -> bytes:
 def change_type(content: bytes, rng: Random) -> bytes:
     """The values are stored as another type."""
     with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
-        return dump(load(content).astype(rng.choice([t for t in TYPES if t not in ("|O", "<M8[s]", "<m8[D]")])))
+        return dump(
+            load(content).astype(
+                rng.choice([t for t in TYPES if t not in ("|O", "<M8[s]", "<m8[D]")])
+            )
+        )
 
 
 @mutates(".npy")
@@ -67,11 +93,23 @@ def change_shape(content: bytes, rng: Random) -> bytes:
     array = load(content)
     flat = array.reshape(-1)
     shapes = (
-        array[:-1] if array.ndim else flat, array[..., :-1] if array.ndim else flat, array[:0] if array.ndim else flat,
-        array.T, flat, array[None], array[..., None], np.asfortranarray(array), flat[:1].reshape(()), array.repeat(2),
-        np.zeros((0, 4), array.dtype), np.zeros((3, 0), array.dtype), np.zeros((1,) * 40, array.dtype)[..., 0],
-    )  # fmt: skip
-    return dump(np.ascontiguousarray(shapes[i]) if (i := rng.randrange(len(shapes))) != 7 else shapes[7])
+        array[:-1] if array.ndim else flat,
+        array[..., :-1] if array.ndim else flat,
+        array[:0] if array.ndim else flat,
+        array.T,
+        flat,
+        array[None],
+        array[..., None],
+        np.asfortranarray(array),
+        flat[:1].reshape(()),
+        array.repeat(2),
+        np.zeros((0, 4), array.dtype),
+        np.zeros((3, 0), array.dtype),
+        np.zeros((1,) * 40, array.dtype)[..., 0],
+    )
+    return dump(
+        np.ascontiguousarray(shapes[i]) if (i := rng.randrange(len(shapes))) != 7 else shapes[7]
+    )
 
 
 @mutates(".npy")
@@ -82,10 +120,22 @@ def lie_in_header(content: bytes, rng: Random) -> bytes:
     kinds = ("{}", "{}", "[('a', {}), ('b', '<i4')]", "({}, (2,))", "{}" * 2)
     shape = rng.choice(
         (
-            array.shape, (2**31, 4), (2**62,), (2**63, 2**63), (200_000, 200_000), (10_000_000, 4), (-1, 4), (64.5, 4),
-            (0,), (), (1,) * 33, (True, 2), "4", None,
+            array.shape,
+            (2**31, 4),
+            (2**62,),
+            (2**63, 2**63),
+            (200_000, 200_000),
+            (10_000_000, 4),
+            (-1, 4),
+            (64.5, 4),
+            (0,),
+            (),
+            (1,) * 33,
+            (True, 2),
+            "4",
+            None,
         )
-    )  # fmt: skip
+    )
     told = array.dtype.str if rng.random() < 0.5 else rng.choice(TYPES)
     kind = rng.choice(kinds).format(*[repr(told)] * 2) if rng.random() < 0.3 else repr(told)
     header = f"{{'descr': {kind}, 'fortran_order': {rng.choice((False, False, True, 2))}, 'shape': {shape}, }}".encode()
@@ -139,5 +189,7 @@ def parts(content: bytes) -> tuple[tuple[int, int], bytes, bytes]:
 
 def join(version: tuple[int, int], header: bytes, body: bytes) -> bytes:
     """The inverse of ``parts``; the header's length fits."""
-    length = struct.pack("<H" if version[0] == 1 else "<I", min(len(header), 65535 if version[0] == 1 else 2**32 - 1))
+    length = struct.pack(
+        "<H" if version[0] == 1 else "<I", min(len(header), 65535 if version[0] == 1 else 2**32 - 1)
+    )
     return npy.MAGIC_PREFIX + bytes(version) + length + header + body

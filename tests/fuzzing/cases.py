@@ -1,4 +1,5 @@
-"""Numbered cases: the files of a valid dataset, of which one is mutated. A number gives the same bytes every time."""
+"""Numbered cases: the files of a valid dataset, of which one is mutated. A number gives the same
+bytes every time."""
 
 import shutil
 from collections.abc import Mapping
@@ -16,19 +17,24 @@ Files = Mapping[str, bytes]
 
 
 def seed_files(target: Target, folder: Path) -> Files:
-    """The files of the valid dataset; they are made in ``folder``, or read from there if it exists."""
+    """The files of the valid dataset; they are made in ``folder``, or read from there if it
+    exists."""
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         target.make(part)
         part.rename(folder)
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 def mutable(target: Target, files: Files) -> list[str]:
     """The names of the files that may be mutated."""
-    return [name for name in files if any(fnmatch(Path(name).name, pattern) for pattern in target.files)]
+    return [
+        name for name in files if any(fnmatch(Path(name).name, pattern) for pattern in target.files)
+    ]
 
 
 def mutated(target: Target, files: Files, rng: Random) -> dict[str, bytes | None]:
@@ -53,7 +59,9 @@ class Cases:
     """
 
     def __init__(self, name: str, target: Target, seed: int, folder: Path) -> None:
-        self.name, self.target, self.seed = name, target, seed
+        self.name = name
+        self.target = target
+        self.seed = seed
         self.files = seed_files(target, folder / "valid")
         self.root = folder / "case"
         shutil.rmtree(self.root, ignore_errors=True)
@@ -61,7 +69,8 @@ class Cases:
         self.restore()
 
     def place(self, number: int) -> Path:
-        """Put a case into the folder, beside the files that it shares with the valid dataset; the folder."""
+        """Put a case into the folder, beside the files that it shares with the valid dataset; the
+        folder."""
         rng = Random(f"{self.seed}/{self.name}/{number}")
         for name, content in mutated(self.target, self.files, rng).items():
             self._put(name, content)

@@ -1,4 +1,5 @@
-"""What a result that was read has to be: whole, finite, of the declared types and within the declared limits."""
+"""What a result that was read has to be: whole, finite, of the declared types and within the
+declared limits."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -16,14 +17,24 @@ from lidar_synth.geometry.scan import FARTHEST, REAL, SYNTHETIC, Boxes, RangeIma
 from lidar_synth.geometry.sensor import Sensor
 
 FIELD_TYPES = {
-    "reflectance": "f4", "label": "u1", "raw_label": "u4", "instance": "i4", "ring": "i2", "confidence": "f4",
+    "reflectance": "f4",
+    "label": "u1",
+    "raw_label": "u4",
+    "instance": "i4",
+    "ring": "i2",
+    "confidence": "f4",
     "time": "f4",
-}  # fmt: skip
+}
 
 BOX_TYPES = {
-    "values": "f4", "truncation": "f4", "occlusion": "i1", "image_box": "f4", "instance": "i4", "alpha": "f4",
+    "values": "f4",
+    "truncation": "f4",
+    "occlusion": "i1",
+    "image_box": "f4",
+    "instance": "i4",
+    "alpha": "f4",
     "dont_care": "f4",
-}  # fmt: skip
+}
 
 
 @singledispatch
@@ -89,7 +100,9 @@ def _(camera: Calibration) -> Iterator[str]:
     yield from _transform_flaws("camera_from_sensor", camera.camera_from_sensor)
     if not np.isfinite(camera.projection).all():
         yield "a projection that is not finite"
-    if camera.image_size is not None and not all(isinstance(n, int) and 0 < n < 2**31 for n in camera.image_size):
+    if camera.image_size is not None and not all(
+        isinstance(n, int) and 0 < n < 2**31 for n in camera.image_size
+    ):
         yield f"an image of {camera.image_size} pixels"
 
 
@@ -98,7 +111,11 @@ def _(sensor: Sensor) -> Iterator[str]:
     rows, columns = sensor.shape
     if not (type(rows) is int and type(columns) is int and rows > 0 and columns > 0):
         yield f"a sensor of {rows!r} x {columns!r}"
-    if sensor.edges.shape != (rows + 1,) or not np.isfinite(sensor.edges).all() or (np.diff(sensor.edges) > 0).any():
+    if (
+        sensor.edges.shape != (rows + 1,)
+        or not np.isfinite(sensor.edges).all()
+        or (np.diff(sensor.edges) > 0).any()
+    ):
         yield f"a sensor with edges {sensor.edges[:4]}"
     if not 0 <= sensor.range_min < sensor.range_max <= 1e30:
         yield f"a sensor from {sensor.range_min} to {sensor.range_max} m"
@@ -138,7 +155,10 @@ def _transform_flaws(name: str, matrix: Any) -> Iterator[str]:
     """A rigid transform is finite, and its rotation is one."""
     if matrix.shape != (4, 4) or matrix.dtype != np.float64 or not np.isfinite(matrix).all():
         yield f"{name} of {matrix.dtype}, {matrix.shape}, or not finite"
-    elif np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.1 or (matrix[3] != (0, 0, 0, 1)).any():
+    elif (
+        np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.1
+        or (matrix[3] != (0, 0, 0, 1)).any()
+    ):
         yield f"{name} is not rigid: {matrix.tolist()}"
 
 
@@ -151,7 +171,9 @@ def fingerprint(value: Any) -> str:
 
 def _add(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray):
-        digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        digest.update(
+            f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes()
+        )
     elif isinstance(value, torch.nn.Module):
         _add(digest, {key: tensor.numpy() for key, tensor in value.state_dict().items()})
     elif is_dataclass(value):

@@ -1,4 +1,5 @@
-"""Mutators of containers of files: ``.npz`` (zip) and ``.tar``. A member is mutated as a file of its own suffix."""
+"""Mutators of containers of files: ``.npz`` (zip) and ``.tar``. A member is mutated as a file of
+its own suffix."""
 
 import tarfile
 import zipfile
@@ -12,9 +13,24 @@ from fuzzing.mutators import INTEGERS, LIMIT, mutate, mutates
 Members = list[tuple[str, bytes]]
 
 NAMES = (
-    "", "x.npy", "points.npy", "range.npy", "sensor.npy", "label.npy", "allow_pickle.npy", "../../x.npy", "/x.npy",
-    "points.npy/", "a" * 60_000, "\u00e4.npy", "box_values.npy", "box_.npy", "pose.npy", "image.npy", "json",
-)  # fmt: skip
+    "",
+    "x.npy",
+    "points.npy",
+    "range.npy",
+    "sensor.npy",
+    "label.npy",
+    "allow_pickle.npy",
+    "../../x.npy",
+    "/x.npy",
+    "points.npy/",
+    "a" * 60_000,
+    "\u00e4.npy",
+    "box_values.npy",
+    "box_.npy",
+    "pose.npy",
+    "image.npy",
+    "json",
+)
 """What a member may be called."""
 
 
@@ -38,7 +54,8 @@ def rezip(members: Members, method: int = zipfile.ZIP_STORED) -> bytes:
 
 def edit_members(members: Members, rng: Random) -> Members:
     """Members are mutated, dropped, renamed, repeated, swapped or foreign."""
-    i, j = rng.randrange(len(members)), rng.randrange(len(members))
+    i = rng.randrange(len(members))
+    j = rng.randrange(len(members))
     (name, content), other = members[i], members[j]
     change = rng.randrange(12)
     if change < 6:
@@ -62,8 +79,14 @@ def edit_members(members: Members, rng: Random) -> Members:
 def edit_zip(content: bytes, rng: Random) -> bytes:
     """The members of the zip change."""
     members = edit_members(unzip(content), rng)
-    stored, deflated = zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED
-    return rezip(members, rng.choice((stored, stored, stored, deflated, deflated, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))
+    stored = zipfile.ZIP_STORED
+    deflated = zipfile.ZIP_DEFLATED
+    return rezip(
+        members,
+        rng.choice(
+            (stored, stored, stored, deflated, deflated, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+        ),
+    )
 
 
 @mutates(".npz")
@@ -73,7 +96,8 @@ def lie_in_zip(content: bytes, rng: Random) -> bytes:
     directory = content.index(b"PK\x01\x02")
     starts = [i for i in range(directory, len(content) - 46) if content[i : i + 4] == b"PK\x01\x02"]
     start = rng.choice(starts)
-    # Offsets in a central header: flags 8, method 10, CRC 16, sizes 20 and 24, name 28, extra 30, local header 42.
+    # Offsets in a central header: flags 8, method 10, CRC 16, sizes 20 and 24, name 28, extra 30,
+    # local header 42.
     at, size = rng.choice(((8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (42, 4)))
     number = rng.choice((*INTEGERS, 8, 9, 12, 14, 93, 97, 99)) % 256**size
     values[start + at : start + at + size] = number.to_bytes(size, "little")
@@ -107,7 +131,8 @@ def bomb_zip(content: bytes, rng: Random) -> bytes:
 
 
 def replace_member(content: bytes, name: str, body: bytes, size: int) -> bytes:
-    """A zip whose empty member ``name`` holds a deflated body that claims to unpack into ``size`` bytes."""
+    """A zip whose empty member ``name`` holds a deflated body that claims to unpack into ``size``
+    bytes."""
     with zipfile.ZipFile(BytesIO(content)) as opened:
         info = opened.getinfo(name)
         directory = opened.start_dir
@@ -116,9 +141,13 @@ def replace_member(content: bytes, name: str, body: bytes, size: int) -> bytes:
     central = values.index(name.encode(), directory) - 46
     for start, method, sizes in ((info.header_offset, 8, 18), (central, 10, 20)):
         values[start + method : start + method + 2] = (8).to_bytes(2, "little")
-        values[start + sizes : start + sizes + 8] = len(body).to_bytes(4, "little") + size.to_bytes(4, "little")
+        values[start + sizes : start + sizes + 8] = len(body).to_bytes(4, "little") + size.to_bytes(
+            4, "little"
+        )
     moved = bytearray(values)
-    for start in [i for i in range(directory, len(values) - 46) if values[i : i + 4] == b"PK\x01\x02"]:
+    for start in [
+        i for i in range(directory, len(values) - 46) if values[i : i + 4] == b"PK\x01\x02"
+    ]:
         offset = int.from_bytes(values[start + 42 : start + 46], "little")
         if offset > info.header_offset:
             moved[start + 42 : start + 46] = (offset + len(body)).to_bytes(4, "little")
@@ -132,13 +161,16 @@ def untar(content: bytes) -> Members:
         return [(member.name, opened.extractfile(member).read()) for member in opened]  # type: ignore[union-attr]
 
 
-def retar(members: Members, kinds: dict[int, bytes] | None = None, form: int = tarfile.PAX_FORMAT) -> bytes:
+def retar(
+    members: Members, kinds: dict[int, bytes] | None = None, form: int = tarfile.PAX_FORMAT
+) -> bytes:
     """A tar of the members; some may be of another kind than a file."""
     file = BytesIO()
     with tarfile.open(fileobj=file, mode="w", format=form) as opened:
         for i, (name, content) in enumerate(members):
             info = tarfile.TarInfo(name)
-            info.size, info.type = len(content), (kinds or {}).get(i, tarfile.REGTYPE)
+            info.size = len(content)
+            info.type = (kinds or {}).get(i, tarfile.REGTYPE)
             info.linkname = members[0][0]
             opened.addfile(info, BytesIO(content))
     return file.getvalue()
@@ -153,7 +185,9 @@ def edit_tar(content: bytes, rng: Random) -> bytes:
         stem, dot, kind = members[i][0].partition(".")
         ends = ("json", "points.npy", "ring.npy", "pose.npy", f"{kind}.npy", kind)
         name = (
-            rng.choice(("x", "../../" + stem, "%2E%2E/x", "/x", "", "a" * 300, "\udcff", stem)) + dot + rng.choice(ends)
+            rng.choice(("x", "../../" + stem, "%2E%2E/x", "/x", "", "a" * 300, "\udcff", stem))
+            + dot
+            + rng.choice(ends)
         )
         members[i] = (name, members[i][1])
     else:
@@ -165,8 +199,19 @@ def edit_tar(content: bytes, rng: Random) -> bytes:
 def change_kinds(content: bytes, rng: Random) -> bytes:
     """Members that are links, folders, devices or sparse files."""
     members = untar(content)
-    kinds = (tarfile.LNKTYPE, tarfile.SYMTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE, tarfile.CONTTYPE,
-             tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_SPARSE, tarfile.XHDTYPE, tarfile.XGLTYPE, b"Z")  # fmt: skip
+    kinds = (
+        tarfile.LNKTYPE,
+        tarfile.SYMTYPE,
+        tarfile.CHRTYPE,
+        tarfile.DIRTYPE,
+        tarfile.FIFOTYPE,
+        tarfile.CONTTYPE,
+        tarfile.GNUTYPE_LONGNAME,
+        tarfile.GNUTYPE_SPARSE,
+        tarfile.XHDTYPE,
+        tarfile.XGLTYPE,
+        b"Z",
+    )
     return retar(members, {rng.randrange(len(members)): rng.choice(kinds)})
 
 
@@ -178,7 +223,9 @@ def lie_in_tar(content: bytes, rng: Random) -> bytes:
     header = bytearray(content[start : start + 512])
     if rng.random() < 0.7:
         size = rng.choice((0, 1, 511, 10**6, 8**11 - 1, 2**40, 2**62, 2**63 - 1, 2**80))
-        header[124:136] = b"%011o\x00" % size if size < 8**11 else b"\x80" + size.to_bytes(11, "big")
+        header[124:136] = (
+            b"%011o\x00" % size if size < 8**11 else b"\x80" + size.to_bytes(11, "big")
+        )
     else:
         header[:100] = rng.randbytes(rng.choice((1, 10, 100))).ljust(100, b"\x00")
     header[148:156] = b" " * 8

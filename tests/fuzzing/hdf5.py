@@ -37,11 +37,24 @@ def edit_attributes(content: bytes, rng: Random) -> bytes:
     def edit(file: h5py.File) -> None:
         name = rng.choice(sorted(file.attrs))
         values: tuple[Any, ...] = (
-            *(np.array(i % 2**63) for i in INTEGERS), np.float64("nan"), np.float64(1e30), np.float64(-1), np.uint8(3),
-            fixed(rng.choice(WORDS[:-1])), "variable length", b"bytes", np.zeros(0), np.zeros((3, 3)),
-            np.arange(5000), h5py.Empty("f4"), np.array([b"a", b"b"]), np.array(True), file.ref,
-            np.array(1 + 1j), np.array((1, 2.0), [("a", "i4"), ("b", "f8")]),
-        )  # fmt: skip
+            *(np.array(i % 2**63) for i in INTEGERS),
+            np.float64("nan"),
+            np.float64(1e30),
+            np.float64(-1),
+            np.uint8(3),
+            fixed(rng.choice(WORDS[:-1])),
+            "variable length",
+            b"bytes",
+            np.zeros(0),
+            np.zeros((3, 3)),
+            np.arange(5000),
+            h5py.Empty("f4"),
+            np.array([b"a", b"b"]),
+            np.array(True),
+            file.ref,
+            np.array(1 + 1j),
+            np.array((1, 2.0), [("a", "i4"), ("b", "f8")]),
+        )
         if rng.random() < 0.15:
             del file.attrs[name]
         elif rng.random() < 0.1:
@@ -57,8 +70,14 @@ def edit_json_attributes(content: bytes, rng: Random) -> bytes:
     """The JSON in an attribute says something else."""
 
     def edit(file: h5py.File) -> None:
-        texts = {name: bytes(value) for name, value in file.attrs.items() if isinstance(value, np.bytes_ | bytes)}
-        texts = {name: text for name, text in texts.items() if text[:1] in (b"{", b"[") and len(text) > 2}
+        texts = {
+            name: bytes(value)
+            for name, value in file.attrs.items()
+            if isinstance(value, np.bytes_ | bytes)
+        }
+        texts = {
+            name: text for name, text in texts.items() if text[:1] in (b"{", b"[") and len(text) > 2
+        }
         name = rng.choice(sorted(texts))
         text = edit_json_text(texts[name].decode(), rng)
         file.attrs[name] = fixed(text if len(text) < 60_000 else json.dumps("a" * 50_000))
@@ -68,12 +87,15 @@ def edit_json_attributes(content: bytes, rng: Random) -> bytes:
 
 @mutates(".h5")
 def replace_dataset(content: bytes, rng: Random) -> bytes:
-    """A dataset is missing, or of another shape, type or layout; a huge one takes no room in the file."""
+    """A dataset is missing, or of another shape, type or layout; a huge one takes no room in the
+    file."""
 
     def edit(file: h5py.File) -> None:
         name = rng.choice(sorted(file))
         old = file[name]
-        shape, dtype, data = old.shape, old.dtype, old[()]
+        shape = old.shape
+        dtype = old.dtype
+        data = old[()]
         del file[name]
         others: tuple[Callable[[], object], ...] = (
             lambda: None,
@@ -82,11 +104,15 @@ def replace_dataset(content: bytes, rng: Random) -> bytes:
             lambda: file.create_dataset(
                 name, (shape[0] * 3, *shape[1:]), dtype, maxshape=(None, *shape[1:]), chunks=True
             ),
-            lambda: file.create_dataset(name, (600_000_000, *shape[1:]), dtype, chunks=(2**16, *shape[1:])),
+            lambda: file.create_dataset(
+                name, (600_000_000, *shape[1:]), dtype, chunks=(2**16, *shape[1:])
+            ),
             lambda: file.create_dataset(name, (2**40,), dtype, chunks=(2**16,)),
             lambda: file.create_dataset(name, (), dtype),
             lambda: file.create_dataset(name, (0,), dtype),
-            lambda: file.create_dataset(name, shape, rng.choice(("f4", "c8", "S8", "u8", "i2", "u1", "?", "V3"))),
+            lambda: file.create_dataset(
+                name, shape, rng.choice(("f4", "c8", "S8", "u8", "i2", "u1", "?", "V3"))
+            ),
             lambda: file.create_dataset(name, shape, h5py.string_dtype()),
             lambda: file.create_dataset(name, shape, "S100000000", chunks=(1,) * len(shape)),
             lambda: file.create_dataset(name, data=data, chunks=shape, compression="gzip"),
@@ -110,7 +136,8 @@ def link_elsewhere(content: bytes, rng: Random) -> bytes:
 
     def edit(file: h5py.File) -> None:
         name = rng.choice(sorted(file))
-        shape, dtype = file[name].shape, file[name].dtype
+        shape = file[name].shape
+        dtype = file[name].dtype
         del file[name]
         virtual = h5py.VirtualLayout(shape, dtype)
         virtual[...] = h5py.VirtualSource("elsewhere.h5", name, shape)
@@ -121,8 +148,12 @@ def link_elsewhere(content: bytes, rng: Random) -> bytes:
             lambda: file.__setitem__(name, h5py.SoftLink(f"/{name}")),
             lambda: file.__setitem__(name, h5py.SoftLink("/nowhere")),
             lambda: file.__setitem__(name, file[rng.choice(sorted(file))]),
-            lambda: file.create_dataset(name, shape, dtype, external=[("/etc/hostname", 0, h5py.h5f.UNLIMITED)]),
-            lambda: file.create_dataset(name, shape, dtype, external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)]),
+            lambda: file.create_dataset(
+                name, shape, dtype, external=[("/etc/hostname", 0, h5py.h5f.UNLIMITED)]
+            ),
+            lambda: file.create_dataset(
+                name, shape, dtype, external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)]
+            ),
             lambda: file.create_virtual_dataset(name, virtual),
         )
         rng.choice(others)()
@@ -141,7 +172,8 @@ def change_scan(content: bytes, rng: Random) -> bytes:
         values = file[name][position]
         if name in names:
             for _ in range(rng.choice((1, 10))):
-                row, column = rng.randrange(values.shape[0]), rng.randrange(values.shape[1])
+                row = rng.randrange(values.shape[0])
+                column = rng.randrange(values.shape[1])
                 values[row, column] = rng.choice(INTEGERS) % (int(np.iinfo(values.dtype).max) + 1)
             file[name][position] = values
         else:
@@ -149,7 +181,8 @@ def change_scan(content: bytes, rng: Random) -> bytes:
         if rng.random() < 0.8:
             condition = bytes(file["condition"][position]) if "condition" in file else b""
             arrays = {name: np.ascontiguousarray(file[name][position]) for name in names}
-            seed, index = int(file["seed"][position]), int(file["index"][position])
+            seed = int(file["seed"][position])
+            index = int(file["index"][position])
             file["crc"][position] = checksum(seed, index, arrays, condition)
 
     return edited(content, edit)

@@ -1,4 +1,5 @@
-"""Mutators: functions from the bytes of a file to other bytes, listed by the suffix of the files they know."""
+"""Mutators: functions from the bytes of a file to other bytes, listed by the suffix of the files
+they know."""
 
 import struct
 from collections import defaultdict
@@ -11,10 +12,40 @@ Mutator = Callable[[bytes, Random], bytes]
 BY_SUFFIX: dict[str, list[Mutator]] = defaultdict(list)
 """Mutators of the files with a suffix; those under ``""`` apply to every file."""
 
-INTEGERS = (0, 1, -1, 2, 127, 128, 255, 256, 32767, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1)
+INTEGERS = (
+    0,
+    1,
+    -1,
+    2,
+    127,
+    128,
+    255,
+    256,
+    32767,
+    65535,
+    65536,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**63 - 1,
+)
 """Whole numbers at the limits of types."""
 
-FLOATS = (0.0, -0.0, 1.0, -1.0, 64.5, 1e-30, 1e5, 1e30, 3.4e38, -1e30, float("nan"), float("inf"), float("-inf"))
+FLOATS = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    64.5,
+    1e-30,
+    1e5,
+    1e30,
+    3.4e38,
+    -1e30,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+)
 """Numbers at which arithmetic goes wrong."""
 
 LIMIT = 4_000_000
@@ -47,14 +78,21 @@ def mutate(name: str, content: bytes, rng: Random) -> bytes:
     count = rng.choice((1, 1, 1, 2, 3))
     structured = sum(rng.random() < 0.75 for _ in range(count)) if known else 0
     if suffix == ".h5":
-        structured = min(structured, 1)  # HDF5 itself crashes when it is to write into a file with such contents
+        structured = min(
+            structured, 1
+        )  # HDF5 itself crashes when it is to write into a file with such contents
     for i in range(count):
-        content = apply(rng.choice(known), content, rng) if i < structured else rng.choice(BY_SUFFIX[""])(content, rng)
+        content = (
+            apply(rng.choice(known), content, rng)
+            if i < structured
+            else rng.choice(BY_SUFFIX[""])(content, rng)
+        )
     return content[:LIMIT]
 
 
 def apply(mutator: Mutator, content: bytes, rng: Random) -> bytes:
-    """What a mutator makes of bytes; a flipped bit where an earlier mutation left nothing that it can read."""
+    """What a mutator makes of bytes; a flipped bit where an earlier mutation left nothing that it
+    can read."""
     try:
         return mutator(content, rng)
     except Exception:
@@ -80,7 +118,9 @@ def flip_bits(content: bytes, rng: Random) -> bytes:
 @mutates("")
 def cut_off(content: bytes, rng: Random) -> bytes:
     """The end is missing."""
-    return content[: rng.choice((0, 1, len(content) // 2, len(content) - 1, rng.randrange(len(content) + 1)))]
+    return content[
+        : rng.choice((0, 1, len(content) // 2, len(content) - 1, rng.randrange(len(content) + 1)))
+    ]
 
 
 @mutates("")
@@ -118,7 +158,14 @@ def insert(content: bytes, rng: Random) -> bytes:
     """Something foreign stands in between."""
     at = rng.choice((0, len(content), rng.randrange(len(content) + 1)))
     foreign = rng.choice(
-        (b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"\r\n", b"\n", rng.randbytes(rng.choice((1, 7, 4096))))
+        (
+            b"\x00",
+            b"\xff\xfe",
+            b"\xef\xbb\xbf",
+            b"\r\n",
+            b"\n",
+            rng.randbytes(rng.choice((1, 7, 4096))),
+        )
     )
     return content[:at] + foreign + content[at:]
 
@@ -130,9 +177,13 @@ def set_number(content: bytes, rng: Random) -> bytes:
     size = struct.calcsize(code)
     if len(content) < size:
         return content + bytes(size)
-    at = rng.choice((rng.randrange(len(content) - size + 1), rng.randrange(min(64, len(content) - size + 1))))
+    at = rng.choice(
+        (rng.randrange(len(content) - size + 1), rng.randrange(min(64, len(content) - size + 1)))
+    )
     if code in ("<f", "<d"):
         number = struct.pack(code, rng.choice(FLOATS))
     else:
-        number = (rng.choice(INTEGERS) % 256**size).to_bytes(size, "little" if code[0] == "<" else "big")
+        number = (rng.choice(INTEGERS) % 256**size).to_bytes(
+            size, "little" if code[0] == "<" else "big"
+        )
     return content[:at] + number + content[at + size :]

@@ -1,4 +1,5 @@
-"""Mutators of pickled tables, compressed with gzip (``.gz``): opcodes, and the tree of values and calls."""
+"""Mutators of pickled tables, compressed with gzip (``.gz``): opcodes, and the tree of values and
+calls."""
 
 import gzip
 import pickletools
@@ -23,7 +24,13 @@ WORDS = ("", "x", "f8", "O8", "U4", ">", "M8", "Car", "label", "a" * 5000, "0.14
 SHORT = (b"N", b"}", b"]", b")", b"(", b"0", b"2", b"t", b"R", b"b", b"\x81", b"Q", b"1")
 """Opcodes without an argument."""
 
-HOSTILE = (b"cos\nsystem\n", b"r\xff\xff\xff\xff", b"B\xff\xff\xff\x7f", b"\x8b\xff\xff\xff\x7f", b"\x82\x01")
+HOSTILE = (
+    b"cos\nsystem\n",
+    b"r\xff\xff\xff\xff",
+    b"B\xff\xff\xff\x7f",
+    b"\x8b\xff\xff\xff\x7f",
+    b"\x82\x01",
+)
 """A name that is not known, places and lengths beyond memory, an extension."""
 
 
@@ -42,7 +49,8 @@ def edit_opcodes(content: bytes, rng: Random) -> bytes:
     starts = [position for _, _, position in pickletools.genops(plain)]
     parts = [plain[a:b] for a, b in zip(starts, [*starts[1:], len(plain)], strict=True)]
     for _ in range(rng.choice((1, 1, 2, 5))):
-        i, change = rng.randrange(len(parts)), rng.randrange(6)
+        i = rng.randrange(len(parts))
+        change = rng.randrange(6)
         if change == 0:
             del parts[i]
         elif change < 3:
@@ -67,10 +75,14 @@ def edit_tree(content: bytes, rng: Random) -> bytes:
 def edit_array(content: bytes, rng: Random) -> bytes:
     """Numbers of an array are impossible or unlikely ones."""
     found = places(parse_pickle(unpacked(content), KNOWN, "", ""))
-    value, put = rng.choice([(value, put) for value, put in found if type(value) is bytes and len(value) > 8])
+    value, put = rng.choice(
+        [(value, put) for value, put in found if type(value) is bytes and len(value) > 8]
+    )
     array = np.frombuffer(value[: len(value) // 8 * 8], rng.choice(("<f8", "<i8"))).copy()
     for _ in range(rng.choice((1, 1, 5, 50))):
-        number = rng.choice(FLOATS if array.dtype.kind == "f" else [n for n in INTEGERS if abs(n) < 2**63])
+        number = rng.choice(
+            FLOATS if array.dtype.kind == "f" else [n for n in INTEGERS if abs(n) < 2**63]
+        )
         array[rng.randrange(len(array))] = number
     return packed(dump(put(array.tobytes())))
 
@@ -81,10 +93,15 @@ def lie_about_gzip(content: bytes, rng: Random) -> bytes:
     plain = unpacked(content)
     return rng.choice(
         (
-            content[: rng.randrange(len(content))], content + content, plain, packed(packed(plain)),
-            packed(plain + bytes(1000)), packed(plain[: rng.randrange(len(plain))]), bomb(),
+            content[: rng.randrange(len(content))],
+            content + content,
+            plain,
+            packed(packed(plain)),
+            packed(plain + bytes(1000)),
+            packed(plain[: rng.randrange(len(plain))]),
+            bomb(),
         )
-    )  # fmt: skip
+    )
 
 
 @cache
@@ -95,20 +112,31 @@ def bomb() -> bytes:
 
 
 def places(value: Any, put: Put = lambda whole: whole) -> Iterator[tuple[Any, Put]]:
-    """Every value below, and a function that gives the whole tree with another value in its place."""
+    """Every value below, and a function that gives the whole tree with another value in its
+    place."""
     children: list[tuple[Any, Put]] = []
     if isinstance(value, dict):
-        children = [(child, lambda new, key=key: value | {key: new}) for key, child in value.items()]
+        children = [
+            (child, lambda new, key=key: value | {key: new}) for key, child in value.items()
+        ]
     elif isinstance(value, list | tuple):
         kind = type(value)
-        children = [(child, lambda new, i=i: kind([*value[:i], new, *value[i + 1 :]])) for i, child in enumerate(value)]
+        children = [
+            (child, lambda new, i=i: kind([*value[:i], new, *value[i + 1 :]]))
+            for i, child in enumerate(value)
+        ]
     elif isinstance(value, Call):
         children = [
             (
                 value.name,
-                lambda new: replace(value, name=new if isinstance(new, str) and "." in new else "numpy.dtype"),
+                lambda new: replace(
+                    value, name=new if isinstance(new, str) and "." in new else "numpy.dtype"
+                ),
             ),
-            (value.args, lambda new: replace(value, args=new if isinstance(new, tuple) else (new,))),
+            (
+                value.args,
+                lambda new: replace(value, args=new if isinstance(new, tuple) else (new,)),
+            ),
             (value.state, lambda new: replace(value, state=new)),
         ]
     for child, rebuild in children:
@@ -125,8 +153,23 @@ def another(rng: Random) -> Any:
     names = sorted(KNOWN)
     return rng.choice(
         (
-            None, True, rng.choice(INTEGERS), rng.choice(INTEGERS), rng.choice(FLOATS), rng.choice(WORDS), b"",
-            rng.randbytes(8), (), [], {}, (1, 2), (2**40, 3), [1.0, "a", None], {"a": 1}, Name(rng.choice(names)),
-            Call(rng.choice(names), (1,)), Call(rng.choice(names), (), (1, (2,), 3)),
+            None,
+            True,
+            rng.choice(INTEGERS),
+            rng.choice(INTEGERS),
+            rng.choice(FLOATS),
+            rng.choice(WORDS),
+            b"",
+            rng.randbytes(8),
+            (),
+            [],
+            {},
+            (1, 2),
+            (2**40, 3),
+            [1.0, "a", None],
+            {"a": 1},
+            Name(rng.choice(names)),
+            Call(rng.choice(names), (1,)),
+            Call(rng.choice(names), (), (1, (2,), 3)),
         )
-    )  # fmt: skip
+    )

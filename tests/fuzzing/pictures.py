@@ -15,7 +15,8 @@ Chunk = tuple[bytes, bytes]
 def chunks(content: bytes) -> list[Chunk]:
     """(kind, data) of each chunk."""
     assert content.startswith(SIGNATURE)
-    found, at = [], len(SIGNATURE)
+    found = []
+    at = len(SIGNATURE)
     while at + 12 <= len(content):
         size = int.from_bytes(content[at : at + 4], "big")
         found.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + size]))
@@ -26,7 +27,8 @@ def chunks(content: bytes) -> list[Chunk]:
 def join(parts: list[Chunk]) -> bytes:
     """The inverse of ``chunks``."""
     return SIGNATURE + b"".join(
-        len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big") for kind, data in parts
+        len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        for kind, data in parts
     )
 
 
@@ -41,7 +43,9 @@ def edit_size(content: bytes, rng: Random) -> bytes:
     header = bytearray(dict(chunks(content))[b"IHDR"])
     field = rng.randrange(7)
     if field < 4:
-        width = rng.choice((0, 1, 31, 33, 64, 5000, 9000, 13_000, 30_000, 60_000, 2**31 - 1, 2**32 - 1))
+        width = rng.choice(
+            (0, 1, 31, 33, 64, 5000, 9000, 13_000, 30_000, 60_000, 2**31 - 1, 2**32 - 1)
+        )
         start = 4 * (field % 2)
         header[start : start + 4] = width.to_bytes(4, "big")
         if field == 3:
@@ -56,11 +60,15 @@ def edit_size(content: bytes, rng: Random) -> bytes:
 def grow_picture(content: bytes, rng: Random) -> bytes:
     """A picture of another size, whole: perhaps a huge one of zeros, which packs into little."""
     header = bytearray(dict(chunks(content))[b"IHDR"])
-    width, height = rng.choice(((8, 31), (1, 1), (33, 8), (32, 9), (1000, 1), (9000, 9000), (13_000, 12_000)))
+    width, height = rng.choice(
+        ((8, 31), (1, 1), (33, 8), (32, 9), (1000, 1), (9000, 9000), (13_000, 12_000))
+    )
     header[:8] = width.to_bytes(4, "big") + height.to_bytes(4, "big")
     pixel = header[8] // 8 or 1
     rows = height if rng.random() < 0.3 else min(height, 100)
-    return changed(changed(content, b"IHDR", bytes(header)), b"IDAT", zeros(1 + width * pixel, rows))
+    return changed(
+        changed(content, b"IHDR", bytes(header)), b"IDAT", zeros(1 + width * pixel, rows)
+    )
 
 
 @cache
@@ -94,13 +102,22 @@ def edit_chunks(content: bytes, rng: Random) -> bytes:
     elif change == 2:
         rng.shuffle(parts)
     elif change == 3:
-        parts[i] = (rng.choice((b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"acTL", b"xxxx", b"IEND")), parts[i][1])
+        parts[i] = (
+            rng.choice((b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"acTL", b"xxxx", b"IEND")),
+            parts[i][1],
+        )
     elif change == 4:
         bomb = zlib.compress(bytes(rng.choice((1000, 1000, 1000, 70_000_000))), 1)
         parts.insert(1, (b"zTXt", b"lidar_synth\x00\x00" + bomb))
     else:
         number = rng.choice(INTEGERS) % 2**32
-        parts.insert(1, (rng.choice((b"gAMA", b"pHYs", b"iCCP", b"eXIf", b"fcTL")), number.to_bytes(4, "big") * 4))
+        parts.insert(
+            1,
+            (
+                rng.choice((b"gAMA", b"pHYs", b"iCCP", b"eXIf", b"fcTL")),
+                number.to_bytes(4, "big") * 4,
+            ),
+        )
     return join(parts)
 
 

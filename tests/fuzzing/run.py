@@ -1,4 +1,5 @@
-"""Watch the workers: count what came of the cases, and notice those that die, hang or take too much."""
+"""Watch the workers: count what came of the cases, and notice those that die, hang or take too
+much."""
 
 import signal
 import threading
@@ -65,7 +66,8 @@ def fuzz(
     limits: Limits = Limits(),  # noqa: B008 - frozen
     progress: Callable[[Outcome], object] = lambda outcome: None,
 ) -> Report:
-    """Read the cases ``numbers`` of a reader, in a process that is started again wherever a case ends it.
+    """Read the cases ``numbers`` of a reader, in a process that is started again wherever a case
+    ends it.
 
     Raises:
         RuntimeError: where the valid dataset cannot be read, or the harness itself fails.
@@ -80,7 +82,9 @@ def fuzz(
     return report
 
 
-def _until_the_end(name: str, target: Target, numbers: range, seed: int, limits: Limits, folder: Path) -> list[Outcome]:
+def _until_the_end(
+    name: str, target: Target, numbers: range, seed: int, limits: Limits, folder: Path
+) -> list[Outcome]:
     """The outcomes of one worker's life; at least one."""
     process, connection = _start(name, target, numbers, seed, limits, folder)
     found: list[Outcome] = []
@@ -102,8 +106,14 @@ def _until_the_end(name: str, target: Target, numbers: range, seed: int, limits:
     except EOFError:
         process.join()
         if current is None:
-            text = (folder / "output.txt").read_text(errors="replace") if (folder / "output.txt").is_file() else ""
-            raise RuntimeError(f"{name}: the harness failed ({_ending(process)})\n{text[-3000:]}") from None
+            text = (
+                (folder / "output.txt").read_text(errors="replace")
+                if (folder / "output.txt").is_file()
+                else ""
+            )
+            raise RuntimeError(
+                f"{name}: the harness failed ({_ending(process)})\n{text[-3000:]}"
+            ) from None
         found.append(Outcome(current, DIED, _ending(process)))
     finally:
         process.kill()
@@ -119,7 +129,9 @@ def _start(
     context = forkserver()
     with _starting:
         ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=work, args=(name, target, seed, numbers, limits, folder, theirs), daemon=True)
+        process = context.Process(
+            target=work, args=(name, target, seed, numbers, limits, folder, theirs), daemon=True
+        )
         process.start()
         theirs.close()
     return process, ours

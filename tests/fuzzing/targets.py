@@ -1,4 +1,5 @@
-"""The readers that are fuzzed, one line each in ``TARGETS``: how to write a small valid dataset, and how to read it."""
+"""The readers that are fuzzed, one line each in ``TARGETS``: how to write a small valid dataset,
+and how to read it."""
 
 import hashlib
 import json
@@ -47,7 +48,8 @@ class Target:
         make: writes a small valid dataset into a folder; the same bytes every time.
         read: reads the folder and returns all that it found, for ``checks``.
         files: patterns of the names of the files that are mutated.
-        mend: makes checksums of the folder fit again after a mutation, where they can be; done for half of the cases.
+        mend: makes checksums of the folder fit again after a mutation, where they can be; done for
+            half of the cases.
     """
 
     make: Callable[[Path], object]
@@ -66,7 +68,8 @@ def scans(**fields: bool) -> list[Scan]:
 
 
 def write(to: str, root: Path) -> None:
-    """Two scans in one of the package's formats, with a camera and its images where the format has a place for them."""
+    """Two scans in one of the package's formats, with a camera and its images where the format has
+    a place for them."""
     writer = WRITERS[to](root, calibration=some_camera())
     image = np.full((13, 35, 3), 128, np.uint8)
     for index, scan in enumerate(scans()):
@@ -75,7 +78,8 @@ def write(to: str, root: Path) -> None:
 
 
 def some_rows() -> np.ndarray:
-    """(N, 4) float32 x, y, z, reflectance of a scan, every point twice, one half behind the other."""
+    """(N, 4) float32 x, y, z, reflectance of a scan, every point twice, one half behind the
+    other."""
     scan = scans()[0]
     return np.tile(np.column_stack([scan.points, scan.reflectance])[:50], (2, 1))
 
@@ -85,7 +89,10 @@ def make_pcd(root: Path) -> None:
     write("pcd", root)
     rows = some_rows()
     told = f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\n"
-    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n{told}"
+    head = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 "
+        f"1 1\n{told}"
+    )
     (root / "text.pcd").write_text(head + "DATA ascii\n" + lines_of(rows))
     columns = [column.tobytes() for column in rows.T.astype("<f4")]
     packed = b"".join(lzf(column[: len(column) // 2]) for column in columns)
@@ -98,7 +105,8 @@ def lines_of(rows: np.ndarray) -> str:
 
 
 def lzf(plain: bytes) -> bytes:
-    """LZF of these bytes twice, one behind the other: runs of bytes as they are, then references to them."""
+    """LZF of these bytes twice, one behind the other: runs of bytes as they are, then references to
+    them."""
     runs = [plain[i : i + 32] for i in range(0, len(plain), 32)]
     packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
     back = len(plain) - 1
@@ -107,7 +115,8 @@ def lzf(plain: bytes) -> bytes:
 
 
 def make_ply(root: Path) -> None:
-    """Binary as the package writes it; and, as other tools do, text and the other order of bytes, with faces."""
+    """Binary as the package writes it; and, as other tools do, text and the other order of bytes,
+    with faces."""
     write("ply", root)
     rows = some_rows()
     fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
@@ -144,7 +153,11 @@ def make_kitti_raw(root: Path) -> None:
     camera = some_camera()
     transform = camera.camera_from_sensor
     velo = {"R": transform[:3, :3], "T": transform[:3, 3]}
-    cam = {"S_rect_02": np.array(camera.image_size), "R_rect_00": np.eye(3), "P_rect_02": camera.projection}
+    cam = {
+        "S_rect_02": np.array(camera.image_size),
+        "R_rect_00": np.eye(3),
+        "P_rect_02": camera.projection,
+    }
     write_named_matrices(root / "2011_09_26" / "calib_velo_to_cam.txt", velo)
     write_named_matrices(root / "2011_09_26" / "calib_cam_to_cam.txt", cam)
 
@@ -152,15 +165,35 @@ def make_kitti_raw(root: Path) -> None:
 def make_bank(root: Path) -> None:
     """Two shards with every array."""
     images = [some_image(i) for i in range(3)]
-    write_bank(root, images, shard_size=2, fields=("reflectance", "label", "confidence"), provenance={"data": "none"})
+    write_bank(
+        root,
+        images,
+        shard_size=2,
+        fields=("reflectance", "label", "confidence"),
+        provenance={"data": "none"},
+    )
 
 
 def make_sensors(root: Path) -> None:
     """One sensor with linear beams, one with a table of them."""
     root.mkdir()
-    linear = {"rows": 8, "fov_up": 3.0, "fov_down": -25.0, "columns": 32, "range_min": 1.45, "range_max": 80.0}
-    table = {"elevations": [4.0, 2.5, 0.0, -10.0], "beams": [4.1, 2.4, 0.1, -9.0], "heights": [0.1, 0.1, 0.0, 0.0],
-             "columns": 32, "range_min": 0.5, "range_max": 120.0, "description": "a table"}  # fmt: skip
+    linear = {
+        "rows": 8,
+        "fov_up": 3.0,
+        "fov_down": -25.0,
+        "columns": 32,
+        "range_min": 1.45,
+        "range_max": 80.0,
+    }
+    table = {
+        "elevations": [4.0, 2.5, 0.0, -10.0],
+        "beams": [4.1, 2.4, 0.1, -9.0],
+        "heights": [0.1, 0.1, 0.0, 0.0],
+        "columns": 32,
+        "range_min": 0.5,
+        "range_max": 120.0,
+        "description": "a table",
+    }
     (root / "linear.yaml").write_text(yaml.safe_dump({"linear": linear}))
     (root / "grouped.json").write_text(json.dumps(ouster_metadata()))
     (root / "flat.json").write_text(json.dumps(ouster_metadata(flat=True)))
@@ -169,14 +202,26 @@ def make_sensors(root: Path) -> None:
 
 def make_checkpoint(root: Path) -> None:
     """A small velocity network with every key that a header has."""
-    arguments = {"resolution": [8, 32], "channels": 7, "width": 16, "time_width": 8, "depths": [1, 1], "heads": [2, 2]}
+    arguments = {
+        "resolution": [8, 32],
+        "channels": 7,
+        "width": 16,
+        "time_width": 8,
+        "depths": [1, 1],
+        "heads": [2, 2],
+    }
     header = Header(
         networks={VELOCITY: NetworkSpec("hdit", arguments)},
         sensor=SENSOR,
         normalisation=NORMALISATIONS["r2flow"],
         channels=("range", "reflectance", "label"),
         time_grid=(1.0, 0.86, 0.58, 0.22, 0.0),
-        provenance={"data": "none", "data_licence": "none", "licence": "MIT", "metrics": {"jsd": 0.1}},
+        provenance={
+            "data": "none",
+            "data_licence": "none",
+            "licence": "MIT",
+            "metrics": {"jsd": 0.1},
+        },
         conditioning={"semantic": {"classes": 19}},
     )
     torch.manual_seed(0)
@@ -186,7 +231,11 @@ def make_checkpoint(root: Path) -> None:
 
 def make_mixture(root: Path) -> None:
     """A bank, and the settings of a mixture with it that use every key."""
-    write_bank(root / "bank", [some_image(i) for i in range(3)], fields=("reflectance", "label", "confidence"))
+    write_bank(
+        root / "bank",
+        [some_image(i) for i in range(3)],
+        fields=("reflectance", "label", "confidence"),
+    )
     settings = {
         "synthetic": "bank",
         "ratio": {0: 0.5, 3: 0.25},
@@ -215,7 +264,8 @@ def read_mixture(root: Path) -> list[Any]:
 
 
 def read(layout: str, root: Path, **options: Any) -> list[Any]:
-    """Scans, images and cameras of a dataset, through the reader and through what recognises its layout."""
+    """Scans, images and cameras of a dataset, through the reader and through what recognises its
+    layout."""
     layout_of(root)
     source: Any = READERS[layout](root, **options)
     found: list[Any] = [source.sensor]
@@ -237,7 +287,10 @@ def read_shard(root: Path) -> list[Any]:
 
 def read_sensors(root: Path) -> list[Any]:
     """The sensors, after their rays were made."""
-    found = [load_sensor(root / name) for name in ("linear.yaml", "table.yaml", "grouped.json", "flat.json")]
+    found = [
+        load_sensor(root / name)
+        for name in ("linear.yaml", "table.yaml", "grouped.json", "flat.json")
+    ]
     for sensor in found:
         sensor.ray_directions()
     return [*found]
@@ -297,4 +350,5 @@ TARGETS: dict[str, Target] = {
     "mixture": Target(make_mixture, read_mixture, files=("mix.yaml",)),
     "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
 }
-"""By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is left out."""
+"""By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is
+left out."""

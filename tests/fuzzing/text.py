@@ -11,23 +11,92 @@ import yaml
 from fuzzing.mutators import mutates
 
 WORDS = (
-    "0", "-1", "1", "2", "3", "64.5", "-0.0", "100000", "65536", "2147483647", "2147483648", "2000000000", "4294967296",
-    "18446744073709551616", "1e9", "1e30", "1e308", "1e400", "-1e30", "nan", "inf", "-inf", "", "x", "0x10", "1_0",
-    "1,5", "\u0663", "None", "null", "true", "[]", "{}", "../../x", "%s", "\x00", "\ud800", "9" * 5000, "a" * 100_000,
-)  # fmt: skip
+    "0",
+    "-1",
+    "1",
+    "2",
+    "3",
+    "64.5",
+    "-0.0",
+    "100000",
+    "65536",
+    "2147483647",
+    "2147483648",
+    "2000000000",
+    "4294967296",
+    "18446744073709551616",
+    "1e9",
+    "1e30",
+    "1e308",
+    "1e400",
+    "-1e30",
+    "nan",
+    "inf",
+    "-inf",
+    "",
+    "x",
+    "0x10",
+    "1_0",
+    "1,5",
+    "\u0663",
+    "None",
+    "null",
+    "true",
+    "[]",
+    "{}",
+    "../../x",
+    "%s",
+    "\x00",
+    "\ud800",
+    "9" * 5000,
+    "a" * 100_000,
+)
 """What takes the place of a number or a word."""
 
 LINES = (".txt", ".json", ".yaml", ".xml", ".pcd", ".ply")
 """Suffixes of the files that are, or begin with, lines of text."""
 
-DEEP, LONG = "@deep@", "@long@"
-"""Stand for values that no JSON writer writes: brackets within brackets, and a number of 5,000 digits."""
+DEEP = "@deep@"
+LONG = "@long@"
+"""Stand for values that no JSON writer writes: brackets within brackets, and a number of 5,000
+digits."""
 
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 2, 3, 64.5, 2**31, 2_000_000_000, 2**63, 10**30, 1e30, 1e308, float("nan"),
-    float("inf"), "", "x", "0", "64", "../../x", "a" * 100_000, "\x00", "\ud800", [], {}, [0], [[1, 2], [3]], {"": 0},
-    [1] * 1000, {"a": {"b": None}}, DEEP, LONG,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    2,
+    3,
+    64.5,
+    2**31,
+    2_000_000_000,
+    2**63,
+    10**30,
+    1e30,
+    1e308,
+    float("nan"),
+    float("inf"),
+    "",
+    "x",
+    "0",
+    "64",
+    "../../x",
+    "a" * 100_000,
+    "\x00",
+    "\ud800",
+    [],
+    {},
+    [0],
+    [[1, 2], [3]],
+    {"": 0},
+    [1] * 1000,
+    {"a": {"b": None}},
+    DEEP,
+    LONG,
+)
 """What takes the place of a value of JSON or YAML."""
 
 
@@ -60,7 +129,8 @@ def replace_word(content: bytes, rng: Random) -> bytes:
 def change_lines(content: bytes, rng: Random) -> bytes:
     """Lines are dropped, repeated, swapped, joined or ended in another way."""
     lines = content.split(b"\n")
-    i, j = rng.randrange(len(lines)), rng.randrange(len(lines))
+    i = rng.randrange(len(lines))
+    j = rng.randrange(len(lines))
     change = rng.randrange(7)
     if change == 0:
         del lines[i]
@@ -97,7 +167,9 @@ def edit_header(content: bytes, rng: Random) -> bytes:
     end = next(m.end() for m in re.finditer(rb"^(DATA|end_header)[^\n]*\n", content, re.M))
     header = content[:end]
     for _ in range(rng.choice((1, 1, 2, 3))):
-        change = rng.choice((replace_number, replace_number, replace_word, change_lines, change_words_of_a_line))
+        change = rng.choice(
+            (replace_number, replace_number, replace_word, change_lines, change_words_of_a_line)
+        )
         header = change(header, rng)
     return header + content[end:]
 
@@ -106,7 +178,14 @@ def edit_header(content: bytes, rng: Random) -> bytes:
 def change_encoding(content: bytes, rng: Random) -> bytes:
     """Another encoding than UTF-8."""
     text = content.decode()
-    return rng.choice((text.encode("utf-16"), text.encode("utf-32-le"), b"\xef\xbb\xbf" + content, content + b"\xe9"))
+    return rng.choice(
+        (
+            text.encode("utf-16"),
+            text.encode("utf-32-le"),
+            b"\xef\xbb\xbf" + content,
+            content + b"\xe9",
+        )
+    )
 
 
 def places(root: Any) -> list[tuple[Any, Any]]:
@@ -115,7 +194,13 @@ def places(root: Any) -> list[tuple[Any, Any]]:
     waiting = [root]
     while waiting:
         node = waiting.pop()
-        keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
+        keys = (
+            list(node)
+            if isinstance(node, dict)
+            else range(len(node))
+            if isinstance(node, list)
+            else []
+        )
         found += [(node, key) for key in keys]
         if len(found) > MOST_PLACES:
             raise ValueError("aliases of aliases, which are not followed here")
@@ -139,7 +224,9 @@ def edit(root: Any, rng: Random) -> None:
     elif change == 4 and isinstance(node, list):
         node[key:key] = [node[key]] * rng.choice((1, 2, 1000))
     elif change == 5 and isinstance(node[key], int | float):
-        node[key] = rng.choice((-node[key], node[key] * 2, node[key] + 0.5, str(node[key]), node[key] * 10**9))
+        node[key] = rng.choice(
+            (-node[key], node[key] * 2, node[key] + 0.5, str(node[key]), node[key] * 10**9)
+        )
     else:
         node[key] = rng.choice(VALUES)
 
@@ -168,7 +255,8 @@ def edit_yaml(content: bytes, rng: Random) -> bytes:
     """Values of the YAML change."""
     root = yaml.safe_load(content)
     edit(root, rng)
-    # Every JSON text is YAML too; nesting is kept shallower, because YAML's own parser takes long for it.
+    # Every JSON text is YAML too; nesting is kept shallower, because YAML's own parser takes long
+    # for it.
     return encoded(written(json.dumps(root), 2000) if rng.random() < 0.5 else yaml.safe_dump(root))
 
 
@@ -176,7 +264,8 @@ def edit_yaml(content: bytes, rng: Random) -> bytes:
 def abuse_yaml(content: bytes, rng: Random) -> bytes:
     """What YAML offers beyond plain values: aliases of aliases, tags, merges, several documents."""
     bomb = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
-        f"{b}: &{b} [{','.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+        f"{b}: &{b} [{','.join([f'*{a}'] * 10)}]\n"
+        for a, b in zip("abcdefgh", "bcdefghi", strict=True)
     )
     shared = "elevations: &e [5, 4, 3, 2, 1]\n"
     foreign = (
@@ -202,7 +291,11 @@ def abuse_yaml(content: bytes, rng: Random) -> bytes:
         "x: " + "9" * 5000 + "\n",
         "x: " + "- " * 2000 + "\n",
     )
-    return content + encoded(rng.choice(foreign)) if rng.random() < 0.7 else encoded(rng.choice(foreign)) + content
+    return (
+        content + encoded(rng.choice(foreign))
+        if rng.random() < 0.7
+        else encoded(rng.choice(foreign)) + content
+    )
 
 
 @mutates(".xml")
@@ -216,7 +309,9 @@ def edit_xml(content: bytes, rng: Random) -> bytes:
         change = rng.randrange(6)
         if not len(parent) or change == 0:
             leaves = [node for node in root.iter() if not len(node)]
-            rng.choice(leaves).text = rng.choice(WORDS[:-1]).replace("\x00", "").replace("\ud800", "")
+            rng.choice(leaves).text = (
+                rng.choice(WORDS[:-1]).replace("\x00", "").replace("\ud800", "")
+            )
         elif change == 1:
             parent.remove(parent[i])
         elif change == 2:
@@ -226,7 +321,9 @@ def edit_xml(content: bytes, rng: Random) -> bytes:
         elif change == 4:
             leaf = rng.choice([node for node in root.iter() if not len(node)])
             words = (leaf.text or "").split()
-            leaf.text = " ".join(rng.choice((words[:-1], words * 2, [*words, "1"], words[::-1], ["nan", *words[1:]])))
+            leaf.text = " ".join(
+                rng.choice((words[:-1], words * 2, [*words, "1"], words[::-1], ["nan", *words[1:]]))
+            )
         else:
             parent[:] = rng.sample(list(parent), len(parent))
     return ElementTree.tostring(root)
@@ -235,17 +332,24 @@ def edit_xml(content: bytes, rng: Random) -> bytes:
 @mutates(".xml")
 def abuse_xml(content: bytes, rng: Random) -> bytes:
     """Entities of entities, elements within elements, encodings, and what is no element."""
-    body = content[content.index(b"<", content.find(b"?>") + 1) :] if content.startswith(b"<?xml") else content
+    body = (
+        content[content.index(b"<", content.find(b"?>") + 1) :]
+        if content.startswith(b"<?xml")
+        else content
+    )
     entities = b'<!ENTITY a "aaaaaaaaaa">' + b"".join(
-        b'<!ENTITY %c "%s">' % (b, b"&%c;" % a * 10) for a, b in zip(b"abcdefgh", b"bcdefghi", strict=True)
+        b'<!ENTITY %c "%s">' % (b, b"&%c;" % a * 10)
+        for a, b in zip(b"abcdefgh", b"bcdefghi", strict=True)
     )
     depth = rng.choice((100, 100_000))
     return rng.choice(
         (
             b"<!DOCTYPE x [" + entities + b"]>" + re.sub(rb">\d", b">&i;", body, count=1),
-            b'<!DOCTYPE x [<!ENTITY f SYSTEM "file:///etc/hostname">]>' + re.sub(rb">\d", b">&f;", body, count=1),
+            b'<!DOCTYPE x [<!ENTITY f SYSTEM "file:///etc/hostname">]>'
+            + re.sub(rb">\d", b">&f;", body, count=1),
             b"<a>" * depth + body + b"</a>" * depth,
-            b'<?xml version="1.0" encoding="%s"?>' % rng.choice((b"utf-16", b"x", b"cp037", b"utf-7", b"euc-jp"))
+            b'<?xml version="1.0" encoding="%s"?>'
+            % rng.choice((b"utf-16", b"x", b"cp037", b"utf-7", b"euc-jp"))
             + body,
             body + body,
             b"<x>" + b"<item/>" * 50_000 + body + b"</x>",

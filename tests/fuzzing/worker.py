@@ -20,10 +20,16 @@ from fuzzing.checks import fingerprint, flaws
 from fuzzing.targets import Target
 from lidar_synth.errors import LidarSynthError
 
-EQUAL, SOUND, REFUSED = "read equal", "read otherwise, sound", "refused"
+EQUAL = "read equal"
+SOUND = "read otherwise, sound"
+REFUSED = "refused"
 """What may come of a case."""
 
-UNSOUND, FOREIGN, MEMORY, DIED, SLOW = "unsound", "foreign error", "too much memory", "died", "too slow"
+UNSOUND = "unsound"
+FOREIGN = "foreign error"
+MEMORY = "too much memory"
+DIED = "died"
+SLOW = "too slow"
 """What may not."""
 
 
@@ -60,11 +66,18 @@ class Outcome:
 
 
 def work(
-    name: str, target: Target, seed: int, numbers: range, limits: Limits, folder: Path, connection: Connection
+    name: str,
+    target: Target,
+    seed: int,
+    numbers: range,
+    limits: Limits,
+    folder: Path,
+    connection: Connection,
 ) -> None:
     """Read the cases ``numbers`` and send, for each, its number before and its ``Outcome`` behind.
 
-    First the valid dataset is read: that imports and compiles all that reading needs, and tells what "equal" is. None
+    First the valid dataset is read: that imports and compiles all that reading needs, and tells
+        what "equal" is. None
     is sent when that has been done.
     """
     quiet(folder / "output.txt")
@@ -88,7 +101,8 @@ def work(
 def judge(number: int, target: Target, root: Path, expected: str, limits: Limits) -> Outcome:
     """Read a case."""
     gc.collect()
-    before, data = reset_peak(), memory("VmData")
+    before = reset_peak()
+    data = memory("VmData")
     resource.setrlimit(resource.RLIMIT_DATA, (data + limits.memory, resource.RLIM_INFINITY))
     start = time.perf_counter()
     try:
@@ -145,8 +159,8 @@ def memory(name: str) -> int:
 
 
 def reset_peak() -> int:
-    """Set the peak of the process's memory to what it holds now; bytes. Where the system refuses, the old peak stays,
-    and what lies below it is not seen."""
+    """Set the peak of the process's memory to what it holds now; bytes. Where the system refuses,
+    the old peak stays, and what lies below it is not seen."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return memory("VmHWM")

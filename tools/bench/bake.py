@@ -1,10 +1,12 @@
-"""The cost of a bake: generating alone and with writing, one process and two, memory of short and long bakes.
+"""The cost of a bake: generating alone and with writing, one process and two, memory of short and
+long bakes.
 
     python tools/bench/bake.py [--model town] [--count 256] [--lengths 400 4000]
 
-Speeds are those of the named model. Memory is measured with a fast model with random weights, because the memory per
-scan does not depend on the model. Every bake runs in its own process with one thread per worker; the machine has to be
-idle. Compared runs take turns, three times; the table has medians.
+Speeds are those of the named model. Memory is measured with a fast model with random weights,
+because the memory per scan does not depend on the model. Every bake runs in its own process with
+one thread per worker; the machine has to be idle. Compared runs take turns, three times; the table
+has medians.
 """
 
 import argparse
@@ -70,11 +72,17 @@ def peak_memory(out: Path, model: str, count: int) -> float:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
     parser.add_argument("--count", type=int, default=256, help="scans of a timed bake")
     parser.add_argument(
-        "--lengths", type=int, nargs=2, default=(400, 4000), help="scans of the bakes whose memory is measured"
+        "--lengths",
+        type=int,
+        nargs=2,
+        default=(400, 4000),
+        help="scans of the bakes whose memory is measured",
     )
     given = parser.parse_args()
     print(f"\n### Baking\n\n{machine()}\n\n| what | |\n|---|---:|")
@@ -83,7 +91,15 @@ def main() -> None:
         seconds: dict[int, list[float]] = {1: [], 2: []}
         for turn in range(ROUNDS):
             for workers, times in seconds.items():
-                times.append(alone(by_processes, root / f"{turn} by {workers}", given.model, given.count, workers))
+                times.append(
+                    alone(
+                        by_processes,
+                        root / f"{turn} by {workers}",
+                        given.model,
+                        given.count,
+                        workers,
+                    )
+                )
         one, two = (median(times) for times in seconds.values())
         print(f"| {given.count} scans by one process | {one:.1f} s |")
         print(f"| by two processes | {two:.1f} s, {one / two:.2f} times as fast |")
@@ -92,7 +108,8 @@ def main() -> None:
         plain, whole = (median(times) for times in zip(*turns, strict=True))
         print(f"| generating only, in one process | {few / plain:.2f} scans/s |")
         print(
-            f"| generating and writing | {few / whole:.2f} scans/s, {1 - plain / whole:.1%} of the time for writing |"
+            f"| generating and writing | {few / whole:.2f} scans/s, {1 - plain / whole:.1%} of "
+            "the time for writing |"
         )
         untrained = str(write_untrained(root / "untrained.safetensors"))
         for count in given.lengths:

@@ -1,4 +1,5 @@
-"""Time of every feature extractor on one scan of the town's sensor, with random weights of the published shapes.
+"""Time of every feature extractor on one scan of the town's sensor, with random weights of the
+published shapes.
 
 python tools/bench/extractors.py [--rounds N] [--cpu-time] [--only NAME ...]
 """
@@ -22,9 +23,13 @@ from random_archives import write  # the folder of tools/extractors is on the pa
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--cpu-time", action="store_true", help="time of this process alone, on a busy machine")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="time of this process alone, on a busy machine"
+    )
     parser.add_argument("--only", nargs="*", default=list(EXTRACTORS), choices=list(EXTRACTORS))
     given = parser.parse_args()
     scan = Town(seed=0, scans=1)[0]
@@ -39,7 +44,11 @@ def main() -> None:
             calls[name] = lambda extract=extract: extract([scan])
         clock = time.process_time if given.cpu_time else time.perf_counter
         seconds = time_in_turns(calls, given.rounds, clock)
-    print_table(f"one scan of {len(scan)} points, {torch.get_num_threads()} threads", seconds, next(iter(seconds)))
+    print_table(
+        f"one scan of {len(scan)} points, {torch.get_num_threads()} threads",
+        seconds,
+        next(iter(seconds)),
+    )
 
 
 if __name__ == "__main__":

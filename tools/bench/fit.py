@@ -15,7 +15,9 @@ from lidar_synth import Town, assign_beams, fit_sensor
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=1)
     given = parser.parse_args()
     scans = [Town(0, "os1_128", 5)[index] for index in range(5)]

@@ -1,11 +1,13 @@
 """Scans per second of shipped models, and of a network of R2Flow's size, on a GPU.
 
-    python tools/bench/gpu.py [MODEL ...] [--batch 1 16 64] [--dtype bfloat16] [--rounds N] [--device cuda]
+    python tools/bench/gpu.py [MODEL ...] [--batch 1 16 64] [--dtype bfloat16] [--rounds N]
+    [--device cuda]
 
-From noise to the tensors of labelled scans: the flow's steps and the decoder, eager and compiled, in turns. The network
-of R2Flow's size is this package's HDiT with random weights in 4 steps, as ``networks.py`` measures it. The last column
-is the share of the rate of a large matrix product; it is left out for models whose operations are not counted.
-``--device cpu`` tries the script without a GPU.
+From noise to the tensors of labelled scans: the flow's steps and the decoder, eager and compiled,
+    in turns. The network
+of R2Flow's size is this package's HDiT with random weights in 4 steps, as ``networks.py`` measures
+it. The last column is the share of the rate of a large matrix product; it is left out for models
+whose operations are not counted. ``--device cpu`` tries the script without a GPU.
 """
 
 import argparse
@@ -43,13 +45,21 @@ class Row(NamedTuple):
     work: float = 0.0
 
 
-def table(models: list[str], batches: list[int], device: torch.device, dtype: torch.dtype) -> Iterator[Row]:
+def table(
+    models: list[str], batches: list[int], device: torch.device, dtype: torch.dtype
+) -> Iterator[Row]:
     """The rows of the table."""
     for model in models:
         for batch in batches:
-            both = [load_generator(model, device=device, dtype=dtype, batch=batch, compile=c) for c in (False, True)]
+            both = [
+                load_generator(model, device=device, dtype=dtype, batch=batch, compile=c)
+                for c in (False, True)
+            ]
             for steps in (4, 2, 1):
-                pair = (lambda g=g, n=batch, s=steps: list(g.samples(0, range(n), steps=s)) for g in both)
+                pair = (
+                    lambda g=g, n=batch, s=steps: list(g.samples(0, range(n), steps=s))
+                    for g in both
+                )
                 yield Row(f"{model}, {steps} steps", batch, *pair)
     net = full_network(None).to(device, dtype)
     compiled = torch.compile(net)
@@ -73,7 +83,9 @@ def seconds(call: Call, device: torch.device, rounds: int) -> float:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("model", nargs="*", default=["town", "town-dense"])
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 16, 64])
     parser.add_argument("--dtype", choices=("bfloat16", "float16", "float32"), default="bfloat16")
@@ -81,14 +93,18 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     given = parser.parse_args()
     torch.set_grad_enabled(False)
-    device, dtype = checked_device(given.device), getattr(torch, given.dtype)
+    device = checked_device(given.device)
+    dtype = getattr(torch, given.dtype)
     size = 8192 if device.type == "cuda" else 2048
     a = torch.randn(size, size, device=device, dtype=dtype)
     rate = 2 * size**3 / seconds(lambda: a @ a, device, given.rounds)
     card = torch.cuda.get_device_name(device) if device.type == "cuda" else machine()
     print(f"\n### {card}, {given.dtype}, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n")
     print(f"product of {size} x {size}: {rate / 1e12:.2f} TFLOP/s\n")
-    print("| model | batch | eager, scans/s | compiled, scans/s | latency, ms | share of the product's rate |")
+    print(
+        "| model | batch | eager, scans/s | compiled, scans/s | latency, ms | share of the "
+        "product's rate |"
+    )
     print("|---|---:|---:|---:|---:|---:|")
     for row in tqdm(list(table(given.model, given.batch, device, dtype)), leave=False):
         times = [seconds(call, device, given.rounds) for call in (row.eager, row.compiled)]

@@ -2,9 +2,10 @@
 
     python tools/bench/latent.py [--rounds N] [--threads N] [--busy]
 
-LiDM's U-Net (257.8 M parameters, 171.7 GFLOP) on a latent of 8 x 16 x 128, its autoencoder (15.1 M; 93 GFLOP to encode
-and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml. Random weights. All measurements take turns.
-With --busy, processor time replaces wall-clock time, for a machine that does other work.
+LiDM's U-Net (257.8 M parameters, 171.7 GFLOP) on a latent of 8 x 16 x 128, its autoencoder (15.1 M;
+93 GFLOP to encode and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml.
+Random weights. All measurements take turns. With --busy, processor time replaces wall-clock time,
+for a machine that does other work.
 """
 
 import argparse
@@ -28,18 +29,24 @@ def network(architecture: str, **arguments: Any) -> Any:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--busy", action="store_true", help="measure processor time")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    full, codec = network("unet", resolution=(16, 128)), network("vqvae", resolution=(64, 1024))
+    full = network("unet", resolution=(16, 128))
+    codec = network("vqvae", resolution=(64, 1024))
     shipped = load_generator("town")
-    town, town_flow = shipped.autoencoder, shipped.network
+    town = shipped.autoencoder
+    town_flow = shipped.network
     a = torch.randn(4096, 4096)
-    image, latent = torch.randn(1, 1, 64, 1024), torch.randn(1, 8, 16, 128)
-    town_image, town_latent = torch.randn(1, 7, 64, 1024), torch.randn(1, *town.latent_shape)
+    image = torch.randn(1, 1, 64, 1024)
+    latent = torch.randn(1, 8, 16, 128)
+    town_image = torch.randn(1, 7, 64, 1024)
+    town_latent = torch.randn(1, *town.latent_shape)
     calls = {
         "product of 4096 x 4096 (137 GFLOP)": lambda: a @ a,
         "LiDM's U-Net, one evaluation": lambda: full(latent, 0.5),
@@ -50,9 +57,14 @@ def main() -> None:
         "town's autoencoder, decode": lambda: town.decode(town_latent),
     }
     with torch.inference_mode():
-        seconds = time_in_turns(calls, given.rounds, time.process_time if given.busy else time.perf_counter)
+        seconds = time_in_turns(
+            calls, given.rounds, time.process_time if given.busy else time.perf_counter
+        )
     what = "processor time" if given.busy else "wall time"
-    title = f"Latent models on the CPU, {given.threads} threads, float32, batch 1, {what}; torch {torch.__version__}"
+    title = (
+        f"Latent models on the CPU, {given.threads} threads, float32, batch 1, {what}; torch "
+        f"{torch.__version__}"
+    )
     print_table(title, seconds, next(iter(calls)))
 
 

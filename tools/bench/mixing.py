@@ -2,10 +2,11 @@
 
     python tools/bench/mixing.py [--real SEMANTICKITTI_ROOT] [--scans 32] [--rounds 40]
 
-Targets: at ratio 0 at least 97 % of the dataset alone; from a bank at ratio 0.5 at least 90 % of real scans only, with
-the same output. Without ``--real``, the real scans are the town's, written as SemanticKITTI; the bank holds
-scans of the town. One process, so that workers hide nothing; processor time, so that other programs do not count. The
-caches of the file system are warm.
+Targets: at ratio 0 at least 97 % of the dataset alone; from a bank at ratio 0.5 at least 90 % of
+    real scans only, with
+the same output. Without ``--real``, the real scans are the town's, written as SemanticKITTI; the
+bank holds scans of the town. One process, so that workers hide nothing; processor time, so that
+other programs do not count. The caches of the file system are warm.
 """
 
 import argparse
@@ -57,18 +58,31 @@ def write_dataset(root: Path, scans: Sequence[Scan]) -> SemanticKITTI:
 
 def write_bank(root: Path, scans: Sequence[Scan]) -> Bank:
     """The scans as a bank of one shard."""
-    facts = Facts(scans[0].sensor, ("reflectance", "label"), "town", "", {"seed": 0}, "generated", "MIT", "none")
+    facts = Facts(
+        scans[0].sensor,
+        ("reflectance", "label"),
+        "town",
+        "",
+        {"seed": 0},
+        "generated",
+        "MIT",
+        "none",
+    )
     entry = Entry("shard-00000.h5", 0, 0, len(scans))
     root.mkdir()
     with ShardWriter(root / entry.file, facts, entry) as writer:
         for scan in scans:
             writer.append(project(scan))
     path = root / entry.file
-    write_bank_files(root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),)))
+    write_bank_files(
+        root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),))
+    )
     return Bank(root)
 
 
-def epoch(samples: Any, order: Sequence[int], collate: Callable[[list[Any]], Any] = list) -> Callable[[], None]:
+def epoch(
+    samples: Any, order: Sequence[int], collate: Callable[[list[Any]], Any] = list
+) -> Callable[[], None]:
     """A pass through an epoch, batch by batch."""
 
     def go_through() -> None:
@@ -80,7 +94,9 @@ def epoch(samples: Any, order: Sequence[int], collate: Callable[[list[Any]], Any
 
 def print_rates(title: str, samples: int, seconds: dict[str, float], base: str) -> None:
     """Print a Markdown table of samples per second, also relative to one of the rows."""
-    print(f"\n### {title}\n\n{machine()}\n\n| what | samples/s | share of '{base}' |\n|---|---:|---:|")
+    print(
+        f"\n### {title}\n\n{machine()}\n\n| what | samples/s | share of '{base}' |\n|---|---:|---:|"
+    )
     for name, value in seconds.items():
         print(f"| {name} | {samples / value:.1f} | {seconds[base] / value:.1%} |")
 
@@ -99,13 +115,16 @@ def print_long_plan(bank: Bank, samples: int = 10**8) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     print(
-        f"\nA plan of {len(train):,} samples: {1e3 * seconds:.0f} ms to the first batch, {peak / 2**20:.2f} MiB at most"
+        f"\nA plan of {len(train):,} samples: {1e3 * seconds:.0f} ms to the first batch, "
+        f"{peak / 2**20:.2f} MiB at most"
     )
 
 
 def main() -> None:
     """Times everything in turns and prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--real", type=Path, help="root of SemanticKITTI")
     parser.add_argument("--scans", type=int, default=32, help="scans, real and synthetic each")
     parser.add_argument("--rounds", type=int, default=100)
@@ -133,7 +152,9 @@ def main() -> None:
         seconds = time_in_turns(calls, arguments.rounds, time.process_time)
         print_rates("Overhead at ratio 0", len(real), seconds, next(iter(calls)))
         numbers = MixedScans.wrap(range(1000), None, 0, to_sample=to_item)
-        bare = time_in_turns({"": lambda: [numbers[i] for i in range(1000)]}, arguments.rounds, time.process_time)
+        bare = time_in_turns(
+            {"": lambda: [numbers[i] for i in range(1000)]}, arguments.rounds, time.process_time
+        )
         print(f"\nWrapping alone, around a dataset of numbers: {1e3 * bare['']:.1f} µs a sample")
         for form, title in (("offsets", "points"), ("range", "range images")):
             only = MixedScans(real, None, 0, collate=form)  # type: ignore[arg-type]
@@ -143,7 +164,12 @@ def main() -> None:
                 "half from a bank": epoch(half, range(len(half)), half.collate),
             }
             seconds = time_in_turns(calls, arguments.rounds, time.process_time)
-            print_rates(f"A bank at ratio 0.5, batches of {BATCH} as {title}", len(real), seconds, next(iter(calls)))
+            print_rates(
+                f"A bank at ratio 0.5, batches of {BATCH} as {title}",
+                len(real),
+                seconds,
+                next(iter(calls)),
+            )
 
 
 if __name__ == "__main__":

@@ -2,10 +2,13 @@
 
     python tools/bench/networks.py [--rounds N] [--threads N] [--model FILE.safetensors]
 
-On a CPU: seconds of one evaluation, its rate relative to the product's, a profile by kind of operation, peak memory. On
-a GPU: scans per second by batch, latency of one scan, rate relative to the product's, the errors of bfloat16 and TF32.
-Rates count the operations that the network needs, not those of an implementation. The weights are random unless a
-checkpoint of the same size is given; errors in metres are meaningful only with trained ones.
+On a CPU: seconds of one evaluation, its rate relative to the product's, a profile by kind of
+    operation, peak memory. On
+a GPU: scans per second by batch, latency of one scan, rate relative to the product's, the errors of
+    bfloat16 and TF32.
+Rates count the operations that the network needs, not those of an implementation. The weights are
+random unless a checkpoint of the same size is given; errors in metres are meaningful only with
+trained ones.
 """
 
 import argparse
@@ -69,24 +72,40 @@ def on_cpu(net: nn.Module, rounds: int) -> None:
     """Evaluation and product in turns, then the profile."""
     y = torch.randn(1, 2, 64, 1024)
     a, b = torch.randn(2, 4096, 4096)
-    product, evaluation, busy = [], [], []
+    product = []
+    evaluation = []
+    busy = []
     net(y, 0.5)
     for _ in tqdm(range(rounds), desc="timing", leave=False):
         product.append(seconds(lambda: a @ b))
         before = time.process_time()
         evaluation.append(seconds(lambda: net(y, 0.5)))
         busy.append(time.process_time() - before)
-    print(f"\n### One evaluation on the CPU, {torch.get_num_threads()} threads, float32\n\n{machine()}; "
-          f"torch {torch.__version__}; median (best) of {rounds}\n")  # fmt: skip
+    print(
+        f"\n### One evaluation on the CPU, {torch.get_num_threads()} threads, "
+        f"float32\n\n{machine()}; "
+        f"torch {torch.__version__}; median (best) of {rounds}\n"
+    )
     print("| what | s | GFLOP/s | share of the product's rate |\n|---|---:|---:|---:|")
-    rates = {name: 2 * 4096**3 / f(product) / 1e9 for name, f in (("median", median), ("best", min))}
-    print(f"| product of 4096 x 4096 | {median(product):.3f} ({min(product):.3f}) "
-          f"| {rates['median']:.0f} ({rates['best']:.0f}) | 100 % |")  # fmt: skip
-    share = [EVALUATION / f(evaluation) / 1e9 / rates[name] for name, f in (("median", median), ("best", min))]
-    print(f"| HDiT, batch 1 | {median(evaluation):.3f} ({min(evaluation):.3f}) "
-          f"| {EVALUATION / median(evaluation) / 1e9:.0f} ({EVALUATION / min(evaluation) / 1e9:.0f}) "
-          f"| {share[0]:.0%} ({share[1]:.0%}) |")  # fmt: skip
-    print(f"\nThe processor was busy for {median(busy):.2f} s per evaluation, all threads together.")
+    rates = {
+        name: 2 * 4096**3 / f(product) / 1e9 for name, f in (("median", median), ("best", min))
+    }
+    print(
+        f"| product of 4096 x 4096 | {median(product):.3f} ({min(product):.3f}) "
+        f"| {rates['median']:.0f} ({rates['best']:.0f}) | 100 % |"
+    )
+    share = [
+        EVALUATION / f(evaluation) / 1e9 / rates[name]
+        for name, f in (("median", median), ("best", min))
+    ]
+    print(
+        f"| HDiT, batch 1 | {median(evaluation):.3f} ({min(evaluation):.3f}) "
+        f"| {EVALUATION / median(evaluation) / 1e9:.0f} ({EVALUATION / min(evaluation) / 1e9:.0f}) "
+        f"| {share[0]:.0%} ({share[1]:.0%}) |"
+    )
+    print(
+        f"\nThe processor was busy for {median(busy):.2f} s per evaluation, all threads together."
+    )
     breakdown(net, y)
 
 
@@ -97,7 +116,9 @@ def breakdown(net: nn.Module, y: Tensor) -> None:
     spent: dict[str, float] = defaultdict(float)
     for event in profiler.key_averages():
         name = event.key.removeprefix("aten::").lstrip("_")
-        kind = next((k for k, names in KINDS.items() if any(name.startswith(n) for n in names)), "other")
+        kind = next(
+            (k for k, names in KINDS.items() if any(name.startswith(n) for n in names)), "other"
+        )
         spent[kind] += event.self_cpu_time_total
     print("\n| kind of operation | share of the time |\n|---|---:|")
     for kind in sorted(spent, key=lambda k: -spent[k]):
@@ -106,7 +127,9 @@ def breakdown(net: nn.Module, y: Tensor) -> None:
 
 def peak_memory() -> float:
     """Peak memory of a fresh process in GB, including Python and torch."""
-    out = subprocess.run([sys.executable, __file__, "--peak"], check=True, capture_output=True, text=True)
+    out = subprocess.run(
+        [sys.executable, __file__, "--peak"], check=True, capture_output=True, text=True
+    )
     return float(out.stdout)
 
 
@@ -116,9 +139,15 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
     a = torch.randn(8192, 8192, device="cuda", dtype=torch.bfloat16)
     a @ a
     rate = 2 * 8192**3 / min(seconds(lambda: a @ a, cuda=True) for _ in range(rounds))
-    print(f"\n### 4-step scans on {card}, bfloat16, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n")
+    print(
+        f"\n### 4-step scans on {card}, bfloat16, torch {torch.__version__}, "
+        f"{time.strftime('%Y-%m-%d')}\n"
+    )
     print(f"product of 8192 x 8192: {rate / 1e12:.0f} TFLOP/s\n")
-    print("| batch | eager: scans/s | compiled: scans/s | latency, ms | share of the product's rate | memory, GB |")
+    print(
+        "| batch | eager: scans/s | compiled: scans/s | latency, ms | share of the product's rate "
+        "| memory, GB |"
+    )
     print("|---:|---:|---:|---:|---:|---:|")
     half = full_network(None).cuda()
     half.load_state_dict(net.state_dict())
@@ -127,17 +156,26 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
         noise = torch.randn(batch, 2, 64, 1024, device="cuda")
         torch.compiler.reset()
         torch.cuda.reset_peak_memory_stats()
-        fast = torch.compile(half, mode="reduce-overhead")  # CUDA graphs: kernels are not launched singly
+        fast = torch.compile(
+            half, mode="reduce-overhead"
+        )  # CUDA graphs: kernels are not launched singly
         times = []
         for velocity in (half, fast):
             for _ in range(3):
                 solve(velocity, noise, GRID)
             torch.cuda.synchronize()
-            times.append(median(seconds(lambda v=velocity, y=noise: solve(v, y, GRID), True) for _ in range(rounds)))
+            times.append(
+                median(
+                    seconds(lambda v=velocity, y=noise: solve(v, y, GRID), True)
+                    for _ in range(rounds)
+                )
+            )
         share = 4 * EVALUATION * batch / min(times) / rate
         memory = torch.cuda.max_memory_allocated() / 1e9
-        print(f"| {batch} | {batch / times[0]:.0f} | {batch / times[1]:.0f} | {1e3 * min(times):.1f} "
-              f"| {share:.0%} | {memory:.1f} |")  # fmt: skip
+        print(
+            f"| {batch} | {batch / times[0]:.0f} | {batch / times[1]:.0f} | {1e3 * min(times):.1f} "
+            f"| {share:.0%} | {memory:.1f} |"
+        )
     precision(net.cuda(), half)
 
 
@@ -150,21 +188,31 @@ def precision(net: nn.Module, half: nn.Module) -> None:
     scans["bfloat16"] = solve(half, noise, GRID)
     torch.backends.cuda.matmul.allow_tf32 = True
     scans["TF32"] = solve(net, noise, GRID)
-    print("\n| precision | relative l2 | median of differences in range, m | 99 %, m |\n|---|---:|---:|---:|")
+    print(
+        "\n| precision | relative l2 | median of differences in range, m | 99 %, m "
+        "|\n|---|---:|---:|---:|"
+    )
     decode = NORMALISATIONS["r2flow"].decode
     for name, scan in scans.items():
         metres = (decode(scan[:, 0]) - decode(exact[:, 0])).abs().flatten()
-        print(f"| {name} | {float((scan - exact).norm() / exact.norm()):.1e} | {float(metres.median()):.4f} "
-              f"| {float(metres[: 1 << 24].quantile(0.99)):.4f} |")  # fmt: skip
+        print(
+            f"| {name} | {float((scan - exact).norm() / exact.norm()):.1e} | "
+            f"{float(metres.median()):.4f} "
+            f"| {float(metres[: 1 << 24].quantile(0.99)):.4f} |"
+        )
 
 
 def main() -> None:
     """Prints the tables for the devices of this machine."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--model", type=Path, help="a checkpoint with a network of this size")
-    parser.add_argument("--peak", action="store_true", help="evaluate once and print the peak memory in GB")
+    parser.add_argument(
+        "--peak", action="store_true", help="evaluate once and print the peak memory in GB"
+    )
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     torch.set_grad_enabled(False)

@@ -24,21 +24,33 @@ def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:
     """(N, 4) points in raw ring order, ring by ring, as an HDL-64E stores them."""
     rng = np.random.default_rng(0)
     elevation = np.repeat(sensor.laser_elevations, count // sensor.shape[0])
-    azimuth = np.tile(np.linspace(0, 2 * np.pi, count // sensor.shape[0], endpoint=False), sensor.shape[0])
+    azimuth = np.tile(
+        np.linspace(0, 2 * np.pi, count // sensor.shape[0], endpoint=False), sensor.shape[0]
+    )
     distance = rng.uniform(3, 70, len(elevation))
-    x, y = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
-    return np.c_[np.stack([x, y, np.sin(elevation)], 1) * distance[:, None], rng.random(len(x))].astype(np.float32)
+    x = np.cos(azimuth) * np.cos(elevation)
+    y = np.sin(azimuth) * np.cos(elevation)
+    return np.c_[
+        np.stack([x, y, np.sin(elevation)], 1) * distance[:, None], rng.random(len(x))
+    ].astype(np.float32)
 
 
 def sort_and_scatter(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """The plain numpy formula: every angle by numpy, all points sorted by range, far ones overwritten."""
-    (height, width), up, down = sensor.shape, np.radians(np.float32(sensor.up)), np.radians(np.float32(sensor.down))
+    """The plain numpy formula: every angle by numpy, all points sorted by range, far ones
+    overwritten."""
+    (height, width), up, down = (
+        sensor.shape,
+        np.radians(np.float32(sensor.up)),
+        np.radians(np.float32(sensor.down)),
+    )
     distance = np.linalg.norm(points[:, :3], axis=1)
     kept = (distance >= sensor.range_min) & (distance <= sensor.range_max)
-    points, distance = points[kept], distance[kept]
+    points = points[kept]
+    distance = distance[kept]
     row = (1 - (np.arcsin(points[:, 2] / distance) - down) / (up - down)) * height
     column = (-np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) / 2 % 1 * width
-    row, column = np.clip(row, 0, height - 1).astype(np.int32), np.clip(column, 0, width - 1).astype(np.int32)
+    row = np.clip(row, 0, height - 1).astype(np.int32)
+    column = np.clip(column, 0, width - 1).astype(np.int32)
     order = np.argsort(-distance)
     image = np.zeros((2, height, width), np.float32)
     image[0, row[order], column[order]] = distance[order]
@@ -48,7 +60,9 @@ def sort_and_scatter(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np
 
 def main() -> None:
     """Times everything in turns and prints two tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
     path: Path | None = parser.parse_args().scan
     torch.set_num_threads(1)
@@ -61,7 +75,8 @@ def main() -> None:
         scan = Scan(points[:, :3], points[:, 3], sensor)
         image = project(scan)
         assert np.array_equal(sort_and_scatter(points, sensor)[0] > 0, image.mask)
-        tensor, offsets = torch.from_numpy(points), torch.tensor([0, len(points)])
+        tensor = torch.from_numpy(points)
+        offsets = torch.tensor([0, len(points)])
         ours = "points -> range image with reflectance"
         calls = {
             ours: lambda: project(scan),
@@ -71,13 +86,18 @@ def main() -> None:
             "scan unfolding": lambda: unfold(scan),
             "range image -> points with reflectance": lambda: unproject(image),
         }
-        print_table(f"{len(points):,} points, 64 x 1024, one core", time_in_turns(calls, clock=time.process_time), ours)
+        print_table(
+            f"{len(points):,} points, 64 x 1024, one core",
+            time_in_turns(calls, clock=time.process_time),
+            ours,
+        )
 
         def read() -> Scan:
             values = read_points(path)
             return Scan(values[:, :3], values[:, 3], sensor)
 
-        plain, both = "bare read (numpy.fromfile)", "read, check, project"
+        plain = "bare read (numpy.fromfile)"
+        both = "read, check, project"
         seconds = time_in_turns(
             {
                 plain: lambda: np.fromfile(path, np.float32),
@@ -88,7 +108,8 @@ def main() -> None:
         )
         print_table("From the file to the range image", seconds, both)
         print(
-            f"\nread, check, project = {seconds[both] / (seconds[plain] + seconds['project']):.2f} x (read + project)"
+            "\nread, check, project = "
+            f"{seconds[both] / (seconds[plain] + seconds['project']):.2f} x (read + project)"
         )
 
 

@@ -2,10 +2,11 @@
 
     python tools/bench/scans.py [MODEL ...] [--rounds N] [--threads N] [--busy]
 
-MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise to points with
-labels. All measurements of the first table take turns. With --busy, processor time replaces wall-clock time, for a
-machine that does other work. The second table has the peak memory of a process that generates scans one by one, and how
-many scans one process of one thread for each core generate together, as those of ``bake --engine processes`` do.
+MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise
+to points with labels. All measurements of the first table take turns. With --busy, processor time
+replaces wall-clock time, for a machine that does other work. The second table has the peak memory
+of a process that generates scans one by one, and how many scans one process of one thread for each
+core generate together, as those of ``bake --engine processes`` do.
 """
 
 import argparse
@@ -43,7 +44,8 @@ class Kind(NamedTuple):
 
 
 def conditions(generator: Generator) -> list[Scan] | None:
-    """A scan of the town, from which a conditional model takes its condition; None for an unconditional one."""
+    """A scan of the town, from which a conditional model takes its condition; None for an
+    unconditional one."""
     return None if generator.condition is None else [Town(0, generator.sensor, 1)[0]]
 
 
@@ -64,7 +66,8 @@ def _start(barrier: Barrier) -> None:
 
 
 def _alone(kind: Kind) -> tuple[float, float]:
-    """Scans per second of this process, beside others that began at the same time; its peak memory in megabytes."""
+    """Scans per second of this process, beside others that began at the same time; its peak memory
+    in megabytes."""
     generator = kind.generator()
     given = conditions(generator)
     generator.scans(0, [0], given, steps=kind.steps)
@@ -76,14 +79,17 @@ def _alone(kind: Kind) -> tuple[float, float]:
 
 
 def _peak() -> float:
-    """Peak memory of this process in megabytes; ``ru_maxrss`` of a spawned process begins with that of its parent."""
+    """Peak memory of this process in megabytes; ``ru_maxrss`` of a spawned process begins with that
+    of its parent."""
     words = Path("/proc/self/status").read_text().split()
     return int(words[words.index("VmHWM:") + 1]) / 1e3
 
 
 def together(kind: Kind) -> tuple[float, float]:
-    """Scans per second of one process for each core, and the peak memory of one of them in megabytes."""
-    cores, context = os.cpu_count() or 1, get_context("spawn")
+    """Scans per second of one process for each core, and the peak memory of one of them in
+    megabytes."""
+    cores = os.cpu_count() or 1
+    context = get_context("spawn")
     with context.Pool(cores, _start, (context.Barrier(cores),)) as pool:
         found = pool.map(_alone, [kind] * cores, chunksize=1)
     return sum(rate for rate, _ in found), max(memory for _, memory in found)
@@ -91,26 +97,39 @@ def together(kind: Kind) -> tuple[float, float]:
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("model", nargs="*", default=["town"])
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--busy", action="store_true", help="measure processor time")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    a, index = torch.randn(4096, 4096), count()
+    a = torch.randn(4096, 4096)
+    index = count()
     calls = {"product of 4096 x 4096 (137 GFLOP)": lambda: a @ a}
     for kind in kinds(given.model):
         generator = kind.generator()
         streets = conditions(generator)
-        calls[str(kind)] = lambda g=generator, k=kind, c=streets: g.scans(0, [next(index)], c, steps=k.steps)
-    seconds = time_in_turns(calls, given.rounds, time.process_time if given.busy else time.perf_counter)
+        calls[str(kind)] = lambda g=generator, k=kind, c=streets: g.scans(
+            0, [next(index)], c, steps=k.steps
+        )
+    seconds = time_in_turns(
+        calls, given.rounds, time.process_time if given.busy else time.perf_counter
+    )
     what = "processor time" if given.busy else "wall time"
-    title = f"A labelled scan on the CPU, {given.threads} threads, float32, {what}; torch {torch.__version__}"
+    title = (
+        f"A labelled scan on the CPU, {given.threads} threads, float32, {what}; torch "
+        f"{torch.__version__}"
+    )
     base = next(iter(calls))
     print_table(title, seconds, base)
     cores = os.cpu_count()
-    print(f"\n| {cores} processes of one thread | scans/s | scans in the time of a product | MB of each |")
+    print(
+        f"\n| {cores} processes of one thread | scans/s | scans in the time of a product | MB of "
+        "each |"
+    )
     print("|---|---:|---:|---:|")
     for kind in kinds(given.model):
         rate, memory = together(kind)

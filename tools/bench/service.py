@@ -2,8 +2,8 @@
 
     python tools/bench/service.py [--model NAME|FILE] [--threads 1]
 
-Scans are 64 x 1024 with reflectance, labels and confidence; by default from an untrained network, because training does
-not change these times. The target is a copied scan in less than 1 ms.
+Scans are 64 x 1024 with reflectance, labels and confidence; by default from an untrained network,
+because training does not change these times. The target is a copied scan in less than 1 ms.
 """
 
 import argparse
@@ -21,9 +21,13 @@ from lidar_synth.mixing.service import RollingBank
 
 def main() -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", help="a shipped model or a checkpoint")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch in the generator process")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="threads of torch in the generator process"
+    )
     parser.add_argument("--rounds", type=int, default=200)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -34,7 +38,9 @@ def main() -> None:
             image = bank._slots.encoding.decode(arrays)
             size = sum(values.nbytes for values in arrays.values())
             parts = {
-                "copy of the bytes alone": lambda: {name: values.copy() for name, values in arrays.items()},
+                "copy of the bytes alone": lambda: {
+                    name: values.copy() for name, values in arrays.items()
+                },
                 "copied scan (ask, copy, check the sum)": lambda: bank.read(0),
                 "decode to a range image": lambda: bank._slots.encoding.decode(arrays),
                 "range image to points": lambda: unproject(image),
@@ -42,15 +48,22 @@ def main() -> None:
             }
             bank.expect([])  # the generator is idle after the scans that it has started
             bank.read(1)
-            print_table(f"{size:,} bytes per scan, generator idle",
-                        time_in_turns(parts, options.rounds), "bank[n], all of it")  # fmt: skip
+            print_table(
+                f"{size:,} bytes per scan, generator idle",
+                time_in_turns(parts, options.rounds),
+                "bank[n], all of it",
+            )
             bank.expect(range(10**6))
             numbers = count()
             busy = {
                 "copied scan (ask, copy, check the sum)": lambda: bank.read(next(numbers)),
                 "bank[n], all of it": lambda: bank[next(numbers)],
             }
-            print_table("The same, generator running", time_in_turns(busy, 10 * options.rounds), "bank[n], all of it")
+            print_table(
+                "The same, generator running",
+                time_in_turns(busy, 10 * options.rounds),
+                "bank[n], all of it",
+            )
             print(f"\n{bank.counts()}")
 
 

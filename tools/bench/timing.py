@@ -11,9 +11,12 @@ from tqdm import tqdm
 
 
 def time_in_turns(
-    calls: Mapping[str, Callable[[], object]], rounds: int = 60, clock: Callable[[], float] = time.perf_counter
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int = 60,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Median seconds of each call; the calls take turns, so that other load affects all of them alike.
+    """Median seconds of each call; the calls take turns, so that other load affects all of them
+    alike.
 
     On a busy machine, ``clock=time.process_time`` measures only the work of this process.
     """
@@ -32,7 +35,10 @@ def machine() -> str:
     """A line that describes the machine: processor, cores, AVX-512, Python and numpy."""
     info = Path("/proc/cpuinfo")
     text = info.read_text() if info.exists() else ""
-    model = next((line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")), "")
+    model = next(
+        (line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")),
+        "",
+    )
     cores = text.count("processor\t") or 1
     vector = "AVX-512" if "avx512f" in text else "no AVX-512"
     return (
@@ -43,6 +49,8 @@ def machine() -> str:
 
 def print_table(title: str, seconds: Mapping[str, float], base: str) -> None:
     """Print a Markdown table of milliseconds, and of ratios to one of the rows."""
-    print(f"\n### {title}\n\n{machine()}\n\n| operation | ms | ratio to '{base}' |\n|---|---:|---:|")
+    print(
+        f"\n### {title}\n\n{machine()}\n\n| operation | ms | ratio to '{base}' |\n|---|---:|---:|"
+    )
     for name, value in seconds.items():
         print(f"| {name} | {1e3 * value:.3f} | {value / seconds[base]:.2f} |")

@@ -2,14 +2,16 @@
 
     python tools/bench/town.py [--stretches 10] [--jobs 2]
 
-The town's target is 25 scans per second on 2 cores with 2,175 firings, with labels and boxes, without images.
+The town's target is 25 scans per second on 2 cores with 2,175 firings, with labels and boxes,
+without images.
 """
 
 import argparse
 import os
 import time
 
-# Set before numpy is imported: one process per core does the work, and numpy's threads would compete for the cores.
+# Set before numpy is imported: one process per core does the work, and numpy's threads would
+# compete for the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import multiprocessing
@@ -24,10 +26,12 @@ from lidar_synth.lab.town.world import build_world
 
 
 def make(stretches: list[int]) -> tuple[float, float]:
-    """Make all scans of some stretches; seconds of processor time and of the clock, without start-up."""
+    """Make all scans of some stretches; seconds of processor time and of the clock, without
+    start-up."""
     town = Town(0, scans=10**6)
     town[10**6 - 1]
-    clock, used = time.perf_counter(), time.process_time()
+    clock = time.perf_counter()
+    used = time.process_time()
     for k in stretches:
         for i in range(STRETCH_FRAMES):
             town[STRETCH_FRAMES * k + i]
@@ -54,7 +58,11 @@ def parts(stretches: int) -> dict[str, float]:
         for i in range(1, 6):
             town[STRETCH_FRAMES * k + i]
         cast = time.process_time()
-        spent = ((built - start) / STRETCH_FRAMES, (ready - built) / STRETCH_FRAMES, (cast - begin) / 5)
+        spent = (
+            (built - start) / STRETCH_FRAMES,
+            (ready - built) / STRETCH_FRAMES,
+            (cast - begin) / 5,
+        )
         for part, seconds in zip(PARTS, spent, strict=False):
             used[part] += seconds / stretches
     start = time.process_time()
@@ -65,10 +73,13 @@ def parts(stretches: int) -> dict[str, float]:
 
 
 def skin() -> float:
-    """Seconds of processor time of a skin on a scan; the shipped one, taken for the town's sensor."""
-    scan, other = Town(0)[0], load_skin("pandar64")
+    """Seconds of processor time of a skin on a scan; the shipped one, taken for the town's
+    sensor."""
+    scan = Town(0)[0]
+    other = load_skin("pandar64")
     assert scan.ring is not None and scan.instance is not None
-    own, boxed = replace(other, sensor=scan.sensor), scan.instance > 0
+    own = replace(other, sensor=scan.sensor)
+    boxed = scan.instance > 0
     rng = np.random.default_rng(0)
     own.apply(scan.points, scan.reflectance, scan.ring, boxed, rng)
     start = time.process_time()
@@ -79,8 +90,12 @@ def skin() -> float:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--stretches", type=int, default=10, help=f"stretches of {STRETCH_FRAMES} scans each")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--stretches", type=int, default=10, help=f"stretches of {STRETCH_FRAMES} scans each"
+    )
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args()
     print(f"64 x 1024, {machine()}, load {os.getloadavg()[0]:.1f}\n")
@@ -95,9 +110,16 @@ def main() -> None:
         results = pool.map(make, shares, chunksize=1)
     count = STRETCH_FRAMES * arguments.stretches
     seconds = sum(r[0] for r in results)
-    rate, clock = arguments.jobs * count / seconds, count / max(r[1] for r in results)
-    print(f"\n{count} scans by {arguments.jobs} processes: {1e3 * seconds / count:.1f} ms of processor time each")
-    print(f"{rate:.1f} scans/s on {arguments.jobs} dedicated cores; {clock:.1f} scans/s of wall-clock time here")
+    rate = arguments.jobs * count / seconds
+    clock = count / max(r[1] for r in results)
+    print(
+        f"\n{count} scans by {arguments.jobs} processes: {1e3 * seconds / count:.1f} ms of "
+        "processor time each"
+    )
+    print(
+        f"{rate:.1f} scans/s on {arguments.jobs} dedicated cores; {clock:.1f} scans/s of "
+        "wall-clock time here"
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""The time that an adapter adds to a trainer's loading of a real sample, and the time of a synthetic sample.
+"""The time that an adapter adds to a trainer's loading of a real sample, and the time of a
+synthetic sample.
 
-Processor time, measured in turns, each trainer in its own process. MMDetection3D is measured where it is installed
-(``tools/install_mmdet3d.sh``; stock SemanticKITTI pipeline: points, labels, flip, rotation, packing; scans of the
-town). The others are measured where a variable names their checkout, as for the tests, on the small scans of the tests,
-which
-make the adapter's share larger::
+Processor time, measured in turns, each trainer in its own process. MMDetection3D is measured where
+it is installed (``tools/install_mmdet3d.sh``; stock SemanticKITTI pipeline: points, labels, flip,
+rotation, packing; scans of the town). The others are measured where a variable names their
+checkout, as for the tests, on the small scans of the tests, which make the adapter's share larger::
 
     OPENPCDET_ROOT=/path/to/OpenPCDet python tools/bench/trainers.py
 """
@@ -28,8 +28,13 @@ SCANS = 8
 OWN = "a real sample, the trainer's own dataset"
 MIXED = "the same through the mixture"
 SYNTHETIC = "a synthetic sample, from a folder of .npz"
-VARIABLES = {"openpcdet": "OPENPCDET_ROOT", "pointcept": "POINTCEPT_ROOT", "rangenet": "RANGENET_ROOT",
-             "cylinder3d": "CYLINDER3D_ROOT", "open3d_ml": "OPEN3D_ML_ROOT"}  # fmt: skip
+VARIABLES = {
+    "openpcdet": "OPENPCDET_ROOT",
+    "pointcept": "POINTCEPT_ROOT",
+    "rangenet": "RANGENET_ROOT",
+    "cylinder3d": "CYLINDER3D_ROOT",
+    "open3d_ml": "OPEN3D_ML_ROOT",
+}
 
 
 def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
@@ -47,37 +52,62 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     from lidar_synth.formats.convert import convert
     from lidar_synth.lab.town import Town, export_town
 
-    export_town(Town(seed=1, scans=SCANS), root / "real", "semantic_kitti", camera=False, progress=False)
+    export_town(
+        Town(seed=1, scans=SCANS), root / "real", "semantic_kitti", camera=False, progress=False
+    )
     convert(Town(seed=2, scans=SCANS), WRITERS["npz"](root / "synthetic"), progress=False)
     listed = semantic_kitti_list(root / "real", root / "real" / "train.json")
     settings = {"synthetic": root / "synthetic", "ratio": 0.5}
     mixed = write_infos(root / "mixed", listed, settings, data_root=root / "real")
     init_default_scope("mmdet3d")
-    config = Config.fromfile(str(Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py"))
+    config = Config.fromfile(
+        str(Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py")
+    )
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
     ours["pipeline"] = [*ours["pipeline"][:3], *ours["pipeline"][-2:]]  # without random partners
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
-    stock, dataset, slots = DATASETS.build(theirs), DATASETS.build(ours), iter(range(10**9))
-    return {OWN: lambda: stock[0], MIXED: lambda: dataset[0], SYNTHETIC: lambda: dataset[SCANS + next(slots) % SCANS]}
+    stock = DATASETS.build(theirs)
+    dataset = DATASETS.build(ours)
+    slots = iter(range(10**9))
+    return {
+        OWN: lambda: stock[0],
+        MIXED: lambda: dataset[0],
+        SYNTHETIC: lambda: dataset[SCANS + next(slots) % SCANS],
+    }
 
 
 def of_tests(trainer: str, root: Path) -> dict[str, Callable[[], Any]]:
     """The same for the datasets that a trainer's tests compare."""
     tests = import_module(f"test_integrations_{trainer}")
     own, ours = tests.both(tests.make(root))
-    where = [next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain) for domain in (0, 1)]
+    where = [
+        next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain) for domain in (0, 1)
+    ]
     load = "get_data" if trainer == "open3d_ml" else "__getitem__"
-    theirs, mine = getattr(own, load), getattr(ours, load)
+    theirs = getattr(own, load)
+    mine = getattr(ours, load)
     number = ours.mixed[where[0]]
-    return {OWN: lambda: theirs(number), MIXED: lambda: mine(where[0]), SYNTHETIC: lambda: mine(where[1])}
+    return {
+        OWN: lambda: theirs(number),
+        MIXED: lambda: mine(where[0]),
+        SYNTHETIC: lambda: mine(where[1]),
+    }
 
 
 def main() -> None:
     """Prints a table for each installed trainer, or for the one that is named."""
     if sys.argv[1:]:
         with tempfile.TemporaryDirectory() as folder:
-            calls = mmdet3d(Path(folder)) if sys.argv[1] == "mmdet3d" else of_tests(sys.argv[1], Path(folder))
-            print_table(f"{sys.argv[1]}, one sample", time_in_turns(calls, rounds=200, clock=time.process_time), OWN)
+            calls = (
+                mmdet3d(Path(folder))
+                if sys.argv[1] == "mmdet3d"
+                else of_tests(sys.argv[1], Path(folder))
+            )
+            print_table(
+                f"{sys.argv[1]}, one sample",
+                time_in_turns(calls, rounds=200, clock=time.process_time),
+                OWN,
+            )
         return
     for trainer in ("mmdet3d", *VARIABLES):
         if os.environ.get(VARIABLES[trainer]) if trainer in VARIABLES else find_spec(trainer):

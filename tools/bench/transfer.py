@@ -2,7 +2,8 @@
 
     python tools/bench/transfer.py [SCAN.bin]
 
-SCAN.bin is any scan of KITTI or KITTI-360; the default is a scan of the shipped model, and one of the town.
+SCAN.bin is any scan of KITTI or KITTI-360; the default is a scan of the shipped model, and one of
+the town.
 """
 
 import argparse
@@ -23,12 +24,18 @@ from lidar_synth.geometry.transfer.surfaces import estimate
 
 HDL64E_FIRINGS = 2170
 MOUNT = Mount(1.0, 0.2)
-TARGETS = {"HDL-64E, 64 x 1024": "hdl64e_kitti360", "HDL-32E, 32 x 1024": "hdl32e_nuscenes", "OS1-128": "os1_128"}
+TARGETS = {
+    "HDL-64E, 64 x 1024": "hdl64e_kitti360",
+    "HDL-32E, 32 x 1024": "hdl32e_nuscenes",
+    "OS1-128": "os1_128",
+}
 
 
 def main() -> None:
     """Times everything in turns and prints a table of each scan."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
     path: Path | None = parser.parse_args().scan
     torch.set_num_threads(1)
@@ -45,9 +52,15 @@ def main() -> None:
         calls: dict[str, Callable[[], object]] = {
             f"as {one}": partial(Transfer(target), scan) for one, target in sensors.items()
         }
-        calls["as HDL-64E, 64 x 2170, 1 m higher, pitched by 0.2 degrees"] = partial(Transfer(sensor, MOUNT), scan)
-        surfaces, grid = "of which: rings and surfaces", "one return per cell (project, unproject)"
-        calls |= {surfaces: partial(estimate, scan), grid: partial(_through_cells, scan, sensors["OS1-128"])}
+        calls["as HDL-64E, 64 x 2170, 1 m higher, pitched by 0.2 degrees"] = partial(
+            Transfer(sensor, MOUNT), scan
+        )
+        surfaces = "of which: rings and surfaces"
+        grid = "one return per cell (project, unproject)"
+        calls |= {
+            surfaces: partial(estimate, scan),
+            grid: partial(_through_cells, scan, sensors["OS1-128"]),
+        }
         seconds = time_in_turns(calls, rounds=20, clock=time.process_time)
         print_table(f"A scan of {name}, {len(scan):,} points, one core", seconds, surfaces)
 

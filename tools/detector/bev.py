@@ -1,8 +1,10 @@
-"""Bird's-eye view: from a scan to the input and the targets of the network, and from its output back to boxes.
+"""Bird's-eye view: from a scan to the input and the targets of the network, and from its output
+back to boxes.
 
-The input is occupancy in slices of height (as PIXOR's, Yang et al. 2018), with reflectance and the number of returns.
-The targets are those of CenterPoint (Yin et al. 2021), with the doubled yaw: a box that points backwards has the same
-footprint, and few labelled boxes do not teach front from back.
+The input is occupancy in slices of height (as PIXOR's, Yang et al. 2018), with reflectance and the
+number of returns. The targets are those of CenterPoint (Yin et al. 2021), with the doubled yaw: a
+box that points backwards has the same footprint, and few labelled boxes do not teach front from
+back.
 """
 
 from dataclasses import dataclass
@@ -21,13 +23,16 @@ REACH = 51.2
 """Metres from the sensor to each of the four sides of the view."""
 CELL = 0.2
 """Side of an input cell, metres."""
-LOW, SLICE, SLICES = -4.0, 0.3, 20
+LOW = -4.0
+SLICE = 0.3
+SLICES = 20
 """Lowest height above the sensor, and height and number of the slices; metres."""
 CELLS = round(2 * REACH / CELL)
 CHANNELS = 4 * (SLICES + 2)
 """Of the input: 2 x 2 cells side by side are one pixel."""
 REGRESSED = 8
-"""Offset (2) in pixels of the output, height of the centre, logarithm of the size (3), cosine and sine of 2 yaw."""
+"""Offset (2) in pixels of the output, height of the centre, logarithm of the size (3), cosine and
+sine of 2 yaw."""
 LOGARITHM = np.minimum(40 * np.log2(1 + np.arange(100)), 255).astype(np.uint8)
 """The value of a cell by its number of returns."""
 APART = (1.2, 0.4, 0.7)
@@ -59,7 +64,8 @@ class Found:
 
 def view(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> Tensor:
     """(n, n, CHANNELS) uint8: a scan of N points from above, x along the first axis."""
-    image, count = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8), np.zeros(CELLS * CELLS, np.int32)
+    image = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8)
+    count = np.zeros(CELLS * CELLS, np.int32)
     _fill(image, count, points, reflectance)
     image[:, SLICES + 1] = LOGARITHM[np.minimum(count, len(LOGARITHM) - 1)]
     return torch.from_numpy(image).view(CELLS // 2, CELLS // 2, CHANNELS)
@@ -69,10 +75,12 @@ def view(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> Tenso
 def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
     """Set the slices and a reflectance of every cell that has returns, and count them."""
     for k in range(len(points)):
-        x, y = (points[k, 0] + REACH) / CELL, (points[k, 1] + REACH) / CELL
+        x = (points[k, 0] + REACH) / CELL
+        y = (points[k, 1] + REACH) / CELL
         height = (points[k, 2] - LOW) / SLICE
         if 0 <= x < CELLS and 0 <= y < CELLS and 0 <= height < SLICES:
-            i, j = int(x), int(y)
+            i = int(x)
+            j = int(y)
             cell = (i // 2 * (CELLS // 2) + j // 2) * 4 + i % 2 * 2 + j % 2
             image[cell, int(height)] = 255
             image[cell, SLICES] = int(reflectance[k] * 255)  # of any of its returns
@@ -83,14 +91,17 @@ def targets(boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float
     """The targets of M boxes (M, 7) with classes (M,); pixels have sides of ``pixel`` metres."""
     count = round(2 * REACH / pixel)
     heat = np.zeros((len(CLASSES), count, count), np.float32)
-    values, weight = np.zeros((REGRESSED, count, count), np.float32), np.zeros((count, count), np.float32)
+    values = np.zeros((REGRESSED, count, count), np.float32)
+    weight = np.zeros((count, count), np.float32)
     for box, each in zip(boxes.astype(np.float64), classes, strict=True):
         centre = (box[:2] + REACH) / pixel
         if (centre < 0).any() or (centre >= count).any():
             continue
         spread = max(0.6, np.sqrt(box[3] * box[4]) / pixel / 6)
         reach = int(np.ceil(3 * spread))
-        rows, columns = (np.arange(max(c - reach, 0), min(c + reach + 1, count)) for c in centre.astype(int))
+        rows, columns = (
+            np.arange(max(c - reach, 0), min(c + reach + 1, count)) for c in centre.astype(int)
+        )
         at = np.ix_(rows, columns)
         square = (rows - int(centre[0]))[:, None] ** 2 + (columns - int(centre[1])) ** 2
         bump = np.exp(-square / (2 * spread**2)).astype(np.float32)
@@ -102,9 +113,14 @@ def targets(boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float
     return Target(*map(torch.from_numpy, (heat, values, weight)))
 
 
-def _offsets(centre: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> list[NDArray]:
-    """From the middle of each pixel to a centre, in pixels: along the rows and along the columns."""
-    return list(np.broadcast_arrays((centre[0] - rows - 0.5)[:, None], (centre[1] - columns - 0.5)[None]))
+def _offsets(
+    centre: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> list[NDArray]:
+    """From the middle of each pixel to a centre, in pixels: along the rows and along the
+    columns."""
+    return list(
+        np.broadcast_arrays((centre[0] - rows - 0.5)[:, None], (centre[1] - columns - 0.5)[None])
+    )
 
 
 def _shape(box: NDArray[np.float64]) -> list[float]:
@@ -125,7 +141,9 @@ def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) ->
     """
     pixel = 2 * REACH / heat.shape[-1]
     peaks = heat * (F.max_pool2d(heat[None], 3, 1, 1)[0] == heat)
-    boxes, scores, classes = [], [], []
+    boxes = []
+    scores = []
+    classes = []
     for each, peak in enumerate(peaks):
         top = peak.flatten().topk(most)
         index = top.indices[top.values > least]
@@ -133,7 +151,9 @@ def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) ->
         pixels = np.stack(np.divmod(index.numpy(), heat.shape[-1])) + 0.5
         x, y = (pixels + found[:2]) * pixel - REACH
         yaw = np.arctan2(found[7], found[6]) / 2
-        candidates = np.stack([x, y, found[2], *np.exp(found[3:6].clip(-3, 4)), yaw], 1).astype(np.float32)
+        candidates = np.stack([x, y, found[2], *np.exp(found[3:6].clip(-3, 4)), yaw], 1).astype(
+            np.float32
+        )
         kept = _apart(candidates[:, :2], APART[each])
         boxes.append(candidates[kept])
         scores.append(top.values.numpy()[: len(index)][kept])

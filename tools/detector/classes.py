@@ -1,6 +1,10 @@
 """The classes that are detected."""
 
-CLASSES = {"car": ("Car", "Van"), "pedestrian": ("Pedestrian", "Person_sitting"), "cyclist": ("Cyclist",)}
+CLASSES = {
+    "car": ("Car", "Van"),
+    "pedestrian": ("Pedestrian", "Person_sitting"),
+    "cyclist": ("Cyclist",),
+}
 """Names of the boxes of each class; other boxes (trucks, trams) are background."""
 
 CLASS_OF = {name: number for number, names in enumerate(CLASSES.values()) for name in names}

@@ -1,4 +1,5 @@
-"""The detector: a convolutional network in bird's-eye view with CenterPoint's head, its training and its test."""
+"""The detector: a convolutional network in bird's-eye view with CenterPoint's head, its training
+and its test."""
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
@@ -19,7 +20,8 @@ from lidar_synth.lab.train.precision import faster_in_bfloat16
 
 PIXEL = 0.8
 """Side of a pixel of the output, metres."""
-WIDTHS, DEPTHS = (32, 64, 96), (1, 2, 3)
+WIDTHS = (32, 64, 96)
+DEPTHS = (1, 2, 3)
 """Channels and additional layers of the three levels."""
 RARE_HEAT = -4.6
 """Initial logit of the heat: few pixels hold a centre."""
@@ -52,11 +54,14 @@ class Detector(nn.Module):
         first, second, third = WIDTHS
         levels = zip((CHANNELS, first, second), WIDTHS, DEPTHS, strict=True)
         self.levels = nn.ModuleList(
-            nn.Sequential(_layer(i, o, 2), *(_layer(o, o) for _ in range(depth))) for i, o, depth in levels
+            nn.Sequential(_layer(i, o, 2), *(_layer(o, o) for _ in range(depth)))
+            for i, o, depth in levels
         )
         self.up = nn.ModuleList(
             nn.Sequential(
-                nn.ConvTranspose2d(width, first, scale, scale, bias=False), nn.BatchNorm2d(first), nn.ReLU(inplace=True)
+                nn.ConvTranspose2d(width, first, scale, scale, bias=False),
+                nn.BatchNorm2d(first),
+                nn.ReLU(inplace=True),
             )
             for width, scale in ((second, 2), (third, 4))
         )
@@ -64,20 +69,23 @@ class Detector(nn.Module):
         nn.init.constant_(self.head[1].bias[: len(CLASSES)], RARE_HEAT)
 
     def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of the heat (B, classes, n, n) and values (B, REGRESSED, n, n) of views (B, CHANNELS, 2n, 2n)."""
+        """Logits of the heat (B, classes, n, n) and values (B, REGRESSED, n, n) of views (B,
+        CHANNELS, 2n, 2n)."""
         found = []
         x = views
         for level in self.levels:
             x = level(x)
             found.append(x)
-        joined = torch.cat([found[0], *(up(x) for up, x in zip(self.up, found[1:], strict=True))], 1)
+        joined = torch.cat(
+            [found[0], *(up(x) for up, x in zip(self.up, found[1:], strict=True))], 1
+        )
         out = self.head(joined).float()
         return out[:, : len(CLASSES)], out[:, len(CLASSES) :]
 
 
 def answer(network: nn.Module, views: Tensor) -> tuple[Tensor, Tensor]:
-    """The network on views (B, 2n, 2n, CHANNELS) uint8. The first layer is normalised, so that the scale of its input
-    does not matter."""
+    """The network on views (B, 2n, 2n, CHANNELS) uint8. The first layer is normalised, so that the
+    scale of its input does not matter."""
     with _precision():
         logits, values = network(_input(views))
     return logits, values
@@ -93,15 +101,20 @@ def _precision() -> torch.autocast:
 
 def loss_of(logits: Tensor, values: Tensor, target: Target) -> Tensor:
     """CenterPoint's focal loss of the heat, and the absolute error of the values around centres."""
-    p, log_p, log_q = logits.sigmoid(), F.logsigmoid(logits), F.logsigmoid(-logits)
+    p = logits.sigmoid()
+    log_p = F.logsigmoid(logits)
+    log_q = F.logsigmoid(-logits)
     centre = target.heat == 1
     heat = torch.where(centre, (1 - p) ** 2 * log_p, (1 - target.heat) ** 4 * p**2 * log_q)
     error = (values - target.values).abs() * target.weight[:, None]
     return -heat.sum() / centre.sum().clamp(min=1) + error.sum() / target.weight.sum().clamp(min=1)
 
 
-def train(network: Detector, batches: Iterable[Sample], iterations: int, rate: float, name: str) -> list[float]:
-    """Train a network in place; the loss of every iteration. AdamW, one cycle of the learning rate."""
+def train(
+    network: Detector, batches: Iterable[Sample], iterations: int, rate: float, name: str
+) -> list[float]:
+    """Train a network in place; the loss of every iteration. AdamW, one cycle of the learning
+    rate."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     network.train()
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
@@ -121,7 +134,8 @@ def train(network: Detector, batches: Iterable[Sample], iterations: int, rate: f
 
 
 def settled(network: Detector, batches: Iterable[Sample]) -> Detector:
-    """A copy whose statistics of the batch normalisation are those of some batches, of labelled scans in every arm."""
+    """A copy whose statistics of the batch normalisation are those of some batches, of labelled
+    scans in every arm."""
     network = deepcopy(network)
     with _precision():
         update_bn((_input(views) for views, _ in batches), network)

@@ -1,4 +1,5 @@
-"""Scans of the trial: made once, kept as ``.npz``, shared by all trainings. An interrupted pool is continued."""
+"""Scans of the trial: made once, kept as ``.npz``, shared by all trainings. An interrupted pool is
+continued."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +26,12 @@ RARE = {"Pedestrian": 1, "Person_sitting": 1, "Cyclist": 2}
 def make_pool(folder: Path, count: int, make: Callable[[int], Scan]) -> Source:
     """The scans 0 to ``count`` - 1 of a function, kept in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for i in tqdm(range(count), desc=folder.name, unit="scan", disable=(folder / f"{count - 1:06d}.npz").exists()):
+    for i in tqdm(
+        range(count),
+        desc=folder.name,
+        unit="scan",
+        disable=(folder / f"{count - 1:06d}.npz").exists(),
+    ):
         if not (path := folder / f"{i:06d}.npz").exists():
             write_scan(path, make(i))
     return open_scans(folder)
@@ -34,7 +40,8 @@ def make_pool(folder: Path, count: int, make: Callable[[int], Scan]) -> Source:
 def streets(folder: Path, seed: int, first: int, count: int, every_box: bool = False) -> Source:
     """One scan of each of ``count`` stretches of a town, from the stretch ``first`` on.
 
-    Of three moments of a stretch, the one with most pedestrians and cyclists near the vehicle is taken: with one at
+    Of three moments of a stretch, the one with most pedestrians and cyclists near the vehicle is
+        taken: with one at
     random, thirty scans have two cyclists.
 
     Args:
@@ -54,11 +61,18 @@ def streets(folder: Path, seed: int, first: int, count: int, every_box: bool = F
 
 
 def _rare(town: Town, index: int) -> int:
-    """Pedestrians and cyclists around the vehicle, hidden ones included; a cyclist counts as two."""
+    """Pedestrians and cyclists around the vehicle, hidden ones included; a cyclist counts as
+    two."""
     snapshot, pose, _ = town.moment(index)
-    objects = [o for o in (*town.world(index).scene.placed, *snapshot.movers) if o.prototype.name in RARE]
+    objects = [
+        o for o in (*town.world(index).scene.placed, *snapshot.movers) if o.prototype.name in RARE
+    ]
     places = [(np.linalg.inv(pose) @ o.pose)[:2, 3] for o in objects]
-    return sum(RARE[o.prototype.name] for o, place in zip(objects, places, strict=True) if abs(place).max() < NEAR)
+    return sum(
+        RARE[o.prototype.name]
+        for o, place in zip(objects, places, strict=True)
+        if abs(place).max() < NEAR
+    )
 
 
 def unconditional(folder: Path, count: int, model: str) -> Source:
@@ -68,16 +82,19 @@ def unconditional(folder: Path, count: int, model: str) -> Source:
 
 
 def without_unboxed(folder: Path, scans: Source) -> Source:
-    """The same scans, as the package's default makes them: objects without a box are removed, their holes filled."""
+    """The same scans, as the package's default makes them: objects without a box are removed, their
+    holes filled."""
     return make_pool(folder, len(scans), lambda i: closed(scans[i]))
 
 
 def laid_out(folder: Path, model: str, layouts: Source) -> Source:
-    """One scan of a layout model for the layout of each given scan, with its boxes; as the package's default, objects
-    without a box are removed."""
+    """One scan of a layout model for the layout of each given scan, with its boxes; as the
+    package's default, objects without a box are removed."""
     generator = load_generator(model)
     return make_pool(
-        folder, len(layouts), lambda i: with_points(closed(generator.scans(0, [i], condition=layouts[i])[0]))
+        folder,
+        len(layouts),
+        lambda i: with_points(closed(generator.scans(0, [i], condition=layouts[i])[0])),
     )
 
 

@@ -1,7 +1,7 @@
 """Average precision of detected boxes, by their overlap in bird's-eye view.
 
-A detection is right if it overlaps a box of its class that no better detection has taken. The precision is
-interpolated at all recalls (PASCAL VOC since 2010).
+A detection is right if it overlaps a box of its class that no better detection has taken. The
+precision is interpolated at all recalls (PASCAL VOC since 2010).
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ OVERLAP = (0.5, 0.25, 0.25)
 
 @dataclass(frozen=True)
 class Truth:
-    """The boxes of a tested scan: (M, 7), classes (M,), and whether each has to be found (M,). The others, with fewer
-    than ``LEAST`` returns or outside the view, may be found."""
+    """The boxes of a tested scan: (M, 7), classes (M,), and whether each has to be found (M,). The
+    others, with fewer than ``LEAST`` returns or outside the view, may be found."""
 
     boxes: NDArray[np.float32]
     classes: NDArray[np.int64]
@@ -41,10 +41,14 @@ def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
     """The average precision of every class over some scans, 0 to 1; NaN for one without a box."""
     every = []
     for each, least in enumerate(OVERLAP):
-        scores, hits = [], []
+        scores = []
+        hits = []
         for some, truth in zip(found, truths, strict=True):
-            mine, real = some.classes == each, truth.classes == each
-            right = matched(some.boxes[mine], some.scores[mine], truth.boxes[real], truth.wanted[real], least)
+            mine = some.classes == each
+            real = truth.classes == each
+            right = matched(
+                some.boxes[mine], some.scores[mine], truth.boxes[real], truth.wanted[real], least
+            )
             scores.append(some.scores[mine][right >= 0])
             hits.append(right[right >= 0])
         wanted = sum(int(truth.wanted[truth.classes == each].sum()) for truth in truths)
@@ -59,7 +63,8 @@ def matched(
     wanted: NDArray[np.bool_],
     least: float,
 ) -> NDArray[np.int64]:
-    """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box that is not wanted."""
+    """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box
+    that is not wanted."""
     result = np.zeros(len(boxes), np.int64)
     overlaps = footprint_ious(boxes, truth)
     free = np.ones(len(truth), bool)
@@ -80,7 +85,8 @@ def footprint_ious(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np
         return ious
     distance = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
     near = distance < (np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])) / 2
-    first, second = _footprints(a), _footprints(b)
+    first = _footprints(a)
+    second = _footprints(b)
     for i, j in np.argwhere(near):
         common = _common_area(first[i], second[j])
         ious[i, j] = common / (float(a[i, 3]) * a[i, 4] + float(b[j, 3]) * b[j, 4] - common)
@@ -94,15 +100,19 @@ def _footprints(values: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _common_area(polygon: NDArray[np.float64], window: NDArray[np.float64]) -> float:
-    """Area of the intersection of two convex polygons (n, 2), counter-clockwise: Sutherland and Hodgman (1974)."""
+    """Area of the intersection of two convex polygons (n, 2), counter-clockwise: Sutherland and
+    Hodgman (1974)."""
     for start, end in zip(window, np.roll(window, -1, 0), strict=True):
         along = end - start
         left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0])
         clipped = []
         for k in range(len(polygon)):
-            before, here = left[k - 1], left[k]
+            before = left[k - 1]
+            here = left[k]
             if (before < 0) != (here < 0):
-                clipped.append(polygon[k - 1] + (polygon[k] - polygon[k - 1]) * before / (before - here))
+                clipped.append(
+                    polygon[k - 1] + (polygon[k] - polygon[k - 1]) * before / (before - here)
+                )
             if here >= 0:
                 clipped.append(polygon[k])
         if len(clipped) < 3:

@@ -1,4 +1,5 @@
-"""Extension of griffe, which reads docstrings for mkdocstrings: a section ``Example:`` is shown as code."""
+"""Extension of griffe, which reads docstrings for mkdocstrings: a section ``Example:`` is shown as
+code."""
 
 import re
 from typing import Any
@@ -11,4 +12,6 @@ class Examples(griffe.Extension):
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:
-            obj.docstring.value = re.sub(r"^(\s*)Example:$", r"\1Examples:", obj.docstring.value, flags=re.M)
+            obj.docstring.value = re.sub(
+                r"^(\s*)Example:$", r"\1Examples:", obj.docstring.value, flags=re.M
+            )

@@ -1,4 +1,5 @@
-"""Hook of mkdocs: each notebook of docs/notebooks becomes a page, as it was executed, without a script.
+"""Hook of mkdocs: each notebook of docs/notebooks becomes a page, as it was executed, without a
+script.
 
 A link to a notebook in another page leads to that page; the notebook itself is a file beside it.
 """

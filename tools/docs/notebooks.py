@@ -1,9 +1,10 @@
-"""Executes the notebooks of docs/notebooks and keeps their outputs, which the site shows: ``make notebooks``.
+"""Executes the notebooks of docs/notebooks and keeps their outputs, which the site shows: ``make
+notebooks``.
 
     python tools/docs/notebooks.py [NOTEBOOK...]
 
-Each runs in an empty folder of its own. The notebook's metadata record a hash of its code, by which a test sees that
-the outputs belong to the code.
+Each runs in an empty folder of its own. The notebook's metadata record a hash of its code, by which
+a test sees that the outputs belong to the code.
 """
 
 import hashlib
@@ -32,7 +33,9 @@ def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
     """
     book = nbformat.read(path, as_version=4)
     environment = os.environ | {"IPYTHONDIR": str(folder / ".ipython")}
-    client = NotebookClient(book, timeout=600, record_timing=False, resources={"metadata": {"path": str(folder)}})
+    client = NotebookClient(
+        book, timeout=600, record_timing=False, resources={"metadata": {"path": str(folder)}}
+    )
     client.execute(env=environment)
     for cell in book.cells:
         if cell.cell_type == "code":

@@ -1,7 +1,7 @@
 """Hook of mkdocs: text that follows from the code is generated when the site is built.
 
-A page has a line ``<!-- generated: NAME -->``; the function of that name in ``GENERATED`` returns what replaces it.
-mkdocstrings then replaces ``::: NAME`` by the documentation of a name.
+A page has a line ``<!-- generated: NAME -->``; the function of that name in ``GENERATED`` returns
+what replaces it. mkdocstrings then replaces ``::: NAME`` by the documentation of a name.
 """
 
 import inspect
@@ -89,8 +89,8 @@ SECTIONS: dict[str, tuple[type, ...]] = {
     "models": (ModelConfig,),
     "stages": (Stage,),
 }
-"""Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student besides,
-"models" = those of a model of several stages."""
+"""Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student
+besides, "models" = those of a model of several stages."""
 
 
 def topic_of(home: str) -> str:
@@ -105,7 +105,10 @@ def api() -> str:
         given = getattr(lidar_synth, name)
         topics[topic_of(home)].append(f"{given.__module__}.{given.__qualname__}")
     topics["Further names"] = list(FURTHER)
-    return "\n".join(f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names) for topic, names in topics.items())
+    return "\n".join(
+        f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names)
+        for topic, names in topics.items()
+    )
 
 
 def command_line() -> str:
@@ -138,12 +141,17 @@ def recipes() -> str:
 
 def recipe_keys() -> str:
     """A table of the keys of each section of a recipe."""
-    titles = {"": "Keys of every recipe", "distill": "Keys of a student's recipe", "models": "Keys of a model's file"}
+    titles = {
+        "": "Keys of every recipe",
+        "distill": "Keys of a student's recipe",
+        "models": "Keys of a model's file",
+    }
     parts = []
     for name, models in SECTIONS.items():
         rows = [row for model in models for row in _keys(model)]
         parts.append(
-            f"## {titles.get(name, f'`{name}`')}\n\n| key | default | meaning |\n|---|---|---|\n" + "\n".join(rows)
+            f"## {titles.get(name, f'`{name}`')}\n\n| key | default | meaning |\n|---|---|---|\n"
+            + "\n".join(rows)
         )
     return "\n\n".join(parts)
 
@@ -175,4 +183,6 @@ GENERATED: dict[str, Callable[[], str]] = {
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by mkdocs with the Markdown of a page."""
-    return re.sub(r"^<!-- generated: (.*?) -->$", lambda found: GENERATED[found[1]](), markdown, flags=re.M)
+    return re.sub(
+        r"^<!-- generated: (.*?) -->$", lambda found: GENERATED[found[1]](), markdown, flags=re.M
+    )

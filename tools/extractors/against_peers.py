@@ -1,12 +1,15 @@
-"""Every extractor beside the peers' own code, with the same random weights of the published shapes, on real scans.
+"""Every extractor beside the peers' own code, with the same random weights of the published shapes,
+on real scans.
 
-    python tools/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden FILE]
+    python tools/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden
+    FILE]
 
-CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet, lidar-bonnetal. SCANS holds
-``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will do), timm, torchvision and einops. Prints the
-largest difference of the features relative to the largest feature, and the Fréchet distance between the two halves of
-the scans (of fixed sums of the features) by our features and code, and by the peers'. ``--golden`` writes the peers'
-numbers on random points and images for the tests.
+CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet,
+lidar-bonnetal. SCANS holds ``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will
+do), timm, torchvision and einops. Prints the largest difference of the features relative to the
+largest feature, and the Fréchet distance between the two halves of the scans (of fixed sums of the
+features) by our features and code, and by the peers'. ``--golden`` writes the peers' numbers on
+random points and images for the tests.
 """
 
 import argparse
@@ -35,7 +38,8 @@ Points = NDArray[np.float32]
 
 
 class Peer(NamedTuple):
-    """A peer's extractor: features of points (N, 4), and of an input of its network (1, C, H, W) if it takes images."""
+    """A peer's extractor: features of points (N, 4), and of an input of its network (1, C, H, W) if
+    it takes images."""
 
     features: Callable[[Points], NDArray[np.floating]]
     of_image: Callable[[torch.Tensor], NDArray[np.floating]] | None = None
@@ -43,7 +47,11 @@ class Peer(NamedTuple):
 
 def _functions(path: Path, names: Iterable[str], env: dict[str, Any]) -> Namespace:
     """Some functions of a file whose imports are not needed."""
-    body = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef) and n.name in names]
+    body = [
+        n
+        for n in ast.parse(path.read_text()).body
+        if isinstance(n, ast.FunctionDef) and n.name in names
+    ]
     for function in body:
         function.decorator_list = []
     exec(compile(ast.Module(body, []), str(path), "exec"), env)
@@ -60,15 +68,24 @@ class R2Flow:
     def __init__(self, clones: Path) -> None:
         sys.path.insert(0, str(clones / "r2flow"))
         loader = clones / "r2flow" / "r2flow" / "data" / "kitti_360" / "kitti_360.py"
-        self.load = _functions(loader, ("scatter", "load_points_as_images"), {"np": np}).load_points_as_images
+        self.load = _functions(
+            loader, ("scatter", "load_points_as_images"), {"np": np}
+        ).load_points_as_images
 
     def image(self, points: Points) -> torch.Tensor:
         """(1, 5, 64, 1024) as its ``evaluate.py`` makes it from the dataset's images."""
         with tempfile.NamedTemporaryFile(suffix=".bin") as file:
             points.tofile(file.name)
-            grid = torch.from_numpy(self.load(file.name, scan_unfolding=False, H=64, W=1024)).permute(2, 0, 1)[None]
-        xyz, rflct, depth, mask = grid[:, :3], grid[:, 3:4], grid[:, 4:5], grid[:, 5:6]
-        return torch.cat([depth, xyz, rflct], 1) * mask * torch.logical_and(depth > 0.5, depth < 63.0)
+            grid = torch.from_numpy(
+                self.load(file.name, scan_unfolding=False, H=64, W=1024)
+            ).permute(2, 0, 1)[None]
+        xyz = grid[:, :3]
+        rflct = grid[:, 3:4]
+        depth = grid[:, 4:5]
+        mask = grid[:, 5:6]
+        return (
+            torch.cat([depth, xyz, rflct], 1) * mask * torch.logical_and(depth > 0.5, depth < 63.0)
+        )
 
     def rangenet(self, archive: Path, agg_type: str, channels: int) -> Peer:
         """RangeNet with R2Flow's loader; it reads a tar."""
@@ -103,15 +120,23 @@ class R2Flow:
         from r2flow.metrics.models import utls
 
         model = getattr(importlib.import_module(f"r2flow.metrics.models.{module}"), name)
-        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+        net = _loaded(
+            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive
+        )
         utls.unique = _unique
-        before, after = utls.PreProcess(), utls.PostProcess()
-        return Peer(lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy())
+        before = utls.PreProcess()
+        after = utls.PostProcess()
+        return Peer(
+            lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy()
+        )
 
 
 def _unique(x: torch.Tensor, dim: int = 0) -> tuple[torch.Tensor, ...]:
-    """R2Flow's ``unique``, which finds the first of equal values by float32 keys that tie, with a stable sort."""
-    values, inverse, counts = torch.unique(x, dim=dim, sorted=True, return_inverse=True, return_counts=True)
+    """R2Flow's ``unique``, which finds the first of equal values by float32 keys that tie, with a
+    stable sort."""
+    values, inverse, counts = torch.unique(
+        x, dim=dim, sorted=True, return_inverse=True, return_counts=True
+    )
     starts = torch.cat((counts.new_zeros(1), counts.cumsum(0)))[:-1]
     return values, inverse, counts, inverse.argsort(stable=True)[starts].sort().values
 
@@ -124,13 +149,17 @@ class LiDM:
         import lidm.eval.metric_utils as metrics
         from lidm.utils.lidar_utils import pcd2range, range2pcd
 
-        self.metrics, self.config = metrics, metrics.DATASET_CONFIG["kitti"]
-        self.project, self.unproject = pcd2range, range2pcd
+        self.metrics = metrics
+        self.config = metrics.DATASET_CONFIG["kitti"]
+        self.project = pcd2range
+        self.unproject = range2pcd
 
     def cloud(self, points: Points) -> Points:
         """(N, 3) the returns of the range image."""
         image = self.project(points[:, :3], **self.config)[0]
-        return self.unproject(image, self.config["fov"], self.config["depth_range"], 1, log_scale=False)[0].astype("f4")
+        return self.unproject(
+            image, self.config["fov"], self.config["depth_range"], 1, log_scale=False
+        )[0].astype("f4")
 
     def image(self, points: Points) -> NDArray[np.floating]:
         """(4, 64, 1024) the cloud, projected again."""
@@ -154,10 +183,14 @@ class LiDM:
         import importlib
 
         model = importlib.import_module(f"lidm.modules.{module}.model").Model
-        net = _loaded(model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive)
+        net = _loaded(
+            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive
+        )
 
         def features(points: Points) -> NDArray[np.floating]:
-            voxels = self.metrics.pcd2voxel(self.metrics.preprocess_pcd(self.cloud(points), **self.config))
+            voxels = self.metrics.pcd2voxel(
+                self.metrics.preprocess_pcd(self.cloud(points), **self.config)
+            )
             out = net(self.metrics.sparse_collate_fn([voxels]), return_final_logits=True)
             return self.metrics.batch2list(out, "depth", **self.config)[0]
 
@@ -172,7 +205,11 @@ class R3DPA:
         env = {"np": np, "torch": torch}
         dataset = _functions(clones / "R3DPA" / "dataset_kitti.py", ("pcd2range",), env)
         config = yaml.safe_load((clones / "R3DPA" / "configs" / "kitti.yaml").read_text())
-        self.arguments = {"size": config["size"], "fov": config["fov"], "depth_range": config["depth_range"]}
+        self.arguments = {
+            "size": config["size"],
+            "fov": config["fov"],
+            "depth_range": config["depth_range"],
+        }
         self.project = dataset.pcd2range
 
     def image(self, points: Points) -> NDArray[np.float32]:
@@ -191,13 +228,22 @@ class R3DPA:
 
         def of_image(image: torch.Tensor) -> NDArray[np.floating]:
             inputs = ((image - net.image_mean) / net.image_std)[:, : settings["in_channels"]]
-            return net.rangevit.forward_2d_features(inputs)[0].unflatten(1, (8, -1)).mean((2, 3)).flatten().numpy()
+            return (
+                net.rangevit.forward_2d_features(inputs)[0]
+                .unflatten(1, (8, -1))
+                .mean((2, 3))
+                .flatten()
+                .numpy()
+            )
 
-        return Peer(lambda p: net([self.image(p)])[0].numpy(), of_image if name == "rangevit" else None)
+        return Peer(
+            lambda p: net([self.image(p)])[0].numpy(), of_image if name == "rangevit" else None
+        )
 
 
 def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
-    """Load a checkpoint as the peers do, and make sure that it reached every weight before the classifier."""
+    """Load a checkpoint as the peers do, and make sure that it reached every weight before the
+    classifier."""
     state = torch.load(archive / "model.ckpt", weights_only=True)["state_dict"]
     missing, unexpected = net.load_state_dict(state, strict=False)
     assert not unexpected, unexpected
@@ -205,10 +251,14 @@ def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
     return net.eval()
 
 
-def _bonnetal(clones: Path, archive: Path, name: str, pool: Callable[[torch.Tensor, torch.Tensor], Any]) -> Peer:
-    """lidar-bonnetal's own network on its own projection; ``pool`` makes features of (1, C, H, W) and the image.
+def _bonnetal(
+    clones: Path, archive: Path, name: str, pool: Callable[[torch.Tensor, torch.Tensor], Any]
+) -> Peer:
+    """lidar-bonnetal's own network on its own projection; ``pool`` makes features of (1, C, H, W)
+    and the image.
 
-    Its projection takes the cell of the first point for empty: a point that another one hides is put first.
+    Its projection takes the cell of the first point for empty: a point that another one hides is
+        put first.
     """
     import importlib
 
@@ -217,12 +267,17 @@ def _bonnetal(clones: Path, archive: Path, name: str, pool: Callable[[torch.Tens
         sys.path.insert(0, train)
     from common.laserscan import LaserScan
 
-    networks = importlib.import_module(f"backbones.{name}"), importlib.import_module(f"tasks.semantic.decoders.{name}")
+    networks = (
+        importlib.import_module(f"backbones.{name}"),
+        importlib.import_module(f"tasks.semantic.decoders.{name}"),
+    )
     settings = yaml.safe_load((archive / "arch_cfg.yaml").read_text())
     stride = {"squeezeseg": 16, "darknet": 32}[name]
     backbone = networks[0].Backbone(params=settings["backbone"] | {"OS": stride})
     _, skips = backbone(torch.zeros(1, 5, 64, 64))
-    decoder = networks[1].Decoder(settings["decoder"], skips, OS=stride, feature_depth=backbone.get_last_depth())
+    decoder = networks[1].Decoder(
+        settings["decoder"], skips, OS=stride, feature_depth=backbone.get_last_depth()
+    )
     backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
     decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
     backbone.eval(), decoder.eval()
@@ -236,7 +291,11 @@ def _bonnetal(clones: Path, archive: Path, name: str, pool: Callable[[torch.Tens
         scan = LaserScan(project=True, H=64, W=sensor["img_prop"]["width"], fov_up=3, fov_down=-25)
         hidden_first = np.concatenate([points[:1] * np.float32([1.5, 1.5, 1.5, 1]), points])
         scan.set_points(hidden_first[:, :3].copy(), hidden_first[:, 3].copy())
-        channels = [scan.proj_range[None], scan.proj_xyz.transpose(2, 0, 1), scan.proj_remission[None]]
+        channels = [
+            scan.proj_range[None],
+            scan.proj_xyz.transpose(2, 0, 1),
+            scan.proj_remission[None],
+        ]
         mask = torch.from_numpy(scan.proj_mask).float()
         return of_image(((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None])
 
@@ -245,7 +304,12 @@ def _bonnetal(clones: Path, archive: Path, name: str, pool: Callable[[torch.Tens
 
 def _squeezeseg(clones: Path, archive: Path) -> Peer:
     """The pooling is this package's."""
-    return _bonnetal(clones, archive, "squeezeseg", lambda maps, image: maps[0][:, image[0].abs().sum(0) > 0].mean(1))
+    return _bonnetal(
+        clones,
+        archive,
+        "squeezeseg",
+        lambda maps, image: maps[0][:, image[0].abs().sum(0) > 0].mean(1),
+    )
 
 
 def _rangenet21(clones: Path, archive: Path) -> Peer:
@@ -258,8 +322,11 @@ def _rangenet21(clones: Path, archive: Path) -> Peer:
 
 
 def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
-    """The peer's code and the preparation for each comparison: {"extractor" or "extractor as preparation": ...}."""
-    r2flow, lidm, r3dpa = R2Flow(clones), LiDM(clones), R3DPA(clones)
+    """The peer's code and the preparation for each comparison: {"extractor" or "extractor as
+    preparation": ...}."""
+    r2flow = R2Flow(clones)
+    lidm = LiDM(clones)
+    r3dpa = R3DPA(clones)
     return {
         "rangenet53": (lambda a: r2flow.rangenet(a, "subsample", 5), "r2flow"),
         "r2flow_rangenet": (lambda a: r2flow.rangenet(a, "depth", 4), "r2flow"),
@@ -269,7 +336,10 @@ def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
         "lidm_rangenet": (lidm.rangenet, "lidm"),
         "lidm_minkowski": (lambda a: lidm.voxels(a, "minkowskinet"), "lidm"),
         "lidm_spvcnn": (lambda a: lidm.voxels(a, "spvcnn"), "lidm"),
-        "lidm_minkowski as r2flow": (lambda a: r2flow.voxels(a, "minkowskinet", "MinkowskiNet"), "r2flow"),
+        "lidm_minkowski as r2flow": (
+            lambda a: r2flow.voxels(a, "minkowskinet", "MinkowskiNet"),
+            "r2flow",
+        ),
         "lidm_spvcnn as r2flow": (lambda a: r2flow.voxels(a, "spvcnn", "SPVCNN"), "r2flow"),
         "r3dpa_rangevit": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
         "r3dpa_rangevit_remission": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
@@ -278,11 +348,14 @@ def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
 
 
 def read(path: Path) -> Points:
-    """(N, 4) the points of a scan, without those whose place in an image depends on rounding or on the sort in the
-    peers' code: points that lie in one cell at one range with an earlier point, and points at the edge of a cell."""
+    """(N, 4) the points of a scan, without those whose place in an image depends on rounding or on
+    the sort in the peers' code: points that lie in one cell at one range with an earlier point, and
+    points at the edge of a cell."""
     points = np.fromfile(path, np.float32).reshape(-1, 4)
     cells = locate(points[:, :3].copy(), presets()["hdl64e_kitti360"])
-    _, first = np.unique(np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True)
+    _, first = np.unique(
+        np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True
+    )
     points = points[np.sort(first)]
     x, y, z = points[:, :3].T.astype(np.float64)
     column = (1 - np.arctan2(y, x) / np.pi) / 2 * 2048
@@ -293,7 +366,10 @@ def read(path: Path) -> Points:
 
 def compare(clones: Path, files: list[Path], only: list[str]) -> None:
     """Print the table."""
-    print("| extractor | prepared as | features | largest difference | Frechet distance: ours | the peer's |")
+    print(
+        "| extractor | prepared as | features | largest difference | Frechet distance: ours | the "
+        "peer's |"
+    )
     print("|---|---|---:|---:|---:|---:|")
     frechet = peers_frechet(clones)
     for key, (make, preparation) in peers(clones).items():
@@ -302,20 +378,36 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
             continue
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode():
             archive = write(name, Path(folder) / EXTRACTORS[name].archives[0])
-            ours, theirs = load_extractor(name, archive, preparation), make(archive)
+            ours = load_extractor(name, archive, preparation)
+            theirs = make(archive)
             rows: list[list[NDArray[Any]]] = [[], []]
             for file in files:
                 points = read(file)
-                scan = Scan(points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id=file.stem)
+                scan = Scan(
+                    points[:, :3].copy(),
+                    points[:, 3].copy(),
+                    presets()["hdl64e_kitti360"],
+                    id=file.stem,
+                )
                 rows[0].append(ours([scan])[0])
                 rows[1].append(np.asarray(theirs.features(points)))
-        a, b = np.stack(rows[0]), np.stack(rows[1])
-        error, half = abs(a - b).max() / abs(b).max(), len(files) // 2
+        a = np.stack(rows[0])
+        b = np.stack(rows[1])
+        error = abs(a - b).max() / abs(b).max()
+        half = len(files) // 2
         distances = ["", ""]
         if half > 2:
-            ours, theirs = reduced(a, half - 1), reduced(b, half - 1)
-            distances = [f"{v:.6g}" for v in (frechet_distance(ours[:half], ours[half:]), frechet(theirs, half))]
-        print(f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | {distances[1]} |", flush=True)
+            ours = reduced(a, half - 1)
+            theirs = reduced(b, half - 1)
+            distances = [
+                f"{v:.6g}"
+                for v in (frechet_distance(ours[:half], ours[half:]), frechet(theirs, half))
+            ]
+        print(
+            f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | "
+            f"{distances[1]} |",
+            flush=True,
+        )
 
 
 def peers_frechet(clones: Path) -> Callable[[NDArray[np.float64], int], float]:
@@ -325,18 +417,21 @@ def peers_frechet(clones: Path) -> Callable[[NDArray[np.float64], int], float]:
     code = _functions(path, ("calculate_frechet_distance",), env)
 
     def distance(x: NDArray[np.float64], first: int) -> float:
-        moments = [m for part in (x[:first], x[first:]) for m in (part.mean(0), np.cov(part, rowvar=False))]
+        moments = [
+            m for part in (x[:first], x[first:]) for m in (part.mean(0), np.cov(part, rowvar=False))
+        ]
         return float(code.calculate_frechet_distance(*moments))
 
     return distance
 
 
 def golden(clones: Path, path: Path) -> None:
-    """Write what the peers' networks make of random images or points, their Fréchet distances between two sets of them,
-    and their images of the points."""
+    """Write what the peers' networks make of random images or points, their Fréchet distances
+    between two sets of them, and their images of the points."""
     from safetensors.numpy import save_file
 
-    points, frechet = random_points(), peers_frechet(clones)
+    points = random_points()
+    frechet = peers_frechet(clones)
     found: dict[str, Any] = {"points": points}
     makers = {"r2flow": R2Flow(clones), "lidm": LiDM(clones)}
     for name, maker in makers.items():
@@ -350,12 +445,16 @@ def golden(clones: Path, path: Path) -> None:
             peer = make(write(name, Path(folder) / EXTRACTORS[name].archives[0]))
             channels = 4 if name in ("lidm_rangenet", "r2flow_rangenet") else 5
 
-            def of(seed: int, scale: float, peer: Peer = peer, channels: int = channels) -> NDArray[np.floating]:
+            def of(
+                seed: int, scale: float, peer: Peer = peer, channels: int = channels
+            ) -> NDArray[np.floating]:
                 if peer.of_image:
                     return np.asarray(peer.of_image(random_image(channels, seed, scale)))
                 return np.asarray(peer.features(random_points(1000, seed, scale)))
 
-            features = peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
+            features = (
+                peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
+            )
             found[key] = np.ascontiguousarray(features, np.float32)
             both = reduced(np.stack([of(*one) for one in two_sets()]))
             found[f"{key} distance"] = np.array([frechet(both, PER_SET)])
@@ -364,7 +463,9 @@ def golden(clones: Path, path: Path) -> None:
 
 def main() -> None:
     """Parse the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("clones", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", nargs="*", default=[], choices=list(WRITERS))

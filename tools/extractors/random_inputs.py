@@ -1,5 +1,5 @@
-"""Random inputs of the extractors, and the few numbers to which their features are reduced: for the peers' kept numbers
-and for the tests that compare ours with them."""
+"""Random inputs of the extractors, and the few numbers to which their features are reduced: for the
+peers' kept numbers and for the tests that compare ours with them."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -8,18 +8,30 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-PER_SET, KEPT = 5, 3
-"""Inputs in each of the two sets of a Fréchet distance, and numbers kept of the features of each."""
+PER_SET = 5
+KEPT = 3
+"""Inputs in each of the two sets of a Fréchet distance, and numbers kept of the features of
+each."""
 SCALES = (1.0, 1.25)
-"""Of the values of the inputs of both sets, so that their distance is large beside the rounding of the features."""
+"""Of the values of the inputs of both sets, so that their distance is large beside the rounding of
+the features."""
 
 
 def random_points(count: int = 3000, seed: int = 5, scale: float = 1.0) -> NDArray[np.float32]:
     """(N, 4) points all around a sensor, 2 m to 70 m away, and their reflectance."""
     rng = np.random.RandomState(seed)
-    azimuth, elevation = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(-24.5, 2.5, count))
-    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    points = np.stack(directions, -1) * np.exp(rng.uniform(np.log(2), np.log(70), count))[:, None] / scale
+    azimuth = rng.uniform(-np.pi, np.pi, count)
+    elevation = np.radians(rng.uniform(-24.5, 2.5, count))
+    directions = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
+    points = (
+        np.stack(directions, -1)
+        * np.exp(rng.uniform(np.log(2), np.log(70), count))[:, None]
+        / scale
+    )
     return np.column_stack([points, rng.random_sample(count)]).astype(np.float32)
 
 
@@ -36,8 +48,10 @@ def two_sets() -> Iterator[tuple[int, float]]:
 
 
 def reduced(features: NDArray[np.floating], kept: int = KEPT) -> NDArray[np.float64]:
-    """(N, D) features to (N, kept), fixed random sums of all of them: the peers' Fréchet distance needs covariances of
-    full rank, which few inputs have in few dimensions only."""
-    weights = np.random.RandomState(7).normal(size=(features.shape[1], kept)) / np.sqrt(features.shape[1])
+    """(N, D) features to (N, kept), fixed random sums of all of them: the peers' Fréchet distance
+    needs covariances of full rank, which few inputs have in few dimensions only."""
+    weights = np.random.RandomState(7).normal(size=(features.shape[1], kept)) / np.sqrt(
+        features.shape[1]
+    )
     found: NDArray[np.float64] = features.astype(np.float64) @ weights
     return found

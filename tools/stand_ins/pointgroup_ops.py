@@ -1,4 +1,5 @@
-"""The names of Pointcept's pointgroup_ops, which is compiled for CUDA only, to import Pointcept without it."""
+"""The names of Pointcept's pointgroup_ops, which is compiled for CUDA only, to import Pointcept
+without it."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """The function of Pointcept's pointops that Sonata calls, by torch's own operators.
 
-pointops is compiled for CUDA only (``libs/pointops`` of Pointcept). Put this folder on PYTHONPATH to try Pointcept on a
-CPU; on a GPU install the real library.
+pointops is compiled for CUDA only (``libs/pointops`` of Pointcept). Put this folder on PYTHONPATH
+to try Pointcept on a CPU; on a GPU install the real library.
 """
 
 import torch
@@ -9,7 +9,11 @@ from torch import Tensor
 
 
 def knn_query(
-    nsample: int, xyz: Tensor, offset: Tensor, new_xyz: Tensor | None = None, new_offset: Tensor | None = None
+    nsample: int,
+    xyz: Tensor,
+    offset: Tensor,
+    new_xyz: Tensor | None = None,
+    new_offset: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The nearest points of the same sample.
 
@@ -23,7 +27,9 @@ def knn_query(
     Returns:
         (M, K) int32 indices into ``xyz``, -1 where a sample has fewer points, and their distances.
     """
-    new_xyz, new_offset = (xyz, offset) if new_xyz is None or new_offset is None else (new_xyz, new_offset)
+    new_xyz, new_offset = (
+        (xyz, offset) if new_xyz is None or new_offset is None else (new_xyz, new_offset)
+    )
     index = torch.full((len(new_xyz), nsample), -1, dtype=torch.int32, device=xyz.device)
     distance = torch.full((len(new_xyz), nsample), 1e5, device=xyz.device)
     ends, new_ends = ([0, *each.tolist()] for each in (offset, new_offset))
@@ -31,5 +37,8 @@ def knn_query(
         count = min(nsample, end - start)
         for chunk in torch.split(torch.arange(first, last, device=xyz.device), 4096):
             near = torch.cdist(new_xyz[chunk], xyz[start:end]).topk(count, largest=False)
-            index[chunk, :count], distance[chunk, :count] = (near.indices + start).int(), near.values
+            index[chunk, :count], distance[chunk, :count] = (
+                (near.indices + start).int(),
+                near.values,
+            )
     return index, distance

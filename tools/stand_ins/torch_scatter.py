@@ -1,7 +1,7 @@
 """The functions of torch_scatter that FRNet and Pointcept call, by torch's own operators.
 
-torch_scatter is distributed as source only and takes half an hour to compile. Put this folder on PYTHONPATH to try
-these trainers without it; on a GPU install the real library.
+torch_scatter is distributed as source only and takes half an hour to compile. Put this folder on
+PYTHONPATH to try these trainers without it; on a GPU install the real library.
 """
 
 import torch
@@ -15,7 +15,9 @@ def scatter_max(
     return [_reduce(src, index, dim, dim_size, "amax")]
 
 
-def scatter_mean(src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None) -> Tensor:
+def scatter_mean(
+    src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
+) -> Tensor:
     """The mean of the values for each index; 0 for an index without values."""
     return _reduce(src, index, dim, dim_size, "mean")
 
@@ -28,7 +30,8 @@ def segment_coo(
 
 
 def segment_csr(src: Tensor, indptr: Tensor, out: None = None, reduce: str = "sum") -> Tensor:
-    """Reduce rows of consecutive segments; segment i has the rows from ``indptr[i]`` to ``indptr[i + 1]``."""
+    """Reduce rows of consecutive segments; segment i has the rows from ``indptr[i]`` to ``indptr[i
+    + 1]``."""
     lengths = indptr.diff()
     index = torch.arange(len(lengths), device=src.device).repeat_interleave(lengths)
     return _reduce(src, index, 0, len(lengths), KINDS[reduce])
@@ -46,7 +49,8 @@ def scatter_min(
 
 
 def scatter_softmax(*args: object, **options: object) -> None:
-    """Imported by Pointcept for its StratifiedTransformer, which needs further libraries for a GPU."""
+    """Imported by Pointcept for its StratifiedTransformer, which needs further libraries for a
+    GPU."""
     raise RuntimeError("install torch_scatter")
 
 
@@ -54,6 +58,10 @@ def _reduce(src: Tensor, index: Tensor, dim: int, size: int | None, how: str) ->
     size = int(index.max()) + 1 if size is None else size
     shape = list(src.shape)
     shape[dim] = size
-    where = index.view([-1 if i == dim % src.ndim else 1 for i in range(src.ndim)]) if index.ndim == 1 else index
+    where = (
+        index.view([-1 if i == dim % src.ndim else 1 for i in range(src.ndim)])
+        if index.ndim == 1
+        else index
+    )
     zeros = torch.zeros(shape, dtype=src.dtype, device=src.device)
     return zeros.scatter_reduce(dim, where.expand_as(src), src, how, include_self=False)

@@ -1,4 +1,5 @@
-"""CENet: its ``train.py`` with validation on 64 x 512 images, with its stock network and with that of FIDNet."""
+"""CENet: its ``train.py`` with validation on 64 x 512 images, with its stock network and with that
+of FIDNet."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +9,11 @@ from trainers.trial import Failed, Row, Trial
 
 TITLE = "CENet"
 ARCH = "config/arch/senet-512.yml"
-FIDNET = {'pipeline: "res"': 'pipeline: "fid"', "aux_loss: True": "aux_loss: False", "Hardswish": "LeakyReLU"}
+FIDNET = {
+    'pipeline: "res"': 'pipeline: "fid"',
+    "aux_loss: True": "aux_loss: False",
+    "Hardswish": "LeakyReLU",
+}
 
 
 def rows(trial: Trial) -> Iterator[Row]:
@@ -30,7 +35,9 @@ def one(trial: Trial, python: Path, tree: Path, network: str) -> Row:
     names["/data/mix.yaml"] = mixture(trial)
     expect = [EPOCH, r"Loss \d", "Validation set:", "IoU avg"]
     skip = r" -p |^pip" if network == "fid" else " -p "
-    said = trial.type_page(f"train {network}", python, PAGE, names, skip=skip, expect=expect, minutes=60)
+    said = trial.type_page(
+        f"train {network}", python, PAGE, names, skip=skip, expect=expect, minutes=60
+    )
     if "Loss nan" in said or not list(log.rglob("SENet*")):
         raise Failed("a loss of NaN, or no checkpoint")
     left_out = "mixed precision; it cannot resume an epoch"

@@ -17,7 +17,11 @@ def rows(trial: Trial) -> Iterator[Row]:
     own = yaml.safe_load((tree / "config/semantickitti.yaml").read_text())
     own["dataset_params"]["pc_dataset_type"] = "SemKITTI_mixed"
     for loader in ("train_data_loader", "val_data_loader"):
-        own[loader] |= {"data_path": f"{trial.data.semantic_kitti}/sequences", "num_workers": 1, "batch_size": 1}
+        own[loader] |= {
+            "data_path": f"{trial.data.semantic_kitti}/sequences",
+            "num_workers": 1,
+            "batch_size": 1,
+        }
     own["model_params"] |= {"output_shape": [120, 90, 16], "init_size": 8, "out_fea_dim": 64}
     model = trial.folder / "model.pt"
     own["train_params"] |= {"max_num_epochs": 2, "eval_every_n_steps": 8}
@@ -26,11 +30,21 @@ def rows(trial: Trial) -> Iterator[Row]:
     config.write_text(yaml.safe_dump(own))
     names = {"Cylinder3D": tree, "/data/mix.yaml": mixture(trial), "config/mixed.yaml": config}
     trial.type_page(
-        "train", python, "cylinder3d", names, minutes=120,
-        expect=[r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"loss: \d", r"Current val loss is \d"],
-    )  # fmt: skip
+        "train",
+        python,
+        "cylinder3d",
+        names,
+        minutes=120,
+        expect=[
+            r"epoch 1: \d+ samples, [1-9]\d* of them synthetic",
+            r"loss: \d",
+            r"Current val loss is \d",
+        ],
+    )
     if not model.is_file():
         raise Failed("no checkpoint")
-    left_out = "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch"
+    left_out = (
+        "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch"
+    )
     script = "cylinder3d train_cylinder_asym.py"
     yield trial.row(script, ["training", "validation", "checkpoint"], left_out)

@@ -1,8 +1,9 @@
-"""Datasets on disk for the trials: real scans where the machine has them, the town beside them, and synthetic scans.
+"""Datasets on disk for the trials: real scans where the machine has them, the town beside them, and
+synthetic scans.
 
 Real scans come from the folders that LIDAR_SYNTH_LABELLED_SCANS (``semantic_kitti/sequences``) and
-LIDAR_SYNTH_REAL_SCANS (``kitti_object/training``) name; without them every scan is one of the town. Each dataset is
-written when it is first used.
+LIDAR_SYNTH_REAL_SCANS (``kitti_object/training``) name; without them every scan is one of the town.
+Each dataset is written when it is first used.
 """
 
 import os
@@ -26,24 +27,32 @@ class Data:
 
     Args:
         folder: where they are written.
-        scans: number of scans of each SemanticKITTI sequence, and of the town in KITTI's object set.
+        scans: number of scans of each SemanticKITTI sequence, and of the town in KITTI's object
+            set.
     """
 
     def __init__(self, folder: Path, scans: int = 1) -> None:
-        self.folder, self.scans = folder, scans
+        self.folder = folder
+        self.scans = scans
 
     @cached_property
     def real(self) -> str:
         """Where the real scans come from, for the table."""
-        kinds = {"LIDAR_SYNTH_LABELLED_SCANS": "SemanticKITTI", "LIDAR_SYNTH_REAL_SCANS": "KITTI object"}
+        kinds = {
+            "LIDAR_SYNTH_LABELLED_SCANS": "SemanticKITTI",
+            "LIDAR_SYNTH_REAL_SCANS": "KITTI object",
+        }
         given = [kind for variable, kind in kinds.items() if os.environ.get(variable)]
         return f"{' and '.join(given)}, and the town" if given else "the town"
 
     @cached_property
     def semantic_kitti(self) -> Path:
-        """SemanticKITTI's ``dataset`` folder: sequences 00 to 10; those without real scans are streets of the town."""
+        """SemanticKITTI's ``dataset`` folder: sequences 00 to 10; those without real scans are
+        streets of the town."""
         out = self.folder / "semantic_kitti"
-        recorded = Path(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS", "")) / "semantic_kitti" / "sequences"
+        recorded = (
+            Path(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS", "")) / "semantic_kitti" / "sequences"
+        )
         use = bool(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS"))
         for number in (*TRAINING, VALIDATION):
             source = recorded / (REAL_VALIDATION if number == VALIDATION else number)
@@ -58,7 +67,8 @@ class Data:
 
     @cached_property
     def kitti(self) -> Path:
-        """KITTI's object set with ``ImageSets``: the real frames that have an image, then frames of the town.
+        """KITTI's object set with ``ImageSets``: the real frames that have an image, then frames of
+        the town.
 
         The last frame of each kind is for validation.
         """
@@ -76,15 +86,23 @@ class Data:
         if os.environ.get("LIDAR_SYNTH_REAL_SCANS") and recorded.is_dir():
             kinds = {"velodyne": ".bin", "label_2": ".txt", "calib": ".txt", "image_2": ".png"}
             for path in sorted((recorded / "velodyne").glob("*.bin")):
-                files = {kind: recorded / kind / f"{path.stem}{ending}" for kind, ending in kinds.items()}
+                files = {
+                    kind: recorded / kind / f"{path.stem}{ending}" for kind, ending in kinds.items()
+                }
                 if all(file.is_file() for file in files.values()):
                     real.append(path.stem)
                     for kind, file in files.items():
                         shutil.copyfile(file, made / "training" / kind / file.name)
         validation = [frames[-1] for frames in (real, town) if frames]
         training = [frame for frame in real + town if frame not in validation]
-        for split, frames in {"train": training, "val": validation, "trainval": sorted(training + validation)}.items():
-            (made / "ImageSets" / f"{split}.txt").write_text("".join(f"{frame}\n" for frame in sorted(frames)))
+        for split, frames in {
+            "train": training,
+            "val": validation,
+            "trainval": sorted(training + validation),
+        }.items():
+            (made / "ImageSets" / f"{split}.txt").write_text(
+                "".join(f"{frame}\n" for frame in sorted(frames))
+            )
         made.rename(out)
         return out
 
@@ -119,7 +137,9 @@ class Data:
             (target / kind).mkdir(parents=True)
         for frame in frames:
             shutil.copyfile(frame, target / "velodyne" / frame.name)
-            shutil.copyfile(source / "labels" / f"{frame.stem}.label", target / "labels" / f"{frame.stem}.label")
+            shutil.copyfile(
+                source / "labels" / f"{frame.stem}.label", target / "labels" / f"{frame.stem}.label"
+            )
         for name in ("calib.txt", "poses.txt", "times.txt"):
             if (source / name).is_file():
                 shutil.copyfile(source / name, target / name)

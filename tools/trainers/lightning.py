@@ -1,4 +1,5 @@
-"""Lightning from the package index: fit with validation, and runs resumed at an epoch's start and in its middle."""
+"""Lightning from the package index: fit with validation, and runs resumed at an epoch's start and
+in its middle."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,8 @@ SCRIPTS = Path(__file__).parent / "scripts"
 """``segmenter.py`` there is the reader's own model."""
 OPTIONS = (
     "accelerator='cpu', logger=False, enable_progress_bar=False, "
-    "callbacks=[lightning.pytorch.callbacks.ModelCheckpoint({folder!r}, 'last', every_n_train_steps=1)]"
+    "callbacks=[lightning.pytorch.callbacks.ModelCheckpoint({folder!r}, 'last', "
+    "every_n_train_steps=1)]"
 )
 
 
@@ -41,5 +43,8 @@ def rows(trial: Trial) -> Iterator[Row]:
         first = fit(f"stop in the {name} of an epoch", name, limit)
         rest = fit(f"resume from the {name} of an epoch", name, resumed=True)
         if not rest or first + rest != seen:
-            raise Failed(f"resuming from the {name} of an epoch gives other samples; see {trial.folder / 'logs'}")
+            raise Failed(
+                f"resuming from the {name} of an epoch gives other samples; see "
+                f"{trial.folder / 'logs'}"
+            )
     yield trial.row("trainer.fit(model, data)", STEPS, "GPUs: `on_device`")

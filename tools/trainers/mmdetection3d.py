@@ -1,7 +1,10 @@
-"""MMDetection3D from the package index: its stock ``train.py`` with validation, on KITTI, SemanticKITTI and nuScenes.
+"""MMDetection3D from the package index: its stock ``train.py`` with validation, on KITTI,
+SemanticKITTI and nuScenes.
 
-MMCV_WHEEL names a wheel of mmcv 2.1.0 with its operators; without it they are compiled. FRNet, the network for
-SemanticKITTI, runs if FRNET_ROOT names a clone of its repository: it needs torch-scatter, which is compiled. MinkUNet
+MMCV_WHEEL names a wheel of mmcv 2.1.0 with its operators; without it they are compiled. FRNet, the
+network for
+SemanticKITTI, runs if FRNET_ROOT names a clone of its repository: it needs torch-scatter, which is
+    compiled. MinkUNet
 cannot run on a CPU, because its voxelisation sends tensors to CUDA.
 """
 
@@ -30,18 +33,26 @@ LEFT_OUT = {
     "frnet_semantickitti.py": "MinkUNet, whose voxelisation sends tensors to CUDA",
 }
 ENVIRONMENT = {"NUMBA_ENABLE_CUDASIM": "1"}
-"""KITTI's metrics are kernels for CUDA by numba, which simulates them on a CPU if it is asked to."""
+"""KITTI's metrics are kernels for CUDA by numba, which simulates them on a CPU if it is asked
+to."""
 
 
 def rows(trial: Trial) -> Iterator[Row]:
     """A few iterations, validation and a checkpoint of each configuration, and a resumed run."""
     python = trial.environment()
-    installer = {"VENV": python.parent.parent, "tools/install_mmdet3d.sh": ROOT / "tools" / "install_mmdet3d.sh"}
+    installer = {
+        "VENV": python.parent.parent,
+        "tools/install_mmdet3d.sh": ROOT / "tools" / "install_mmdet3d.sh",
+    }
     trial.type_page("install", python, PAGE, installer, skip="^(?!bash)", minutes=90)
     trial.install(python, "spconv")
-    configs, env = dict(RUNS), ENVIRONMENT | {"PYTHONPATH": str(SCRIPTS)}
+    configs = dict(RUNS)
+    env = ENVIRONMENT | {"PYTHONPATH": str(SCRIPTS)}
     if os.environ.get("FRNET_ROOT"):
-        env |= {"PYTHONPATH": f"{SCRIPTS}:{trial.tree('FRNET_ROOT')}", "FRNET_ROOT": str(trial.tree("FRNET_ROOT"))}
+        env |= {
+            "PYTHONPATH": f"{SCRIPTS}:{trial.tree('FRNET_ROOT')}",
+            "FRNET_ROOT": str(trial.tree("FRNET_ROOT")),
+        }
         trial.install(python, "wheel")
         trial.install(python, "torch-scatter", options=["--no-build-isolation"])
     else:
@@ -52,7 +63,8 @@ def rows(trial: Trial) -> Iterator[Row]:
 
 
 def prepare(trial: Trial, python: Path, configs: list[str], env: dict[str, str]) -> None:
-    """Write data, lists and short configurations to the trial's folder; the page writes SemanticKITTI's lists."""
+    """Write data, lists and short configurations to the trial's folder; the page writes
+    SemanticKITTI's lists."""
     nuscenes = trial.folder / "nuscenes"
     trial.run("nuScenes", [python, SCRIPTS / "nuscenes_town.py", nuscenes])
     data = ["--kitti", trial.data.kitti, "--nuscenes", nuscenes]
@@ -63,24 +75,35 @@ def prepare(trial: Trial, python: Path, configs: list[str], env: dict[str, str])
     trial.run("prepare", command, env=env)
     shutil.copytree(trial.data.semantic_kitti, trial.folder / "data" / "semantickitti")
     names = {'"bank"': repr(str(trial.data.bank))}
-    trial.type_page("lists", python, PAGE, names, skip="^bash|^python VENV|custom_imports|data/nuscenes")
+    trial.type_page(
+        "lists", python, PAGE, names, skip="^bash|^python VENV|custom_imports|data/nuscenes"
+    )
 
 
 def one(trial: Trial, python: Path, config: str, metric: str, env: dict[str, str]) -> Row:
     """Train with a configuration, and for the first one resume from the middle."""
-    name, ran = config.removesuffix(".py"), ["training", "validation", "checkpoint"]
+    name = config.removesuffix(".py")
+    ran = ["training", "validation", "checkpoint"]
     out = trial.folder / f"work-{name}"
 
     def train(title: str, arguments: str, expect: list[str]) -> list[str]:
         names = {"VENV": python.parent.parent, "CONFIG": f"{config} {arguments}"}
-        said = trial.type_page(title, python, PAGE, names, skip="^(?!python VENV)", env=env, expect=expect, minutes=120)
+        said = trial.type_page(
+            title, python, PAGE, names, skip="^(?!python VENV)", env=env, expect=expect, minutes=120
+        )
         return [line for line in said.splitlines() if line.startswith("samples ")]
 
     seen = train(name, f"--work-dir {out}", [r"loss: \d", metric])
     if len(seen) != ITERATIONS or not (out / f"iter_{ITERATIONS}.pth").is_file():
-        raise Failed(f"{name}: {len(seen)} of {ITERATIONS} iterations, or no checkpoint; see {trial.folder / 'logs'}")
+        raise Failed(
+            f"{name}: {len(seen)} of {ITERATIONS} iterations, or no checkpoint; see "
+            f"{trial.folder / 'logs'}"
+        )
     if config == next(iter(RUNS)):
-        load = f"--resume {out / f'iter_{ITERATIONS // 2}.pth'} --work-dir {trial.folder / 'work-resumed'}"
+        load = (
+            f"--resume {out / f'iter_{ITERATIONS // 2}.pth'} --work-dir "
+            f"{trial.folder / 'work-resumed'}"
+        )
         rest = train(f"{name} resumed", load, [])
         if rest != seen[ITERATIONS // 2 :]:
             raise Failed(f"{name}: the resumed run saw {rest} instead of {seen}")

@@ -1,4 +1,5 @@
-"""Open3D-ML: the lines of its page, with the ML part that is bundled with Open3D and its pipeline, RandLANet."""
+"""Open3D-ML: the lines of its page, with the ML part that is bundled with Open3D and its pipeline,
+RandLANet."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +27,9 @@ def rows(trial: Trial) -> Iterator[Row]:
     trial.type_page("train", python, PAGE, names, skip=PIP, expect=expect, minutes=90)
     if not list(trial.folder.rglob("ckpt_00001.pth")):
         raise Failed("no checkpoint")
-    left_out = "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch"
+    left_out = (
+        "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch"
+    )
     yield trial.row("pipeline.run_train()", ["training", "validation", "checkpoint"], left_out)
 
 

@@ -1,4 +1,5 @@
-"""OpenPCDet's own ``train.py`` with its evaluation: PointPillars on KITTI, CenterPoint with voxels on nuScenes."""
+"""OpenPCDet's own ``train.py`` with its evaluation: PointPillars on KITTI, CenterPoint with voxels
+on nuScenes."""
 
 import re
 import shutil
@@ -16,7 +17,10 @@ TITLE = "OpenPCDet 0.6"
 
 PAGE = "openpcdet"
 SCRIPTS = Path(__file__).parent / "scripts"
-LEFT_OUT = "its GPU kernels: non-maximum suppression is ours, from its overlaps for a CPU; `pointnet2`, RoI pooling"
+LEFT_OUT = (
+    "its GPU kernels: non-maximum suppression is ours, from its overlaps for a CPU; `pointnet2`, "
+    "RoI pooling"
+)
 
 
 def rows(trial: Trial) -> Iterator[Row]:
@@ -32,7 +36,10 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     """Stock PointPillars on cars, pedestrians and cyclists."""
     data = trial.folder / "kitti"
     shutil.copytree(trial.data.kitti, data)
-    trial.run("KITTI's lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data, trial.data.objects])
+    trial.run(
+        "KITTI's lists",
+        [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data, trial.data.objects],
+    )
     mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "mix"}
     mixture |= {"label_options": {"objects": str(trial.data.objects)}}
 
@@ -57,15 +64,23 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
 
 
 def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
-    """Stock CenterPoint with voxels of 0.1 m; town scans of nuScenes' sensor are real and synthetic ones."""
+    """Stock CenterPoint with voxels of 0.1 m; town scans of nuScenes' sensor are real and synthetic
+    ones."""
     data = trial.folder / "nuscenes"
     trial.run("nuScenes", [python, SCRIPTS / "nuscenes_town.py", data / "v1.0-mini"])
     synthetic = trial.folder / "synthetic"
-    convert(Town(seed=9, sensor="hdl32e_nuscenes", scans=4), WRITERS["npz"](synthetic), progress=False)
-    trial.run("nuScenes' lists", [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects])
+    convert(
+        Town(seed=9, sensor="hdl32e_nuscenes", scans=4), WRITERS["npz"](synthetic), progress=False
+    )
+    trial.run(
+        "nuScenes' lists",
+        [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects],
+    )
     mixture = {"synthetic": str(synthetic), "ratio": 0.5}
     small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
-    small |= {"BALANCED_RESAMPLING": False}  # it divides by the number of objects of each class; the town has four
+    small |= {
+        "BALANCED_RESAMPLING": False
+    }  # it divides by the number of objects of each class; the town has four
     small["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]["SAMPLE_GROUPS"] = ["car:2", "pedestrian:2"]
     (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").write_text(yaml.safe_dump(small))
     changes = f"DATA_CONFIG.DATA_PATH {data} DATA_CONFIG.VERSION v1.0-mini"
@@ -73,7 +88,9 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     type_training(trial, python, "CenterPoint", "MixedNuScenes", mixture, changes, "nus", expect)
     if not list((trial.folder / "nus").rglob("checkpoint_epoch_1.pth")):
         raise Failed("no checkpoint")
-    script = "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
+    script = (
+        "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
+    )
     return trial.row(script, ["training", "validation", "checkpoint"], LEFT_OUT)
 
 
@@ -87,7 +104,8 @@ def type_training(
     out: str,
     expect: list[str],
 ) -> str:
-    """Type the page's command for one of its datasets, with the script for a CPU that the page names."""
+    """Type the page's command for one of its datasets, with the script for a CPU that the page
+    names."""
     file = trial.folder / f"{dataset}.yaml"
     file.write_text(yaml.safe_dump(mixture))
     options = "--epochs 2 --batch_size 2 --workers 1 --logger_iter_interval 1 --wo_gpu_stat"
@@ -100,7 +118,9 @@ def type_training(
     }
     other = "MixedNuScenes" if dataset == "MixedKitti" else "MixedKitti"
     env = {"OPENPCDET_OUTPUT": str(trial.folder / out)}
-    return trial.type_page(title, python, PAGE, names, skip=f"{PIP}|{other}", env=env, expect=expect, minutes=90)
+    return trial.type_page(
+        title, python, PAGE, names, skip=f"{PIP}|{other}", env=env, expect=expect, minutes=90
+    )
 
 
 def batches(output: str) -> list[str]:

@@ -1,4 +1,5 @@
-"""Pointcept's own ``tools/train.py`` with its evaluation: SparseUNet on SemanticKITTI, and Sonata's pretraining."""
+"""Pointcept's own ``tools/train.py`` with its evaluation: SparseUNet on SemanticKITTI, and Sonata's
+pretraining."""
 
 import re
 from collections.abc import Iterator
@@ -11,7 +12,10 @@ TITLE = "Pointcept"
 
 PAGE = "pointcept"
 SCRIPTS = Path(__file__).parent / "scripts"
-LEFT_OUT = "mixed precision; `tools/stand_ins` replaces pointops and, to save an hour, torch_scatter and torch_cluster"
+LEFT_OUT = (
+    "mixed precision; `tools/stand_ins` replaces pointops and, to save an hour, torch_scatter and "
+    "torch_cluster"
+)
 SEGMENTATION = """
 _base_ = [{stock!r}]
 seed, batch_size, num_worker, mix_prob, enable_wandb, epoch, eval_epoch = 1, 2, 2, 0, False, 2, 2
@@ -30,7 +34,8 @@ data = dict(train=dict(data_root={root!r}, mixture={mix!r}, split=["train"]))
 
 
 def rows(trial: Trial) -> Iterator[Row]:
-    """Two epochs and a resumed one of the stock SparseUNet; one of Sonata on scans without labels."""
+    """Two epochs and a resumed one of the stock SparseUNet; one of Sonata on scans without
+    labels."""
     python = trial.environment()
     trial.type_page("install", python, PAGE, {}, skip=NOT_PIP)
     tree = trial.tree("POINTCEPT_ROOT")
@@ -57,25 +62,37 @@ def rows(trial: Trial) -> Iterator[Row]:
     rest = train("resumed", f"resume=True weight={saved}")
     if samples(rest) != {1: samples(whole)[1]}:
         raise Failed(f"the resumed run saw {samples(rest)} instead of {samples(whole)[1]}")
-    yield trial.row(f"tools/train.py, {stock}", ["training", "validation", "checkpoint", "resume"], LEFT_OUT)
+    yield trial.row(
+        f"tools/train.py, {stock}", ["training", "validation", "checkpoint", "resume"], LEFT_OUT
+    )
 
     sonata = ROOT / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
     config = trial.folder / "sonata.py"
     unlabelled = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "none"}
     config.write_text(PRETRAINING.format(stock=str(sonata), root=str(root), mix=unlabelled))
-    names = common(tree) | {"configs/semantic_kitti/mixed.py": config, "exp/mixed": trial.folder / "sonata"}
-    trial.type_page("pretraining", python, PAGE, names, skip=f"{PIP}|^cat", expect=[r"loss: \d"], minutes=120)
+    names = common(tree) | {
+        "configs/semantic_kitti/mixed.py": config,
+        "exp/mixed": trial.folder / "sonata",
+    }
+    trial.type_page(
+        "pretraining", python, PAGE, names, skip=f"{PIP}|^cat", expect=[r"loss: \d"], minutes=120
+    )
     if not (trial.folder / "sonata" / "model" / "model_last.pth").is_file():
         raise Failed("no checkpoint")
     left_out = (
-        f"{LEFT_OUT}; flash attention; the stock width: 24 GB of memory; Pointcept has no validation in pretraining"
+        f"{LEFT_OUT}; flash attention; the stock width: 24 GB of memory; Pointcept has no "
+        "validation in pretraining"
     )
     yield trial.row(f"tools/train.py, {sonata.name}", ["training", "checkpoint"], left_out)
 
 
 def common(tree: Path) -> dict[str, object]:
-    """What every command of the page has here: the clone, and the script for a CPU that the page names."""
-    return {"Pointcept": tree, "python tools/train.py": f"python {SCRIPTS / 'pointcept_cpu.py'} tools/train.py"}
+    """What every command of the page has here: the clone, and the script for a CPU that the page
+    names."""
+    return {
+        "Pointcept": tree,
+        "python tools/train.py": f"python {SCRIPTS / 'pointcept_cpu.py'} tools/train.py",
+    }
 
 
 def samples(output: str) -> dict[int, list[str]]:

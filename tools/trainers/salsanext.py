@@ -19,8 +19,12 @@ def rows(trial: Trial) -> Iterator[Row]:
     expect = [r"Loss \d", "Validation set:", "Finished Training"]
 
     def train(title: str, epochs: int, resumed: Path | None = None) -> str:
-        names = configure(trial, tree, "salsanext.yml", epochs=epochs, width=WIDTH) | {"LOG": trial.folder / "log"}
-        names |= {"/data/mix.yaml": mixture(trial)} | ({'-p ""': f"-p {resumed}"} if resumed else {})
+        names = configure(trial, tree, "salsanext.yml", epochs=epochs, width=WIDTH) | {
+            "LOG": trial.folder / "log"
+        }
+        names |= {"/data/mix.yaml": mixture(trial)} | (
+            {'-p ""': f"-p {resumed}"} if resumed else {}
+        )
         return trial.type_page(title, python, PAGE, names, skip="NAME", expect=expect, minutes=120)
 
     said = train("train", 1)

@@ -1,4 +1,5 @@
-"""One trainer's trial: its folder, its fresh environment, the copy of its source tree, and the commands it runs."""
+"""One trainer's trial: its folder, its fresh environment, the copy of its source tree, and the
+commands it runs."""
 
 import os
 import re
@@ -16,8 +17,8 @@ from trainers.data import Data
 
 ROOT = Path(__file__).parent.parent.parent
 STEPS = ("training", "validation", "checkpoint", "resume")
-"""What a run of a trainer can show: iterations with finite losses; its own evaluation; a checkpoint on disk; and
-resumed training that sees the samples of an uninterrupted run."""
+"""What a run of a trainer can show: iterations with finite losses; its own evaluation; a checkpoint
+on disk; and resumed training that sees the samples of an uninterrupted run."""
 
 PIP = "^pip "
 """``skip`` of ``Trial.type_page`` for what has been installed."""
@@ -58,24 +59,32 @@ class Trial:
         title: the trainer in the table.
         work: the folder of all trials.
         data: datasets on disk, shared by all trials.
-        reuse: keep the environment of an earlier run, to develop a trial; the table of a release is made without.
+        reuse: keep the environment of an earlier run, to develop a trial; the table of a release is
+            made without.
 
     Attributes:
         folder: ``work/<name>``, for everything that this trainer writes.
     """
 
     def __init__(self, name: str, title: str, work: Path, data: Data, reuse: bool = False) -> None:
-        self.name, self.title, self.data, self.reuse = name, title, data, reuse
+        self.name = name
+        self.title = title
+        self.data = data
+        self.reuse = reuse
         self.folder = work / name
         self._wheel = work / "wheel"
         for old in () if not self.folder.exists() else self.folder.iterdir():
             if not (reuse and old.name == "venv"):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
         (self.folder / "logs").mkdir(parents=True, exist_ok=True)
-        self._began, self._commands = time.monotonic(), 0
+        self._began = time.monotonic()
+        self._commands = 0
 
-    def environment(self, *packages: str, extras: Sequence[str] = (), options: Sequence[str] = ()) -> Path:
-        """Make a virtual environment with torch, lidar_synth (a wheel of this checkout) and ``packages``.
+    def environment(
+        self, *packages: str, extras: Sequence[str] = (), options: Sequence[str] = ()
+    ) -> Path:
+        """Make a virtual environment with torch, lidar_synth (a wheel of this checkout) and
+        ``packages``.
 
         Args:
             packages: what to install from the package index, as for pip.
@@ -83,7 +92,8 @@ class Trial:
             options: further options of pip for ``packages``, such as ``--no-deps``.
 
         Returns:
-            Its Python. Call ``install`` for packages that need other options, or the trainer's own installer.
+            Its Python. Call ``install`` for packages that need other options, or the trainer's own
+            installer.
         """
         folder = self.folder / "venv"
         python = folder / "bin" / "python"
@@ -92,7 +102,11 @@ class Trial:
             self.install(python, str(wheel), options=["--force-reinstall", "--no-deps"])
             return python
         venv.create(folder, with_pip=True, clear=True)
-        torch = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
+        torch = next(
+            line
+            for line in (ROOT / "constraints.txt").read_text().splitlines()
+            if line.startswith("torch==")
+        )
         self.install(python, torch)
         self.install(python, f"{wheel}[{','.join(extras)}]" if extras else str(wheel))
         if packages:
@@ -101,7 +115,10 @@ class Trial:
 
     def install(self, python: Path, *packages: str, options: Sequence[str] = ()) -> None:
         """``pip install`` into an environment."""
-        self.run("install", [python, "-m", "pip", "install", "--disable-pip-version-check", *options, *packages])
+        self.run(
+            "install",
+            [python, "-m", "pip", "install", "--disable-pip-version-check", *options, *packages],
+        )
 
     def tree(self, variable: str) -> Path:
         """A copy of the trainer's public source tree, whose folder an environment variable names.
@@ -112,7 +129,8 @@ class Trial:
         given = os.environ.get(variable)
         if not given or not Path(given).is_dir():
             raise Failed(
-                f"{variable}={given or ''} names no folder; expected: a clone of the trainer's public repository"
+                f"{variable}={given or ''} names no folder; expected: a clone of the trainer's "
+                "public repository"
             )
         out = self.folder / "tree"
         if not out.exists():
@@ -148,16 +166,26 @@ class Trial:
             Failed: with the log's path and last lines.
         """
         self._commands += 1
-        log = self.folder / "logs" / f"{self._commands:02d}-{re.sub(r'[^A-Za-z0-9]+', '-', title)}.log"
+        log = (
+            self.folder
+            / "logs"
+            / f"{self._commands:02d}-{re.sub(r'[^A-Za-z0-9]+', '-', title)}.log"
+        )
         words = [str(word) for word in command]
         with log.open("w") as file:
             file.write(f"$ {' '.join(words)}\n")
             file.flush()
             try:
                 code = subprocess.run(
-                    words, cwd=cwd or self.folder, env=_environment(env or {}), stdin=subprocess.DEVNULL, stdout=file,
-                    stderr=subprocess.STDOUT, timeout=60 * minutes, check=False,
-                ).returncode  # fmt: skip
+                    words,
+                    cwd=cwd or self.folder,
+                    env=_environment(env or {}),
+                    stdin=subprocess.DEVNULL,
+                    stdout=file,
+                    stderr=subprocess.STDOUT,
+                    timeout=60 * minutes,
+                    check=False,
+                ).returncode
             except subprocess.TimeoutExpired:
                 raise Failed(f"{title}: not finished after {minutes:g} minutes; {log}") from None
         output = log.read_text(errors="replace")
@@ -169,15 +197,24 @@ class Trial:
         return output
 
     def type_page(
-        self, title: str, python: Path, page: str, names: Mapping[str, object], *, skip: str = "(?!)", **options: Any
+        self,
+        title: str,
+        python: Path,
+        page: str,
+        names: Mapping[str, object],
+        *,
+        skip: str = "(?!)",
+        **options: Any,
     ) -> str:
-        """Type the blocks of a trainer's page as they stand, from top to bottom, in one shell; see ``commands_of``.
+        """Type the blocks of a trainer's page as they stand, from top to bottom, in one shell; see
+        ``commands_of``.
 
         Args:
             title: name of the log.
             python: of the environment, whose programs come first.
             page: name of a page of ``docs/how-to/trainers``.
-            names: what the reader has in place of names in the page, such as ``{"/data/mix.yaml": file}``.
+            names: what the reader has in place of names in the page, such as ``{"/data/mix.yaml":
+                file}``.
             skip: a regular expression of commands that the reader leaves out; see ``re.search``.
             options: of ``run``.
 
@@ -194,18 +231,24 @@ class Trial:
                 raise Failed(f"{title}: {page}.md has no {name!r} in {script!r}")
             script = re.sub(pattern, str(own).replace("\\", r"\\"), script)
         path = {"PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
-        return self.run(title, ["bash", "-euxc", script], env=path | dict(options.pop("env", {})), **options)
+        return self.run(
+            title, ["bash", "-euxc", script], env=path | dict(options.pop("env", {})), **options
+        )
 
-    def row(self, script: str, ran: Sequence[str], left_out: str = "", *, failed: bool = False) -> Row:
+    def row(
+        self, script: str, ran: Sequence[str], left_out: str = "", *, failed: bool = False
+    ) -> Row:
         """A line of the table, with the minutes since the line before."""
         assert set(ran) <= set(STEPS), ran
         now = time.monotonic()
-        minutes, self._began = (now - self._began) / 60, now
+        minutes = (now - self._began) / 60
+        self._began = now
         return Row(self.title, script, tuple(ran), left_out, minutes, failed)
 
 
 def commands_of(page: str) -> list[str]:
-    """What the reader of a page of ``docs/how-to/trainers`` types, as commands of a shell, without comments.
+    """What the reader of a page of ``docs/how-to/trainers`` types, as commands of a shell, without
+    comments.
 
     Python and YAML whose first line names a file are saved under that name; other Python is run.
     """
@@ -224,14 +267,25 @@ def commands_of(page: str) -> list[str]:
 
 
 def wheel_of_checkout(folder: Path) -> Path:
-    """A wheel of this checkout, built from a copy so that the checkout stays clean, unless the folder has one."""
+    """A wheel of this checkout, built from a copy so that the checkout stays clean, unless the
+    folder has one."""
     if not list(folder.glob("lidar_synth-*.whl")):
         source = folder / "source"
         for name in ("lidar_synth", "integrations", "configs"):
-            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__")
+            )
         for name in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copy(ROOT / name, source)
-        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--quiet", "--no-deps"]
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "--disable-pip-version-check",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+        ]
         subprocess.run([*pip, "--wheel-dir", folder, source], check=True)
     return next(folder.glob("lidar_synth-*.whl"))
 

@@ -29,11 +29,18 @@ def rows(trial: Trial) -> Iterator[Row]:
         own["scheduler"] |= {"max_epoch": epochs, "epoch_warmup": 0.5}
         config.write_text(yaml.safe_dump(own))
         names = {"WaffleIron": tree, "/data/mix.yaml": mixture(trial), "KITTI": dataset}
-        names |= {"configs/WaffleIron-48-256__kitti.yaml": config, "LOG": f"{trial.folder / log} {more}"}
+        names |= {
+            "configs/WaffleIron-48-256__kitti.yaml": config,
+            "LOG": f"{trial.folder / log} {more}",
+        }
         said = trial.type_page(
-            f"{log} {epochs}", python, "waffleiron", names, minutes=60,
+            f"{log} {epochs}",
+            python,
+            "waffleiron",
+            names,
+            minutes=60,
             expect=[r"Loss = \d", "Validation: ", "Finished Training"],
-        )  # fmt: skip
+        )
         found = re.findall(r"lidar_synth: epoch 1: .*", said)
         return found[0] if found else ""
 
@@ -43,5 +50,8 @@ def rows(trial: Trial) -> Iterator[Row]:
         raise Failed("the resumed run has another mixture in epoch 1")
     if not (trial.folder / "stopped" / "ckpt_last.pth").is_file():
         raise Failed("no checkpoint")
-    left_out = "--fp16 and --multiprocessing-distributed: GPUs; CutMix: all of SemanticKITTI; stock depth: time"
+    left_out = (
+        "--fp16 and --multiprocessing-distributed: GPUs; CutMix: all of SemanticKITTI; stock "
+        "depth: time"
+    )
     yield trial.row(f"waffleiron launch_train.py --dataset {NAME}", STEPS, left_out)

@@ -1,1 +1,2 @@
-"""Rectified flow for any velocity ``v(y, t, c)``: path and losses, solvers, timestep selection, distillation."""
+"""Rectified flow for any velocity ``v(y, t, c)``: path and losses, solvers, timestep selection,
+distillation."""

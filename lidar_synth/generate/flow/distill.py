@@ -1,23 +1,27 @@
 """Distillation of a few-step student from a rectified-flow teacher.
 
-Every strategy is one function that gives the supervision of a batch: states, times, and the velocities that the student
-is trained to predict there. The strategies differ in the times of training and in the part of the teacher's trajectory
-that the student approximates by a straight line::
+Every strategy is one function that gives the supervision of a batch: states, times, and the
+    velocities that the student
+is trained to predict there. The strategies differ in the times of training and in the part of the
+teacher's trajectory that the student approximates by a straight line::
 
-    strategy               time of training                                straightened part       source
-    adaptive_piecewise     starts of the intervals of the selected grid    interval's start -> end   Algorithm 1
-    uniform_piecewise      starts of the intervals of a uniform grid       interval's start -> end   its ablation
-    piecewise_reflow       anywhere in an interval                         interval's start -> end   PeRFlow
-    reflow                 anywhere in [0, 1]                              noise -> data             2-RF
-    timestep_distillation  starts of the intervals of a uniform grid       noise -> data             k-TD of R2Flow
+    strategy               time of training                                straightened part
+    source adaptive_piecewise     starts of the intervals of the selected grid    interval's start
+    -> end   Algorithm 1 uniform_piecewise      starts of the intervals of a uniform grid
+    interval's start -> end   its ablation piecewise_reflow       anywhere in an interval
+    interval's start -> end   PeRFlow reflow                 anywhere in [0, 1]
+    noise -> data             2-RF timestep_distillation  starts of the intervals of a uniform grid
+    noise -> data             k-TD of R2Flow
 
-Euler steps of the teacher give the end of each part; the example counts the evaluations. Sources: LiDAR-Flow (the
-paper, Eq. 6); Yan et al., "PeRFlow", NeurIPS 2024; Liu et al., "Flow Straight and Fast",
-ICLR 2023 (reflow and k-step distillation); Nakashima et al., "Fast LiDAR Data Generation with Rectified
-Flows", ICRA 2025. R2Flow generates its pairs of noise and data once, before training, and distils the timesteps of
-its 2-RF model. Here the pairs are generated during training, from any teacher.
+Euler steps of the teacher give the end of each part; the example counts the evaluations. Sources:
+LiDAR-Flow (the paper, Eq. 6); Yan et al., "PeRFlow", NeurIPS 2024; Liu et al., "Flow Straight and
+Fast", ICLR 2023 (reflow and k-step distillation); Nakashima et al., "Fast LiDAR Data Generation
+with Rectified Flows", ICRA 2025. R2Flow generates its pairs of noise and data once, before
+training, and distils the timesteps of its 2-RF model. Here the pairs are generated during training,
+from any teacher.
 
-To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the dictionary. One student for
+To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the
+    dictionary. One student for
 several numbers of steps is trained by ``every_piece``.
 """
 
@@ -33,14 +37,15 @@ from lidar_synth.generate.flow.path import Example, Velocity, interpolate, per_s
 from lidar_synth.generate.flow.solvers import checked_grid, solve, uniform_grid
 
 Strategy = Callable[[Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any], Example]
-"""``strategy(teacher, y0, y1, u, grid, steps, cond)``. All strategies have the same arguments and raise a
-``ConfigError`` on a grid or a number of steps that they do not support:
+"""``strategy(teacher, y0, y1, u, grid, steps, cond)``. All strategies have the same arguments and
+raise a ``ConfigError`` on a grid or a number of steps that they do not support:
 
 - teacher: the velocity to distil; it is evaluated without gradients.
 - y0: (B, ...) data; reflow and timestep distillation ignore it and use the teacher's data.
 - y1: (B, ...) noise.
-- u: (B,) uniform numbers in (0, 1) (``noise.uniform``) that select the time of training of each sample. For ``reflow``,
-  u is the time t itself, possibly after one of ``flow.TIMESTEPS`` (R2Flow: ``u_shaped``).
+- u: (B,) uniform numbers in (0, 1) (``noise.uniform``) that select the time of training of each
+  sample. For ``reflow``, u is the time t itself, possibly after one of ``flow.TIMESTEPS`` (R2Flow:
+  ``u_shaped``).
 - grid: N + 1 descending times from 1 to 0, the student's time grid.
 - steps: Euler steps of the teacher over the part that it integrates: an interval, or all of [1, 0].
 - cond: the condition, passed to the teacher.
@@ -48,10 +53,17 @@ Strategy = Callable[[Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any
 
 
 def adaptive_piecewise(
-    teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    u: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
-    """Algorithm 1: at the start t_i of a random interval and y = (1 - t_i) y0 + t_i y1, the target is the constant
-    velocity to the teacher's state at the end of the interval. ``grid`` comes from ``select_timesteps``."""
+    """Algorithm 1: at the start t_i of a random interval and y = (1 - t_i) y0 + t_i y1, the target
+    is the constant velocity to the teacher's state at the end of the interval. ``grid`` comes from
+    ``select_timesteps``."""
     interval = (u * (len(grid) - 1)).long().clamp_(max=len(grid) - 2)
     start, end = _bounds(interval, grid, u)
     y = interpolate(y0, y1, start)
@@ -59,7 +71,13 @@ def adaptive_piecewise(
 
 
 def uniform_piecewise(
-    teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    u: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
     """Algorithm 1 on a uniform grid, without timestep selection.
 
@@ -71,10 +89,16 @@ def uniform_piecewise(
 
 
 def piecewise_reflow(
-    teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    u: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
-    """PeRFlow: t is uniform in [0, 1]; state and velocity are those of the straight line from the start of t's interval
-    to the teacher's state at its end."""
+    """PeRFlow: t is uniform in [0, 1]; state and velocity are those of the straight line from the
+    start of t's interval to the teacher's state at its end."""
     start, end = _bounds(interval_of(u, grid), grid, u)
     y_start = interpolate(y0, y1, start)
     slope = _slope(teacher, y_start, start, end, steps, cond)
@@ -82,17 +106,31 @@ def piecewise_reflow(
 
 
 def reflow(
-    teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    u: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
-    """Flow matching on pairs of noise and the data that the teacher generates from it, with t uniform in [0, 1]."""
+    """Flow matching on pairs of noise and the data that the teacher generates from it, with t
+    uniform in [0, 1]."""
     return _straight(teacher, y1, u, steps, cond)
 
 
 def timestep_distillation(
-    teacher: Velocity, y0: Tensor, y1: Tensor, u: Tensor, grid: Sequence[float], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    u: Tensor,
+    grid: Sequence[float],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
-    """Reflow with t moved up to the start of its interval, so that only the N times of sampling are trained. On a
-    uniform grid, this equals R2Flow's rounding of its time (0 = noise) to floor(N t) / N.
+    """Reflow with t moved up to the start of its interval, so that only the N times of sampling are
+    trained. On a uniform grid, this equals R2Flow's rounding of its time (0 = noise) to floor(N t)
+    / N.
 
     Raises:
         ConfigError: on a grid that is not uniform.
@@ -103,22 +141,30 @@ def timestep_distillation(
 
 
 def every_piece(
-    teacher: Velocity, y0: Tensor, y1: Tensor, grids: Sequence[Sequence[float]], steps: int, cond: Any = None
+    teacher: Velocity,
+    y0: Tensor,
+    y1: Tensor,
+    grids: Sequence[Sequence[float]],
+    steps: int,
+    cond: Any = None,
 ) -> Example:
-    """A student of several numbers of steps, which is told where a step ends: every interval of all grids.
+    """A student of several numbers of steps, which is told where a step ends: every interval of all
+    grids.
 
-    Intervals that begin at noise are parts of one trajectory of the teacher. The others begin between data and noise,
-    as in Algorithm 1.
+    Intervals that begin at noise are parts of one trajectory of the teacher. The others begin
+    between data and noise, as in Algorithm 1.
 
     Args:
         teacher: the velocity to distil.
         y0, y1: (B, ...) data and noise.
         grids: the time grids.
-        steps: Euler steps of the teacher in an interval of the first grid, in the mean; longer intervals have more.
+        steps: Euler steps of the teacher in an interval of the first grid, in the mean; longer
+            intervals have more.
         cond: (B, ...) conditions, passed to the teacher.
 
     Returns:
-        An example of P B samples, P intervals in the order of the grids. Its condition is repeated, too.
+        An example of P B samples, P intervals in the order of the grids. Its condition is repeated,
+        too.
 
     Raises:
         ConfigError: on fewer than one step, or a grid that does not descend within [0, 1].
@@ -126,7 +172,8 @@ def every_piece(
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
     pieces = [(a, b) for grid in grids for a, b in pairwise(checked_grid(grid).tolist())]
-    evaluations, total = 0, steps * (len(grids[0]) - 1)
+    evaluations = 0
+    total = steps * (len(grids[0]) - 1)
 
     def follow(y: Tensor, a: float, b: float) -> Tensor:
         nonlocal evaluations
@@ -138,10 +185,17 @@ def every_piece(
         from_noise = {1.0: y1}
         for a, b in pairwise(sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)):
             from_noise[b] = follow(from_noise[a], a, b)
-        start, end = (torch.cat([y1.new_full((len(y1),), t) for t in side]) for side in zip(*pieces, strict=True))
+        start, end = (
+            torch.cat([y1.new_full((len(y1),), t) for t in side])
+            for side in zip(*pieces, strict=True)
+        )
         states = [y1 if a == 1 else torch.lerp(y0, y1, a) for a, _ in pieces]
-        ends = [from_noise[b] if a == 1 else follow(y, a, b) for y, (a, b) in zip(states, pieces, strict=True)]
-    y, y_end = torch.cat(states), torch.cat(ends)
+        ends = [
+            from_noise[b] if a == 1 else follow(y, a, b)
+            for y, (a, b) in zip(states, pieces, strict=True)
+        ]
+    y = torch.cat(states)
+    y_end = torch.cat(ends)
     repeated = None if cond is None else torch.cat([cond] * len(pieces))
     return Example(y, start, (y_end - y) / per_sample(end - start, y), evaluations, repeated, end)
 
@@ -157,7 +211,8 @@ STRATEGIES: dict[str, Strategy] = {
 
 
 def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
-    """(B,) index of the interval (t_{i+1}, t_i] of a descending grid that contains t; 0 = the noisiest."""
+    """(B,) index of the interval (t_{i+1}, t_i] of a descending grid that contains t; 0 = the
+    noisiest."""
     ascending = _times(grid, t).flip(0)
     above = torch.searchsorted(ascending, t.contiguous()).clamp_(1, len(grid) - 1)
     return len(grid) - 1 - above
@@ -177,8 +232,11 @@ def _times(grid: Sequence[float], like: Tensor) -> Tensor:
     return times.to(like.device, like.dtype)
 
 
-def _slope(teacher: Velocity, y: Tensor, start: Tensor, end: Tensor, steps: int, cond: Any) -> Tensor:
-    """(B, ...) constant velocity between y at ``start`` and the state that the teacher reaches at ``end``."""
+def _slope(
+    teacher: Velocity, y: Tensor, start: Tensor, end: Tensor, steps: int, cond: Any
+) -> Tensor:
+    """(B, ...) constant velocity between y at ``start`` and the state that the teacher reaches at
+    ``end``."""
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
     weights = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[:, None]
@@ -196,4 +254,6 @@ def _straight(teacher: Velocity, y1: Tensor, t: Tensor, steps: int, cond: Any) -
 def _check_uniform(grid: Sequence[float]) -> None:
     uniform = uniform_grid(len(checked_grid(grid)) - 1)
     if max(abs(a - b) for a, b in zip(grid, uniform, strict=True)) > 1e-6:
-        raise ConfigError(f"time grid {tuple(grid)}", f"{uniform}, which is uniform", "Or use adaptive_piecewise.")
+        raise ConfigError(
+            f"time grid {tuple(grid)}", f"{uniform}, which is uniform", "Or use adaptive_piecewise."
+        )

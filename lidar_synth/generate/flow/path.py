@@ -7,7 +7,8 @@ preliminaries; Liu et al., "Flow Straight and Fast", ICLR 2023)::
     v   = y1 - y0                                             its velocity dy/dt
     L   = E_{y0, y1, t} m(v_theta(y_t, t, c), v)              flow matching, Eq. (1) and (3)
 
-The network may be any callable ``v(y, t, cond)``. The importers translate other projects' conventions of time and sign.
+The network may be any callable ``v(y, t, cond)``. The importers translate other projects'
+conventions of time and sign.
 
 To add a training metric or a distribution of t: write the function and enter it in ``METRICS`` or
 ``TIMESTEPS``; the tests run over the dictionaries.
@@ -25,11 +26,13 @@ from lidar_synth.errors import DataError
 
 Velocity = Callable[[Tensor, Tensor, Any], Tensor]
 """``v(y, t, cond)``: y (B, ...), t (B,) float32 in [0, 1], cond as the network takes it (None =
-unconditional) -> dy/dt, of y's shape. Guidance wraps one velocity in another. A network with the attribute ``ends`` can
-also be told (B,) times where the step ends, v(y, t, cond, end), and gives the mean velocity until then."""
+unconditional) -> dy/dt, of y's shape. Guidance wraps one velocity in another. A network with the
+attribute ``ends`` can also be told (B,) times where the step ends, v(y, t, cond, end), and gives
+the mean velocity until then."""
 
 Metric = Callable[[Tensor, Tensor], Tensor]
-"""The paper's m: two (B, ...) tensors of the same shape -> (B,) means over the elements of each sample."""
+"""The paper's m: two (B, ...) tensors of the same shape -> (B,) means over the elements of each
+sample."""
 
 PSEUDO_HUBER = 0.00054
 """R2Flow's coefficient: c = 0.00054 sqrt(elements of a sample), 0.1955 for 2x64x1024."""
@@ -37,7 +40,8 @@ PSEUDO_HUBER = 0.00054
 
 @dataclass(frozen=True)
 class Example:
-    """One batch of supervision: at ``y`` and ``t``, the velocity network is trained to predict ``velocity``.
+    """One batch of supervision: at ``y`` and ``t``, the velocity network is trained to predict
+    ``velocity``.
 
     Args:
         y: (B, ...) states.
@@ -45,7 +49,8 @@ class Example:
         velocity: (B, ...) targets.
         teacher_evaluations: number of teacher evaluations for the batch, one per sample and step.
         cond: the condition, (B, ...) or None.
-        end: (B,) times up to which the target is the mean velocity, for a network that is told; None otherwise.
+        end: (B,) times up to which the target is the mean velocity, for a network that is told;
+            None otherwise.
     """
 
     y: Tensor
@@ -84,9 +89,9 @@ def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tenso
 
 
 def balanced_velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
-    """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors are tens of times
-    larger, do not outweigh short ones (Geng et al., "Mean Flows for One-step Generative Modeling", NeurIPS 2025: p = 1,
-    c = 0.001)."""
+    """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors
+    are tens of times larger, do not outweigh short ones (Geng et al., "Mean Flows for One-step
+    Generative Modeling", NeurIPS 2025: p = 1, c = 0.001)."""
     errors = _errors(velocity, example, metric)
     return (errors / (errors.detach() + 1e-3)).mean()
 
@@ -97,17 +102,20 @@ def _errors(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
 
 
 def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
-    """Classifier-free guidance (Ho and Salimans, 2022): v(y, t, blank) + scale (v(y, t, c) - v(y, t, blank)).
+    """Classifier-free guidance (Ho and Salimans, 2022): v(y, t, blank) + scale (v(y, t, c) - v(y,
+    t, blank)).
 
     Args:
         velocity: a velocity trained with conditions and, with some probability, with blank ones.
-        scale: 1 = no guidance; larger scales follow the condition more closely, with less diversity.
+        scale: 1 = no guidance; larger scales follow the condition more closely, with less
+            diversity.
         blank: (...) the blank condition of one sample, as ``velocity`` takes it.
     """
 
     def guided_velocity(y: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         blanks = blank.expand(len(y), *blank.shape)
-        # One evaluation of twice the batch, so that the network computes what does not depend on the batch once.
+        # One evaluation of twice the batch, so that the network computes what does not depend on
+        # the batch once.
         both = velocity(torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, blanks.to(cond))))
         with_condition, without = both.chunk(2)
         return torch.lerp(without, with_condition, scale)
@@ -118,16 +126,17 @@ def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
 def autoguided(
     velocity: Velocity, weaker: Velocity, scale: float, within: tuple[float, float] = (0.0, 1.0)
 ) -> Velocity:
-    """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself", NeurIPS 2024):
-    v_weaker + scale (v - v_weaker), which reduces errors that both share, with or without a condition.
+    """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself",
+    NeurIPS 2024): v_weaker + scale (v - v_weaker), which reduces errors that both share, with or
+    without a condition.
 
     Args:
         velocity: the velocity to guide.
-        weaker: a velocity for the same data and conditions with larger errors of the same kind: from a smaller network,
-            or one trained for fewer iterations.
+        weaker: a velocity for the same data and conditions with larger errors of the same kind:
+            from a smaller network, or one trained for fewer iterations.
         scale: 1 = no guidance.
-        within: smallest and largest time with guidance; guidance at high noise reduces diversity (Kynkaanniemi et al.,
-            "Applying Guidance in a Limited Interval", NeurIPS 2024).
+        within: smallest and largest time with guidance; guidance at high noise reduces diversity
+            (Kynkaanniemi et al., "Applying Guidance in a Limited Interval", NeurIPS 2024).
     """
     low, high = within
 
@@ -150,8 +159,8 @@ def l1(a: Tensor, b: Tensor) -> Tensor:
 
 
 def pseudo_huber(a: Tensor, b: Tensor, coefficient: float = PSEUDO_HUBER) -> Tensor:
-    """(B,) mean of sqrt(e^2 + c^2) - c with e = a - b and c = coefficient sqrt(elements of a sample); the
-    paper's metric for pixel models, from R2Flow and Song and Dhariwal (ICLR 2024)."""
+    """(B,) mean of sqrt(e^2 + c^2) - c with e = a - b and c = coefficient sqrt(elements of a
+    sample); the paper's metric for pixel models, from R2Flow and Song and Dhariwal (ICLR 2024)."""
     error = _error(a, b)
     c = coefficient * math.sqrt(error.shape[1])
     square = error.square()
@@ -162,7 +171,9 @@ def pseudo_huber(a: Tensor, b: Tensor, coefficient: float = PSEUDO_HUBER) -> Ten
 def _error(a: Tensor, b: Tensor) -> Tensor:
     """(B, elements) a - b in float32 or higher precision."""
     if a.shape != b.shape:
-        raise DataError(f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}", "one shape (B, ...)")
+        raise DataError(
+            f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}", "one shape (B, ...)"
+        )
     error = a - b
     return error.to(torch.promote_types(error.dtype, torch.float32)).flatten(1)
 
@@ -172,13 +183,14 @@ METRICS: dict[str, Metric] = {"squared_l2": squared_l2, "pseudo_huber": pseudo_h
 
 
 def u_shaped(u: Tensor, sharpness: float = 4.0) -> Tensor:
-    """Density proportional to cosh(a (t - 1/2)) with a = ``sharpness``, which is highest at both ends; for reflow
-    (Lee et al., "Improving the Training of Rectified Flows", NeurIPS 2024)."""
+    """Density proportional to cosh(a (t - 1/2)) with a = ``sharpness``, which is highest at both
+    ends; for reflow (Lee et al., "Improving the Training of Rectified Flows", NeurIPS 2024)."""
     return 0.5 + torch.asinh((2 * u - 1) * math.sinh(sharpness / 2)) / sharpness
 
 
 def logit_normal(u: Tensor, mean: float = 0.0, std: float = 1.0) -> Tensor:
-    """t = sigmoid(n) with normally distributed n (Esser et al., "Scaling Rectified Flow Transformers", ICML 2024)."""
+    """t = sigmoid(n) with normally distributed n (Esser et al., "Scaling Rectified Flow
+    Transformers", ICML 2024)."""
     return torch.sigmoid(mean + std * torch.special.ndtri(u))
 
 
@@ -188,8 +200,9 @@ TIMESTEPS: dict[str, Callable[[Tensor], Tensor]] = {
     "logit_normal": logit_normal,
     "logit_normal_shifted": lambda u: logit_normal(u, math.log(2)),
 }
-"""Distributions of t as quantile functions, from uniform numbers u in (0, 1) (``noise.uniform``) to times of the same
-shape. With numbers keyed by (seed, index), training is reproducible.
+"""Distributions of t as quantile functions, from uniform numbers u in (0, 1) (``noise.uniform``) to
+times of the same shape. With numbers keyed by (seed, index), training is reproducible.
 
-"logit_normal_shifted" doubles the odds of noise, t / (1 - t) (Esser et al.'s shift of 2): neighbouring cells of a range
-image are so strongly correlated that its layout is already determined at high noise."""
+"logit_normal_shifted" doubles the odds of noise, t / (1 - t) (Esser et al.'s shift of 2):
+neighbouring cells of a range image are so strongly correlated that its layout is already determined
+at high noise."""

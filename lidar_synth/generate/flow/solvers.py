@@ -1,8 +1,10 @@
 """Solvers of dy/dt = v(y, t, c) downwards from noise at t = 1 to data at t = 0 (Eq. 4).
 
-The time grid is any descending sequence of times, evenly spaced or not; a distilled student has its own.
+The time grid is any descending sequence of times, evenly spaced or not; a distilled student has its
+own.
 
-To add a solver: write its step and enter it in ``SOLVERS`` with its order; the tests measure the order.
+To add a solver: write its step and enter it in ``SOLVERS`` with its order; the tests measure the
+    order.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +18,8 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.flow.path import Velocity, per_sample
 
 Grid = Sequence[float] | Tensor
-"""S + 1 descending times for S steps, shared by all samples, or a tensor (S + 1, B) with one grid per sample."""
+"""S + 1 descending times for S steps, shared by all samples, or a tensor (S + 1, B) with one grid
+per sample."""
 
 
 class State(NamedTuple):
@@ -25,7 +28,8 @@ class State(NamedTuple):
     Args:
         t: (B,) time, in the dtype of the state or float32, whichever is more precise.
         y: (B, ...) state.
-        velocity: (B, ...) mean velocity of the next step, (y_next - y) / (t_next - t); None at the end.
+        velocity: (B, ...) mean velocity of the next step, (y_next - y) / (t_next - t); None at the
+            end.
     """
 
     t: Tensor
@@ -74,11 +78,13 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
     return tuple((start * (steps - i) + end * i) / steps for i in range(steps + 1))
 
 
-def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Iterator[State]:
+def trajectory(
+    velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None
+) -> Iterator[State]:
     """Solve dy/dt = v(y, t, cond) along the grid, and yield the states one at a time.
 
-    Only the current state is in memory. It keeps its dtype (float32 is recommended), independent of the network's
-    dtype.
+    Only the current state is in memory. It keeps its dtype (float32 is recommended), independent of
+    the network's dtype.
 
     Args:
         velocity: the velocity of the flow.
@@ -103,7 +109,9 @@ def trajectory(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler",
     yield State(times[-1], y, None)
 
 
-def solve(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None) -> Tensor:
+def solve(
+    velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None
+) -> Tensor:
     """Solve dy/dt = v(y, t, cond) along the grid, and return the state (B, ...) at its last time.
 
     Arguments and errors are those of ``trajectory``.
@@ -122,8 +130,8 @@ def solve(velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond
 
 
 def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
-    """A network with ``ends`` as a v(y, t, cond) for the steps of a grid: its mean velocity until the next time.
-    Other velocities are returned as they are.
+    """A network with ``ends`` as a v(y, t, cond) for the steps of a grid: its mean velocity until
+    the next time. Other velocities are returned as they are.
 
     Raises:
         ConfigError: on a grid that does not descend within [0, 1].
@@ -134,7 +142,9 @@ def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
 
     def mean_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
         times = ascending.to(t.device, t.dtype)
-        return velocity(y, t, cond, times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)])  # type: ignore[call-arg]
+        return velocity(
+            y, t, cond, times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)]
+        )  # type: ignore[call-arg]
 
     return mean_velocity
 
@@ -148,7 +158,10 @@ def checked_grid(grid: Sequence[float] | Tensor) -> Tensor:
     times = torch.as_tensor(grid, dtype=torch.float64, device="cpu")
     inside = times.ndim == 1 and len(times) >= 2 and times[0] <= 1 and times[-1] >= 0
     if not inside or not (times.diff() < 0).all():
-        raise ConfigError(f"time grid {times.tolist()}", "at least two descending times within [0, 1], noise first")
+        raise ConfigError(
+            f"time grid {times.tolist()}",
+            "at least two descending times within [0, 1], noise first",
+        )
     return times
 
 

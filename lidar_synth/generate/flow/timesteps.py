@@ -1,12 +1,15 @@
-"""Adaptive timestep selection: the best division of a teacher's trajectories into N straight pieces (Eq. 5).
+"""Adaptive timestep selection: the best division of a teacher's trajectories into N straight pieces
+(Eq. 5).
 
-The teacher is solved by Euler's method in M uniform steps, t_0 = 1 > ... > t_M = 0. The cost of one straight step from
-t_i to t_j with the velocity at t_i is ::
+The teacher is solved by Euler's method in M uniform steps, t_0 = 1 > ... > t_M = 0. The cost of one
+straight step from t_i to t_j with the velocity at t_i is ::
 
     C[i, j] = E_trajectories m(y_i + (t_j - t_i) v_i, y_j),        i < j
 
-and the timesteps of an N-step student are the path of exactly N intervals from 0 to M with the least total cost, shared
-by all trajectories: C is averaged first, then dynamic programming in O(N M^2) finds the path. Trajectories are
+and the timesteps of an N-step student are the path of exactly N intervals from 0 to M with the
+least total cost, shared
+by all trajectories: C is averaged first, then dynamic programming in O(N M^2) finds the path.
+    Trajectories are
 streamed, so that only C is kept in memory.
 """
 
@@ -27,11 +30,12 @@ from lidar_synth.generate.flow.solvers import trajectory, uniform_grid
 from lidar_synth.noise import gaussian
 
 Costs = NDArray[np.float64]
-"""(..., M + 1, M + 1) cost of one straight step from candidate i to candidate j > i; inf where j <= i."""
+"""(..., M + 1, M + 1) cost of one straight step from candidate i to candidate j > i; inf where j <=
+i."""
 
 _CHUNK = {"cpu": 2**18, "cuda": 2**25}
-"""Elements that the cost matrix compares at a time: few enough for a CPU's cache (five times faster), enough to fill a
-GPU."""
+"""Elements that the cost matrix compares at a time: few enough for a CPU's cache (five times
+faster), enough to fill a GPU."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,8 @@ class Selection:
         uniform_cost: total cost of N uniform intervals.
         candidates: M + 1 descending times.
         costs: (M + 1, M + 1) mean cost matrix.
-        per_trajectory: (trajectories, N - 1) inner times that are best for each trajectory alone (the
-            paper's Figure 3).
+        per_trajectory: (trajectories, N - 1) inner times that are best for each trajectory alone
+            (the paper's Figure 3).
     """
 
     grid: tuple[float, ...]
@@ -75,15 +79,16 @@ def select_timesteps(
 ) -> Selection:
     """Select the time grid of N steps on which a teacher's trajectories are straightest.
 
-    Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024 and
-    M = 100), independent of the number of trajectories.
+    Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024
+    and M = 100), independent of the number of trajectories.
 
     Args:
         velocity: the teacher.
         shape: (C, H, W), shape of one state.
         intervals: N.
         candidates: M, uniform steps of the teacher.
-        trajectories: number of trajectories to average over; trajectory k starts from the noise of (``seed``, k).
+        trajectories: number of trajectories to average over; trajectory k starts from the noise of
+            (``seed``, k).
         metric: m, a key of ``METRICS`` or a callable; the metric of the student's training.
         seed: seed of the noise.
         batch: number of trajectories computed at once.
@@ -97,7 +102,8 @@ def select_timesteps(
     """
     if not 1 <= intervals <= candidates or trajectories < 1 or batch < 1:
         raise ConfigError(
-            f"{intervals} intervals of {candidates} candidates on {trajectories} trajectories, {batch} at a time",
+            f"{intervals} intervals of {candidates} candidates on {trajectories} trajectories, "
+            f"{batch} at a time",
             "1 <= intervals <= candidates, at least one trajectory, at least one at a time",
         )
     if isinstance(metric, str) and metric not in METRICS:
@@ -106,7 +112,10 @@ def select_timesteps(
     times = uniform_grid(candidates)
     total = np.zeros((candidates + 1, candidates + 1))
     optima = []
-    with torch.inference_mode(), tqdm(total=trajectories, desc="trajectories", disable=not progress) as bar:
+    with (
+        torch.inference_mode(),
+        tqdm(total=trajectories, desc="trajectories", disable=not progress) as bar,
+    ):
         for first in range(0, trajectories, batch):
             part = range(first, min(first + batch, trajectories))
             start = gaussian(seed, part, shape, device)
@@ -117,7 +126,9 @@ def select_timesteps(
     return _selection(total / trajectories, times, intervals, np.concatenate(optima))
 
 
-def _selection(costs: Costs, times: tuple[float, ...], intervals: int, optima: NDArray[np.int64]) -> Selection:
+def _selection(
+    costs: Costs, times: tuple[float, ...], intervals: int, optima: NDArray[np.int64]
+) -> Selection:
     path = best_path(costs, intervals)
     uniform = np.round(np.linspace(0, len(times) - 1, intervals + 1)).astype(np.int64)
     return Selection(
@@ -130,7 +141,9 @@ def _selection(costs: Costs, times: tuple[float, ...], intervals: int, optima: N
     )
 
 
-def cost_matrix(velocity: Velocity, start: Tensor, times: tuple[float, ...], metric: Metric, cond: Any = None) -> Costs:
+def cost_matrix(
+    velocity: Velocity, start: Tensor, times: tuple[float, ...], metric: Metric, cond: Any = None
+) -> Costs:
     """The cost matrices of a batch of trajectories, solved by Euler's method.
 
     Args:
@@ -163,7 +176,9 @@ def cost_matrix(velocity: Velocity, start: Tensor, times: tuple[float, ...], met
                 straight = torch.addcmul(y[b, i], ahead[part] - ahead[i], v[b, i])
                 costs[b, i, part] = metric(straight, y[b, part])
     if not costs.triu(1).isfinite().all():
-        raise DataError("the teacher's trajectory is not finite", "finite velocities", "Check the checkpoint.")
+        raise DataError(
+            "the teacher's trajectory is not finite", "finite velocities", "Check the checkpoint."
+        )
     return costs.double().cpu().numpy()
 
 

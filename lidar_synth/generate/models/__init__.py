@@ -1,8 +1,10 @@
-"""Networks, one file per architecture. They work on tensors and ray angles and depend on no sensor class.
+"""Networks, one file per architecture. They work on tensors and ray angles and depend on no sensor
+class.
 
-To add one: write its file with a subclass of ``Network`` (or ``Encoder``), and enter the class in ``NETWORKS``. Its
-arguments have to be plain values, since a checkpoint stores them; its class attributes state what a training run
-provides beyond them.
+To add one: write its file with a subclass of ``Network`` (or ``Encoder``), and enter the class in
+    ``NETWORKS``. Its
+arguments have to be plain values, since a checkpoint stores them; its class attributes state what a
+training run provides beyond them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -42,7 +44,8 @@ NETWORKS: dict[str, type[Network]] = {
     "clip_views": ClipViewEncoder,
     "sight": SightEncoder,
 }
-"""Architectures by the name that a checkpoint stores: velocity networks, autoencoders, encoders of conditions."""
+"""Architectures by the name that a checkpoint stores: velocity networks, autoencoders, encoders of
+conditions."""
 
 
 def network_class(architecture: str) -> type[Network]:
@@ -57,8 +60,11 @@ def network_class(architecture: str) -> type[Network]:
 
 
 def encoders_of(condition: str) -> tuple[str, ...]:
-    """The architectures that encode a kind of condition, in the order of ``NETWORKS``; the first is the default."""
-    return tuple(k for k, cls in NETWORKS.items() if issubclass(cls, Encoder) and cls.condition == condition)
+    """The architectures that encode a kind of condition, in the order of ``NETWORKS``; the first is
+    the default."""
+    return tuple(
+        k for k, cls in NETWORKS.items() if issubclass(cls, Encoder) and cls.condition == condition
+    )
 
 
 def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
@@ -78,12 +84,15 @@ def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
         raise
     except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         given = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
-        raise ConfigError(f"{architecture}({given})", f"the arguments of its class ({error})") from error
+        raise ConfigError(
+            f"{architecture}({given})", f"the arguments of its class ({error})"
+        ) from error
 
 
 @contextmanager
 def bounded(most: int) -> Iterator[None]:
-    """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9 layers.
+    """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9
+    layers.
 
     Raises:
         ConfigError: on more modules.
@@ -94,7 +103,9 @@ def bounded(most: int) -> Iterator[None]:
         nonlocal built
         built += 1
         if built > most:
-            raise ConfigError(f"a network of more than {most} modules", "a network that its weights can fill")
+            raise ConfigError(
+                f"a network of more than {most} modules", "a network that its weights can fill"
+            )
 
     hook = register_module_module_registration_hook(count)
     try:
@@ -128,12 +139,21 @@ def assemble(
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error
     expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    missing, unexpected = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
+    missing = sorted(set(expected) - set(state))
+    unexpected = sorted(set(state) - set(expected))
     if missing or unexpected:
-        raise DataError(f"{what} has missing keys {missing} and unexpected keys {unexpected}", "exactly its own keys")
+        raise DataError(
+            f"{what} has missing keys {missing} and unexpected keys {unexpected}",
+            "exactly its own keys",
+        )
     if wrong := {key: tuple(v.shape) for key, v in state.items() if v.shape != expected[key]}:
         shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
-        raise DataError(f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give")
-    network.load_state_dict({key: v.to(device, torch.float32) for key, v in state.items()}, assign=True)
-    # Convolutions would otherwise convert their weights at every call; other weights have no such layout.
+        raise DataError(
+            f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give"
+        )
+    network.load_state_dict(
+        {key: v.to(device, torch.float32) for key, v in state.items()}, assign=True
+    )
+    # Convolutions would otherwise convert their weights at every call; other weights have no such
+    # layout.
     return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]

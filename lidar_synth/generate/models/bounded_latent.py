@@ -1,8 +1,9 @@
-"""What the autoencoders of the town have in common: an encoder on patches, and latents that are bounded.
+"""What the autoencoders of the town have in common: an encoder on patches, and latents that are
+bounded.
 
-The latent lies in (-1, 1) in place of a codebook, and the decoder is trained on noisy latents, so that it tolerates the
-errors of a flow. Every norm is over the channels of one cell, so that crops (in training) and full turns (in use) give
-the same result.
+The latent lies in (-1, 1) in place of a codebook, and the decoder is trained on noisy latents, so
+that it tolerates the errors of a flow. Every norm is over the channels of one cell, so that crops
+(in training) and full turns (in use) give the same result.
 """
 
 from abc import ABC, abstractmethod
@@ -29,7 +30,8 @@ class Residual(nn.Module):
 
     def __init__(self, channels: int, reach: int = 1) -> None:
         super().__init__()
-        self.first, self.second = WrapConv(channels, channels), WrapConv(channels, channels, dilation=(1, reach))
+        self.first = WrapConv(channels, channels)
+        self.second = WrapConv(channels, channels, dilation=(1, reach))
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -40,7 +42,8 @@ class Residual(nn.Module):
 
 
 class BoundedAutoencoder(Network, ABC):
-    """Images (B, C, H, W) to latents and back. A subclass calls ``add_encoder``, and has ``embed`` and ``expand``."""
+    """Images (B, C, H, W) to latents and back. A subclass calls ``add_encoder``, and has ``embed``
+    and ``expand``."""
 
     is_autoencoder: ClassVar[bool] = True
 
@@ -49,7 +52,9 @@ class BoundedAutoencoder(Network, ABC):
     shift: Tensor
     scale: Tensor
 
-    def add_encoder(self, stem: nn.Module, widths: Sequence[int], rows: int, depth: int, latent_channels: int) -> None:
+    def add_encoder(
+        self, stem: nn.Module, widths: Sequence[int], rows: int, depth: int, latent_channels: int
+    ) -> None:
         """Add the modules of the encoder.
 
         Args:
@@ -67,22 +72,24 @@ class BoundedAutoencoder(Network, ABC):
         self.merge = nn.Conv2d(outer, inner, 2, 2)
         self.encode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth)))
         self.to_latent = nn.Conv2d(inner, latent_channels, 1)
-        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
+        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
+        # needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
 
     @abstractmethod
     def embed(self, x: Tensor) -> Tensor:
-        """Images with a channel of their returns, (B, C + 1, H, W), to patches (B, widths[0], rows, columns)."""
+        """Images with a channel of their returns, (B, C + 1, H, W), to patches (B, widths[0], rows,
+        columns)."""
 
     @abstractmethod
     def expand(self, z: Tensor, image: Tensor) -> Any:
-        """Bounded latents (B, *latent_shape) to the distributions of the cells; a decoder may predict some of them from
-        other cells of the image (B, C, H, W)."""
+        """Bounded latents (B, *latent_shape) to the distributions of the cells; a decoder may
+        predict some of them from other cells of the image (B, C, H, W)."""
 
     def forward(self, x: Tensor, noise: Tensor) -> Any:
-        """Encodes images (B, C, H, W) and expands them with ``noise`` (B, *latent_shape) added to the bounded latents;
-        in training mode, updates the running statistics of the latents."""
+        """Encodes images (B, C, H, W) and expands them with ``noise`` (B, *latent_shape) added to
+        the bounded latents; in training mode, updates the running statistics of the latents."""
         z = self.squeeze(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
@@ -102,8 +109,8 @@ class BoundedAutoencoder(Network, ABC):
         return torch.tanh(self.to_latent(self.encode_inner(self.merge(h))).float())
 
     def encode(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of mean 0 and variance 1
-        per channel."""
+        """Images (B, C, H, W) in [-1, 1], range -1 = no return, to latents (B, *latent_shape) of
+        mean 0 and variance 1 per channel."""
         return (self.squeeze(x) - _channel(self.shift)) / _channel(self.scale)
 
     def bounded(self, z: Tensor) -> Tensor:

@@ -1,4 +1,5 @@
-"""A codebook: vectors are quantised to the nearest code, and codes are trained to follow their vectors."""
+"""A codebook: vectors are quantised to the nearest code, and codes are trained to follow their
+vectors."""
 
 import torch
 import torch.nn.functional as F
@@ -8,16 +9,20 @@ from lidar_synth.generate.models.convolution import to_map, to_tokens
 from lidar_synth.generate.models.layers import PIECE
 
 CODEBOOKS = ("gradient", "ema")
-"""How codes are trained: by the gradient of the distance, or as exponential moving averages of their vectors."""
+"""How codes are trained: by the gradient of the distance, or as exponential moving averages of
+their vectors."""
 
 DECAY = 0.99
 """Decay of the moving averages, per batch."""
 
-_LEAST = 0.03  # average vectors per batch below which a code of an "ema" codebook is dead and is reset
+_LEAST = (
+    0.03  # average vectors per batch below which a code of an "ema" codebook is dead and is reset
+)
 
 
 class Codebook(nn.Module):
-    """Vector quantisation (van den Oord et al., "Neural Discrete Representation Learning", NeurIPS 2017).
+    """Vector quantisation (van den Oord et al., "Neural Discrete Representation Learning", NeurIPS
+    2017).
 
     Args:
         count: number of codes; 0 = no quantisation.
@@ -50,7 +55,8 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def nearest(self, tokens: Tensor) -> Tensor:
-        """(N, K) vectors to the (N,) indices of the nearest codes, which maximise z e - |e|^2 / 2."""
+        """(N, K) vectors to the (N,) indices of the nearest codes, which maximise z e - |e|^2 /
+        2."""
         codes = self.codes.float()
         half = codes.square().sum(1) / -2
         length = max(1, PIECE // len(codes)) if tokens.device.type == "cpu" else len(tokens)
@@ -60,10 +66,12 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def follow(self, z: Tensor, index: Tensor) -> None:
-        """Update the codes of an "ema" codebook by the maps (B, K, h, w) that ``index`` (B, h w) assigns to them."""
+        """Update the codes of an "ema" codebook by the maps (B, K, h, w) that ``index`` (B, h w)
+        assigns to them."""
         if not len(self.counts):
             return
-        tokens, index = to_tokens(z).flatten(0, 1).float(), index.flatten()
+        tokens = to_tokens(z).flatten(0, 1).float()
+        index = index.flatten()
         counts = torch.bincount(index, minlength=len(self)).to(tokens.dtype)
         sums = torch.zeros_like(self.sums).index_add_(0, index, tokens)
         if torch.distributed.is_available() and torch.distributed.is_initialized():

@@ -1,7 +1,8 @@
-"""Layers of convolutional networks over range images, whose columns wrap around and whose rows do not.
+"""Layers of convolutional networks over range images, whose columns wrap around and whose rows do
+not.
 
-Tensors have the memory format channels last, in which convolutions, norms and attention over tokens need no copies on
-a CPU.
+Tensors have the memory format channels last, in which convolutions, norms and attention over tokens
+need no copies on a CPU.
 """
 
 import math
@@ -17,8 +18,9 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.attention import Grid
 
 GROUPS = 32
-"""Groups of a group norm, as in latent diffusion and LiDM. A group of a single channel removes the channel's mean and,
-with it, the time embedding: networks with fewer than 64 channels need fewer groups."""
+"""Groups of a group norm, as in latent diffusion and LiDM. A group of a single channel removes the
+channel's mean and, with it, the time embedding: networks with fewer than 64 channels need fewer
+groups."""
 
 
 class WrapConv(nn.Conv2d):
@@ -28,8 +30,8 @@ class WrapConv(nn.Conv2d):
         inputs, outputs: channels.
         kernel: rows and columns.
         stride: rows and columns.
-        pad: columns to the left and to the right, rows above and below; by default the size is kept, with an odd column
-            or row added to the right or below.
+        pad: columns to the left and to the right, rows above and below; by default the size is
+            kept, with an odd column or row added to the right or below.
         bias: whether to add a bias.
         dilation: rows and columns between neighbouring weights of the kernel.
     """
@@ -45,10 +47,17 @@ class WrapConv(nn.Conv2d):
         dilation: Grid = (1, 1),
     ) -> None:
         rows, columns = (d * (k - 1) for k, d in zip(kernel, dilation, strict=True))
-        self.left, self.right, above, below = pad or (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
+        self.left, self.right, above, below = pad or (
+            columns // 2,
+            columns - columns // 2,
+            rows // 2,
+            rows - rows // 2,
+        )
         # The convolution itself adds symmetric padding of rows, without a copy.
         self.below = 0 if above == below else below - above
-        super().__init__(inputs, outputs, kernel, stride, padding=(above, 0), dilation=dilation, bias=bias)
+        super().__init__(
+            inputs, outputs, kernel, stride, padding=(above, 0), dilation=dilation, bias=bias
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
@@ -60,7 +69,8 @@ class WrapConv(nn.Conv2d):
 
 
 class Norm(nn.GroupNorm):
-    """Group norm with the greatest common divisor of ``groups`` and the channels as number of groups."""
+    """Group norm with the greatest common divisor of ``groups`` and the channels as number of
+    groups."""
 
     def __init__(self, channels: int, eps: float, groups: int = GROUPS) -> None:
         super().__init__(math.gcd(groups, channels), channels, eps)
@@ -72,7 +82,8 @@ def activate(x: Tensor) -> Tensor:
 
 
 class Residual(nn.Module):
-    """x + f(x), where f is two times norm, SiLU, convolution; the time embedding is added in between.
+    """x + f(x), where f is two times norm, SiLU, convolution; the time embedding is added in
+    between.
 
     Args:
         inputs, outputs: channels.
@@ -91,9 +102,11 @@ class Residual(nn.Module):
         groups: int = GROUPS,
     ) -> None:
         super().__init__()
-        self.norm1, self.conv1 = Norm(inputs, eps, groups), WrapConv(inputs, outputs, kernel)
+        self.norm1 = Norm(inputs, eps, groups)
+        self.conv1 = WrapConv(inputs, outputs, kernel)
         self.time = nn.Linear(embedding, outputs) if embedding else None
-        self.norm2, self.conv2 = Norm(outputs, eps, groups), WrapConv(outputs, outputs, kernel)
+        self.norm2 = Norm(outputs, eps, groups)
+        self.conv2 = WrapConv(outputs, outputs, kernel)
         self.shortcut = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else None
         if embedding:
             nn.init.zeros_(self.conv2.weight)
@@ -104,7 +117,9 @@ class Residual(nn.Module):
         h = self.conv1(activate(self.norm1(x)))
         if self.time is not None:
             h = h + self.time(time)[:, :, None, None]
-        out: Tensor = self.conv2(activate(self.norm2(h))) + (x if self.shortcut is None else self.shortcut(x))
+        out: Tensor = self.conv2(activate(self.norm2(h))) + (
+            x if self.shortcut is None else self.shortcut(x)
+        )
         return out
 
 
@@ -117,7 +132,9 @@ class Attention(nn.Module):
         eps, groups: arguments of the norm.
     """
 
-    def __init__(self, channels: int, heads: int = 1, eps: float = 1e-6, groups: int = GROUPS) -> None:
+    def __init__(
+        self, channels: int, heads: int = 1, eps: float = 1e-6, groups: int = GROUPS
+    ) -> None:
         super().__init__()
         self.heads = heads
         self.norm = Norm(channels, eps, groups)
@@ -131,8 +148,9 @@ class Attention(nn.Module):
 
 
 class ContextBlock(nn.Module):
-    """x + a transformer block: self-attention over all cells, cross-attention to context tokens, gated feed-forward
-    (the spatial transformer of Rombach et al., "High-Resolution Image Synthesis with Latent Diffusion Models", 2022).
+    """x + a transformer block: self-attention over all cells, cross-attention to context tokens,
+    gated feed-forward (the spatial transformer of Rombach et al., "High-Resolution Image Synthesis
+    with Latent Diffusion Models", 2022).
 
     Args:
         channels: channels of a cell.
@@ -142,11 +160,14 @@ class ContextBlock(nn.Module):
         ratio: hidden channels per channel.
     """
 
-    def __init__(self, channels: int, heads: int, context: int, groups: int = GROUPS, ratio: int = 4) -> None:
+    def __init__(
+        self, channels: int, heads: int, context: int, groups: int = GROUPS, ratio: int = 4
+    ) -> None:
         super().__init__()
         self.heads = heads
         self.norm = Norm(channels, 1e-6, groups)
-        self.enter, self.leave = nn.Linear(channels, channels), nn.Linear(channels, channels)
+        self.enter = nn.Linear(channels, channels)
+        self.leave = nn.Linear(channels, channels)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.qkv = nn.Linear(channels, 3 * channels, bias=False)
         self.out = nn.Linear(channels, channels)
@@ -172,7 +193,8 @@ class ContextBlock(nn.Module):
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
-    """softmax(q k^T / sqrt(D)) v of queries (B, N, heads D) and keys and values (B, M, heads D), as (B, N, heads D)."""
+    """softmax(q k^T / sqrt(D)) v of queries (B, N, heads D) and keys and values (B, M, heads D), as
+    (B, N, heads D)."""
     q, k, v = (z.reshape(*z.shape[:2], heads, -1).transpose(1, 2) for z in (q, k, v))
     return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
@@ -188,7 +210,8 @@ def to_map(tokens: Tensor, like: Tensor) -> Tensor:
 
 
 def fold(x: Tensor, patch: Grid) -> Tensor:
-    """(B, C, H, W) to (B, C p q, H / p, W / q): the cells of a patch become channels. Channels last."""
+    """(B, C, H, W) to (B, C p q, H / p, W / q): the cells of a patch become channels. Channels
+    last."""
     batch, channels, rows, columns = x.shape
     x = x.reshape(batch, channels, rows // patch[0], patch[0], columns // patch[1], patch[1])
     return x.permute(0, 2, 4, 1, 3, 5).flatten(3).permute(0, 3, 1, 2)
@@ -201,7 +224,8 @@ def unfold(x: Tensor, patch: Grid) -> Tensor:
 
 
 def run(block: nn.Module, checkpointing: bool, *inputs: Tensor | None) -> Tensor:
-    """The output of a block; with ``checkpointing``, its activations are recomputed in the backward pass."""
+    """The output of a block; with ``checkpointing``, its activations are recomputed in the backward
+    pass."""
     if checkpointing and torch.is_grad_enabled():
         return cast(Tensor, checkpoint(block, *inputs, use_reentrant=False))
     return cast(Tensor, block(*inputs))
@@ -235,7 +259,9 @@ def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
         raise DataError(f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})")
 
 
-def check_condition(cond: Tensor | None, count: int, maps: tuple[int, int, int], tokens: int) -> None:
+def check_condition(
+    cond: Tensor | None, count: int, maps: tuple[int, int, int], tokens: int
+) -> None:
     """Check the shape of a condition against what a network takes.
 
     Args:

@@ -1,4 +1,5 @@
-"""Layers shared by networks: a norm modulated by time, a gated feed-forward layer, a mapping network.
+"""Layers shared by networks: a norm modulated by time, a gated feed-forward layer, a mapping
+network.
 
 Tokens are (B, N, C), so that a linear layer is one matrix product without a copy.
 """
@@ -14,12 +15,13 @@ EPS = 1e-6
 """Added to the mean square in RMS norms."""
 
 PIECE = 1 << 20
-"""Floats of the largest temporary array per piece on a CPU: 4 MB. Larger blocks are returned to the system when they
-are freed, and allocating each page anew is slow."""
+"""Floats of the largest temporary array per piece on a CPU: 4 MB. Larger blocks are returned to the
+system when they are freed, and allocating each page anew is slow."""
 
 
 def piece_length(x: Tensor, items: int, floats: int) -> int:
-    """The number of items to compute at once, so that temporary arrays stay within ``PIECE`` on a CPU.
+    """The number of items to compute at once, so that temporary arrays stay within ``PIECE`` on a
+    CPU.
 
     It is all items if gradients are recorded, on an accelerator, and under ``torch.compile``.
 
@@ -36,7 +38,12 @@ def piece_length(x: Tensor, items: int, floats: int) -> int:
 
 def rms_norm(x: Tensor, eps: float = EPS) -> Tensor:
     """x / rms(x) over the last dimension (..., C)."""
-    if x.device.type != "cpu" or x.dtype != torch.float32 or torch.is_grad_enabled() or torch.compiler.is_compiling():
+    if (
+        x.device.type != "cpu"
+        or x.dtype != torch.float32
+        or torch.is_grad_enabled()
+        or torch.compiler.is_compiling()
+    ):
         return F.rms_norm(x, x.shape[-1:], eps=eps)
     # Half as many passes over memory as torch's own on a CPU.
     square = torch.linalg.vector_norm(x, dim=-1, keepdim=True).square_()
@@ -47,17 +54,20 @@ def rms_norm(x: Tensor, eps: float = EPS) -> Tensor:
 class Exact(nn.Module):
     """A module whose buffers stay float32 when the network is cast to half precision.
 
-    An angle of 3 rad in bfloat16 has an error of up to 0.008 rad; in the 128th harmonic, that is one radian.
+    An angle of 3 rad in bfloat16 has an error of up to 0.008 rad; in the 128th harmonic, that is
+    one radian.
     """
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        # Viewed as integers, the buffers move between devices, but casts of floats do not apply to them.
+        # Viewed as integers, the buffers move between devices, but casts of floats do not apply to
+        # them.
         super()._apply(lambda t: fn(t.view(torch.int32)).view(torch.float32), recurse)  # type: ignore[no-untyped-call]
         return self
 
 
 class RMSNorm(nn.Module):
-    """RMS norm with a learned gain, g x / rms(x). Unlike torch's, it accepts inputs and gains of different dtypes.
+    """RMS norm with a learned gain, g x / rms(x). Unlike torch's, it accepts inputs and gains of
+    different dtypes.
 
     Args:
         dim: C, channels of a token.
@@ -108,7 +118,8 @@ class GatedFeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., C) to (..., C)."""
-        # Two products instead of one keep both halves contiguous, which makes gelu twice as fast on a CPU.
+        # Two products instead of one keep both halves contiguous, which makes gelu twice as fast on
+        # a CPU.
         value, gate = self.expand.weight.chunk(2)
         out: Tensor = self.contract(F.linear(x, value) * F.gelu(F.linear(x, gate)))
         return out

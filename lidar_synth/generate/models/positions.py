@@ -1,8 +1,8 @@
 """Position and time encodings: ray angles and timesteps as features of tokens.
 
-Angles are (2, H, W): elevation, then azimuth, radians. Attention uses a rotary encoding with integer harmonics of the
-angles (``Rotary``). One of four further encodings is added to the tokens: a learned table, or one of three fixed
-features of the angles, mapped by a small network.
+Angles are (2, H, W): elevation, then azimuth, radians. Attention uses a rotary encoding with
+integer harmonics of the angles (``Rotary``). One of four further encodings is added to the tokens:
+a learned table, or one of three fixed features of the angles, mapped by a small network.
 """
 
 import math
@@ -20,7 +20,8 @@ class RayAngles(Exact):
 
     Args:
         resolution: H, W.
-        angles: (2, H, W) radians; None = NaN until a checkpoint is loaded, so that missing angles are noticed.
+        angles: (2, H, W) radians; None = NaN until a checkpoint is loaded, so that missing angles
+            are noticed.
     """
 
     cells: Tensor
@@ -31,7 +32,8 @@ class RayAngles(Exact):
         self.register_buffer("cells", cells.detach().to(torch.float32, copy=True))
 
     def forward(self, patch: Sequence[int], levels: int) -> list[Tensor]:
-        """(2, rows, columns) angles of the tokens of each level, finest first: means over patches, then over 2 x 2."""
+        """(2, rows, columns) angles of the tokens of each level, finest first: means over patches,
+        then over 2 x 2."""
         means = [F.avg_pool2d(self.cells[None], tuple(patch))]
         while len(means) < levels:
             means.append(F.avg_pool2d(means[-1], 2))
@@ -39,10 +41,12 @@ class RayAngles(Exact):
 
 
 class Rotary(Exact):
-    """Axial rotary encoding (Su et al., "RoFormer", 2021) with integer harmonics of elevation and azimuth.
+    """Axial rotary encoding (Su et al., "RoFormer", 2021) with integer harmonics of elevation and
+    azimuth.
 
-    Of the D / 2 rotations of a head, the first half depends on elevation, the second on azimuth. The harmonics are
-    spaced geometrically from 1 to half the number of rows (columns), over all heads together.
+    Of the D / 2 rotations of a head, the first half depends on elevation, the second on azimuth.
+    The harmonics are spaced geometrically from 1 to half the number of rows (columns), over all
+    heads together.
 
     Args:
         grid: rows and columns of tokens.
@@ -55,9 +59,13 @@ class Rotary(Exact):
     def __init__(self, grid: Sequence[int], heads: int, width: int) -> None:
         super().__init__()
         highest = [math.log(max(size // 2, 1)) for size in grid]
-        spread = torch.stack([torch.linspace(0, h, heads * width // 4).exp().round() for h in highest])
+        spread = torch.stack(
+            [torch.linspace(0, h, heads * width // 4).exp().round() for h in highest]
+        )
         # (2, heads, D / 4): neighbouring harmonics are assigned to different heads.
-        self.register_buffer("harmonics", spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous())
+        self.register_buffer(
+            "harmonics", spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous()
+        )
 
     def forward(self, angles: Tensor) -> tuple[Tensor, Tensor]:
         """Angles (2, H, W) to the tokens' cosines and sines, each (N, heads, D / 2)."""
@@ -72,8 +80,8 @@ def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def spherical_harmonics(angles: Tensor, degree: int = 4) -> Tensor:
-    """Real spherical harmonics of the ray directions, orthonormal, in the order l = 0..degree and, for each l, m =
-    -l..l.
+    """Real spherical harmonics of the ray directions, orthonormal, in the order l = 0..degree and,
+    for each l, m = -l..l.
 
     Args:
         angles: (2, H, W) radians.
@@ -82,11 +90,14 @@ def spherical_harmonics(angles: Tensor, degree: int = 4) -> Tensor:
         (H, W, (degree + 1)^2).
     """
     elevation, azimuth = angles
-    z, across = elevation.sin(), elevation.cos()
+    z = elevation.sin()
+    across = elevation.cos()
     components = {}
     for m in range(degree + 1):
-        # Associated Legendre polynomials P_l^m without the sign (-1)^m, by recurrence in l, starting at P_m^m.
-        below, legendre = torch.zeros_like(z), across**m * math.prod(range(1, 2 * m, 2))
+        # Associated Legendre polynomials P_l^m without the sign (-1)^m, by recurrence in l,
+        # starting at P_m^m.
+        below = torch.zeros_like(z)
+        legendre = across**m * math.prod(range(1, 2 * m, 2))
         for n in range(m, degree + 1):
             norm = (2 * n + 1) / (2 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
             # y = cos(elevation) sin(-azimuth), since azimuth increases clockwise.
@@ -105,7 +116,9 @@ def fourier_features(angles: Tensor) -> Tensor:
     Returns:
         (H, W, 2 (ceil(log2 H) + ceil(log2 W))).
     """
-    octaves = [torch.arange(math.ceil(math.log2(size)), device=angles.device) for size in angles.shape[1:]]
+    octaves = [
+        torch.arange(math.ceil(math.log2(size)), device=angles.device) for size in angles.shape[1:]
+    ]
     turn = torch.cat([a[..., None] * n.exp2() for a, n in zip(angles, octaves, strict=True)], -1)
     return torch.cat((turn.sin(), turn.cos()), -1)
 
@@ -207,7 +220,8 @@ class TimeEmbedding(nn.Module):
 
 
 class StepEmbedding(nn.Module):
-    """The length of a step, to be added to the embedding of its time; zero at first, as if no length was given.
+    """The length of a step, to be added to the embedding of its time; zero at first, as if no
+    length was given.
 
     Args:
         dim: E, channels of the embedding, even.
@@ -216,7 +230,8 @@ class StepEmbedding(nn.Module):
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.features = TimeFeatures(dim)
-        self.hidden, self.out = nn.Linear(dim, dim), nn.Linear(dim, dim, bias=False)
+        self.hidden = nn.Linear(dim, dim)
+        self.out = nn.Linear(dim, dim, bias=False)
         nn.init.zeros_(self.out.weight)
 
     def forward(self, length: Tensor) -> Tensor:

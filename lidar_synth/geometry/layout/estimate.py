@@ -17,10 +17,14 @@ SECTORS = 512
 """Directions in which an outline has a corner."""
 
 _LEAST = 3  # returns of an outline in a sector
-_GAP = 1.5  # metres between the first wall of a sector and what stands behind it; and between connected sectors
-_STEP = 0.5  # metres by which the edges of connected sectors may differ, before they are two outlines
+# metres between the first wall of a sector and what stands behind it; and between connected sectors
+_GAP = 1.5
+_STEP = (
+    0.5  # metres by which the edges of connected sectors may differ, before they are two outlines
+)
 _EDGE = 0.05  # metres between the outermost return and the edge of an outline
-_FLAT = 0.3  # metres; the returns of a building in one sector differ less in their distance, without labels
+# metres; the returns of a building in one sector differ less in their distance, without labels
+_FLAT = 0.3
 _CLEAR = 0.3  # metres above the ground of what stands on it, without labels
 _NEAR = 30.0  # metres around the sensor in which the ground is a plane
 _CUBE = 1.0  # metres; side of the columns whose lowest return may be ground, without labels
@@ -30,8 +34,9 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     """The layout of a scan.
 
     Args:
-        scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels has the plane of
-            its lowest returns, and outlines of what stands on it. Its boxes are ``known_boxes``.
+        scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels
+            has the plane of its lowest returns, and outlines of what stands on it. Its boxes are
+            ``known_boxes``.
         reach: of the ground, metres; by default the sensor's range.
 
     Raises:
@@ -52,27 +57,32 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
 
 
 def known_boxes(scan: Scan) -> Boxes:
-    """The boxes of a scan with boxes that its layout has: of known classes, within the sensor's range, of overlapping
-    ones the first, and none around the sensor."""
+    """The boxes of a scan with boxes that its layout has: of known classes, within the sensor's
+    range, of overlapping ones the first, and none around the sensor."""
     assert scan.boxes is not None
     boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
     boxes = boxes[np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)]
     later: set[int] = set()
-    for first, second in overlaps(boxes):  # in order, so that the first of a pair is kept or dropped already
+    for first, second in overlaps(
+        boxes
+    ):  # in order, so that the first of a pair is kept or dropped already
         if first not in later:
             later.add(second)
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes
 
 
 def _plane(points: NDArray[np.float32], name: str) -> tuple[float, float, float]:
-    """The plane z = a + b x + c y through ground returns near the sensor, by repeated least squares."""
+    """The plane z = a + b x + c y through ground returns near the sensor, by repeated least
+    squares."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR].astype(np.float64)
     if len(near) < 20:
         raise DataError(f"scan {name!r} with {len(near)} returns of the ground", "20 or more")
-    plane, kept = np.zeros(3), near
+    plane = np.zeros(3)
+    kept = near
     for limit in (0.5, 0.2):
         design = np.c_[np.ones(len(kept)), kept[:, :2]]
-        # Returns crowd near the sensor; the weight makes the plane fit everywhere. A level plane is preferred.
+        # Returns crowd near the sensor; the weight makes the plane fit everywhere. A level plane is
+        # preferred.
         weight = np.hypot(kept[:, 0], kept[:, 1])[:, None]
         normal = design.T @ (weight * design) + np.diag([0.0, 1e3, 1e3])
         plane = np.linalg.solve(normal, design.T @ (weight[:, 0] * kept[:, 2]))
@@ -97,25 +107,35 @@ def _labelled(points: NDArray[np.float32], label: NDArray[np.uint8]) -> Iterator
 
 
 def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outline]:
-    """Outlines of what stands on the ground outside all boxes: flat things are buildings, others vegetation."""
+    """Outlines of what stands on the ground outside all boxes: flat things are buildings, others
+    vegetation."""
     height = scan.points[:, 2] - (ground[0] + scan.points[:, :2] @ np.array(ground[1:], np.float32))
     assert scan.boxes is not None
-    for profile in _profiles(scan.points[(height > _CLEAR) & ~scan.boxes.contain(scan.points).any(0)]):
+    for profile in _profiles(
+        scan.points[(height > _CLEAR) & ~scan.boxes.contain(scan.points).any(0)]
+    ):
         kind = "building" if np.median(profile[:, 4]) < _FLAT else "vegetation"
         yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 
 def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
-    """The first thing in each sector, connected to lines: (K, 5) x, y, lowest z, highest z, depth of its returns."""
-    rho, azimuth = np.hypot(points[:, 0], points[:, 1]), -np.arctan2(points[:, 1], points[:, 0])
+    """The first thing in each sector, connected to lines: (K, 5) x, y, lowest z, highest z, depth
+    of its returns."""
+    rho = np.hypot(points[:, 0], points[:, 1])
+    azimuth = -np.arctan2(points[:, 1], points[:, 0])
     sector = ((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     order = np.lexsort((rho, sector))
-    rho, sector, z = rho[order], sector[order], points[order, 2]
+    rho = rho[order]
+    sector = sector[order]
+    z = points[order, 2]
     rows = []
     for number, start, stop in _groups(sector):
         # The first run of returns without a gap that has enough of them.
         ends = np.append(np.flatnonzero(np.diff(rho[start:stop]) > _GAP) + 1, stop - start)
-        first, last = next(((a, b) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True) if b - a >= _LEAST), (0, 0))
+        first, last = next(
+            ((a, b) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True) if b - a >= _LEAST),
+            (0, 0),
+        )
         if last:
             part = slice(start + first, start + last)
             near, far = np.quantile(rho[part], (0.1, 0.9))
@@ -127,11 +147,14 @@ def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
 def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     """(sector, first, last + 1) of sorted sectors."""
     numbers, starts = np.unique(sector, return_index=True)
-    yield from zip(numbers.tolist(), starts.tolist(), np.append(starts, len(sector))[1:].tolist(), strict=True)
+    yield from zip(
+        numbers.tolist(), starts.tolist(), np.append(starts, len(sector))[1:].tolist(), strict=True
+    )
 
 
 def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
-    """Lines of neighbouring sectors with similar distance and edges; a sector alone is a line across it."""
+    """Lines of neighbouring sectors with similar distance and edges; a sector alone is a line
+    across it."""
     if not len(rows):
         return
     gap = np.abs(np.diff(rows, axis=0))
@@ -142,5 +165,7 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
         edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
         padded = np.r_[line[:1], line, line[-1:]]
         azimuth = (edges / SECTORS - 0.5) * 2 * np.pi
-        corners = np.c_[padded[:, 1] * np.cos(azimuth), -padded[:, 1] * np.sin(azimuth), padded[:, 2:]]
+        corners = np.c_[
+            padded[:, 1] * np.cos(azimuth), -padded[:, 1] * np.sin(azimuth), padded[:, 2:]
+        ]
         yield corners.astype(np.float32)

@@ -5,8 +5,10 @@
     ground: -1.73                     # metres; 0 is the height of the sensor
     reach: 15                         # metres up to which the ground is known
     objects:
-      - {class: Van, at: [12, 0]}     # x forward, y left, metres; default: the size of its class, on the ground
-      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}  # degrees counter-clockwise from x
+      - {class: Van, at: [12, 0]}     # x forward, y left, metres; default: the size of its class,
+        on the ground
+      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}  # degrees
+        counter-clockwise from x
     outlines:
       - {kind: building, line: [[-10, 9], [40, 9]], height: 8}
       - {kind: vegetation, line: [[5, -7], [12, -7]], from: 2, height: 6}  # metres above the ground
@@ -24,10 +26,17 @@ from lidar_synth.geometry.layout.layout import Layout, Outline
 from lidar_synth.geometry.scan import Boxes
 
 SIZES = {
-    "Car": (4.3, 1.8, 1.5), "Van": (5.0, 2.0, 2.2), "Truck": (7.2, 2.5, 3.2), "Bus": (11.8, 2.55, 3.05),
-    "Tram": (26.0, 2.4, 3.5), "Trailer": (3.5, 2.0, 1.8), "Pedestrian": (0.6, 0.6, 1.75),
-    "Person_sitting": (0.8, 0.6, 1.25), "Cyclist": (1.8, 0.65, 1.75), "Motorcyclist": (2.1, 0.8, 1.7),
-}  # fmt: skip
+    "Car": (4.3, 1.8, 1.5),
+    "Van": (5.0, 2.0, 2.2),
+    "Truck": (7.2, 2.5, 3.2),
+    "Bus": (11.8, 2.55, 3.05),
+    "Tram": (26.0, 2.4, 3.5),
+    "Trailer": (3.5, 2.0, 1.8),
+    "Pedestrian": (0.6, 0.6, 1.75),
+    "Person_sitting": (0.8, 0.6, 1.25),
+    "Cyclist": (1.8, 0.65, 1.75),
+    "Motorcyclist": (2.1, 0.8, 1.7),
+}
 """Length, width and height of each class of objects, metres."""
 
 NAMES = {"Bus": "Misc", "Trailer": "Misc"}
@@ -85,9 +94,14 @@ def load_layout(path: str | Path) -> Layout:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "its top level"
-        raise ConfigError(f"{path}: {where}: {first['msg']}", "ground, reach, objects and outlines") from error
+        raise ConfigError(
+            f"{path}: {where}: {first['msg']}", "ground, reach, objects and outlines"
+        ) from error
     rows = [_box(one, given.ground, path) for one in given.objects]
-    boxes = Boxes(np.array(rows, np.float32).reshape(-1, 7), tuple(NAMES.get(o.kind, o.kind) for o in given.objects))
+    boxes = Boxes(
+        np.array(rows, np.float32).reshape(-1, 7),
+        tuple(NAMES.get(o.kind, o.kind) for o in given.objects),
+    )
     walls = [
         Outline(w.kind, np.array(w.line, np.float32), given.ground + w.low, given.ground + w.height)
         for w in given.outlines
@@ -98,7 +112,9 @@ def load_layout(path: str | Path) -> Layout:
 def _box(given: _Object, ground: float, path: Path) -> tuple[float, ...]:
     """(7,) the box of an object."""
     if given.kind not in SIZES:
-        raise ConfigError(f"{path}: an object of class {given.kind!r}", f"one of {', '.join(SIZES)}")
+        raise ConfigError(
+            f"{path}: an object of class {given.kind!r}", f"one of {', '.join(SIZES)}"
+        )
     length, width, height = given.size or SIZES[given.kind]
     yaw = (np.radians(given.heading) + np.pi) % (2 * np.pi) - np.pi
     return (*given.at, ground + given.above + height / 2, length, width, height, float(yaw))

@@ -1,6 +1,8 @@
-"""What stands where: oriented boxes with a class, the ground, and outlines of buildings, vegetation and fences.
+"""What stands where: oriented boxes with a class, the ground, and outlines of buildings, vegetation
+and fences.
 
-A layout is in the sensor frame, metres: x forward, y left, z up. It is the condition of a model that generates the scan
+A layout is in the sensor frame, metres: x forward, y left, z up. It is the condition of a model
+    that generates the scan
 of it, and its boxes are the boxes of that scan.
 """
 
@@ -16,8 +18,19 @@ from lidar_synth.geometry.scan import Boxes
 OUTLINES = ("building", "vegetation", "fence")
 """Kinds of outlines."""
 
-CLASSES = ("Car", "Van", "Truck", "Tram", "Misc", "Pedestrian", "Person_sitting", "Cyclist", "Motorcyclist")
-"""Classes of boxes as KITTI spells them; it counts motorcyclists as ``Misc``, of which narrow boxes are theirs."""
+CLASSES = (
+    "Car",
+    "Van",
+    "Truck",
+    "Tram",
+    "Misc",
+    "Pedestrian",
+    "Person_sitting",
+    "Cyclist",
+    "Motorcyclist",
+)
+"""Classes of boxes as KITTI spells them; it counts motorcyclists as ``Misc``, of which narrow boxes
+are theirs."""
 
 CODES = {name: code for code, name in enumerate(("unknown", "ground", *OUTLINES, *CLASSES))}
 """The code of each class in a layout's image."""
@@ -25,8 +38,10 @@ CODES = {name: code for code, name in enumerate(("unknown", "ground", *OUTLINES,
 CHANNELS = ("class", "depth_high", "depth_low", "chord", "along")
 """Channels of a layout's image, uint8: see ``raster.layout_image``."""
 
-DEPTH_STEP, CHORD_STEP = 0.002, 0.1
-"""Metres per step of the depth (65,536 steps in two channels), and of the way of a ray through a box."""
+DEPTH_STEP = 0.002
+CHORD_STEP = 0.1
+"""Metres per step of the depth (65,536 steps in two channels), and of the way of a ray through a
+box."""
 
 NARROW = 1.3
 """Maximum width of a motorcyclist's box, metres."""
@@ -44,8 +59,8 @@ class Outline:
     Args:
         kind: one of ``OUTLINES``.
         line: (K, 2) float32 x, y of the line's K >= 2 corners, metres.
-        low, high: height of its lower and upper edge above the sensor's origin, metres: one number, or (K,) for the
-            corners.
+        low, high: height of its lower and upper edge above the sensor's origin, metres: one number,
+            or (K,) for the corners.
 
     Raises:
         DataError: on another kind, a line without length, or edges in the wrong order.
@@ -62,15 +77,23 @@ class Outline:
         if self.kind not in OUTLINES:
             raise DataError(f"an outline of {self.kind!r}", f"one of {', '.join(OUTLINES)}")
         if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2 or not (np.abs(line) < _FAR).all():
-            raise DataError(f"an outline of shape {line.shape}", "two or more corners x, y in metres")
+            raise DataError(
+                f"an outline of shape {line.shape}", "two or more corners x, y in metres"
+            )
         for name in ("low", "high"):
             edge = np.asarray(getattr(self, name), np.float32)
             if edge.shape not in ((), (len(line),)):
-                raise DataError(f"an outline's {name} of shape {edge.shape}", f"one number, or ({len(line)},)")
+                raise DataError(
+                    f"an outline's {name} of shape {edge.shape}", f"one number, or ({len(line)},)"
+                )
             object.__setattr__(self, name, np.broadcast_to(edge, len(line)))
-        low, high = np.asarray(self.low), np.asarray(self.high)
+        low = np.asarray(self.low)
+        high = np.asarray(self.high)
         if not ((low > -_FAR) & (low < high) & (high < _FAR)).all():
-            raise DataError(f"an outline from {low.min()} to {high.max()} m", "low < high, metres above the sensor")
+            raise DataError(
+                f"an outline from {low.min()} to {high.max()} m",
+                "low < high, metres above the sensor",
+            )
 
 
 @dataclass(frozen=True)
@@ -79,15 +102,16 @@ class Layout:
 
     Args:
         boxes: of the objects, with names of ``CLASSES``.
-        ground: (3,) height of the ground below the sensor, above its origin (metres, negative), and its rise per metre
-            along x and y.
+        ground: (3,) height of the ground below the sensor, above its origin (metres, negative), and
+            its rise per metre along x and y.
         outlines: of what stands still; where there is none, a model decides.
-        reach: metres up to which the ground is known; a layout without outlines does not know what ends the ground.
+        reach: metres up to which the ground is known; a layout without outlines does not know what
+            ends the ground.
         id: name of the layout.
 
     Raises:
-        DataError: on a class that no model knows, a box around the sensor, boxes that overlap, or a ground that is
-            above the sensor or steep.
+        DataError: on a class that no model knows, a box around the sensor, boxes that overlap, or a
+            ground that is above the sensor or steep.
 
     Example:
         >>> import numpy as np
@@ -107,27 +131,40 @@ class Layout:
     def __post_init__(self) -> None:
         object.__setattr__(self, "outlines", tuple(self.outlines))
         if unknown := sorted(set(self.boxes.names) - set(CLASSES)):
-            raise self._error(f"boxes of {', '.join(map(repr, unknown))}", f"classes of {', '.join(CLASSES)}")
+            raise self._error(
+                f"boxes of {', '.join(map(repr, unknown))}", f"classes of {', '.join(CLASSES)}"
+            )
         height, rise, across = map(float, self.ground)
         if not -10 < height < -0.2 or not np.hypot(rise, across) <= 0.3:
-            raise self._error(f"ground {tuple(self.ground)}", "-10 to -0.2 m, and a rise of at most 0.3 per metre")
+            raise self._error(
+                f"ground {tuple(self.ground)}", "-10 to -0.2 m, and a rise of at most 0.3 per metre"
+            )
         if not 0 < self.reach < _FAR:
             raise self._error(f"ground up to {self.reach} m", "metres above 0")
         if (around := around_sensor(self.boxes)).any():
-            raise self._error(f"box {int(around.argmax())} around the sensor", "boxes beside the sensor")
+            raise self._error(
+                f"box {int(around.argmax())} around the sensor", "boxes beside the sensor"
+            )
         for i, j in overlaps(self.boxes):
             names = f"{self.boxes.names[i]} and {self.boxes.names[j]}"
             raise self._error(
-                f"boxes {i} and {j} ({names}) that overlap", "boxes that stand apart", "Move one of them."
+                f"boxes {i} and {j} ({names}) that overlap",
+                "boxes that stand apart",
+                "Move one of them.",
             )
 
     def _error(self, given: str, expected: str, hint: str = "") -> DataError:
-        return DataError(f"layout {self.id!r}: {given}" if self.id else f"a layout with {given}", expected, hint)
+        return DataError(
+            f"layout {self.id!r}: {given}" if self.id else f"a layout with {given}", expected, hint
+        )
 
     def codes(self) -> NDArray[np.uint8]:
         """(M,) the code of each box."""
         narrow = self.boxes.values[:, 4] < NARROW
-        names = ["Motorcyclist" if n == "Misc" and s else n for n, s in zip(self.boxes.names, narrow, strict=True)]
+        names = [
+            "Motorcyclist" if n == "Misc" and s else n
+            for n, s in zip(self.boxes.names, narrow, strict=True)
+        ]
         return np.array([CODES[name] for name in names], np.uint8)
 
 
@@ -138,23 +175,28 @@ def around_sensor(boxes: Boxes) -> NDArray[np.bool_]:
 
 
 def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
-    """Pairs of boxes that reach more than ``margin`` metres into each other, by their footprints and heights."""
+    """Pairs of boxes that reach more than ``margin`` metres into each other, by their footprints
+    and heights."""
     values = boxes.values.astype(np.float64)
     half = np.maximum(values[:, 3:6] - margin, 1e-3) / 2
-    c, s = np.cos(values[:, 6]), np.sin(values[:, 6])
+    c = np.cos(values[:, 6])
+    s = np.sin(values[:, 6])
     axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)  # (M, 2 axes, x and y)
     found = []
     for i in range(len(values)):
         gap = values[i + 1 :, :3] - values[i, :3]
         near = np.hypot(*gap[:, :2].T) < np.hypot(*half[i, :2]) + np.hypot(*half[i + 1 :, :2].T)
         for j in i + 1 + np.flatnonzero(near & (np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2])):
-            if _footprints_meet(axes[i], half[i, :2], axes[j], half[j, :2], values[j, :2] - values[i, :2]):
+            if _footprints_meet(
+                axes[i], half[i, :2], axes[j], half[j, :2], values[j, :2] - values[i, :2]
+            ):
                 found.append((i, int(j)))
     return found
 
 
 def _footprints_meet(axes_a, half_a, axes_b, half_b, gap) -> bool:  # type: ignore[no-untyped-def]
-    """Separating axis theorem for two rectangles with unit axes (2, 2), half sides (2,) and centres ``gap`` apart."""
+    """Separating axis theorem for two rectangles with unit axes (2, 2), half sides (2,) and centres
+    ``gap`` apart."""
     for axis in (*axes_a, *axes_b):
         if abs(axis @ gap) >= np.abs(axes_a @ axis) @ half_a + np.abs(axes_b @ axis) @ half_b:
             return False

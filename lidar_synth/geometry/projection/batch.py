@@ -1,4 +1,5 @@
-"""Projection and unprojection of batches of torch tensors on any device, bit-identical to those on the CPU."""
+"""Projection and unprojection of batches of torch tensors on any device, bit-identical to those on
+the CPU."""
 
 from typing import NamedTuple
 
@@ -6,7 +7,16 @@ import numpy as np
 import torch
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.projection.kernels import ASIN, ATAN, PI, PI_2, PI_4, TAN_PI_8, Grid, grid_of
+from lidar_synth.geometry.projection.kernels import (
+    ASIN,
+    ATAN,
+    PI,
+    PI_2,
+    PI_4,
+    TAN_PI_8,
+    Grid,
+    grid_of,
+)
 from lidar_synth.geometry.sensor import Rays, Sensor
 
 _NONE = torch.iinfo(torch.int64).max
@@ -27,14 +37,16 @@ class BatchImage(NamedTuple):
 
 
 def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cell (N,) int64 and range (N,) float32 of points (N, 3); cell 0 and range inf outside the range limits."""
+    """Cell (N,) int64 and range (N,) float32 of points (N, 3); cell 0 and range inf outside the
+    range limits."""
     x, y, z = points.unbind(-1)
     r = torch_sqrt(x * x + y * y + z * z)
     in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     elevation = torch_asin(z / torch.where(r > 0, r, 1.0))
     if len(grid.slopes):
         slopes, lifts, starts = (
-            torch.from_numpy(part).to(points.device) for part in (grid.slopes, grid.lifts, grid.starts)
+            torch.from_numpy(part).to(points.device)
+            for part in (grid.slopes, grid.lifts, grid.starts)
         )
         squared = x * x + y * y
         flat = torch_sqrt(squared)[:, None]
@@ -50,15 +62,17 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
         row = ((1 - (elevation - down) / (up - down)) * grid.rows).clamp(0, grid.rows - 1).long()
     azimuth = -torch_atan2(y, x)
     column = ((azimuth / torch.pi + 1) * 0.5 * grid.columns).long() % grid.columns
-    return torch.where(in_range, row * grid.columns + column, 0), torch.where(in_range, r, torch.inf)
+    return torch.where(in_range, row * grid.columns + column, 0), torch.where(
+        in_range, r, torch.inf
+    )
 
 
 def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -> BatchImage:
     """Project a batch of point clouds to range images, each bit for bit as ``project`` does.
 
     Args:
-        points: (N, 3 + C) float32 x, y, z in metres, then C further values; all clouds one after another, on any
-            device.
+        points: (N, 3 + C) float32 x, y, z in metres, then C further values; all clouds one after
+            another, on any device.
         offsets: (B + 1,) int64, cloud b is ``points[offsets[b]:offsets[b + 1]]``.
         sensor: the sensor that defines the grid.
 
@@ -77,14 +91,22 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
         tensor([2, 1])
     """
     if points.dtype != torch.float32 or points.ndim != 2 or points.shape[1] < 3:
-        raise DataError(f"points {tuple(points.shape)} {points.dtype}", "(N, 3 + C) float32: x, y, z in metres, ...")
+        raise DataError(
+            f"points {tuple(points.shape)} {points.dtype}",
+            "(N, 3 + C) float32: x, y, z in metres, ...",
+        )
     if int(offsets[0]) != 0 or int(offsets[-1]) != len(points) or bool((offsets.diff() < 0).any()):
-        raise DataError(f"offsets {offsets.tolist()} for {len(points)} points", "rising from 0 to the number of points")
+        raise DataError(
+            f"offsets {offsets.tolist()} for {len(points)} points",
+            "rising from 0 to the number of points",
+        )
     (height, width), batch = sensor.shape, len(offsets) - 1
     cell, distance = _cells(points[:, :3], grid_of(sensor))
-    cloud = torch.repeat_interleave(torch.arange(batch, device=points.device), offsets.diff().to(points.device))
-    # Positive floats are ordered like their bit patterns, so one integer minimum over (range bits, point index) finds
-    # the nearest point, and the first of points at equal range.
+    cloud = torch.repeat_interleave(
+        torch.arange(batch, device=points.device), offsets.diff().to(points.device)
+    )
+    # Positive floats are ordered like their bit patterns, so one integer minimum over (range bits,
+    # point index) finds the nearest point, and the first of points at equal range.
     key = distance.view(torch.int32).long() << 32 | torch.arange(len(points), device=points.device)
     best = torch.full((batch * height * width,), _NONE, device=points.device)
     in_range = distance < torch.inf
@@ -111,7 +133,9 @@ def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") 
         DataError: on a shape that is not the sensor's.
     """
     if tuple(image.shape[1:]) != sensor.shape:
-        raise DataError(f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})")
+        raise DataError(
+            f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})"
+        )
     directions = torch.tensor(sensor.ray_directions(rays), device=image.device).movedim(-1, 0)
     points = image[:, None] * directions
     if len(sensor.starts):
@@ -121,8 +145,10 @@ def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") 
 
 def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     """``atan2`` on float32 tensors of any one shape, bit for bit."""
-    ax, ay = x.abs(), y.abs()
-    high, low = torch.maximum(ax, ay), torch.minimum(ax, ay)
+    ax = x.abs()
+    ay = y.abs()
+    high = torch.maximum(ax, ay)
+    low = torch.minimum(ax, ay)
     q = low / torch.where(high > 0, high, 1.0)
     upper = q > float(TAN_PI_8)
     u = torch.where(upper, (q - 1) / (q + 1), q)
@@ -134,7 +160,8 @@ def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 
 def torch_sqrt(x: torch.Tensor) -> torch.Tensor:
-    """Square root rounded to the nearest float32, which torch's own on a CPU (MKL's) does not promise."""
+    """Square root rounded to the nearest float32, which torch's own on a CPU (MKL's) does not
+    promise."""
     return x.double().sqrt().float()
 
 

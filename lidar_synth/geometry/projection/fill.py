@@ -1,4 +1,5 @@
-"""From cells back to points: transfers the prediction of a range-view network from cells to all points of a scan."""
+"""From cells back to points: transfers the prediction of a range-view network from cells to all
+points of a scan."""
 
 import numba
 import numpy as np
@@ -14,13 +15,15 @@ _NEIGHBOURS = 32  # largest k
 @numba.njit(cache=True)
 def _vote(cell, distance, point, image, labels, half, k, cutoff, out):  # type: ignore[no-untyped-def]
     rows, columns = image.shape
-    gaps, neighbours = np.empty(_NEIGHBOURS, np.float32), np.empty(_NEIGHBOURS, np.int64)
+    gaps = np.empty(_NEIGHBOURS, np.float32)
+    neighbours = np.empty(_NEIGHBOURS, np.int64)
     votes = np.empty(256, np.int64)
     for i in range(len(cell)):
         if cell[i] < 0:
             out[i] = IGNORE
             continue
-        row, column = cell[i] // columns, cell[i] % columns
+        row = cell[i] // columns
+        column = cell[i] % columns
         if point[row, column] == i:
             out[i] = labels[row, column]
             continue
@@ -57,11 +60,13 @@ def fill_points(
     window: int = 5,
     cutoff: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Transfer labels from cells to points, as a range-view network needs (after RangeNet++, Milioto et al. 2019).
+    """Transfer labels from cells to points, as a range-view network needs (after RangeNet++,
+    Milioto et al. 2019).
 
-    A point that its cell shows takes the cell's label. A hidden point takes the majority label of the k returns in
-    the window around its cell whose range is nearest to its own. Returns whose range differs by more than ``cutoff``
-    do not vote; if none is left, the point takes the label of the nearest.
+    A point that its cell shows takes the cell's label. A hidden point takes the majority label of
+    the k returns in the window around its cell whose range is nearest to its own. Returns whose
+    range differs by more than ``cutoff`` do not vote; if none is left, the point takes the label of
+    the nearest.
 
     Args:
         labels: (H, W) uint8 per cell.
@@ -87,9 +92,14 @@ def fill_points(
         (True, 1.0)
     """
     if not labels.shape == image.shape == cells.point.shape:
-        raise DataError(f"labels {labels.shape}, range {image.shape}, cells {cells.point.shape}", "one shape (H, W)")
+        raise DataError(
+            f"labels {labels.shape}, range {image.shape}, cells {cells.point.shape}",
+            "one shape (H, W)",
+        )
     if not (1 <= k <= _NEIGHBOURS and window >= 1 and window % 2):
         raise DataError(f"k = {k}, window = {window}", f"1 <= k <= {_NEIGHBOURS} and an odd window")
     out = np.empty(len(cells.cell), np.uint8)
-    _vote(cells.cell, cells.range, cells.point, image, labels, window // 2, k, np.float32(cutoff), out)
+    _vote(
+        cells.cell, cells.range, cells.point, image, labels, window // 2, k, np.float32(cutoff), out
+    )
     return out

@@ -1,8 +1,11 @@
-"""Ring numbers from the order of the points, for complete and cropped scans, and a check that they are plausible.
+"""Ring numbers from the order of the points, for complete and cropped scans, and a check that they
+are plausible.
 
-Lasers rotate counter-clockwise, so the azimuth (from straight ahead) increases within a ring, and a decrease marks the
-start of the next ring. The decrease is a full turn in a complete scan, and less in a scan cropped to a sector. Two
-other cases look like the start of a ring: a stray point, and a step back caused by motion compensation, which changes
+Lasers rotate counter-clockwise, so the azimuth (from straight ahead) increases within a ring, and a
+decrease marks the start of the next ring. The decrease is a full turn in a complete scan, and less
+in a scan cropped to a sector. Two
+other cases look like the start of a ring: a stray point, and a step back caused by motion
+    compensation, which changes
 the azimuth of near points more than that of distant ones.
 """
 
@@ -25,21 +28,25 @@ MIN_DECREASE = np.radians(2.0)
 """Smallest decrease of the azimuth at the start of a ring, radians."""
 
 MOTION = 0.3
-"""Largest relative shift of neighbouring points by motion compensation, metres; twice that of SemanticKITTI's scans."""
+"""Largest relative shift of neighbouring points by motion compensation, metres; twice that of
+SemanticKITTI's scans."""
 
 MIN_DECREASE_ALL_AROUND = np.radians(90.0)
-"""Smallest decrease of the azimuth at the start of a ring in a scan that covers all directions, radians."""
+"""Smallest decrease of the azimuth at the start of a ring in a scan that covers all directions,
+radians."""
 
 STRAYS = 5
-"""Number of points before and after the start of a ring whose median azimuth must decrease, so that stray points do
-not start a ring."""
+"""Number of points before and after the start of a ring whose median azimuth must decrease, so that
+stray points do not start a ring."""
 
 FRAGMENT = 0.05
-"""A ring with less than this share of the median number of points may be a fragment of a neighbouring ring."""
+"""A ring with less than this share of the median number of points may be a fragment of a
+neighbouring ring."""
 
 
 def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """(N,) ring of each point, 0 = the first in the file, for a scan in raw ring order or a crop of one.
+    """(N,) ring of each point, 0 = the first in the file, for a scan in raw ring order or a crop of
+    one.
 
     Args:
         points: (N, 3) float32 metres, in the order of the file.
@@ -49,7 +56,8 @@ def ring_numbers(points: NDArray[np.float32]) -> NDArray[np.int16]:
 
 
 def ring_bounds(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a crop of one."""
+    """(R + 1,) the first point of each ring, and N, for a scan of N points in raw ring order or a
+    crop of one."""
     starts = np.empty(0, np.int64)
     groups = _start_candidates(points)
     if groups:
@@ -77,30 +85,46 @@ def fault_of(points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sen
         width = float(np.ptp(np.percentile(azimuth, (1, 99))))
         near = float(np.percentile(flat, 5))
         if width < 3 * (MIN_DECREASE + 2 * MOTION / max(near, 0.1)):
-            return f"points over {np.degrees(width):.0f} degrees of azimuth, too few to separate {count} rings"
+            return (
+                f"points over {np.degrees(width):.0f} degrees of azimuth, too few to separate "
+                f"{count} rings"
+            )
     beams = lasers.laser_elevations.astype(np.float64)
-    gap, extent = float(np.median(-np.diff(beams))), float(beams[0] - beams[-1])
+    gap = float(np.median(-np.diff(beams)))
+    extent = float(beams[0] - beams[-1])
     elevation = np.empty(len(points), np.float32)
     elevations_from(points, np.float32(_height(points, bounds)), elevation)
     middle = np.empty(count)
     medians(elevation, bounds, middle)
     spread = np.empty(count)
     spreads(elevation, bounds, middle, spread)
-    # The limits are loose: motion compensation bends rings near the sensor as much as merged rings would spread.
+    # The limits are loose: motion compensation bends rings near the sensor as much as merged rings
+    # would spread.
     if np.median(spread) > gap or spread.max() > min(3 * gap, extent / 6):
-        found = f"{np.degrees(np.median(spread)):.2f} degrees (median) and {np.degrees(spread.max()):.2f} (largest)"
-        return f"{count} rings found, whose elevations spread by {found}; the lasers are {np.degrees(gap):.2f} apart"
+        found = (
+            f"{np.degrees(np.median(spread)):.2f} degrees (median) and "
+            f"{np.degrees(spread.max()):.2f} (largest)"
+        )
+        return (
+            f"{count} rings found, whose elevations spread by {found}; the lasers are "
+            f"{np.degrees(gap):.2f} apart"
+        )
     downward = -np.diff(middle)
     if everywhere:
         steps_at(elevation, bounds[1:-1], STRAYS, downward)
     if count > 2 and np.median(downward) < gap / 4:
-        return f"{count} rings found that do not descend from one to the next, each starting straight ahead"
+        return (
+            f"{count} rings found that do not descend from one to the next, each starting "
+            "straight ahead"
+        )
     return ""
 
 
 def turns(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi], and (N,) horizontal distance, metres."""
-    azimuth, flat = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi], and (N,) horizontal
+    distance, metres."""
+    azimuth = np.empty(len(points), np.float32)
+    flat = np.empty(len(points), np.float32)
     turns_of(points, azimuth, flat)
     return azimuth, flat
 
@@ -114,16 +138,21 @@ def _all_around(points: NDArray[np.float32]) -> bool:
 
 def _elevations(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """(N,) radians above the horizon of points (N, 3)."""
-    elevation: NDArray[np.float64] = np.arctan2(points[:, 2].astype(np.float64), np.hypot(points[:, 0], points[:, 1]))
+    elevation: NDArray[np.float64] = np.arctan2(
+        points[:, 2].astype(np.float64), np.hypot(points[:, 0], points[:, 1])
+    )
     return elevation
 
 
 def _start_candidates(points: NDArray[np.float32]) -> list[NDArray[np.intp]]:
-    """Candidates for the starts of rings, grouped: candidates at most ``STRAYS`` points apart are one start."""
+    """Candidates for the starts of rings, grouped: candidates at most ``STRAYS`` points apart are
+    one start."""
     azimuth, flat = turns(points)
-    places, limits = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    places = np.empty(len(points), np.int64)
+    limits = np.empty(len(points), np.float32)
     count = decreases(azimuth, flat, np.float32(MIN_DECREASE), np.float32(MOTION), places, limits)
-    places, limits = places[:count], limits[:count]
+    places = places[:count]
+    limits = limits[:count]
     if _all_around(points):
         limits = np.maximum(limits, np.float32(MIN_DECREASE_ALL_AROUND))
     steps = np.empty(count, np.float32)
@@ -138,7 +167,8 @@ def _best_candidate(group: NDArray[np.intp], points: NDArray[np.float32]) -> int
     """The candidate of a group that minimises the spread of the elevations on its two sides."""
     if len(group) == 1:
         return int(group[0])
-    low, high = max(int(group[0]) - STRAYS, 0), int(group[-1]) + STRAYS
+    low = max(int(group[0]) - STRAYS, 0)
+    high = int(group[-1]) + STRAYS
     elevation = _elevations(points[low:high])
 
     def spread(start: int) -> float:
@@ -166,9 +196,11 @@ def _without_fragments(starts: NDArray[np.intp], points: NDArray[np.float32]) ->
 
 
 def _height(points: NDArray[np.float32], bounds: NDArray[np.int64]) -> float:
-    """The height of the lasers above the points' origin, metres, from pairs of near and distant neighbouring points.
+    """The height of the lasers above the points' origin, metres, from pairs of near and distant
+    neighbouring points.
 
-    A laser at height h with elevation e measures z = h + r sin(e), so h is the change of z / r per change of 1 / r.
+    A laser at height h with elevation e measures z = h + r sin(e), so h is the change of z / r per
+    change of 1 / r.
     """
     heights = np.empty(len(points), np.float32)
     count = heights_of(points, bounds, heights)

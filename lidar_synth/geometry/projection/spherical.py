@@ -1,8 +1,8 @@
 """Spherical projection of points to a range image and back, on one CPU core.
 
-Each cell shows the nearest point in its direction within the sensor's range limits, and the first in the file among
-points at equal range. ``unproject`` puts a return at the centre of its cell, so that unprojecting and projecting an
-image again gives the same image.
+Each cell shows the nearest point in its direction within the sensor's range limits, and the first
+in the file among points at equal range. ``unproject`` puts a return at the centre of its cell, so
+that unprojecting and projecting an image again gives the same image.
 """
 
 from collections.abc import Iterable
@@ -67,10 +67,13 @@ def locate(points: NDArray[np.float32], sensor: Sensor) -> Cells:
     return Cells(cell, distance, nearest_in(cell, distance, sensor)[1])
 
 
-def cells_of(points: NDArray[np.float32], grid: Grid) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def cells_of(
+    points: NDArray[np.float32], grid: Grid
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Cell (N,) and range (N,) of each point; see ``locate``."""
     points = _checked(points)
-    cell, distance = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
+    cell = np.empty(len(points), np.int32)
+    distance = np.empty(len(points), np.float32)
     locate_points(points, grid, cell, distance)
     return cell, distance
 
@@ -78,23 +81,29 @@ def cells_of(points: NDArray[np.float32], grid: Grid) -> tuple[NDArray[np.int32]
 def nearest_in(
     cell: NDArray[np.int32], distance: NDArray[np.float32], sensor: Sensor
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Range (H, W) and index (H, W) of the nearest point in each cell; of points at equal range, the first.
+    """Range (H, W) and index (H, W) of the nearest point in each cell; of points at equal range,
+    the first.
 
     Args:
         cell: (N,) row * W + column, -1 = none.
         distance: (N,) metres.
         sensor: the sensor that defines the grid.
     """
-    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    image = np.empty(sensor.shape, np.float32)
+    index = np.empty(sensor.shape, np.int32)
     nearest_in_cells(cell, distance, image.reshape(-1), index.reshape(-1))
     return image, index
 
 
-def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | None = None) -> RangeImage:
-    """Project a scan to a range image: spherical projection, nearest return (paper, "Representing LiDAR data").
+def project(
+    scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | None = None
+) -> RangeImage:
+    """Project a scan to a range image: spherical projection, nearest return (paper, "Representing
+    LiDAR data").
 
-    Returns outside the sensor's range limits are dropped before the projection. Points above or below the field of
-    view go to the first or the last row, since some lasers point slightly outside it.
+    Returns outside the sensor's range limits are dropped before the projection. Points above or
+    below the field of view go to the first or the last row, since some lasers point slightly
+    outside it.
 
     Args:
         scan: N points.
@@ -118,12 +127,15 @@ def project(scan: Scan, sensor: Sensor | None = None, channels: Iterable[str] | 
         (128, 1024)
     """
     sensor = sensor or scan.sensor
-    image, index = np.empty(sensor.shape, np.float32), np.empty(sensor.shape, np.int32)
+    image = np.empty(sensor.shape, np.float32)
+    index = np.empty(sensor.shape, np.int32)
     nearest_points(_checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1))
     return RangeImage(image, sensor, carry(scan, index, channels))
 
 
-def carry(scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+def carry(
+    scan: Scan, index: NDArray[np.int32], channels: Iterable[str] | None = None
+) -> dict[str, NDArray[Any]]:
     """Transfer the fields of a scan from its points to the cells that show them.
 
     Args:
@@ -154,7 +166,8 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
 
     Args:
         image: (H, W) range in metres, 0 = no return.
-        rays: through the cells' centres, or through their corners as in the public code of R2Flow and LiDM.
+        rays: through the cells' centres, or through their corners as in the public code of R2Flow
+            and LiDM.
 
     Returns:
         A scan with one point per return; channels named in ``POINT_FIELDS`` become its fields.
@@ -173,7 +186,10 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
     flat = np.ascontiguousarray(image.range, np.float32).reshape(len(directions))
     count = returns_in(flat)
     if count < 0:
-        raise DataError(f"range image of sensor {image.sensor.name!r} with negative or non-finite range", "metres")
+        raise DataError(
+            f"range image of sensor {image.sensor.name!r} with negative or non-finite range",
+            "metres",
+        )
     points = np.empty((count + 1, 3), np.float32)
     along_rays(flat, directions, points)
     if len(starts := image.sensor.starts):
@@ -190,5 +206,8 @@ def unproject(image: RangeImage, rays: Rays = "centre") -> Scan:
 
 def _checked(points: NDArray[Any]) -> NDArray[np.float32]:
     if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] < 3:
-        raise DataError(f"points of shape {points.shape}, {points.dtype}", "(N, 3) or (N, 4) float32: x, y, z, metres")
+        raise DataError(
+            f"points of shape {points.shape}, {points.dtype}",
+            "(N, 3) or (N, 4) float32: x, y, z, metres",
+        )
     return points

@@ -1,8 +1,9 @@
 """Scan unfolding: one row per laser, from the order of the points instead of their elevation.
 
-KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from straight ahead; rings.py
-finds where each ring starts. Projection by elevation would merge rings where the lasers are closer together than the
-rows (the upper half of an HDL-64E), and leave rows empty where they are further apart.
+KITTI and KITTI-360 store a scan ring by ring from the top, each ring counter-clockwise from
+straight ahead; rings.py finds where each ring starts. Projection by elevation would merge rings
+where the lasers are closer together than the rows (the upper half of an HDL-64E), and leave rows
+empty where they are further apart.
 """
 
 from typing import Literal
@@ -18,12 +19,16 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 Anchor = Literal["elevation", "last"]
-"""How rings are assigned to rows: "elevation" uses the nearest laser beams; "last" counts up from the last ring, as
-the public code of R2Flow does (this shifts a scan whose lower rings are cut off)."""
+"""How rings are assigned to rows: "elevation" uses the nearest laser beams; "last" counts up from
+the last ring, as the public code of R2Flow does (this shifts a scan whose lower rings are cut
+off)."""
 
 
-def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(R,) increasing rows of R rings that minimise the sum of distances between elevations and beams, radians."""
+def _rows_by_elevation(
+    elevations: NDArray[np.float64], beams: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """(R,) increasing rows of R rings that minimise the sum of distances between elevations and
+    beams, radians."""
     distance = np.abs(elevations[:, None] - beams[None].astype(np.float64))
     total = np.full((len(elevations) + 1, len(beams) + 1), np.inf)
     total[0] = 0
@@ -32,7 +37,9 @@ def _rows_by_elevation(elevations: NDArray[np.float64], beams: NDArray[np.float3
     rows = np.empty(len(elevations), np.int64)
     end = len(beams)
     for ring in reversed(range(len(elevations))):
-        end = int(np.argmin(total[ring + 1, : end + 1])) - 1  # the first minimum is the row that was assigned
+        end = (
+            int(np.argmin(total[ring + 1, : end + 1])) - 1
+        )  # the first minimum is the row that was assigned
         rows[ring] = end
     return rows
 
@@ -41,7 +48,8 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
-        scan: N points in raw ring order, or a crop of such a scan; with ``scan.ring``, the points may be in any order.
+        scan: N points in raw ring order, or a crop of such a scan; with ``scan.ring``, the points
+            may be in any order.
         sensor: defines lasers and columns; by default the scan's own sensor.
         anchor: how rows are assigned to rings if the scan has no ``ring``.
 
@@ -49,8 +57,9 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         An image on ``sensor.by_beams()``, whose rays have the elevations of the lasers.
 
     Raises:
-        DataError: on a scan that is not in ring order: more rings than the sensor has lasers, rings that spread over
-            more than one laser's elevation, or a crop that is too narrow to decide.
+        DataError: on a scan that is not in ring order: more rings than the sensor has lasers, rings
+            that spread over more than one laser's elevation, or a crop that is too narrow to
+            decide.
 
     Example:
         >>> from lidar_synth import open_scans, unfold
@@ -98,12 +107,15 @@ def _not_in_rings(scan: Scan, reason: str) -> DataError:
     )
 
 
-def _rows_of_rings(scan: Scan, bounds: NDArray[np.int64], lasers: Sensor, anchor: Anchor) -> NDArray[np.int64]:
+def _rows_of_rings(
+    scan: Scan, bounds: NDArray[np.int64], lasers: Sensor, anchor: Anchor
+) -> NDArray[np.int64]:
     """(R,) the row of each ring."""
     count = len(bounds) - 1
     if anchor == "last":
         return np.arange(count) + lasers.shape[0] - count
-    sine, middle = np.empty(len(scan), np.float32), np.empty(count)
+    sine = np.empty(len(scan), np.float32)
+    middle = np.empty(count)
     sines_of(scan.points, sine)
     medians(sine, bounds, middle)
     return _rows_by_elevation(np.arcsin(middle), lasers.laser_elevations)

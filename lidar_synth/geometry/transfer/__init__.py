@@ -1,4 +1,5 @@
-"""From sensor to sensor: surfaces estimated from a scan, seen again by other beams from another mount."""
+"""From sensor to sensor: surfaces estimated from a scan, seen again by other beams from another
+mount."""
 
 from lidar_synth.geometry.transfer.mount import Mount
 from lidar_synth.geometry.transfer.response import Response

@@ -20,11 +20,12 @@ from lidar_synth.geometry.transfer.rays import Rays
 from lidar_synth.geometry.transfer.surfaces import Surfaces
 
 FRONT = 0.5, 0.03
-"""Metres, and share of its distance, by which the footprint of a return has to lie in front of a surface to hide it."""
+"""Metres, and share of its distance, by which the footprint of a return has to lie in front of a
+surface to hide it."""
 
 REACH = 0.3
-"""Metres by which the level patch of a return that is not of the ground reaches along a ray: roofs end, the road goes
-on."""
+"""Metres by which the level patch of a return that is not of the ground reaches along a ray: roofs
+end, the road goes on."""
 
 
 @dataclass
@@ -40,7 +41,8 @@ class Hits:
     fields: dict[str, NDArray[Any]]
 
     def add(self, other: "Hits", where: NDArray[np.bool_]) -> None:
-        """Take the hits of others, in place, for some rays (H, F); fields that others lack are 0, labels unknown."""
+        """Take the hits of others, in place, for some rays (H, F); fields that others lack are 0,
+        labels unknown."""
         count = len(next(iter(self.fields.values())))
         more = len(next(iter(other.fields.values())))
         for name in Nearest._fields:
@@ -52,21 +54,25 @@ class Hits:
             self.fields[name] = np.concatenate([values, added]).astype(values.dtype)
 
     def carried(self, at: NDArray[np.integer]) -> dict[str, Any]:
-        """{name: (n,)}, the fields of the nearest returns of some rays (n,), numbered row by row, except for
-        reflectance and ring."""
+        """{name: (n,)}, the fields of the nearest returns of some rays (n,), numbered row by row,
+        except for reflectance and ring."""
         vertex = self.nearest.vertex.take(at)
         names = self.fields.keys() - {"reflectance", "ring"}
         return {name: self.fields[name].take(vertex) for name in names}
 
 
-def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]) -> Hits:
+def first_hits(
+    surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]
+) -> Hits:
     """Cast rays at the surfaces of a scan.
 
-    Returns at the rim of a surface stand for a patch of their own: level where the surface is level, else vertical.
+    Returns at the rim of a surface stand for a patch of their own: level where the surface is
+        level, else vertical.
 
     Args:
         surfaces: of N returns.
-        points: (N, 3) the returns in the frame of the rays, metres; NaN for returns that are left out.
+        points: (N, 3) the returns in the frame of the rays, metres; NaN for returns that are left
+            out.
         rays: H lasers with F firings.
         upright: (3,) the upward direction in the frame of the rays.
     """
@@ -77,19 +83,26 @@ def first_hits(surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upri
     rows = np.empty(len(points), np.int32)
     rows_above(points, rays, rho, rows)
     vertices = Vertices(points, azimuth, rho, rows, scan.reflectance)
-    triangles = surfaces.triangles if there.all() else surfaces.triangles[there[surfaces.triangles].all(1)]
+    triangles = (
+        surfaces.triangles if there.all() else surfaces.triangles[there[surfaces.triangles].all(1)]
+    )
     size = len(rays.slope), rays.firings
     nothing = np.zeros(size, np.float32)
-    nearest = Nearest(np.full(size, np.inf), np.zeros(size, np.int32), nothing, np.ones_like(nothing))
+    nearest = Nearest(
+        np.full(size, np.inf), np.zeros(size, np.int32), nothing, np.ones_like(nothing)
+    )
     hit_triangles(vertices, triangles, rays, nearest)
     rim = np.flatnonzero(surfaces.rim & there & (rho > 0.05))
-    shape = FootprintShape(scan.points, surfaces.level, surfaces.step / 2, surfaces.up, surfaces.down)
+    shape = FootprintShape(
+        scan.points, surfaces.level, surfaces.step / 2, surfaces.up, surfaces.down
+    )
     hit_footprints(vertices, rim, _reach(scan, rim), shape, upright, rays, FRONT, nearest)
     return Hits(nearest, scan.fields())
 
 
 def _reach(scan: Scan, which: NDArray[np.intp]) -> NDArray[np.float64]:
-    """(n,) metres by which the patches of some returns reach along a ray; without limit on ground and unlabelled."""
+    """(n,) metres by which the patches of some returns reach along a ray; without limit on ground
+    and unlabelled."""
     if scan.label is None:
         return np.full(len(which), np.inf)
     label = scan.label[which]

@@ -1,8 +1,9 @@
-"""Compiled kernels: the first hits of a sensor's rays on triangles between returns, and on the patches at their rims.
+"""Compiled kernels: the first hits of a sensor's rays on triangles between returns, and on the
+patches at their rims.
 
-Rays of one laser form a cone z = height + slope * rho around the axis, rho = hypot(x, y). A triangle is cut by the cone
-in a segment, and the segment is cut by the firings whose azimuth lies between its ends. So each triangle visits only
-the rays that hit it.
+Rays of one laser form a cone z = height + slope * rho around the axis, rho = hypot(x, y). A
+triangle is cut by the cone in a segment, and the segment is cut by the firings whose azimuth lies
+between its ends. So each triangle visits only the rays that hit it.
 """
 
 from typing import NamedTuple
@@ -11,7 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-NEAREST, FARTHEST = 0.6, 1.6
+NEAREST = 0.6
+FARTHEST = 1.6
 """How far a footprint extends along grazing rays, as a factor of the distance of its return."""
 
 WIDEST_FOOTPRINT = 0.2
@@ -41,7 +43,8 @@ class FootprintShape(NamedTuple):
 
     Args:
         recorded: (N, 3) metres, in the frame of the sensor that recorded the returns.
-        level: (N,) returns of level surfaces; the footprints of others are vertical and face the target.
+        level: (N,) returns of level surfaces; the footprints of others are vertical and face the
+            target.
         half: width to either side, metres per metre of distance.
         up, down: (N,) height above and below the return, metres per metre of distance.
     """
@@ -71,8 +74,8 @@ class Nearest(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def rows_above(points, rays, rho, rows):  # type: ignore[no-untyped-def]
-    """Fill ``rho`` (N,) with horizontal distances, and ``rows`` (N,) with the number of lasers whose cones pass above
-    each point."""
+    """Fill ``rho`` (N,) with horizontal distances, and ``rows`` (N,) with the number of lasers
+    whose cones pass above each point."""
     for i in range(len(points)):
         rho[i] = np.sqrt(points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
         low = 0
@@ -90,8 +93,8 @@ def rows_above(points, rays, rho, rows):  # type: ignore[no-untyped-def]
 def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untyped-def]
     """Find the first triangle that each ray hits.
 
-    Where the cone of a laser passes between the corners of a triangle, one corner is alone on its side. The cone cuts
-    the two edges that meet there.
+    Where the cone of a laser passes between the corners of a triangle, one corner is alone on its
+    side. The cone cuts the two edges that meet there.
 
     Args:
         vertices: N ``Vertices``.
@@ -118,7 +121,8 @@ def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untype
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _alone_first(rows, laser, i, j, k):  # type: ignore[no-untyped-def]
-    """The three corners of a triangle, first the one that is alone on its side of a laser's cone."""
+    """The three corners of a triangle, first the one that is alone on its side of a laser's
+    cone."""
     below = rows[i] > laser
     if below == (rows[j] > laser):
         return k, i, j
@@ -142,7 +146,8 @@ def _cut(vertices, rays, laser, p, q):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _hit_segment(vertices, corners, start, end, normal, rays, laser, nearest):  # type: ignore[no-untyped-def]
-    """Hit a triangle with the firings of a laser between the two cuts of its edges from the first corner."""
+    """Hit a triangle with the firings of a laser between the two cuts of its edges from the first
+    corner."""
     alone, one, other = corners
     share0, x0, y0, azimuth0 = start
     share1, x1, y1, azimuth1 = end
@@ -173,7 +178,9 @@ def _hit_segment(vertices, corners, start, end, normal, rays, laser, nearest):  
             nearest.rho[laser, column] = rho
             nearest.vertex[laser, column] = closest
             value = vertices.value
-            nearest.value[laser, column] = of_alone * value[alone] + of_one * value[one] + of_other * value[other]
+            nearest.value[laser, column] = (
+                of_alone * value[alone] + of_one * value[one] + of_other * value[other]
+            )
             squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
             length = np.sqrt(squares * (1 + rays.slope[laser] * rays.slope[laser]))
             towards = normal[0] * dx + normal[1] * dy + normal[2] * rays.slope[laser]
@@ -197,14 +204,19 @@ def _turn(angle):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, inline="always")
 def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
     """A vector perpendicular to a triangle, of any length."""
-    ax, ay, az = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
-    bx, by, bz = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
+    ax = points[j, 0] - points[i, 0]
+    ay = points[j, 1] - points[i, 1]
+    az = points[j, 2] - points[i, 2]
+    bx = points[k, 0] - points[i, 0]
+    by = points[k, 1] - points[i, 1]
+    bz = points[k, 2] - points[i, 2]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest):  # type: ignore[no-untyped-def]
-    """Find the first footprint that each ray hits: the patch of a surface that one return of the source stands for.
+    """Find the first footprint that each ray hits: the patch of a surface that one return of the
+    source stands for.
 
     Args:
         vertices: N ``Vertices``.
@@ -213,7 +225,8 @@ def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest)
         shape: ``FootprintShape`` of the N returns.
         upright: (3,) the upward direction in the target's frame.
         rays: ``Rays``.
-        front: metres, and share of its distance, by which a footprint has to lie in front of a triangle to hide it.
+        front: metres, and share of its distance, by which a footprint has to lie in front of a
+            triangle to hide it.
         nearest: ``Nearest`` of ``hit_triangles``, in which footprints replace what they hide.
     """
     points = vertices.points
@@ -223,7 +236,9 @@ def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest)
         away = vertices.rho[i]
         z = points[i, 2]
         nx, ny, nz = _level_or_upright(points, i, shape.level[i], upright)
-        x0, y0, z0 = shape.recorded[i, 0], shape.recorded[i, 1], shape.recorded[i, 2]
+        x0 = shape.recorded[i, 0]
+        y0 = shape.recorded[i, 1]
+        z0 = shape.recorded[i, 2]
         distance = np.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
         half = min(shape.half * distance / away, WIDEST_FOOTPRINT)
         above = z + shape.up[i] * distance
@@ -261,10 +276,14 @@ def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest)
 @numba.njit(cache=True, nogil=True, inline="always")
 def _level_or_upright(points, i, level, upright):  # type: ignore[no-untyped-def]
     """The normal of a footprint: upward, or horizontal and along the ray of its return."""
-    ux, uy, uz = upright[0], upright[1], upright[2]
+    ux = upright[0]
+    uy = upright[1]
+    uz = upright[2]
     if level:
         return ux, uy, uz
     above = points[i, 0] * ux + points[i, 1] * uy + points[i, 2] * uz
-    nx, ny, nz = points[i, 0] - above * ux, points[i, 1] - above * uy, points[i, 2] - above * uz
+    nx = points[i, 0] - above * ux
+    ny = points[i, 1] - above * uy
+    nz = points[i, 2] - above * uz
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / length, ny / length, nz / length

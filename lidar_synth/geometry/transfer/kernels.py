@@ -1,25 +1,30 @@
-"""Compiled kernels: triangles between neighbouring returns, which join neighbouring rings like a zip."""
+"""Compiled kernels: triangles between neighbouring returns, which join neighbouring rings like a
+zip."""
 
 import numba
 import numpy as np
 
-SAME_RING, SAME_OBJECT, OTHER_OBJECT = np.tan(np.radians(4.0)), np.tan(np.radians(8.0)), np.tan(np.radians(25.0))
-"""Smallest angle between a ray and the line from its return to the neighbouring return, for which both are of one
-surface (Bogoslavskyi and Stachniss, "Fast range image-based segmentation", IROS 2016): along a ring, between rings,
-and between returns with different labels or instances."""
+SAME_RING = np.tan(np.radians(4.0))
+SAME_OBJECT = np.tan(np.radians(8.0))
+OTHER_OBJECT = np.tan(np.radians(25.0))
+"""Smallest angle between a ray and the line from its return to the neighbouring return, for which
+both are of one surface (Bogoslavskyi and Stachniss, "Fast range image-based segmentation", IROS
+2016): along a ring, between rings, and between returns with different labels or instances."""
 
 NOISE = 0.06
 """Metres; neighbours whose ranges differ by less are of one surface."""
 
 WIDEST = 1.6
-"""The widest gap between neighbours of one ring, in firings; a wider one is a ray without a return."""
+"""The widest gap between neighbours of one ring, in firings; a wider one is a ray without a
+return."""
 
 _UNKNOWN = -1
 
 
 @numba.njit(cache=True, nogil=True)
 def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-untyped-def]
-    """Fill ``below`` (N,) with the nearest return of the next ring within one step of azimuth; -1 = none.
+    """Fill ``below`` (N,) with the nearest return of the next ring within one step of azimuth; -1 =
+    none.
 
     With ``bridge``, a return without one looks in the ring after the next.
     """
@@ -29,10 +34,13 @@ def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-u
         for further in range(1, 3 if bridge else 2):
             if k + further >= rings:
                 break
-            low, high = starts[k + further], starts[k + further + 1]
+            low = starts[k + further]
+            high = starts[k + further + 1]
             j = low
             for i in range(starts[k], starts[k + 1]):
-                while j + 1 < high and abs(azimuth[j + 1] - azimuth[i]) <= abs(azimuth[j] - azimuth[i]):
+                while j + 1 < high and abs(azimuth[j + 1] - azimuth[i]) <= abs(
+                    azimuth[j] - azimuth[i]
+                ):
                     j += 1
                 if below[i] < 0 and j < high and abs(azimuth[j] - azimuth[i]) <= step:
                     below[i] = j
@@ -40,7 +48,8 @@ def neighbours_below(starts, azimuth, step, bridge, below):  # type: ignore[no-u
 
 @numba.njit(cache=True, nogil=True)
 def find_level(points, below, level):  # type: ignore[no-untyped-def]
-    """Mark in ``level`` (N,) the returns of nearly level surfaces, such as the road, by their neighbour below."""
+    """Mark in ``level`` (N,) the returns of nearly level surfaces, such as the road, by their
+    neighbour below."""
     level[:] = False
     for i in range(len(points)):
         j = below[i]
@@ -73,14 +82,19 @@ def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore
     same = key[i] == key[j]
     if across and (same or (ground[i] and ground[j])) and level[i] and level[j]:
         return int(abs(zi - zj) < 0.1 + 0.03 * np.sqrt((xi - xj) ** 2 + (yi - yj) ** 2))
-    cx, cy, cz = yi * zj - zi * yj, zi * xj - xi * zj, xi * yj - yi * xj
+    cx = yi * zj - zi * yj
+    cy = zi * xj - xi * zj
+    cz = xi * yj - yi * xj
     least = OTHER_OBJECT if not same else SAME_OBJECT if across else SAME_RING
-    return int(np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj)))
+    return int(
+        np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj))
+    )
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _around(azimuth, start, i, count):  # type: ignore[no-untyped-def]
-    """Return ``i`` of a ring that begins at ``start``, which may be past its end, and its azimuth, radians."""
+    """Return ``i`` of a ring that begins at ``start``, which may be past its end, and its azimuth,
+    radians."""
     if i < count:
         return start + i, azimuth[start + i]
     i = start + (i - count if i < 2 * count else i % count)
@@ -100,14 +114,17 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
         ground: (N,) returns with the label of a ground.
         level, below: of ``find_level`` and ``neighbours_below``.
         step: radians between firings.
-        bridge: whether to join a ring with the ring after the next where the next one has no return.
+        bridge: whether to join a ring with the ring after the next where the next one has no
+            return.
 
     Returns:
         (T, 3) int32 indices of returns, and (N,) bool, True for returns at the rim of a surface.
     """
-    count, limit = len(azimuth), WIDEST * step
+    count = len(azimuth)
+    limit = WIDEST * step
     triangles = np.empty((4 * count if bridge else 2 * count, 3), np.int32)
-    found, farthest = 0, 2 if bridge else 1
+    found = 0
+    farthest = 2 if bridge else 1
     distance = np.empty(count)
     for i in range(count):
         x, y, z = _exactly(points, i)
@@ -119,30 +136,45 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
         for further in range(1, farthest + 1):
             if k + further >= len(rings):
                 break
-            a0, b0 = starts[k], starts[k + further]
-            n, m = starts[k + 1] - a0, starts[k + further + 1] - b0
+            a0 = starts[k]
+            b0 = starts[k + further]
+            n = starts[k + 1] - a0
+            m = starts[k + further + 1] - b0
             if rings[k + further] - rings[k] > farthest:
                 rim[a0 : a0 + n] = True
                 rim[b0 : b0 + m] = True
                 continue
             i = j = 0
-            a, at_a = a0, azimuth[a0]
-            b, at_b = b0, azimuth[b0]
+            a = a0
+            at_a = azimuth[a0]
+            b = b0
+            at_b = azimuth[b0]
             next_a, to_a = _around(azimuth, a0, 1, n)
             next_b, to_b = _around(azimuth, b0, 1, m)
             joined = _UNKNOWN
             while i < n or j < m:
-                from_a, from_b, between, apart = a, b, joined, at_a - at_b
-                upper = i < n and (j == m or to_a <= to_b)  # the next return of the upper ring comes first
+                from_a = a
+                from_b = b
+                between = joined
+                apart = at_a - at_b
+                upper = i < n and (
+                    j == m or to_a <= to_b
+                )  # the next return of the upper ring comes first
                 if upper:
-                    c, before, gap = next_a, a, to_a - at_a
+                    c = next_a
+                    before = a
+                    gap = to_a - at_a
                     i += 1
-                    a, at_a = next_a, to_a
+                    a = next_a
+                    at_a = to_a
                     next_a, to_a = _around(azimuth, a0, i + 1, n)
                 else:
-                    c, before, gap = next_b, b, to_b - at_b
+                    c = next_b
+                    before = b
+                    gap = to_b - at_b
                     j += 1
-                    b, at_b = next_b, to_b
+                    b = next_b
+                    at_b = to_b
                     next_b, to_b = _around(azimuth, b0, j + 1, m)
                 joined = _UNKNOWN
                 if further == 2 and (0 <= below[from_a] < b0 or (upper and 0 <= below[c] < b0)):
@@ -150,13 +182,17 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                 whole = False
                 if gap <= limit and abs(apart) <= limit and abs(at_a - at_b) <= limit:
                     if between == _UNKNOWN:
-                        between = _joined(points, distance, key, ground, level, from_a, from_b, True)
+                        between = _joined(
+                            points, distance, key, ground, level, from_a, from_b, True
+                        )
                     if between:
                         joined = _joined(points, distance, key, ground, level, a, b, True)
                     if between and joined:
                         whole = _joined(points, distance, key, ground, level, before, c, False) == 1
                 if whole:
-                    triangles[found, 0], triangles[found, 1], triangles[found, 2] = from_a, from_b, c
+                    triangles[found, 0] = from_a
+                    triangles[found, 1] = from_b
+                    triangles[found, 2] = c
                     found += 1
                 else:
                     rim[from_a] = rim[from_b] = rim[c] = True

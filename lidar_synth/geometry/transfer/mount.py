@@ -34,12 +34,16 @@ class Mount:
 
     def __post_init__(self) -> None:
         if not (abs(self.z) <= 5 and abs(self.pitch) <= 45):
-            raise ConfigError(f"a mount {self.z} m higher, pitched by {self.pitch} degrees", "at most 5 m, 45 degrees")
+            raise ConfigError(
+                f"a mount {self.z} m higher, pitched by {self.pitch} degrees",
+                "at most 5 m, 45 degrees",
+            )
 
     @property
     def matrix(self) -> Matrix:
         """(4, 4) from the target's frame to the frame of the recording sensor."""
-        c, s = np.cos(np.radians(self.pitch)), np.sin(np.radians(self.pitch))
+        c = np.cos(np.radians(self.pitch))
+        s = np.sin(np.radians(self.pitch))
         return np.array([(c, 0, s, 0), (0, 1, 0, 0), (-s, 0, c, self.z), (0, 0, 0, 1)], np.float64)
 
     def points(self, points: NDArray[np.floating]) -> Matrix:
@@ -53,13 +57,17 @@ class Mount:
     def boxes(self, boxes: Boxes) -> Boxes:
         """Boxes of the recording sensor's frame in the target's frame.
 
-        Boxes have a yaw only: with a pitch, sizes stay, and a box no longer contains exactly the same points. What
+        Boxes have a yaw only: with a pitch, sizes stay, and a box no longer contains exactly the
+            same points. What
         concerns the camera stays, because the camera does not move with the sensor.
         """
         if self == Mount():
             return boxes
         values = boxes.values.astype(np.float64)
-        heading = np.stack([np.cos(values[:, 6]), np.sin(values[:, 6]), np.zeros(len(boxes))], 1) @ self.matrix[:3, :3]
+        heading = (
+            np.stack([np.cos(values[:, 6]), np.sin(values[:, 6]), np.zeros(len(boxes))], 1)
+            @ self.matrix[:3, :3]
+        )
         values[:, :3] = self.points(values[:, :3])
         values[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
         return replace(boxes, values=values.astype(np.float32))

@@ -10,7 +10,8 @@ from lidar_synth.geometry.sensor import Sensor
 
 
 class Rays(NamedTuple):
-    """H lasers with F firings each. Laser h fires at azimuth ``first[h] + f * step`` for f = 0 .. F - 1.
+    """H lasers with F firings each. Laser h fires at azimuth ``first[h] + f * step`` for f = 0 .. F
+    - 1.
 
     Args:
         slope: (H,) tangent of the elevation.
@@ -30,12 +31,17 @@ class Rays(NamedTuple):
 
 
 def rays_from(
-    slope: NDArray[np.float64], height: NDArray[np.float64], first: NDArray[np.float64], firings: int
+    slope: NDArray[np.float64],
+    height: NDArray[np.float64],
+    first: NDArray[np.float64],
+    firings: int,
 ) -> Rays:
     """The rays of H lasers (H,) with F firings each, see ``Rays``."""
     step = 2 * np.pi / firings
     turned = first[:, None] + np.arange(firings) * step
-    return Rays(slope, height, first, step, firings, np.stack([np.cos(turned), -np.sin(turned)], -1))
+    return Rays(
+        slope, height, first, step, firings, np.stack([np.cos(turned), -np.sin(turned)], -1)
+    )
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,5 @@
-"""The response of a target sensor: which reflectance it gives where the recording sensor gave another one."""
+"""The response of a target sensor: which reflectance it gives where the recording sensor gave
+another one."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +11,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 
 QUANTILES = np.linspace(0, 1, 65)
-NEAR, FAR = 4.0, 40.0
+NEAR = 4.0
+FAR = 40.0
 """Metres between which returns are compared: sensors of different ranges both see them."""
 
 
@@ -30,10 +32,14 @@ class Response:
     gives: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        given, gives = np.array(self.given), np.array(self.gives)
+        given = np.array(self.given)
+        gives = np.array(self.gives)
         valid = given.shape == gives.shape and given.ndim == 1 and len(given) >= 2
         if not (
-            valid and (np.diff(given) > 0).all() and (np.diff(gives) >= 0).all() and 0 <= gives[0] <= gives[-1] <= 1
+            valid
+            and (np.diff(given) > 0).all()
+            and (np.diff(gives) >= 0).all()
+            and 0 <= gives[0] <= gives[-1] <= 1
         ):
             raise ConfigError(
                 f"a response of {len(self.given)} and {len(self.gives)} values",
@@ -46,9 +52,11 @@ class Response:
 
     @classmethod
     def match(cls, recorded: Iterable[Scan], target: Iterable[Scan]) -> "Response":
-        """The curve that gives scans of one sensor the distribution of reflectance of the other, by quantiles.
+        """The curve that gives scans of one sensor the distribution of reflectance of the other, by
+        quantiles.
 
-        Neither needs labels, but both should show scenes of the same kind: the curve cannot tell a brighter street
+        Neither needs labels, but both should show scenes of the same kind: the curve cannot tell a
+            brighter street
         from a brighter sensor.
 
         Raises:
@@ -57,8 +65,11 @@ class Response:
         return cls(*_matched(_reflectances(recorded, "recorded"), _reflectances(target, "target")))
 
 
-def _matched(recorded: NDArray[np.float32], target: NDArray[np.float32]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    given, gives = np.quantile(recorded, QUANTILES), np.quantile(target, QUANTILES)
+def _matched(
+    recorded: NDArray[np.float32], target: NDArray[np.float32]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    given = np.quantile(recorded, QUANTILES)
+    gives = np.quantile(target, QUANTILES)
     values, first = np.unique(given, return_index=True)
     if len(values) < 2:
         return (0.0, 1.0), (float(gives.mean()),) * 2
@@ -72,5 +83,8 @@ def _reflectances(scans: Iterable[Scan], which: str) -> NDArray[np.float32]:
         distance = np.linalg.norm(scan.points, axis=1)
         parts.append(scan.reflectance[(distance >= NEAR) & (distance <= FAR)])
     if not sum(map(len, parts)):
-        raise DataError(f"no {which} return between {NEAR:g} and {FAR:g} m", "scans with returns, to match reflectance")
+        raise DataError(
+            f"no {which} return between {NEAR:g} and {FAR:g} m",
+            "scans with returns, to match reflectance",
+        )
     return np.concatenate(parts)

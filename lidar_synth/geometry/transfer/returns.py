@@ -1,4 +1,5 @@
-"""From hits to returns: losses, noise of the range, limits and quantisation of the target sensor."""
+"""From hits to returns: losses, noise of the range, limits and quantisation of the target
+sensor."""
 
 from dataclasses import dataclass
 
@@ -19,12 +20,14 @@ class Measurement:
     """How the target sensor measures other than the recording one; not at all by default.
 
     Args:
-        range_noise: metres, standard deviation that is added to the range: of the target beyond that of the source.
+        range_noise: metres, standard deviation that is added to the range: of the target beyond
+            that of the source.
         loss: share of returns that are lost at random, in [0, 1).
-        reach: metres at which a surface of 10 % reflectance that faces the sensor returns every second ray; the signal
-            falls with the square of the distance, with the reflectance and with the cosine of the angle of incidence.
-            None loses nothing.
-        response: from the reflectance of the recording sensor to that of the target; None changes nothing.
+        reach: metres at which a surface of 10 % reflectance that faces the sensor returns every
+            second ray; the signal falls with the square of the distance, with the reflectance and
+            with the cosine of the angle of incidence. None loses nothing.
+        response: from the reflectance of the recording sensor to that of the target; None changes
+            nothing.
 
     Raises:
         ConfigError: on values out of range.
@@ -36,7 +39,11 @@ class Measurement:
     response: Response | None = None
 
     def __post_init__(self) -> None:
-        if not (0 <= self.range_noise <= 1 and 0 <= self.loss < 1 and (self.reach is None or self.reach > 0)):
+        if not (
+            0 <= self.range_noise <= 1
+            and 0 <= self.loss < 1
+            and (self.reach is None or self.reach > 0)
+        ):
             raise ConfigError(
                 f"range_noise={self.range_noise}, loss={self.loss}, reach={self.reach}",
                 "0 to 1 m, a share below 1, and metres above 0 or None",
@@ -66,15 +73,20 @@ class Measurement:
         signal = strength * (self.reach / distance) ** 2 / 0.1
         return np.asarray(uniform < (1 - self.loss) * (signal**2 / (1 + signal**2)))
 
-    def ranges(self, distance: NDArray[np.float64], target: Sensor, rng: np.random.Generator) -> NDArray[np.float64]:
+    def ranges(
+        self, distance: NDArray[np.float64], target: Sensor, rng: np.random.Generator
+    ) -> NDArray[np.float64]:
         """(N,) measured ranges of hits at a distance (N,), metres, in the steps of the target."""
         if self.range_noise:
             distance = distance + self.range_noise * rng.standard_normal(len(distance))
         step = target.range_step
         return distance if step is None else np.round(distance / step) * step
 
-    def reflectances(self, reflectance: NDArray[np.floating], target: Sensor) -> NDArray[np.float32]:
-        """(N,) measured reflectances in [0, 1], in the levels of the target: multiples of 1 / levels below 1."""
+    def reflectances(
+        self, reflectance: NDArray[np.floating], target: Sensor
+    ) -> NDArray[np.float32]:
+        """(N,) measured reflectances in [0, 1], in the levels of the target: multiples of 1 /
+        levels below 1."""
         if self.response is not None:
             reflectance = self.response(reflectance)
         levels = target.reflectance_levels
@@ -113,7 +125,8 @@ def place_returns(at, distance, rays, low, high, points):  # type: ignore[no-unt
     """Place the returns of rays, and drop those that are out of range.
 
     Args:
-        at: (N,) the ray of each return, numbered row by row; the M that are in range move to the first places.
+        at: (N,) the ray of each return, numbered row by row; the M that are in range move to the
+            first places.
         distance: (N,) measured from the laser, metres.
         rays: ``Rays``.
         low, high: limits of the range from the sensor's origin, metres.
@@ -131,7 +144,9 @@ def place_returns(at, distance, rays, low, high, points):  # type: ignore[no-unt
         z = np.float32(rays.height[r] + rho * rays.slope[r])
         away = np.sqrt(x * x + y * y + z * z)
         if rho > 0 and low <= away <= high:
-            points[found, 0], points[found, 1], points[found, 2] = x, y, z
+            points[found, 0] = x
+            points[found, 1] = y
+            points[found, 2] = z
             at[found] = at[i]
             found += 1
     return found

@@ -1,4 +1,5 @@
-"""Surfaces of one scan: its returns by ring and azimuth, and the triangles between neighbours of one surface."""
+"""Surfaces of one scan: its returns by ring and azimuth, and the triangles between neighbours of
+one surface."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,14 +17,16 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
 
 ORDERED = np.radians(2.0)
-"""Half of the steps of azimuth between successive points of a file that may be in ring order are smaller, radians."""
+"""Half of the steps of azimuth between successive points of a file that may be in ring order are
+smaller, radians."""
 
 SAMPLES = 4096
 """Number of returns that decide whether a scan lies on rows or on beams."""
 
 SCATTERED = 0.1
-"""Neighbours along a ring differ in elevation by less than this share of the gap between rings, in the median: by 0.01
-in scans of KITTI and nuScenes, by 0.35 or more if they are opened as scans of a sensor with fewer beams."""
+"""Neighbours along a ring differ in elevation by less than this share of the gap between rings, in
+the median: by 0.01 in scans of KITTI and nuScenes, by 0.35 or more if they are opened as scans of a
+sensor with fewer beams."""
 
 
 @dataclass(frozen=True)
@@ -56,36 +59,50 @@ def estimate(scan: Scan) -> Surfaces:
     """Estimate the surfaces of a scan.
 
     Args:
-        scan: N returns with ``ring``, or in the order of a file of KITTI, or on the beams of ``scan.sensor``.
+        scan: N returns with ``ring``, or in the order of a file of KITTI, or on the beams of
+            ``scan.sensor``.
 
     Raises:
-        DataError: on a scan without a return, with one ring only, with values that are not finite, or whose points
-            lie on no rings.
+        DataError: on a scan without a return, with one ring only, with values that are not finite,
+            or whose points lie on no rings.
     """
     _check(scan)
     ring, on_grid = rings_of(scan)
     azimuth = -np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
-    order = np.argsort(ring * 8.0 + azimuth, kind="stable")  # fast where rings are in order, as in most files
-    scan, ring, azimuth = scan[order], ring[order], azimuth[order]
+    order = np.argsort(
+        ring * 8.0 + azimuth, kind="stable"
+    )  # fast where rings are in order, as in most files
+    scan = scan[order]
+    ring = ring[order]
+    azimuth = azimuth[order]
     starts = np.flatnonzero(np.append(True, ring[1:] != ring[:-1]))
     present = ring[starts]
     if len(present) < 2:
-        raise DataError(f"scan {scan.id!r} with returns of one beam only", "at least two beams, to find surfaces")
+        raise DataError(
+            f"scan {scan.id!r} with returns of one beam only",
+            "at least two beams, to find surfaces",
+        )
     starts = np.append(starts, len(scan)).astype(np.int64)
     elevation = _elevations(scan)
     middle = np.empty(len(present))
     medians(elevation, starts, middle)
     _check_rings(scan, elevation, starts, middle)
     step = _step(azimuth, starts, scan)
-    below, level = np.empty(len(scan), np.int64), np.empty(len(scan), bool)
+    below = np.empty(len(scan), np.int64)
+    level = np.empty(len(scan), bool)
     neighbours_below(starts, azimuth, step, on_grid, below)
     find_level(scan.points, below, level)
-    ground = np.ones(len(scan), bool) if scan.label is None else GROUND[scan.label] | (scan.label == IGNORE)
+    ground = (
+        np.ones(len(scan), bool)
+        if scan.label is None
+        else GROUND[scan.label] | (scan.label == IGNORE)
+    )
     triangles, rim = triangulate(
         present, starts, azimuth, scan.points, _objects(scan), ground, level, below, step, on_grid
     )
     half = np.maximum(-np.diff(middle), 0) / np.diff(present) / 2
-    up, down = np.concatenate([half[:1], half]), np.concatenate([half, half[-1:]])
+    up = np.concatenate([half[:1], half])
+    down = np.concatenate([half, half[-1:]])
     counts = np.diff(starts)
     bounds = float(middle.min() - down[-1]), float(middle.max() + up[0])
     up = np.repeat(np.tan(up), counts)
@@ -94,7 +111,8 @@ def estimate(scan: Scan) -> Surfaces:
 
 
 def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
-    """(N,) ring of each return, 0 = highest, and whether rings are rows of a grid, which may lack returns of a row.
+    """(N,) ring of each return, 0 = highest, and whether rings are rows of a grid, which may lack
+    returns of a row.
 
     They come from ``scan.ring``, or from the order of the points, or from the elevations.
     """
@@ -110,7 +128,9 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
         return _rows_of(scan), True
     elevation = _elevations(scan)
     some = elevation[:: 1 + len(elevation) // SAMPLES]
-    off = [np.median(np.abs(some - s.row_elevations()[_row(some, s)])) for s in (scan.sensor, lasers)]
+    off = [
+        np.median(np.abs(some - s.row_elevations()[_row(some, s)])) for s in (scan.sensor, lasers)
+    ]
     on_grid = bool(off[0] <= off[1])
     return _row(elevation, scan.sensor if on_grid else lasers), on_grid
 
@@ -136,14 +156,22 @@ def _rows_of(scan: Scan) -> NDArray[np.int64]:
 
 def _check(scan: Scan) -> None:
     if not len(scan):
-        raise DataError(f"scan {scan.id!r} without a return", "a scan with returns, to find surfaces")
+        raise DataError(
+            f"scan {scan.id!r} without a return", "a scan with returns, to find surfaces"
+        )
     if not np.isfinite(scan.points).all():
-        raise DataError(f"scan {scan.id!r} with points that are NaN or infinite", "finite points",
-                        "on_bad='drop-points' drops them when scans are read.")  # fmt: skip
+        raise DataError(
+            f"scan {scan.id!r} with points that are NaN or infinite",
+            "finite points",
+            "on_bad='drop-points' drops them when scans are read.",
+        )
 
 
 def _check_rings(
-    scan: Scan, elevation: NDArray[np.float32], starts: NDArray[np.int64], middle: NDArray[np.float64]
+    scan: Scan,
+    elevation: NDArray[np.float32],
+    starts: NDArray[np.int64],
+    middle: NDArray[np.float64],
 ) -> None:
     """Refuse points that do not lie on rings, such as those of a map."""
     gap = np.median(np.abs(np.diff(middle)))
@@ -151,20 +179,24 @@ def _check_rings(
     jump[starts[1:-1] - 1] = 0
     if 2 * np.count_nonzero(jump > SCATTERED * gap) > len(jump):
         raise DataError(
-            f"scan {scan.id!r}: its points lie on no rings of {scan.sensor.name!r} (neighbours differ by "
-            f"{np.degrees(np.median(jump)):.2f} degrees of elevation, rings by {np.degrees(gap):.2f})",
+            f"scan {scan.id!r}: its points lie on no rings of {scan.sensor.name!r} (neighbours "
+            "differ by "
+            f"{np.degrees(np.median(jump)):.2f} degrees of elevation, rings by "
+            f"{np.degrees(gap):.2f})",
             "the points of one revolution",
             "Set scan.ring, or open the scan with its own sensor.",
         )
 
 
 def _step(azimuth: NDArray[np.float64], starts: NDArray[np.int64], scan: Scan) -> float:
-    """Radians between two firings: the sensor's own, or the lower quartile between neighbours along a ring."""
+    """Radians between two firings: the sensor's own, or the lower quartile between neighbours along
+    a ring."""
     if scan.sensor.firings is not None:
         return 2 * np.pi / scan.sensor.firings
     turn = np.diff(azimuth)
     turn[starts[1:-1] - 1] = 0
-    turn, nominal = turn[turn > 1e-5], 2 * np.pi / scan.sensor.columns
+    turn = turn[turn > 1e-5]
+    nominal = 2 * np.pi / scan.sensor.columns
     return float(min(np.percentile(turn, 25) if len(turn) else nominal, 1.5 * nominal))
 
 

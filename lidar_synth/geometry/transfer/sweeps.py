@@ -1,4 +1,5 @@
-"""Other sweeps of the same drive as seen from one scan: by the poses, and moving objects by their boxes."""
+"""Other sweeps of the same drive as seen from one scan: by the poses, and moving objects by their
+boxes."""
 
 from dataclasses import replace
 
@@ -19,8 +20,10 @@ MARGIN = 0.15
 def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     """The returns of a sweep in the frame of a scan, each object where the scan has it.
 
-    Returns in a box of the sweep move with the box to the one of the same ``instance`` in the scan. Returns of other
-    vehicles and people are left out, because they may have moved: those in a box that the scan does not have, and
+    Returns in a box of the sweep move with the box to the one of the same ``instance`` in the scan.
+    Returns of other
+    vehicles and people are left out, because they may have moved: those in a box that the scan does
+        not have, and
     those labelled as movable in no box.
 
     Args:
@@ -35,8 +38,11 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     """
     for one in (sweep, scan):
         if one.pose is None:
-            raise DataError(f"scan {one.id!r} without a pose", "poses, to aggregate sweeps",
-                            "Add poses.txt to the dataset, or transfer without sweeps.")  # fmt: skip
+            raise DataError(
+                f"scan {one.id!r} without a pose",
+                "poses, to aggregate sweeps",
+                "Add poses.txt to the dataset, or transfer without sweeps.",
+            )
     assert scan.pose is not None and sweep.pose is not None
     change = np.linalg.inv(scan.pose) @ sweep.pose
     points = sweep.points.astype(np.float64)
@@ -48,13 +54,21 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     inside = _widened(sweep.boxes).contain(sweep.points)
     there = {} if scan.boxes is None else {int(n): box for n, box in _numbered(scan)}
     for held, instance, box in zip(inside, sweep.boxes.instance, sweep.boxes.values, strict=True):
-        out[held] = np.nan if int(instance) not in there else _carried(points[held], box, there[int(instance)])
+        out[held] = (
+            np.nan
+            if int(instance) not in there
+            else _carried(points[held], box, there[int(instance)])
+        )
     return out
 
 
 def _numbered(scan: Scan) -> list[tuple[int, NDArray[np.float32]]]:
     assert scan.boxes is not None
-    return [(int(n), box) for n, box in zip(scan.boxes.instance, scan.boxes.values, strict=True) if n >= 0]
+    return [
+        (int(n), box)
+        for n, box in zip(scan.boxes.instance, scan.boxes.values, strict=True)
+        if n >= 0
+    ]
 
 
 def _widened(boxes: Boxes) -> Boxes:
@@ -63,9 +77,12 @@ def _widened(boxes: Boxes) -> Boxes:
     return replace(boxes, values=values)
 
 
-def _carried(points: NDArray[np.float64], box: NDArray[np.float32], to: NDArray[np.float32]) -> NDArray[np.float64]:
+def _carried(
+    points: NDArray[np.float64], box: NDArray[np.float32], to: NDArray[np.float32]
+) -> NDArray[np.float64]:
     """Points (n, 3) fixed to one box, where that box (7,) is at ``to`` (7,)."""
     turn = float(to[6]) - float(box[6])
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     offset = points - box[:3].astype(np.float64)
     return np.asarray(offset @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) + to[:3], np.float64)

@@ -32,8 +32,8 @@ class Transferred(NamedTuple):
 
     Args:
         scan: its returns, row by row.
-        seen: share of the target's rays, in [0, 1], that lie within the field of view of the recording sensor; the
-            others have no return.
+        seen: share of the target's rays, in [0, 1], that lie within the field of view of the
+            recording sensor; the others have no return.
     """
 
     scan: Scan
@@ -44,21 +44,24 @@ class Transferred(NamedTuple):
 class Transfer:
     """Turns scans of one sensor into scans of another.
 
-    Surfaces are estimated from the returns: neighbours are joined unless the step between them or their labels say
-    that they belong to different surfaces. The target's rays are cast at these surfaces from the target's mount.
-    A return with no neighbour of its surface stands for the patch between it and the neighbouring rays, so that
-    leaves and poles keep their share of returns. Where the recording sensor saw nothing, there is no return.
+    Surfaces are estimated from the returns: neighbours are joined unless the step between them or
+        their labels say
+    that they belong to different surfaces. The target's rays are cast at these surfaces from the
+    target's mount. A return with no neighbour of its surface stands for the patch between it and
+    the neighbouring rays, so that leaves and poles keep their share of returns. Where the recording
+    sensor saw nothing, there is no return.
 
-    Label, raw label, instance, confidence and time are those of the nearest return; reflectance is interpolated; the
-    ring is the target's laser. Boxes, pose and the rest move to the target's frame.
+    Label, raw label, instance, confidence and time are those of the nearest return; reflectance is
+    interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's
+    frame.
 
     Args:
         target: the sensor to imitate: its lasers, firings, limits and quantisation.
         mount: the target's place relative to the recording sensor.
         measurement: how the target measures other than the recording sensor.
-        vehicle: (length, width) in metres of the footprint around the recording sensor, below it, whose returns are of
-            the vehicle that carries it. If the target has another mount they are left out; otherwise they would stand
-            in its way.
+        vehicle: (length, width) in metres of the footprint around the recording sensor, below it,
+            whose returns are of the vehicle that carries it. If the target has another mount they
+            are left out; otherwise they would stand in its way.
 
     Example:
         >>> from lidar_synth import Town, load_sensor
@@ -78,27 +81,38 @@ class Transfer:
         """The scan as the target sensor would have recorded it; see ``cast``."""
         return self._seen_by_target(scan, rng or keyed_rng(0), ())[0]
 
-    def cast(self, scan: Scan, rng: np.random.Generator | None = None, sweeps: Sequence[Scan] = ()) -> Transferred:
-        """The scan as the target sensor would have recorded it, and the share of its field of view that was seen.
+    def cast(
+        self, scan: Scan, rng: np.random.Generator | None = None, sweeps: Sequence[Scan] = ()
+    ) -> Transferred:
+        """The scan as the target sensor would have recorded it, and the share of its field of view
+        that was seen.
 
         Args:
-            scan: N returns; with ``ring``, or in the order of a file of KITTI, or on the beams of its sensor.
+            scan: N returns; with ``ring``, or in the order of a file of KITTI, or on the beams of
+                its sensor.
             rng: samples losses and noise; by default the same for every scan.
-            sweeps: other sweeps of the same drive, with poses. Their surfaces fill rays that hit nothing in the scan;
-                moving objects follow their boxes (sweeps.py). The result has no times.
+            sweeps: other sweeps of the same drive, with poses. Their surfaces fill rays that hit
+                nothing in the scan; moving objects follow their boxes (sweeps.py). The result has
+                no times.
 
         Raises:
-            DataError: on a scan without a return, with one beam only, with points on no rings or that are not finite;
-                if nothing of it is in the target's field of view; on sweeps without poses.
+            DataError: on a scan without a return, with one beam only, with points on no rings or
+                that are not finite; if nothing of it is in the target's field of view; on sweeps
+                without poses.
         """
         result, surfaces = self._seen_by_target(scan, rng or keyed_rng(0), sweeps)
         return Transferred(result, _seen(surfaces, self.target, self.mount))
 
-    def _seen_by_target(self, scan: Scan, rng: np.random.Generator, sweeps: Sequence[Scan]) -> tuple[Scan, Surfaces]:
-        """The scan as the target sensor would have recorded it, and the surfaces of the given one."""
+    def _seen_by_target(
+        self, scan: Scan, rng: np.random.Generator, sweeps: Sequence[Scan]
+    ) -> tuple[Scan, Surfaces]:
+        """The scan as the target sensor would have recorded it, and the surfaces of the given
+        one."""
         rays = rays_of(self.target)
         surfaces = estimate(self._without_vehicle(scan))
-        _warn_of_differences(scan.sensor, self.target, self.mount.pitch, self.measurement.response is None)
+        _warn_of_differences(
+            scan.sensor, self.target, self.mount.pitch, self.measurement.response is None
+        )
         upright = self.mount.matrix[2, :3]
         hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
         further: Hits | None = None
@@ -116,8 +130,10 @@ class Transfer:
         if not len(returns):
             seen = _seen(surfaces, self.target, self.mount)
             raise DataError(
-                f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the field of view and the "
-                f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} degrees; "
+                f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the "
+                "field of view and the "
+                f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} "
+                "degrees; "
                 f"{100 * seen:.0f} % of it was seen)",
                 "sensors whose fields of view overlap",
                 "Check the two sensors and the mount.",
@@ -128,23 +144,34 @@ class Transfer:
         return replace(returns, boxes=boxes, pose=pose, **kept), surfaces
 
     def _without_vehicle(self, scan: Scan) -> Scan:
-        """The scan without returns of the vehicle that carries its sensor, where the target has another mount."""
+        """The scan without returns of the vehicle that carries its sensor, where the target has
+        another mount."""
         if self.mount == Mount():
             return scan
-        along, across, above = np.abs(scan.points[:, 0]), np.abs(scan.points[:, 1]), scan.points[:, 2]
+        along = np.abs(scan.points[:, 0])
+        across = np.abs(scan.points[:, 1])
+        above = scan.points[:, 2]
         # Not the road beside a low sensor: a vehicle is at most 1.5 m below the sensor on it.
-        own = (along < self.vehicle[0] / 2) & (across < self.vehicle[1] / 2) & (above < 0) & (above > -1.5)
+        own = (
+            (along < self.vehicle[0] / 2)
+            & (across < self.vehicle[1] / 2)
+            & (above < 0)
+            & (above > -1.5)
+        )
         return scan if not own.any() else scan[~own]
 
     def _returns(self, hits: Hits, rays: Rays, rng: np.random.Generator) -> Scan:
         """The returns of the rays that hit something, row by row."""
         nearest = hits.nearest
-        at, distance = np.empty(nearest.rho.size, np.int32), np.empty(nearest.rho.size)
+        at = np.empty(nearest.rho.size, np.int32)
+        distance = np.empty(nearest.rho.size)
         count = gather_hits(nearest.rho, rays.slope, at, distance)
-        at, distance = at[:count], distance[:count]
+        at = at[:count]
+        distance = distance[:count]
         kept = self.measurement.returned(distance, nearest.value, nearest.facing, at, rng)
         if not kept.all():
-            at, distance = at[kept], distance[kept]
+            at = at[kept]
+            distance = distance[kept]
         distance = self.measurement.ranges(distance, self.target, rng)
         points = np.empty((len(at), 3), np.float32)
         limits = np.float32(self.target.range_min), np.float32(self.target.range_max)
@@ -157,7 +184,10 @@ class Transfer:
     @property
     def identity(self) -> str:
         """A text of everything that determines the scans."""
-        return f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)} {self.vehicle}"
+        return (
+            f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)} "
+            f"{self.vehicle}"
+        )
 
 
 class SeenAs:
@@ -177,12 +207,15 @@ class SeenAs:
     """
 
     def __init__(self, source: Source, transfer: Transfer, seed: int = 0) -> None:
-        self.source, self.transfer, self.seed = source, transfer, seed
+        self.source = source
+        self.transfer = transfer
+        self.seed = seed
         self.sensor = transfer.target
 
     @property
     def identity(self) -> str:
-        """A text that tells it from other sources: the source, or the names of its scans, transfer and seed."""
+        """A text that tells it from other sources: the source, or the names of its scans, transfer
+        and seed."""
         own = getattr(self.source, "identity", "") or type(self.source).__name__
         names = map(str, getattr(self.source, "ids", ()))
         digest = hash_of_names([own, *names, self.transfer.identity, str(self.seed)])
@@ -197,7 +230,8 @@ class SeenAs:
 
 @lru_cache(maxsize=256)
 def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched: bool) -> None:
-    """Say once what scans of the target will lack: lasers outside the field of view, and its own reflectance."""
+    """Say once what scans of the target will lack: lasers outside the field of view, and its own
+    reflectance."""
     if given.name == target.name:
         return
     elevation = np.degrees(target.optics()[0]) - pitch
@@ -206,17 +240,21 @@ def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched:
     lacks = []
     if blind:
         lacks.append(
-            f"{blind} of its {len(elevation)} lasers look outside the recorded {seen.min():.1f} to {seen.max():.1f} "
+            f"{blind} of its {len(elevation)} lasers look outside the recorded {seen.min():.1f} "
+            f"to {seen.max():.1f} "
             "degrees and return nothing"
         )
     if unmatched:
-        lacks.append("reflectance is the recording sensor's (like=FOLDER or --like matches it to real scans)")
+        lacks.append(
+            "reflectance is the recording sensor's (like=FOLDER or --like matches it to real scans)"
+        )
     if lacks:
         log.warning("scans of %r as %r: %s", given.name, target.name, "; ".join(lacks))
 
 
 def _seen(surfaces: Surfaces, target: Sensor, mount: Mount) -> float:
-    """The share of the target's rays that lie in the field of view of the sensor that recorded the surfaces."""
+    """The share of the target's rays that lie in the field of view of the sensor that recorded the
+    surfaces."""
     elevation, sector = _views(target, mount)
     looked = np.bincount(_sector(-surfaces.azimuth.astype(np.float32)), minlength=SECTORS) > 0
     inside = (elevation >= surfaces.bounds[0]) & (elevation <= surfaces.bounds[1])
@@ -228,7 +266,9 @@ def _views(target: Sensor, mount: Mount) -> tuple[NDArray[np.float64], NDArray[n
     """(H, F) elevation, radians, and sector of each ray in the frame of the recording sensor."""
     rays = rays_of(target)
     slope = np.broadcast_to(rays.slope[:, None, None], (*rays.directions.shape[:2], 1))
-    x, y, z = np.moveaxis(np.concatenate([rays.directions, slope], -1) @ mount.matrix[:3, :3].T, -1, 0)
+    x, y, z = np.moveaxis(
+        np.concatenate([rays.directions, slope], -1) @ mount.matrix[:3, :3].T, -1, 0
+    )
     return np.arctan2(z, np.hypot(x, y)), _sector(np.arctan2(y, x))
 
 

@@ -7,25 +7,43 @@ import typer
 
 
 def adapt(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="a shipped model such as town-dense, or a file")],
-    scans: Annotated[Path, typer.Option(metavar="ROOT", help="20 to 200 scans of one sensor, with labels or without")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="checkpoint to write; its name ends in .safetensors")],
-    minutes: Annotated[float, typer.Option(min=0.01, help="limit of the time of all trainings")] = 120.0,
-    licence: Annotated[str, typer.Option(help="licence of the scans, which the checkpoint states")]
-    = "that of the scans",
-    sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
-    town: Annotated[int, typer.Option(min=0, help="scans of the town, as your sensor sees it, to learn too")] = 400,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and do nothing")] = False,
-) -> None:  # fmt: skip
+    model: Annotated[
+        str, typer.Argument(metavar="MODEL", help="a shipped model such as town-dense, or a file")
+    ],
+    scans: Annotated[
+        Path,
+        typer.Option(metavar="ROOT", help="20 to 200 scans of one sensor, with labels or without"),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="checkpoint to write; its name ends in .safetensors"),
+    ],
+    minutes: Annotated[
+        float, typer.Option(min=0.01, help="limit of the time of all trainings")
+    ] = 120.0,
+    licence: Annotated[
+        str, typer.Option(help="licence of the scans, which the checkpoint states")
+    ] = "that of the scans",
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+    ] = None,
+    town: Annotated[
+        int, typer.Option(min=0, help="scans of the town, as your sensor sees it, to learn too")
+    ] = 400,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="print the plan and do nothing")
+    ] = False,
+) -> None:
     """Adapts a model to your sensor and your streets: autoencoder, flow and student.
 
-    The last fifth of the scans is held out for early stopping. A card is written beside the checkpoint. Run it again to
-    resume.
+    The last fifth of the scans is held out for early stopping. A card is written beside the
+    checkpoint. Run it again to resume.
 
     \b
     Examples:
       lidar-synth adapt town-dense --scans my_scans --out mine.safetensors
-      lidar-synth adapt town-dense --scans PandaSet/002 --out mine.safetensors --minutes 60 --dry-run
+      lidar-synth adapt town-dense --scans PandaSet/002 --out mine.safetensors --minutes 60
+      --dry-run
     """
     from lidar_synth.lab.train.adaptation import adapt as run
     from lidar_synth.lab.train.adaptation import plan_adaptation

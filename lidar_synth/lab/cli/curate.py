@@ -19,26 +19,35 @@ if TYPE_CHECKING:
 def curate(
     bank: BankFolder,
     drop: Annotated[
-        list[str] | None, typer.Option(help="rule that selects scans to drop; repeatable, any match drops")
+        list[str] | None,
+        typer.Option(help="rule that selects scans to drop; repeatable, any match drops"),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="folder of the curated bank; without it nothing is written")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder of the curated bank; without it nothing is written")
+    ] = None,
     reference: Annotated[
-        str | None, typer.Option(help="scans whose mean histograms to compare with [the bank's own]")
+        str | None,
+        typer.Option(help="scans whose mean histograms to compare with [the bank's own]"),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="split of the reference, for instance r2flow/test")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="split of the reference, for instance r2flow/test")
+    ] = None,
     sort: Annotated[
         str, typer.Option(help="sort the list by this score, highest first; -SCORE: lowest first")
     ] = "range",
     limit: Annotated[int, typer.Option(min=0, help="number of scans to list")] = 10,
-    plot: Annotated[Path | None, typer.Option(help="PNG file to write with the distribution of every score")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG file to write with the distribution of every score")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
 ) -> None:
-    """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those that match a rule.
+    """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those
+    that match a rule.
 
-    Scores are saved in BANK/scores.npz; run it again to resume an interrupted run. The curated bank has its own index
-    and links to the same shards. A rule joins conditions by "and"; each is a score, one of < <= > >=, and a number.
-    Run it without --out to see what a rule would drop.
+    Scores are saved in BANK/scores.npz; run it again to resume an interrupted run. The curated bank
+    has its own index and links to the same shards. A rule joins conditions by "and"; each is a
+    score, one of < <= > >=, and a number. Run it without --out to see what a rule would drop.
 
     \b
     Scores:
@@ -56,7 +65,8 @@ def curate(
       lidar-synth curate bank --plot scores.png
       lidar-synth curate bank --sort -confidence --limit 20
       lidar-synth curate bank --drop "confidence < 0.5" --drop "duplicate > 0.99" --out good
-      lidar-synth curate bank --reference KITTI-360 --split r2flow/train --drop "range > 0.3 and empty > 0.4"
+      lidar-synth curate bank --reference KITTI-360 --split r2flow/train --drop "range > 0.3 and
+      empty > 0.4"
     """
     import numpy as np
 
@@ -64,7 +74,8 @@ def curate(
     from lidar_synth.bank import Bank
     from lidar_synth.lab.curate import matching
 
-    opened, rules = Bank(bank), drop or []
+    opened = Bank(bank)
+    rules = drop or []
     _check(plot, out, rules)
     scores = _scores(opened, bank, reference, split, jobs, progress=not as_json)
     dropped = np.zeros(len(opened), bool)
@@ -72,8 +83,15 @@ def curate(
         dropped |= matching(rule, scores.values)
     shown = _sorted(scores, sort)[:limit]
     if as_json:
-        rows = [_row(opened, scores, number) | {"dropped": bool(dropped[number])} for number in shown.tolist()]
-        typer.echo(json.dumps({"scans": len(opened), "dropped": int(dropped.sum()), "listed": rows}, indent=1))
+        rows = [
+            _row(opened, scores, number) | {"dropped": bool(dropped[number])}
+            for number in shown.tolist()
+        ]
+        typer.echo(
+            json.dumps(
+                {"scans": len(opened), "dropped": int(dropped.sum()), "listed": rows}, indent=1
+            )
+        )
     else:
         _table(opened, scores, shown, dropped)
     if plot is not None:
@@ -81,7 +99,10 @@ def curate(
     if out is None:
         return
     compared = f", compared with {scores.reference}" if scores.reference else ""
-    why = f"{dropped.sum()} of {len(opened)} scans left out by {' or '.join(map(repr, rules))}{compared}"
+    why = (
+        f"{dropped.sum()} of {len(opened)} scans left out by "
+        f"{' or '.join(map(repr, rules))}{compared}"
+    )
     index = write(opened, np.flatnonzero(dropped).tolist(), why, out, progress=not as_json)
     if not as_json:
         typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards; {why}")
@@ -111,7 +132,9 @@ def _scores(
     source = None if reference is None else open_scans(reference, split=split)
     name = ""
     if source is not None:
-        which = hash_of_names([*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))])
+        which = hash_of_names(
+            [*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))]
+        )
         name = f"{len(source)} scans of {' '.join(filter(None, (reference, split)))} ({which[:8]})"
     path = bank / FILE
     if path.is_file():
@@ -140,17 +163,27 @@ def _row(bank: "Bank", scores: "Scores", number: int) -> dict[str, Any]:
     return {"number": number, "id": bank.ids[number], **values, "twin": twin if twin >= 0 else None}
 
 
-def _table(bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: "NDArray[np.bool_]") -> None:
+def _table(
+    bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: "NDArray[np.bool_]"
+) -> None:
     """Print percentiles of the scores, and the listed scans."""
     import numpy as np
 
     heads = ("lowest", "1 %", "median", "99 %", "highest")
     typer.echo(f"{'':<12}" + "".join(f"{head:>10}" for head in heads))
     for name, values in scores.values.items():
-        typer.echo(f"{name:<12}" + "".join(f"{v:>10.4f}" for v in np.percentile(values, (0, 1, 50, 99, 100))))
-    typer.echo(f"\n{'number':>8}  {'id':<24}" + "".join(f"{name:>12}" for name in scores.values) + "    twin")
+        typer.echo(
+            f"{name:<12}"
+            + "".join(f"{v:>10.4f}" for v in np.percentile(values, (0, 1, 50, 99, 100)))
+        )
+    typer.echo(
+        f"\n{'number':>8}  {'id':<24}"
+        + "".join(f"{name:>12}" for name in scores.values)
+        + "    twin"
+    )
     for number in shown.tolist():
-        twin, mark = int(scores.twin[number]), "  dropped" if dropped[number] else ""
+        twin = int(scores.twin[number])
+        mark = "  dropped" if dropped[number] else ""
         figures = "".join(f"{values[number]:>12.4f}" for values in scores.values.values())
         typer.echo(f"{number:>8}  {bank.ids[number]:<24}{figures}{twin:>8}{mark}")
     typer.echo(f"\n{dropped.sum()} of {len(bank)} scans match the rules")

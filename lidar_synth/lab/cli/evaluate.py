@@ -13,48 +13,79 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    real: Annotated[Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")],
-    fake: Annotated[Path, typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder")],
+    real: Annotated[
+        Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")
+    ],
+    fake: Annotated[
+        Path,
+        typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder"),
+    ],
     protocol: Annotated[
-        str | None, typer.Option(help="definitions of the metrics: r2flow | lidm | r3dpa | spiral | town | general")
+        str | None,
+        typer.Option(
+            help="definitions of the metrics: r2flow | lidm | r3dpa | spiral | town | general"
+        ),
     ] = None,
     judge: Annotated[
-        Path | None, typer.Option(help="archive of lidar-bonnetal: how well its network recognises both sets")
+        Path | None,
+        typer.Option(help="archive of lidar-bonnetal: how well its network recognises both sets"),
     ] = None,
-    columns: Annotated[int | None, typer.Option(help="width of the judge's grid; its own by default")] = None,
-    split: Annotated[str | None, typer.Option(help="split of REAL, for instance r2flow/test")] = None,
-    sensor: Annotated[str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")] = None,
-    segmenter: Annotated[bool, typer.Option(help="add metrics on features of the town's segmenter")] = False,
+    columns: Annotated[
+        int | None, typer.Option(help="width of the judge's grid; its own by default")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="split of REAL, for instance r2flow/test")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of both sets: a preset or a YAML file")
+    ] = None,
+    segmenter: Annotated[
+        bool, typer.Option(help="add metrics on features of the town's segmenter")
+    ] = False,
     weights: Annotated[
-        Path | None, typer.Option(help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD")
+        Path | None,
+        typer.Option(help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD"),
     ] = None,
     extended: Annotated[
-        bool, typer.Option(help="of features, add unbiased forms, precision, recall, density, coverage")
+        bool,
+        typer.Option(help="of features, add unbiased forms, precision, recall, density, coverage"),
     ] = False,
-    intervals: Annotated[int, typer.Option(help="resamples for 95 % intervals, for instance 200")] = 0,
-    beside: Annotated[bool, typer.Option(help="print the published figures of the protocol, too")] = False,
+    intervals: Annotated[
+        int, typer.Option(help="resamples for 95 % intervals, for instance 200")
+    ] = 0,
+    beside: Annotated[
+        bool, typer.Option(help="print the published figures of the protocol, too")
+    ] = False,
     cache: Annotated[Path | None, typer.Option(help="folder in which features are kept")] = None,
-    processes: Annotated[int, typer.Option(help="processes that extract features; needs --cache", min=1)] = 1,
-    training_data: Annotated[bool, typer.Option(help="permit a reference that the model was trained on")] = False,
-    anyway: Annotated[bool, typer.Option(help="compare fewer scans than the paper's, and other sensors")] = False,
+    processes: Annotated[
+        int, typer.Option(help="processes that extract features; needs --cache", min=1)
+    ] = 1,
+    training_data: Annotated[
+        bool, typer.Option(help="permit a reference that the model was trained on")
+    ] = False,
+    anyway: Annotated[
+        bool, typer.Option(help="compare fewer scans than the paper's, and other sensors")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; distances of features where
-    the published weights are at hand; general: ranges and classes; spiral: classes.
+    """Compares two sets of scans: Jensen-Shannon distance and MMD of bird's-eye views; distances of
+    features where the published weights are at hand; general: ranges and classes; spiral: classes.
 
-    With --judge, a segmentation network that was trained on real streets predicts the classes of both sets: accuracy,
-    IoU by class, the most frequent confusions and feature distances.
+    With --judge, a segmentation network that was trained on real streets predicts the classes of
+    both sets: accuracy, IoU by class, the most frequent confusions and feature distances.
 
-    Papers define metrics of the same name differently: scores of two protocols are not comparable. Fewer scans than the
-    protocol's paper compares, and other sensors than its own, are refused. A reference that shares frames with the
-    model's training data is refused, because it flatters the model; the training data of its teacher and autoencoder
-    count too, and the names of the splits do not matter.
+    Papers define metrics of the same name differently: scores of two protocols are not comparable.
+        Fewer scans than the
+    protocol's paper compares, and other sensors than its own, are refused. A reference that shares
+    frames with the model's training data is refused, because it flatters the model; the training
+    data of its teacher and autoencoder count too, and the names of the splits do not matter.
 
     \b
     Examples:
-      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics --beside
-      lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
-      lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
+      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics
+      --beside lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples
+      --protocol town --json lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns
+      1024
     """
     from lidar_synth.errors import suggest
     from lidar_synth.formats import layout_of, open_scans
@@ -67,7 +98,9 @@ def evaluate(
     from lidar_synth.lab.evaluate.segmentation import load_judge
 
     if beside and (as_json or judge is not None):
-        raise typer.BadParameter("goes with --protocol and prints tables: leave out --json", param_hint="--beside")
+        raise typer.BadParameter(
+            "goes with --protocol and prints tables: leave out --json", param_hint="--beside"
+        )
     if (protocol is None) == (judge is None):
         raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
     if judge is None and protocol not in PROTOCOLS:
@@ -75,7 +108,9 @@ def evaluate(
         raise typer.BadParameter(known, param_hint="--protocol")
     sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
     if not training_data and (seen := seen_by_model_of(fake, sources[1])) is not None:
-        _refuse_training_data(seen, measured(sources[0], layout_of(real), real, split, seen), real, fake)
+        _refuse_training_data(
+            seen, measured(sources[0], layout_of(real), real, split, seen), real, fake
+        )
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
         return
@@ -85,28 +120,48 @@ def evaluate(
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
     left_out: dict[str, str] = {}
     scores = compare(
-        *sources, rules, extractors, progress=not as_json, weights=weights, replicates=intervals, extended=extended,
-        any_sensor=anyway, cache=cache, processes=processes, left_out=left_out,
-    )  # fmt: skip
-    typer.echo(json.dumps([asdict(s) for s in scores], indent=2) if as_json else "\n".join(map(str, scores)))
+        *sources,
+        rules,
+        extractors,
+        progress=not as_json,
+        weights=weights,
+        replicates=intervals,
+        extended=extended,
+        any_sensor=anyway,
+        cache=cache,
+        processes=processes,
+        left_out=left_out,
+    )
+    typer.echo(
+        json.dumps([asdict(s) for s in scores], indent=2)
+        if as_json
+        else "\n".join(map(str, scores))
+    )
     for note in filter(None, (describe_missing(left_out, rules), rules.unverified)):
         typer.echo(note, err=True)
     if beside and not as_json:
         typer.echo(f"\n{published(scores)}")
 
 
-def _recognition(folder: Path, columns: int | None, sources: "tuple[Source, Source]", as_json: bool) -> None:
+def _recognition(
+    folder: Path, columns: int | None, sources: "tuple[Source, Source]", as_json: bool
+) -> None:
     """Print how well the network of an archive recognises both sets."""
     from lidar_synth.lab.evaluate.recognition import as_text, compare, recognise
     from lidar_synth.lab.evaluate.street_judge import load_archive
 
     judge = load_archive(folder, columns)
-    real, fake = (recognise(judge, s, name, not as_json) for s, name in zip(sources, ("real", "fake"), strict=True))
+    real, fake = (
+        recognise(judge, s, name, not as_json)
+        for s, name in zip(sources, ("real", "fake"), strict=True)
+    )
     figures = compare(real, fake)
     typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
 
 
-def _refuse_training_data(seen: "Recordings", reference: "Recordings", real: Path, fake: Path) -> None:
+def _refuse_training_data(
+    seen: "Recordings", reference: "Recordings", real: Path, fake: Path
+) -> None:
     """Refuse a reference that contains scans that the model of the generated ones has seen."""
     from lidar_synth.errors import ConfigError
     from lidar_synth.lab.evaluate.leakage import overlap, undecided
@@ -118,8 +173,14 @@ def _refuse_training_data(seen: "Recordings", reference: "Recordings", real: Pat
             "Use another split, or a town with another --seed; --training-data compares anyway.",
         )
     if not seen:
-        typer.echo(f"{fake} does not record its model's training data: overlap with {real} was not checked", err=True)
+        typer.echo(
+            f"{fake} does not record its model's training data: overlap with {real} was not "
+            "checked",
+            err=True,
+        )
     elif undecided(seen, reference):
         typer.echo(
-            "KITTI's object set is a sample of the raw drives; whether the two sets share frames is not known", err=True
+            "KITTI's object set is a sample of the raw drives; whether the two sets share frames "
+            "is not known",
+            err=True,
         )

@@ -1,4 +1,5 @@
-"""``lidar-synth import``: converts the released weights of another project to a checkpoint of this package."""
+"""``lidar-synth import``: converts the released weights of another project to a checkpoint of this
+package."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,8 +16,8 @@ def import_(
 ) -> None:
     """Converts the released weights of another project to a checkpoint.
 
-    Reading the file runs no code from it. Parameter names, sign and time convention are converted; a file with missing
-    or unexpected keys is refused, and the message lists them.
+    Reading the file runs no code from it. Parameter names, sign and time convention are converted;
+    a file with missing or unexpected keys is refused, and the message lists them.
 
     Examples:
 
@@ -24,7 +25,8 @@ def import_(
 
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
 
-      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
+      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside
+      model.ckpt)
     """
     from lidar_synth.generate.checkpoint import save_checkpoint
     from lidar_synth.lab.importers import IMPORTERS
@@ -33,8 +35,13 @@ def import_(
         raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
     header, networks = IMPORTERS[peer](file)
     digest = save_checkpoint(out, header, networks)
-    counts = [f"{n} {sum(p.numel() for p in net.parameters()) / 1e6:.1f} M parameters" for n, net in networks.items()]
+    counts = [
+        f"{n} {sum(p.numel() for p in net.parameters()) / 1e6:.1f} M parameters"
+        for n, net in networks.items()
+    ]
     rows, columns = header.sensor.shape
     print(f"{out}: {', '.join(counts)}, {rows} x {columns}, {', '.join(header.channels)}")
-    print(f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
-          f"{header.provenance['data_licence']}")  # fmt: skip
+    print(
+        f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
+        f"{header.provenance['data_licence']}"
+    )

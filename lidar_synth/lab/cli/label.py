@@ -12,17 +12,23 @@ if TYPE_CHECKING:
 
 def label(
     dataset: Annotated[str, typer.Argument(metavar="DATASET", help="kitti360")],
-    root: Annotated[Path, typer.Argument(metavar="ROOT", help="root of the dataset, with data_3d_semantics")],
+    root: Annotated[
+        Path, typer.Argument(metavar="ROOT", help="root of the dataset, with data_3d_semantics")
+    ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to; may be ROOT")],
     split: Annotated[str, typer.Option(help="drives to label, for instance r2flow/train")] = "all",
     against: Annotated[
-        Path | None, typer.Option(help="folder with known labels per scan, to compare the new ones with")
+        Path | None,
+        typer.Option(help="folder with known labels per scan, to compare the new ones with"),
     ] = None,
     jobs: Annotated[int, typer.Option(help="number of worker processes; each needs 1 to 3 GB")] = 1,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="only count the frames that would get labels")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="only count the frames that would get labels")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
 ) -> None:
-    """Labels KITTI-360's scans from its accumulated clouds, with a confidence per point and a report by class.
+    """Labels KITTI-360's scans from its accumulated clouds, with a confidence per point and a
+    report by class.
 
     Run it again to resume an interrupted run.
 
@@ -52,14 +58,23 @@ def label(
 
 
 def _print(report: "LabelReport", out: Path) -> None:
-    print(f"{out}: {sum(report.labelled.values())} scans labelled, {report.kept} windows were complete already")
+    print(
+        f"{out}: {sum(report.labelled.values())} scans labelled, {report.kept} windows were "
+        "complete already"
+    )
     _print_frames(report.without_pose, report.outside, report.without_clouds)
     for drive, frames in report.misfits.items():
         if frames:
-            print(f"  {drive}: {len(frames)} scans do not lie on the clouds and got no labels", file=sys.stderr)
+            print(
+                f"  {drive}: {len(frames)} scans do not lie on the clouds and got no labels",
+                file=sys.stderr,
+            )
     for drive, metres in report.moved.items():
         if metres:
-            far = f"lay up to {max(metres):.2f} m off the clouds and were laid onto them: check its poses"
+            far = (
+                f"lay up to {max(metres):.2f} m off the clouds and were laid onto them: check its "
+                "poses"
+            )
             print(f"  {drive}: {len(metres)} scans {far}", file=sys.stderr)
     print("\n" + "  ".join(f"{name} {share:.1%}" for name, share in report.totals().items()) + "\n")
     names = ("points", "confidence", "covered", "right")
@@ -67,11 +82,16 @@ def _print(report: "LabelReport", out: Path) -> None:
     shown = [n for n in names if any(row[n] is not None for row in rows.values())]
     print(f"{'class':<15}" + "".join(f"{name:>12}" for name in shown))
     for name, row in rows.items():
-        cells = ["" if row[n] is None else f"{row[n]:,}" if n == "points" else f"{row[n]:.3f}" for n in shown]
+        cells = [
+            "" if row[n] is None else f"{row[n]:,}" if n == "points" else f"{row[n]:.3f}"
+            for n in shown
+        ]
         print(f"{name:<15}" + "".join(f"{cell:>12}" for cell in cells))
 
 
-def _print_frames(without_pose: dict[str, int], outside: dict[str, int], without_clouds: tuple[str, ...]) -> None:
+def _print_frames(
+    without_pose: dict[str, int], outside: dict[str, int], without_clouds: tuple[str, ...]
+) -> None:
     for counts, reason in ((without_pose, "have no pose"), (outside, "lie outside all windows")):
         for drive, count in counts.items():
             if count:

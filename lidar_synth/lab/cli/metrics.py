@@ -8,7 +8,9 @@ import typer
 if TYPE_CHECKING:
     from lidar_synth.lab.evaluate.extractors import ExtractorSpec
 
-metrics = typer.Typer(name="metrics", help="Weights that the field's measures need: setup.", no_args_is_help=True)
+metrics = typer.Typer(
+    name="metrics", help="Weights that the field's measures need: setup.", no_args_is_help=True
+)
 
 
 @metrics.callback()
@@ -19,15 +21,20 @@ def _commands() -> None:
 @metrics.command("setup")
 def setup(
     folder: Annotated[
-        Path | None, typer.Argument(metavar="[FOLDER]", help="folder of the weights; default: $LIDAR_SYNTH_METRICS")
+        Path | None,
+        typer.Argument(
+            metavar="[FOLDER]", help="folder of the weights; default: $LIDAR_SYNTH_METRICS"
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Says which files the measures need, where to get them, and which are there and readable.
 
-    Nothing is downloaded. Put each archive, packed or unpacked, into one folder and name it in LIDAR_SYNTH_METRICS.
+    Nothing is downloaded. Put each archive, packed or unpacked, into one folder and name it in
+    LIDAR_SYNTH_METRICS.
 
-    The hash is the publisher's, where one states it. sha256 is that of the file that is here, or of the names and
+    The hash is the publisher's, where one states it. sha256 is that of the file that is here, or of
+    the names and
     contents of all files of a folder: state it beside your figures.
 
     \b
@@ -63,14 +70,17 @@ def _status(name: str, spec: "ExtractorSpec", folder: Path | None) -> dict[str, 
     return {
         "measure": spec.measure,
         "state": _state(name, spec, path),
-        "file": " or ".join(spec.archives) if spec.archives == spec.files else
-        " or ".join(f"{archive}, {archive}.tar.gz" for archive in spec.archives),
+        "file": " or ".join(spec.archives)
+        if spec.archives == spec.files
+        else " or ".join(f"{archive}, {archive}.tar.gz" for archive in spec.archives),
         "contents": ", ".join(spec.files),
         "from": spec.source,
         "licence": spec.licence,
-        "hash": f"git blob {spec.git_blob}" if spec.git_blob else "unknown: its publisher states none",
+        "hash": f"git blob {spec.git_blob}"
+        if spec.git_blob
+        else "unknown: its publisher states none",
         "sha256": weights_hash(path) if path else None,
-    }  # fmt: skip
+    }
 
 
 def _state(name: str, spec: "ExtractorSpec", path: Path | None) -> str:

@@ -9,39 +9,67 @@ _ARMS = "a training to compare, repeatable [exchange, pretrain, pretrain-generat
 
 
 def prove(
-    root: Annotated[Path, typer.Argument(metavar="ROOT", help="labelled scans, in any layout that is read")],
-    out: Annotated[Path, typer.Option(help="folder of the page and of all that is needed to resume")] = Path("proof"),
+    root: Annotated[
+        Path, typer.Argument(metavar="ROOT", help="labelled scans, in any layout that is read")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="folder of the page and of all that is needed to resume")
+    ] = Path("proof"),
     minutes: Annotated[float | None, typer.Option(min=1, help="limit of the time [none]")] = None,
-    labelled: Annotated[int | None, typer.Option(min=1, help="labelled scans of a training [all, at most 200]")] = None,
+    labelled: Annotated[
+        int | None, typer.Option(min=1, help="labelled scans of a training [all, at most 200]")
+    ] = None,
     arm: Annotated[list[str] | None, typer.Option(help=_ARMS)] = None,
-    ratio: Annotated[list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")] = None,
-    iterations: Annotated[int, typer.Option(min=10, help="of each training; fewer if --minutes is short")] = 1000,
+    ratio: Annotated[
+        list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")
+    ] = None,
+    iterations: Annotated[
+        int, typer.Option(min=10, help="of each training; fewer if --minutes is short")
+    ] = 1000,
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
-    places: Annotated[str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")] = "auto",
-    model: Annotated[str, typer.Option(help="of the arms with a generator: a name or a file")] = "town-dense",
+    places: Annotated[
+        str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")
+    ] = "auto",
+    model: Annotated[
+        str, typer.Option(help="of the arms with a generator: a name or a file")
+    ] = "town-dense",
     synthetic: Annotated[int, typer.Option(min=1, help="synthetic scans of each kind")] = 150,
-    classes: Annotated[str, typer.Option(help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes")]
-    = "auto",
-    only: Annotated[list[str] | None, typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable")]
-    = None,
-    trainer: Annotated[str | None, typer.Option(help="your own trainer: a command with {job}, the mixture as YAML")]
-    = None,
-    sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
-    split: Annotated[str | None, typer.Option(help="split of ROOT, if its layout has splits")] = None,
-    pools: Annotated[Path | None, typer.Option(help="folder of the synthetic scans, to share between runs")] = None,
+    classes: Annotated[
+        str,
+        typer.Option(help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes"),
+    ] = "auto",
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable")
+    ] = None,
+    trainer: Annotated[
+        str | None, typer.Option(help="your own trainer: a command with {job}, the mixture as YAML")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="split of ROOT, if its layout has splits")
+    ] = None,
+    pools: Annotated[
+        Path | None, typer.Option(help="folder of the synthetic scans, to share between runs")
+    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="processes [one for each core]")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and do nothing")] = False,
-) -> None:  # fmt: skip
-    """Trains a small network with and without synthetic scans, and tests on places that were left out.
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="print the plan and do nothing")
+    ] = False,
+) -> None:
+    """Trains a small network with and without synthetic scans, and tests on places that were left
+    out.
 
-    Writes a page with paired differences and their intervals, index.html in the output folder. Run it again to resume,
-    or to add arms, shares and seeds.
+    Writes a page with paired differences and their intervals, index.html in the output folder. Run
+    it again to resume, or to add arms, shares and seeds.
 
     \b
     Examples:
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
-      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
+      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio
+      0.5 --dry-run
     """
     import os
 
@@ -52,10 +80,19 @@ def prove(
     from lidar_synth.lab.proof.planning import make_plan
 
     settings = ProofSettings(
-        labelled=labelled, arms=tuple(arm or ProofSettings.arms), ratios=tuple(ratio or (0.5,)), iterations=iterations,
-        batch=batch, seeds=seeds, places=places, synthetic=synthetic, model=model, classes=classes,
-        only=tuple(only or ()), columns=None if trainer else 512,
-    )  # fmt: skip
+        labelled=labelled,
+        arms=tuple(arm or ProofSettings.arms),
+        ratios=tuple(ratio or (0.5,)),
+        iterations=iterations,
+        batch=batch,
+        seeds=seeds,
+        places=places,
+        synthetic=synthetic,
+        model=model,
+        classes=classes,
+        only=tuple(only or ()),
+        columns=None if trainer else 512,
+    )
     source = open_scans(root, sensor=sensor, split=split)
     if dry_run:
         typer.echo(describe(make_plan(source, settings, minutes, jobs or os.cpu_count() or 1)[0]))

@@ -8,10 +8,13 @@ import typer
 
 
 def recipes(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="print the file of this recipe")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="print the file of this recipe")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Lists the recipes and the models of several stages of the package with data, size and expected time of each.
+    """Lists the recipes and the models of several stages of the package with data, size and
+    expected time of each.
 
     \b
     Examples:
@@ -20,10 +23,17 @@ def recipes(
       lidar-synth recipes town-dense
       lidar-synth train town_teacher data.path=scans data.town=null output=runs/mine
     """
-    from lidar_synth.lab.train.config import find_model_file, find_recipe, published, published_models
+    from lidar_synth.lab.train.config import (
+        find_model_file,
+        find_recipe,
+        published,
+        published_models,
+    )
 
     if name is not None:
-        typer.echo((find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"), nl=False)
+        typer.echo(
+            (find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"), nl=False
+        )
         return
     listed = [*published_models(), *published()]
     if as_json:
@@ -33,4 +43,6 @@ def recipes(
     rows += [(one.name, one.command, one.data, one.size, one.time) for one in listed]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        typer.echo(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        )

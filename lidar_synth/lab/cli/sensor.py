@@ -13,18 +13,27 @@ if TYPE_CHECKING:
 
 @options_from(Reading, after="scans")
 def fit_from_scans(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")],
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")
+    ],
     out: Annotated[Path, typer.Option(help="YAML file to write, for --sensor of any command")],
-    scans: Annotated[int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")] = 8,
-    columns: Annotated[int | None, typer.Option(help="columns of the range images [from the firings]")] = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG file to write with a plot of the fit")] = None,
+    scans: Annotated[
+        int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")
+    ] = 8,
+    columns: Annotated[
+        int | None, typer.Option(help="columns of the range images [from the firings]")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG file to write with a plot of the fit")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
     **reading: Any,
 ) -> None:
-    """Fits a sensor to scans: elevation and azimuth offset of each beam, firings, range limits, quantisation.
+    """Fits a sensor to scans: elevation and azimuth offset of each beam, firings, range limits,
+    quantisation.
 
-    The points may be raw or motion compensated, complete or cropped, in the frame of the sensor or of the vehicle. If
-    they lie on no beams, the fit fails (exit status 1) and writes nothing.
+    The points may be raw or motion compensated, complete or cropped, in the frame of the sensor or
+    of the vehicle. If they lie on no beams, the fit fails (exit status 1) and writes nothing.
 
     \b
     Examples:
@@ -80,10 +89,14 @@ def _values(found: "SensorFit") -> dict[str, object]:
         "spread of a beam": f"{np.median(found.spread):.4f} degrees (median)",
         "place of the sensor": f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees",
         "firings per turn": f"{sensor.firings or 'not known'}",
-        "azimuth offsets": f"known by {found.azimuths.known}" if found.azimuths.known else "not known",
+        "azimuth offsets": f"known by {found.azimuths.known}"
+        if found.azimuths.known
+        else "not known",
         "ranges": f"{found.nearest:.2f} to {found.farthest:.2f} m"
         + (f", in steps of {1000 * sensor.range_step:.0f} mm" if sensor.range_step else ""),
-        "reflectance": f"{sensor.reflectance_levels} levels" if sensor.reflectance_levels else "not in equal steps",
+        "reflectance": f"{sensor.reflectance_levels} levels"
+        if sensor.reflectance_levels
+        else "not in equal steps",
         "uncertain": " ".join(found.uncertain) or "nothing",
     }
 

@@ -6,22 +6,39 @@ from typing import Annotated
 import typer
 
 skin = typer.Typer(
-    name="skin", help="The look of a real sensor's returns, for the town: fit, show.", no_args_is_help=True
+    name="skin",
+    help="The look of a real sensor's returns, for the town: fit, show.",
+    no_args_is_help=True,
 )
 
 
 @skin.command("fit")
 def fit_from_scans(
     scans: Annotated[
-        Path, typer.Argument(metavar="SCANS", help="real scans of one sensor, in any layout that is read")
+        Path,
+        typer.Argument(
+            metavar="SCANS", help="real scans of one sensor, in any layout that is read"
+        ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")
+    ],
     licence: Annotated[str, typer.Option(help="licence of the scans, which the file states")],
-    sensor: Annotated[str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")] = None,
-    most: Annotated[int, typer.Option(min=5, help="number of scans to learn from, evenly spaced")] = 100,
-    streets: Annotated[int, typer.Option(min=1, help="streets of the town that they are compared with")] = 32,
-    lasers: Annotated[bool, typer.Option(help="give each laser its own offset of reflectance")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the town that they are compared with")] = 0,
+    sensor: Annotated[
+        str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=5, help="number of scans to learn from, evenly spaced")
+    ] = 100,
+    streets: Annotated[
+        int, typer.Option(min=1, help="streets of the town that they are compared with")
+    ] = 32,
+    lasers: Annotated[
+        bool, typer.Option(help="give each laser its own offset of reflectance")
+    ] = False,
+    seed: Annotated[
+        int, typer.Option(min=0, help="seed of the town that they are compared with")
+    ] = 0,
 ) -> None:
     """Learns a skin from 20 to 100 real scans, in some minutes; labels are not used.
 
@@ -38,7 +55,9 @@ def fit_from_scans(
     source = open_scans(scans, sensor=sensor)
     count = min(most, len(source))
     picked = [source[i * len(source) // count] for i in range(count)]
-    learnt = fit_skin(picked, licence=licence, source=scans.name, seed=seed, streets=streets, lasers=lasers)
+    learnt = fit_skin(
+        picked, licence=licence, source=scans.name, seed=seed, streets=streets, lasers=lasers
+    )
     learnt.save(out)
     print(f"{out}: learnt from {count} scans of {learnt.sensor.name}")
 

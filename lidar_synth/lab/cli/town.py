@@ -10,22 +10,38 @@ def town(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
     scans: Annotated[int, typer.Option(help="number of scans")] = 200,
     seed: Annotated[int, typer.Option(help="seed of the town: another seed is another town")] = 0,
-    layout: Annotated[str, typer.Option(help="folder layout: kitti360 | semantic_kitti | kitti")] = "kitti360",
-    sensor: Annotated[str, typer.Option(help="sensor that casts the rays: a preset or a YAML file")] = "town",
-    camera: Annotated[bool, typer.Option(help="render a camera image of each scan (about 1 s each)")] = True,
+    layout: Annotated[
+        str, typer.Option(help="folder layout: kitti360 | semantic_kitti | kitti")
+    ] = "kitti360",
+    sensor: Annotated[
+        str, typer.Option(help="sensor that casts the rays: a preset or a YAML file")
+    ] = "town",
+    camera: Annotated[
+        bool, typer.Option(help="render a camera image of each scan (about 1 s each)")
+    ] = True,
     interval: Annotated[float, typer.Option(help="seconds between consecutive scans")] = 0.4,
     sequence: Annotated[
-        int | None, typer.Option(help="number of the drive or sequence to write [4 for kitti360, 0 for semantic_kitti]")
+        int | None,
+        typer.Option(
+            help="number of the drive or sequence to write [4 for kitti360, 0 for semantic_kitti]"
+        ),
     ] = None,
     accumulate: Annotated[
-        bool, typer.Option("--accumulate", help="also write KITTI-360's accumulated clouds, for lidar-synth label")
+        bool,
+        typer.Option(
+            "--accumulate", help="also write KITTI-360's accumulated clouds, for lidar-synth label"
+        ),
     ] = False,
     jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
     skin: Annotated[
-        str | None, typer.Option(help="look of a real sensor's returns: a shipped skin by name, or a .skin file")
+        str | None,
+        typer.Option(
+            help="look of a real sensor's returns: a shipped skin by name, or a .skin file"
+        ),
     ] = None,
 ) -> None:
-    """Writes street scans of a procedural town with labels, boxes, poses and images, in the layout of a public dataset.
+    """Writes street scans of a procedural town with labels, boxes, poses and images, in the layout
+    of a public dataset.
 
     No scan comes from a real dataset. Run it again to resume an interrupted run.
 
@@ -40,5 +56,7 @@ def town(
     from lidar_synth.lab.town import Town, export_town
 
     source = Town(seed, sensor, scans, interval, skin=skin)
-    written, kept = export_town(source, out, layout, sequence=sequence, camera=camera, accumulate=accumulate, jobs=jobs)
+    written, kept = export_town(
+        source, out, layout, sequence=sequence, camera=camera, accumulate=accumulate, jobs=jobs
+    )
     print(f"{out}: {written} scans written, {kept} were there already")

@@ -7,13 +7,19 @@ from typing import Annotated
 import typer
 
 RecipeName = Annotated[
-    str, typer.Argument(metavar="RECIPE", help="name of a recipe (see `lidar-synth recipes`), or a YAML file")
+    str,
+    typer.Argument(
+        metavar="RECIPE", help="name of a recipe (see `lidar-synth recipes`), or a YAML file"
+    ),
 ]
 Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override")
+    list[str] | None,
+    typer.Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override"),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="resume the run in the output folder")]
-Minutes = Annotated[float | None, typer.Option(help="save and stop after this many minutes; --resume continues")]
+Minutes = Annotated[
+    float | None, typer.Option(help="save and stop after this many minutes; --resume continues")
+]
 
 
 def train(
@@ -21,25 +27,39 @@ def train(
         str,
         typer.Argument(
             metavar="RECIPE|MODEL",
-            help="name of a recipe or of a model of several stages (see `lidar-synth recipes`), or a YAML file",
+            help=(
+                "name of a recipe or of a model of several stages (see `lidar-synth recipes`), "
+                "or a YAML file"
+            ),
         ),
     ],
     overrides: Overrides = None,
     resume: Resume = False,
     minutes: Annotated[
         float | None,
-        typer.Option(help="save and stop after this many minutes; --resume continues. Of a model: limit of all stages"),
+        typer.Option(
+            help=(
+                "save and stop after this many minutes; --resume continues. Of a model: limit of "
+                "all stages"
+            )
+        ),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="STAGE", help="of a model: the last stage to run")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="of a model: print the time of each stage")] = False,
+    until: Annotated[
+        str | None, typer.Option(metavar="STAGE", help="of a model: the last stage to run")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="of a model: print the time of each stage")
+    ] = False,
 ) -> None:
     """Trains a teacher, a rectified flow from noise to scans; or a model by all its stages.
 
-    The output folder gets the checkpoint, named like the folder; state.safetensors, from which an interrupted run
-    resumes with the same losses; logs for TensorBoard; and images of samples. torchrun runs it on several GPUs.
+    The output folder gets the checkpoint, named like the folder; state.safetensors, from which an
+    interrupted run resumes with the same losses; logs for TensorBoard; and images of samples.
+    torchrun runs it on several GPUs.
 
-    A model such as town-dense has several stages: autoencoder, teacher, student, decoder. Each gets its share of
-    the minutes. The same command resumes. STAGE.KEY=VALUE changes the recipe of a stage, KEY=VALUE all of them.
+    A model such as town-dense has several stages: autoencoder, teacher, student, decoder. Each gets
+    its share of the minutes. The same command resumes. STAGE.KEY=VALUE changes the recipe of a
+    stage, KEY=VALUE all of them.
 
     \b
     Examples:
@@ -66,15 +86,19 @@ def train(
         return
     if until is not None or dry_run:
         given = "--dry-run" if dry_run else f"--until {until}"
-        raise ConfigError(f"{given} for the recipe {recipe}", "a model of several stages, such as town-dense")
+        raise ConfigError(
+            f"{given} for the recipe {recipe}", "a model of several stages, such as town-dense"
+        )
     _print_once(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
 
-def distill(recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None) -> None:
+def distill(
+    recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None
+) -> None:
     """Distils a student that needs few steps from a teacher.
 
-    Without a time grid in the configuration, the timesteps are selected first. With a weaker teacher the student learns
-    the autoguided velocity (Karras et al. 2024).
+    Without a time grid in the configuration, the timesteps are selected first. With a weaker
+    teacher the student learns the autoguided velocity (Karras et al. 2024).
 
     \b
     Examples:

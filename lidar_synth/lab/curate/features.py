@@ -14,8 +14,10 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 RANGE_BINS = 64
 """Bins of the histogram of ranges, from 0 to the sensor's range_max."""
 
-SIDE, CELLS = 80.0, 32
-"""The bird's-eye map of a signature: side of its square around the sensor in metres, and cells along a side."""
+SIDE = 80.0
+CELLS = 32
+"""The bird's-eye map of a signature: side of its square around the sensor in metres, and cells
+along a side."""
 
 SIGNATURE = CELLS * CELLS
 """Entries of a signature."""
@@ -55,8 +57,10 @@ def _floating(image: RangeImage, scan: Scan) -> float:
 def _speckle(image: RangeImage, scan: Scan) -> float:
     """Compares cells across the seam of the image, too."""
     assert image.label is not None
-    label, metres = image.label, image.range
-    right, beyond = np.roll(label, -1, 1), np.roll(metres, -1, 1)
+    label = image.label
+    metres = image.range
+    right = np.roll(label, -1, 1)
+    beyond = np.roll(metres, -1, 1)
     known = image.mask & (beyond > 0) & (label != IGNORE) & (right != IGNORE)
     return _share((label != right)[known & (np.abs(metres - beyond) < _SAME_SURFACE * metres)])
 
@@ -68,8 +72,12 @@ def _confidence(image: RangeImage, scan: Scan) -> float:
 MEASURES: dict[str, Measure] = {
     "empty": Measure("share of cells without a return", None, _empty),
     "unlabelled": Measure("share of returns without a label", "label", _unlabelled),
-    "floating": Measure("share of ground returns (road to terrain) above the sensor", "label", _floating),
-    "speckle": Measure("share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle),
+    "floating": Measure(
+        "share of ground returns (road to terrain) above the sensor", "label", _floating
+    ),
+    "speckle": Measure(
+        "share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle
+    ),
     "confidence": Measure("mean confidence of the returns", "confidence", _confidence),
 }
 """Measures by the name of their score; a share of an empty set is 0."""
@@ -82,10 +90,10 @@ class Features(NamedTuple):
         numbers: {name: value} for the names in ``MEASURES``.
         ranges: (RANGE_BINS,) number of returns per range bin.
         classes: (19,) number of returns per train id.
-        signature: (SIGNATURE,) float16 unit vector: the square roots of the number of returns in each cell of a
-            bird's-eye map, starting with the cell farthest ahead and to the left; 0 for a scan without returns in the
-            map. The inner product of two signatures is the Bhattacharyya coefficient of the maps: 1 for identical maps,
-            0 for disjoint ones.
+        signature: (SIGNATURE,) float16 unit vector: the square roots of the number of returns in
+            each cell of a bird's-eye map, starting with the cell farthest ahead and to the left; 0
+            for a scan without returns in the map. The inner product of two signatures is the
+            Bhattacharyya coefficient of the maps: 1 for identical maps, 0 for disjoint ones.
     """
 
     numbers: dict[str, float]
@@ -96,7 +104,11 @@ class Features(NamedTuple):
 
 def measured(fields: Collection[str]) -> tuple[str, ...]:
     """The names in ``MEASURES`` that scans with these fields support."""
-    return tuple(name for name, measure in MEASURES.items() if measure.field is None or measure.field in fields)
+    return tuple(
+        name
+        for name, measure in MEASURES.items()
+        if measure.field is None or measure.field in fields
+    )
 
 
 def features(image: RangeImage) -> Features:

@@ -1,12 +1,14 @@
 """Approximate nearest-neighbour search for near duplicates in large banks, with an inverted file.
 
-A signature is projected onto random signs and rounded to bytes. This sketch preserves distances to a few per cent
-(Johnson and Lindenstrauss; Achlioptas, "Database-friendly random projections", 2003). Randomly sampled sketches are the
-centres of Voronoi cells. A scan is compared with the earlier scans in the ``PROBES`` cells with the nearest centres
-(Jegou et al., "Product quantization for nearest neighbor search", 2011); of these, the ``CANDIDATES`` nearest sketches
-are compared by their full signatures. Exact copies are always found, by their hash.
+A signature is projected onto random signs and rounded to bytes. This sketch preserves distances to
+a few per cent (Johnson and Lindenstrauss; Achlioptas, "Database-friendly random projections",
+2003). Randomly sampled sketches are the centres of Voronoi cells. A scan is compared with the
+earlier scans in the ``PROBES`` cells with the nearest centres (Jegou et al., "Product quantization
+for nearest neighbor search", 2011); of these, the ``CANDIDATES`` nearest sketches are compared by
+their full signatures. Exact copies are always found, by their hash.
 
-All steps before the full signatures compute with integers that float32 represents exactly: the result does not depend
+All steps before the full signatures compute with integers that float32 represents exactly: the
+    result does not depend
 on the machine, the number of threads or the block size. The time grows with N^1.5.
 """
 
@@ -31,8 +33,9 @@ PROBES = 16
 """Number of cells that a scan is compared with."""
 
 CROWD = 4096
-"""Largest number of scans of a cell to compare with; the first ones are taken. At a million scans a cell holds about an
-eighth of that, unless very many scans are nearly identical; then the first of them are found."""
+"""Largest number of scans of a cell to compare with; the first ones are taken. At a million scans a
+cell holds about an eighth of that, unless very many scans are nearly identical; then the first of
+them are found."""
 
 CANDIDATES = 6
 """Number of nearest sketches whose full signatures are compared."""
@@ -43,7 +46,8 @@ ROWS = 1024
 PAIRS = 1 << 19
 """Pairs of sketches compared at a time: 4 MB of keys."""
 
-_STEPS = 4095  # quantisation steps of a signature's entries in [0, 1]: sums of 1024 entries are exact in float32
+# quantisation steps of a signature's entries in [0, 1]: sums of 1024 entries are exact in float32
+_STEPS = 4095
 _SAMPLE = 65_536  # signatures from which the centre and scale of the sketches are estimated
 _SPREAD = 4  # standard deviations that the range of a byte covers
 _NUMBERS = 2.0**30  # larger than any scan number; its product with a distance is exact in float64
@@ -60,16 +64,21 @@ class Signatures(Protocol):
         ...
 
 
-def find_similar(signatures: Signatures, progress: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def find_similar(
+    signatures: Signatures, progress: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """For each signature, approximately the most similar earlier one; like ``most_similar``.
 
     Returns:
-        (N,) similarity in [0, 1], never more than that of the exact nearest neighbour; (N,) number of the earlier scan,
-        -1 where none was found.
+        (N,) similarity in [0, 1], never more than that of the exact nearest neighbour; (N,) number
+        of the earlier scan, -1 where none was found.
     """
     count = len(signatures)
-    similarity, twin = np.zeros(count), np.full(count, -1)
-    with tqdm(total=PROBES + 3, desc="duplicates", unit="step", disable=not progress, delay=2) as steps:
+    similarity = np.zeros(count)
+    twin = np.full(count, -1)
+    with tqdm(
+        total=PROBES + 3, desc="duplicates", unit="step", disable=not progress, delay=2
+    ) as steps:
         first = _first_copies(signatures)
         steps.update()
         own = np.flatnonzero(first == np.arange(count))  # the first of each group of copies
@@ -96,7 +105,10 @@ def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
     hashes = np.empty(len(signatures), np.uint64)
     for part in _parts(len(signatures)):
         rows = np.ascontiguousarray(signatures[part])
-        hashes[part] = [int.from_bytes(hashlib.blake2b(row.tobytes(), digest_size=8).digest(), "big") for row in rows]
+        hashes[part] = [
+            int.from_bytes(hashlib.blake2b(row.tobytes(), digest_size=8).digest(), "big")
+            for row in rows
+        ]
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
     return first[group]
 
@@ -133,7 +145,9 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
     for part in _parts(count, PAIRS // cells + 1):
         keys = _keys(sketches[part], centres, np.arange(cells))
-        probes[part] = np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
+        probes[part] = (
+            np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
+        )
     order, bounds = _by_cell(probes[:, 0], cells)
     members = [order[a:b][:CROWD] for a, b in pairwise(bounds)]
     best = np.full((count, CANDIDATES), _NONE)
@@ -148,24 +162,36 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     return best.astype(np.int32)
 
 
-def _by_cell(of: NDArray[np.unsignedinteger], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of the sketches, sorted by cell and then ascending; start of each cell in this list, and its end."""
+def _by_cell(
+    of: NDArray[np.unsignedinteger], cells: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the sketches, sorted by cell and then ascending; start of each cell in this list,
+    and its end."""
     order = np.argsort(of, kind="stable")
     return order, np.searchsorted(of[order], np.arange(cells + 1))
 
 
 def _compare(
-    sketches: NDArray[np.int8], queries: NDArray[np.int64], members: NDArray[np.int64], best: NDArray[np.float64]
+    sketches: NDArray[np.int8],
+    queries: NDArray[np.int64],
+    members: NDArray[np.int64],
+    best: NDArray[np.float64],
 ) -> None:
     """Update the best candidates of each query with the earlier members of a cell."""
     keys = _keys(sketches[queries], sketches[members], members)
     keys[members >= queries[:, None]] = _NONE
-    best[queries] = np.partition(np.concatenate([best[queries], keys], 1), CANDIDATES - 1)[:, :CANDIDATES]
+    best[queries] = np.partition(np.concatenate([best[queries], keys], 1), CANDIDATES - 1)[
+        :, :CANDIDATES
+    ]
 
 
-def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(M, N) sort keys: the squared distance of two sketches first, then the number of the second sketch."""
-    a, b = some.astype(np.float32), others.astype(np.float32)
+def _keys(
+    some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(M, N) sort keys: the squared distance of two sketches first, then the number of the second
+    sketch."""
+    a = some.astype(np.float32)
+    b = others.astype(np.float32)
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # whole numbers below 2^22
     keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
     return keys
@@ -174,7 +200,8 @@ def _keys(some: NDArray[np.int8], others: NDArray[np.int8], numbers: NDArray[np.
 def _best(
     signatures: Signatures, part: slice, found: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Similarity and number of the most similar of the candidates (M, K) of each signature; the first one of equals."""
+    """Similarity and number of the most similar of the candidates (M, K) of each signature; the
+    first one of equals."""
     found = np.sort(found, 1)
     numbers, places = np.unique(found, return_inverse=True)
     others = signatures[numbers.clip(0)].astype(np.float32)

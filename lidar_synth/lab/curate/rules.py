@@ -1,7 +1,7 @@
 """Rules about scores: ``confidence < 0.5``, ``duplicate > 0.99 and empty <= 0.3``.
 
-A rule joins conditions by "and"; a condition is a score's name, one of < <= > >=, and a number. Several rules together
-select every scan that at least one of them matches.
+A rule joins conditions by "and"; a condition is a score's name, one of < <= > >=, and a number.
+Several rules together select every scan that at least one of them matches.
 """
 
 import operator
@@ -41,7 +41,9 @@ def matching(rule: str, scores: Mapping[str, NDArray[np.float64]]) -> NDArray[np
     for condition in re.split(r"\band\b", rule):
         match = _CONDITION.fullmatch(condition)
         if match is None:
-            raise ConfigError(f"rule {rule!r}", "a score, < <= > or >=, and a number: 'confidence < 0.5'")
+            raise ConfigError(
+                f"rule {rule!r}", "a score, < <= > or >=, and a number: 'confidence < 0.5'"
+            )
         name, sign, number = match.groups()
         if name not in scores:
             raise ConfigError(f"score {name!r} in rule {rule!r}", f"one of {', '.join(scores)}")

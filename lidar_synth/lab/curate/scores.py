@@ -1,7 +1,9 @@
 """Scores of all scans of a bank, and their file.
 
-The file is a numpy ``.npz`` without pickled objects: ``bank``, the identity of its bank; ``reference``, the scans that
-the histograms were compared with ("" = the bank's own mean); ``twin``; and one array (N,) per score.
+The file is a numpy ``.npz`` without pickled objects: ``bank``, the identity of its bank;
+    ``reference``, the scans that
+the histograms were compared with ("" = the bank's own mean); ``twin``; and one array (N,) per
+score.
 """
 
 from collections.abc import Iterable
@@ -33,7 +35,8 @@ FILE = "scores.npz"
 """Name of the file, in the bank's folder."""
 
 FARTHEST = float(np.sqrt(np.log(2)))
-"""The Jensen-Shannon distance of disjoint histograms; also used for a scan without returns or labels."""
+"""The Jensen-Shannon distance of disjoint histograms; also used for a scan without returns or
+labels."""
 
 MEANINGS: dict[str, str] = {
     "range": "Jensen-Shannon distance of the range histogram to the mean histogram, 0 to 0.83",
@@ -54,7 +57,8 @@ class Scores:
 
     Args:
         bank: identity of the bank.
-        reference: name of the scans that the histograms were compared with; "" for the bank's own mean.
+        reference: name of the scans that the histograms were compared with; "" for the bank's own
+            mean.
         values: {name: (N,) float64} for the names in ``MEANINGS`` that the bank's fields support.
         twin: (N,) number of the most similar earlier scan, -1 for the first scan.
     """
@@ -74,17 +78,18 @@ def score(
     progress: bool = True,
     folder: Path | None = None,
 ) -> Scores:
-    """Score every scan of a bank. It needs 2.4 kB per scan on disk and at most 400 bytes per scan in memory.
+    """Score every scan of a bank. It needs 2.4 kB per scan on disk and at most 400 bytes per scan
+    in memory.
 
     Args:
         bank: the bank to score.
-        reference: scans whose mean histograms to compare with, projected onto the bank's sensor; by default the
-            bank's own. Without labels the score ``labels`` is left out.
+        reference: scans whose mean histograms to compare with, projected onto the bank's sensor; by
+            default the bank's own. Without labels the score ``labels`` is left out.
         name: name of the reference.
         jobs: worker processes.
         progress: show bars.
-        folder: stores the features during the run; a killed run resumes with the same folder. By default a temporary
-            one.
+        folder: stores the features during the run; a killed run resumes with the same folder. By
+            default a temporary one.
 
     Raises:
         ConfigError: on fewer than one job, or an empty reference.
@@ -95,7 +100,9 @@ def score(
     with TemporaryDirectory() as temporary:
         store = measure(bank, folder or Path(temporary), jobs, progress)
         if reference is None:
-            ranges, classes = _means((row["ranges"], row["classes"]) for rows in store.blocks() for row in rows)
+            ranges, classes = _means(
+                (row["ranges"], row["classes"]) for rows in store.blocks() for row in rows
+            )
         else:
             ranges, classes = _means_of(reference, bank.sensor, jobs, progress)
         values = {"range": _distances(store, "ranges", ranges)}
@@ -113,7 +120,11 @@ def write_scores(path: Path, scores: Scores) -> None:
     Raises:
         FileError: if it cannot be written.
     """
-    arrays = {"bank": np.array(scores.bank), "reference": np.array(scores.reference), "twin": scores.twin}
+    arrays = {
+        "bank": np.array(scores.bank),
+        "reference": np.array(scores.reference),
+        "twin": scores.twin,
+    }
     write_arrays(path, arrays | scores.values)
 
 
@@ -128,7 +139,9 @@ def read_scores(path: Path) -> Scores:
     values = {name: arrays[name] for name in MEANINGS if name in arrays}
     shapes = {array.shape for name, array in arrays.items() if name in MEANINGS or name == "twin"}
     if not {"bank", "reference", "twin", "range"} <= set(arrays) or len(shapes) != 1:
-        raise DataError(f"{path} holds {sorted(arrays)}", "the scores of a bank", "Remove it and curate again.")
+        raise DataError(
+            f"{path} holds {sorted(arrays)}", "the scores of a bank", "Remove it and curate again."
+        )
     return Scores(str(arrays["bank"]), str(arrays["reference"]), values, arrays["twin"])
 
 
@@ -136,7 +149,8 @@ class _Mean:
     """The mean of normalised histograms with equal weights; empty histograms are ignored."""
 
     def __init__(self, bins: int) -> None:
-        self._total, self._count = np.zeros(bins), 0
+        self._total = np.zeros(bins)
+        self._count = 0
 
     def add(self, histogram: NDArray[np.integer]) -> None:
         if histogram.any():
@@ -150,7 +164,8 @@ class _Mean:
 
 def _means(histograms: Iterable[Histograms]) -> Histograms:
     """The mean histograms of ranges and of classes over all scans."""
-    ranges, classes = _Mean(RANGE_BINS), _Mean(len(NAMES))
+    ranges = _Mean(RANGE_BINS)
+    classes = _Mean(len(NAMES))
     for of_ranges, of_classes in histograms:
         ranges.add(of_ranges)
         classes.add(of_classes)
@@ -158,9 +173,12 @@ def _means(histograms: Iterable[Histograms]) -> Histograms:
 
 
 def _means_of(source: Source, sensor: Sensor, jobs: int, progress: bool) -> Histograms:
-    work, count = partial(_of_source, source, sensor), len(source)
+    work = partial(_of_source, source, sensor)
+    count = len(source)
     with in_processes(work, range(count), jobs, _CHUNK) as results:
-        return _means(tqdm(results, desc="reference", total=count, unit="scan", disable=not progress))
+        return _means(
+            tqdm(results, desc="reference", total=count, unit="scan", disable=not progress)
+        )
 
 
 def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:

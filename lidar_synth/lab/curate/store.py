@@ -1,6 +1,7 @@
 """The features of a bank's scans on disk, so that the bank may be larger than the memory.
 
-A file holds ``BLOCK`` scans, 2.4 kB each, and is written atomically: a killed run resumes after the existing files.
+A file holds ``BLOCK`` scans, 2.4 kB each, and is written atomically: a killed run resumes after the
+    existing files.
 """
 
 import shutil
@@ -41,15 +42,22 @@ class Store:
         names: names of the measured numbers.
 
     Attributes:
-        dtype: type of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in ``Features``.
+        dtype: type of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in
+            ``Features``.
     """
 
     def __init__(self, folder: Path, count: int, names: tuple[str, ...]) -> None:
-        self.folder, self.count, self.names = folder, count, names
-        self.dtype = np.dtype([
-            ("ranges", "<u4", RANGE_BINS), ("classes", "<u4", len(NAMES)), ("numbers", "<f8", len(names)),
-            ("signature", "<f2", SIGNATURE),
-        ])  # fmt: skip
+        self.folder = folder
+        self.count = count
+        self.names = names
+        self.dtype = np.dtype(
+            [
+                ("ranges", "<u4", RANGE_BINS),
+                ("classes", "<u4", len(NAMES)),
+                ("numbers", "<f8", len(names)),
+                ("signature", "<f2", SIGNATURE),
+            ]
+        )
 
     def __len__(self) -> int:
         return self.count
@@ -74,7 +82,9 @@ class Store:
         try:
             rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
         except OSError as error:
-            raise FileError(f"{path} cannot be read ({error.strerror or error})", "what was measured") from error
+            raise FileError(
+                f"{path} cannot be read ({error.strerror or error})", "what was measured"
+            ) from error
         except ValueError as error:
             raise DataError(f"{path} is damaged ({error})", "what was measured") from error
         if rows.dtype != self.dtype or rows.shape != (min(BLOCK, self.count - block * BLOCK),):
@@ -91,7 +101,9 @@ class Store:
         Raises:
             FileError: if it cannot be written.
         """
-        write_file(self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True)
+        write_file(
+            self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True
+        )
 
     def stored(self) -> int:
         """Number of rows in the existing files, up to the first missing or damaged one."""
@@ -119,7 +131,9 @@ def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
     waiting: list[NDArray[Any]] = []
     with (
         in_processes(partial(_rows, bank, store), spans, jobs) as results,
-        tqdm(total=len(bank), initial=start, desc="scores", unit="scan", disable=not progress) as bar,
+        tqdm(
+            total=len(bank), initial=start, desc="scores", unit="scan", disable=not progress
+        ) as bar,
     ):
         for rows in results:
             waiting.append(rows)
@@ -135,14 +149,19 @@ def _rows(bank: Bank, store: Store, span: range) -> NDArray[Any]:
     rows = np.empty(len(span), store.dtype)
     for row, number in zip(rows, span, strict=True):
         found = features(bank.image(number))
-        row["ranges"], row["classes"], row["signature"] = found.ranges, found.classes, found.signature
+        row["ranges"], row["classes"], row["signature"] = (
+            found.ranges,
+            found.classes,
+            found.signature,
+        )
         row["numbers"] = [found.numbers[name] for name in store.names]
     return rows
 
 
 @contextmanager
 def kept_in(root: Path) -> Iterator[Path]:
-    """A folder in the bank's folder for its features; removed at the end, kept if the run is killed or fails."""
+    """A folder in the bank's folder for its features; removed at the end, kept if the run is killed
+    or fails."""
     with shared(root / INDEX):
         yield root / FOLDER
     with alone(root / INDEX) as exclusive, suppress(OSError):

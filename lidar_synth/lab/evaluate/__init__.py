@@ -1,12 +1,17 @@
-"""Metrics of realism. Names such as JSD or MMD have different definitions in different papers. Every score therefore
-carries its protocol; scores of different protocols are not comparable.
+"""Metrics of realism. Names such as JSD or MMD have different definitions in different papers.
+Every score therefore carries its protocol; scores of different protocols are not comparable.
 
-To add a protocol, write a file in ``protocols/``; to add a kind of measure, a line of ``KINDS`` in ``measures.py``.
+To add a protocol, write a file in ``protocols/``; to add a kind of measure, a line of ``KINDS`` in
+``measures.py``.
 """
 
 from lidar_synth.lab.evaluate.comparison import evaluate
 from lidar_synth.lab.evaluate.detection import Detection, Detector, detect
-from lidar_synth.lab.evaluate.distances import frechet_distance, jensen_shannon_distance, squared_mmd
+from lidar_synth.lab.evaluate.distances import (
+    frechet_distance,
+    jensen_shannon_distance,
+    squared_mmd,
+)
 from lidar_synth.lab.evaluate.features import Extractor
 from lidar_synth.lab.evaluate.intervals import Interval, bootstrap, extrapolated_frechet
 from lidar_synth.lab.evaluate.metric import Metric, Score

@@ -1,7 +1,8 @@
-"""Features kept on disk, by the hash of the scan and of the extractor's weights, and extracted by several processes.
+"""Features kept on disk, by the hash of the scan and of the extractor's weights, and extracted by
+several processes.
 
-A folder holds one file per scan and extractor. Files are written whole or not at all, so that processes may share a
-folder; a file that cannot be read is made again.
+A folder holds one file per scan and extractor. Files are written whole or not at all, so that
+processes may share a folder; a file that cannot be read is made again.
 """
 
 import hashlib
@@ -25,7 +26,9 @@ VERSION = 1
 """Of the extractors' arithmetic; a change of it makes all features anew."""
 
 
-def checked(extract: Callable[..., NDArray[np.floating]], scans: Sequence[Scan], *more: bool) -> NDArray[np.floating]:
+def checked(
+    extract: Callable[..., NDArray[np.floating]], scans: Sequence[Scan], *more: bool
+) -> NDArray[np.floating]:
     """Features (n, D) of n scans.
 
     Raises:
@@ -33,15 +36,21 @@ def checked(extract: Callable[..., NDArray[np.floating]], scans: Sequence[Scan],
     """
     features = np.asarray(extract(scans, *more))
     if features.ndim != 2 or len(features) != len(scans):
-        raise DataError(f"features of shape {features.shape} of {len(scans)} scans", f"({len(scans)}, D)")
+        raise DataError(
+            f"features of shape {features.shape} of {len(scans)} scans", f"({len(scans)}, D)"
+        )
     finite = np.isfinite(features).all(1)
     if not finite.all():
-        raise DataError(f"scan {scans[int(finite.argmin())].id!r}: features that are not finite", "finite numbers")
+        raise DataError(
+            f"scan {scans[int(finite.argmin())].id!r}: features that are not finite",
+            "finite numbers",
+        )
     return features
 
 
 def scan_hash(scan: Scan) -> str:
-    """SHA-256 of all that an extractor can see of a scan: its points, their fields and its sensor."""
+    """SHA-256 of all that an extractor can see of a scan: its points, their fields and its
+    sensor."""
     digest = hashlib.sha256(repr(scan.sensor).encode())
     for name in ("points", *POINT_FIELDS):
         values = getattr(scan, name)
@@ -72,7 +81,8 @@ class Cached:
     Args:
         extract: makes the features of scans; takes the further arguments of the call, too.
         folder: for the files; several extractors may share it.
-        key: what the features depend on beside the scan: the extractor's name, ``weights_hash``, its preparation.
+        key: what the features depend on beside the scan: the extractor's name, ``weights_hash``,
+            its preparation.
     """
 
     extract: Callable[..., NDArray[np.floating]]
@@ -90,7 +100,9 @@ class Cached:
         found = [_read(path) for path in paths]
         new = [i for i, features in enumerate(found) if features is None]
         if new:
-            for i, features in zip(new, checked(self.extract, [scans[i] for i in new], *more), strict=True):
+            for i, features in zip(
+                new, checked(self.extract, [scans[i] for i in new], *more), strict=True
+            ):
                 write_arrays(paths[i], {"features": features})
                 found[i] = features
         return np.stack([features for features in found if features is not None])
@@ -111,16 +123,20 @@ def _read(path: Path) -> NDArray[np.floating] | None:
 
 
 def extract_all(
-    make: Callable[[], Callable[..., NDArray[np.floating]]], source: Source, processes: int = 1, batch: int = 16,
+    make: Callable[[], Callable[..., NDArray[np.floating]]],
+    source: Source,
+    processes: int = 1,
+    batch: int = 16,
     more: tuple[bool, ...] = (),
-) -> NDArray[np.floating]:  # fmt: skip
-    """(N, D) features of all scans of a source, by several processes that each make an extractor of their own.
+) -> NDArray[np.floating]:
+    """(N, D) features of all scans of a source, by several processes that each make an extractor of
+    their own.
 
     At most ``batch`` scans of each process are in memory.
 
     Args:
-        make: makes the extractor, for instance one that is ``Cached``; a function at the top level of a module, or a
-            partial of one.
+        make: makes the extractor, for instance one that is ``Cached``; a function at the top level
+            of a module, or a partial of one.
         source: the scans; it is sent to the processes.
         processes: number of them; 1 = this one.
         batch: number of scans that an extractor gets at a time.
@@ -139,14 +155,18 @@ def extract_all(
         finally:
             _state.clear()
     threads = max(1, torch.get_num_threads() // processes)
-    with ProcessPoolExecutor(processes, get_context("spawn"), _start, (make, source, more, threads)) as pool:
+    with ProcessPoolExecutor(
+        processes, get_context("spawn"), _start, (make, source, more, threads)
+    ) as pool:
         return np.concatenate(list(pool.map(_extract, parts)))
 
 
 _state: dict[str, Any] = {}  # of a process: its extractor, the source and the further arguments
 
 
-def _start(make: Callable[[], Any], source: Source, more: tuple[bool, ...], threads: int | None) -> None:
+def _start(
+    make: Callable[[], Any], source: Source, more: tuple[bool, ...], threads: int | None
+) -> None:
     if threads is not None:
         torch.set_num_threads(threads)
     _state.update(extract=make(), source=source, more=more)

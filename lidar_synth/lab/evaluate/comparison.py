@@ -36,21 +36,24 @@ def evaluate(
         real: real scans.
         generated: generated scans.
         protocol: a name of ``PROTOCOLS``, or a protocol.
-        extractors: feature extractors by name; each adds a Frechet distance and a squared maximum mean discrepancy.
+        extractors: feature extractors by name; each adds a Frechet distance and a squared maximum
+            mean discrepancy.
         batch: number of scans that extractors process at a time.
         progress: whether to show a progress bar.
-        weights: folder with the published weights of the protocol's extractors; by default the one that
-            LIDAR_SYNTH_METRICS names. Measures without weights are left out.
+        weights: folder with the published weights of the protocol's extractors; by default the one
+            that LIDAR_SYNTH_METRICS names. Measures without weights are left out.
         replicates: resamples for a 95 % interval of each value; 0 = no intervals.
         extended: add unbiased forms, precision, recall, density and coverage of all features.
         any_sensor: whether to compare scans of sensors that differ.
-        cache: folder in which features of published weights are kept, by the hash of scan and weights.
+        cache: folder in which features of published weights are kept, by the hash of scan and
+            weights.
         processes: number of processes that extract these features; more than one need a ``cache``.
         left_out: filled with {measure: why it was left out}.
 
     Raises:
         ConfigError: on an unknown protocol, or several processes without a cache.
-        DataError: on an empty set, a scan without returns in the protocol's area, or sensors that differ.
+        DataError: on an empty set, a scan without returns in the protocol's area, or sensors that
+            differ.
 
     Example:
         >>> from lidar_synth import Town
@@ -64,7 +67,12 @@ def evaluate(
         _fill(rules, (real, generated), weights, cache, processes, batch)
     metric = Metric(rules, extractors, weights, replicates, extended, any_sensor, batch, cache)
     indices: Sequence[int] = range(len(real))
-    if not extractors and not metric.uses_weights and rules.limit is not None and len(real) > rules.limit:
+    if (
+        not extractors
+        and not metric.uses_weights
+        and rules.limit is not None
+        and len(real) > rules.limit
+    ):
         indices = choice(len(real), rules.limit)
     metric.update(_read(real, indices, "real", progress), real=True)
     metric.update(_read(generated, range(len(generated)), "generated", progress), real=False)
@@ -80,12 +88,16 @@ def check_counts(protocol: Protocol, real: int, generated: int) -> None:
     Raises:
         DataError: with fewer scans.
     """
-    for name, count, least in (("real", real, protocol.needs.real), ("generated", generated, protocol.needs.generated)):
+    for name, count, least in (
+        ("real", real, protocol.needs.real),
+        ("generated", generated, protocol.needs.generated),
+    ):
         if least is not None and count < least:
             raise DataError(
-                f"{count} {name} scans", f"{least}, as the {protocol.name} protocol compares them",
+                f"{count} {name} scans",
+                f"{least}, as the {protocol.name} protocol compares them",
                 "--anyway measures them; the figures do not stand beside the paper's.",
-            )  # fmt: skip
+            )
 
 
 def _fill(
@@ -98,12 +110,18 @@ def _fill(
 ) -> None:
     """Extract the features of both sets into the cache by several processes."""
     if cache is None:
-        raise ConfigError(f"{processes} processes without a cache", "a folder that they share", "Add --cache FOLDER.")
+        raise ConfigError(
+            f"{processes} processes without a cache",
+            "a folder that they share",
+            "Add --cache FOLDER.",
+        )
     for measure in protocol.measures.values():
         path = find_weights(measure.extractor, weights) if measure.extractor else None
         if path is not None:
             for source, generated in zip(sets, (False, True), strict=True):
-                extract_all(partial(published, measure, path, cache), source, processes, batch, (generated,))
+                extract_all(
+                    partial(published, measure, path, cache), source, processes, batch, (generated,)
+                )
 
 
 def _read(source: Source, indices: Sequence[int], name: str, progress: bool) -> Iterator[Scan]:

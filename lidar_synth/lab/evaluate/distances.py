@@ -9,8 +9,8 @@ from lidar_synth.errors import DataError
 
 
 def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> float:
-    """Square root of the Jensen-Shannon divergence (natural logarithm), in [0, sqrt(log 2)]; LiDM and R2Flow both
-    report it as JSD.
+    """Square root of the Jensen-Shannon divergence (natural logarithm), in [0, sqrt(log 2)]; LiDM
+    and R2Flow both report it as JSD.
 
     Args:
         p: non-negative weights of any shape; need not be normalised.
@@ -24,14 +24,16 @@ def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> flo
             f"weights of shape {p.shape} and {q.shape} with sums {p.sum()} and {q.sum()}",
             "two non-negative histograms of one shape, neither of them empty",
         )
-    p, q = p.ravel() / p.sum(), q.ravel() / q.sum()
+    p = p.ravel() / p.sum()
+    q = q.ravel() / q.sum()
     mean = (p + q) / 2
     divergence = sum(float((w[w > 0] * np.log(w[w > 0] / mean[w > 0])).sum()) for w in (p, q)) / 2
     return float(np.sqrt(max(divergence, 0.0)))
 
 
 def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Squared Frechet distance of the Gaussians that fit two sets of features (Dowson and Landau, 1982)::
+    """Squared Frechet distance of the Gaussians that fit two sets of features (Dowson and Landau,
+    1982)::
 
         |m_a - m_b|^2 + tr(S_a + S_b - 2 (S_a^1/2 S_b S_a^1/2)^1/2)
 
@@ -50,7 +52,10 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 
 def frechet_of_moments(
-    mean_a: NDArray[np.float64], cov_a: NDArray[np.float64], mean_b: NDArray[np.float64], cov_b: NDArray[np.float64]
+    mean_a: NDArray[np.float64],
+    cov_a: NDArray[np.float64],
+    mean_b: NDArray[np.float64],
+    cov_b: NDArray[np.float64],
 ) -> float:
     """As ``frechet_distance``, from means (D,) and covariances (D, D)."""
     values, vectors = np.linalg.eigh(cov_a)
@@ -73,8 +78,9 @@ def squared_mmd(
     subsets: int = 100,
     size: int = 1000,
 ) -> float:
-    """Unbiased squared maximum mean discrepancy of features under the kernel (x . y / D + 1)^3, averaged over
-    random subsets (the kernel distance of Binkowski et al., ICLR 2018, as R2Flow reports it).
+    """Unbiased squared maximum mean discrepancy of features under the kernel (x . y / D + 1)^3,
+    averaged over random subsets (the kernel distance of Binkowski et al., ICLR 2018, as R2Flow
+    reports it).
 
     Args:
         real: (N, D) features.
@@ -112,7 +118,10 @@ def checked_features(
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
         raise DataError(f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D)")
     if min(len(a), len(b)) < 2:
-        raise DataError(f"features of {len(a)} and {len(b)} scans", "at least two of each for a distance of features")
+        raise DataError(
+            f"features of {len(a)} and {len(b)} scans",
+            "at least two of each for a distance of features",
+        )
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise DataError("features that are not finite", "finite numbers")
     return a, b

@@ -1,4 +1,5 @@
-"""Features of scans: the extractors of a protocol, and the figures that two sets of features give."""
+"""Features of scans: the extractors of a protocol, and the figures that two sets of features
+give."""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +24,12 @@ Extractor = Callable[[Sequence[Scan]], NDArray[np.floating]]
 """Features of a few scans: n scans -> (n, D)."""
 
 Paired = Callable[[Sequence[Scan], bool], NDArray[np.floating]]
-"""As ``Extractor``, with whether the scans are generated: some protocols prepare the two sets differently."""
+"""As ``Extractor``, with whether the scans are generated: some protocols prepare the two sets
+differently."""
 
 SAMPLES_PER_FEATURE = 4
-"""Samples for each feature from which a Fréchet distance gets an interval; with fewer it does not cover the truth."""
+"""Samples for each feature from which a Fréchet distance gets an interval; with fewer it does not
+cover the truth."""
 
 JOINED: dict[str, Callable[[Scan], NDArray[np.float64]]] = {"class_shares": class_shares}
 """Descriptions that a measure joins to features, by the name of its option ``join``."""
@@ -44,12 +47,15 @@ class Loaded(NamedTuple):
     missing: dict[str, str]
 
 
-def load_extractors(protocol: Protocol, weights: Path | None = None, cache: Path | None = None) -> Loaded:
+def load_extractors(
+    protocol: Protocol, weights: Path | None = None, cache: Path | None = None
+) -> Loaded:
     """Load the extractors of a protocol whose weights are in a folder.
 
     Args:
         protocol: whose measures of features name them.
-        weights: folder with the published archives; by default the one that LIDAR_SYNTH_METRICS names.
+        weights: folder with the published archives; by default the one that LIDAR_SYNTH_METRICS
+            names.
         cache: folder for features; None = they are not kept.
 
     Raises:
@@ -62,7 +68,8 @@ def load_extractors(protocol: Protocol, weights: Path | None = None, cache: Path
         path = find_weights(str(measure.extractor), weights)
         if path is None:
             loaded.missing[name] = (
-                f"no weights of {measure.extractor}; lidar-synth metrics setup says where to get them"
+                f"no weights of {measure.extractor}; lidar-synth metrics setup says where to get "
+                "them"
             )
         else:
             loaded.extractors[name] = published(measure, path, cache)
@@ -70,18 +77,25 @@ def load_extractors(protocol: Protocol, weights: Path | None = None, cache: Path
 
 
 def published(measure: Measure, path: Path, cache: Path | None = None) -> Paired:
-    """The extractor of a measure, with what its option ``join`` names appended to the features; ``cache`` as in
-    ``load_extractors``."""
+    """The extractor of a measure, with what its option ``join`` names appended to the features;
+    ``cache`` as in ``load_extractors``."""
     extract = _package().load_extractor(measure.extractor, path, measure.preparation)
     join = JOINED[measure.options["join"]] if "join" in measure.options else None
 
     def features(scans: Sequence[Scan], generated: bool) -> NDArray[np.floating]:
         own: NDArray[np.floating] = extract(scans, generated=generated)
-        return own if join is None else np.concatenate([own, np.stack([join(scan) for scan in scans])], axis=1)
+        return (
+            own
+            if join is None
+            else np.concatenate([own, np.stack([join(scan) for scan in scans])], axis=1)
+        )
 
     if cache is None:
         return features
-    key = f"{measure.extractor} {measure.preparation} {sorted(measure.options.items())} {weights_hash(path)}"
+    key = (
+        f"{measure.extractor} {measure.preparation} {sorted(measure.options.items())} "
+        f"{weights_hash(path)}"
+    )
     return Cached(features, cache, key)
 
 
@@ -115,12 +129,17 @@ def statistic_of(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Stat
 
 
 Figure = tuple[str, Callable[[], float], Callable[[], Statistic | None], tuple[float, float]]
-"""Title, value, statistic to resample (None = no interval), and the smallest and the largest possible value."""
+"""Title, value, statistic to resample (None = no interval), and the smallest and the largest
+possible value."""
 
-ANY, POSITIVE, SHARE = (-np.inf, np.inf), (0.0, np.inf), (0.0, 1.0)
+ANY = (-np.inf, np.inf)
+POSITIVE = (0.0, np.inf)
+SHARE = (0.0, 1.0)
 
 
-def figures_of(name: str, real: NDArray[np.floating], fake: NDArray[np.floating], extended: bool) -> list[Figure]:
+def figures_of(
+    name: str, real: NDArray[np.floating], fake: NDArray[np.floating], extended: bool
+) -> list[Figure]:
     """The figures of an extractor's features without a protocol.
 
     Args:
@@ -129,16 +148,25 @@ def figures_of(name: str, real: NDArray[np.floating], fake: NDArray[np.floating]
         extended: add unbiased forms, precision, recall, density and coverage.
     """
     figures: list[Figure] = [
-        (f"Frechet distance of {name}", partial(frechet_distance, real, fake), partial(statistic_of, real, fake),
-         POSITIVE),
-        (f"squared maximum mean discrepancy of {name}", partial(squared_mmd, real, fake),
-         partial(polynomial_mmd, real, fake), ANY),
-    ]  # fmt: skip
+        (
+            f"Frechet distance of {name}",
+            partial(frechet_distance, real, fake),
+            partial(statistic_of, real, fake),
+            POSITIVE,
+        ),
+        (
+            f"squared maximum mean discrepancy of {name}",
+            partial(squared_mmd, real, fake),
+            partial(polynomial_mmd, real, fake),
+            ANY,
+        ),
+    ]
     return figures + more_figures(name, real, fake) if extended else figures
 
 
 def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floating]) -> list[Figure]:
-    """Unbiased forms, precision, recall, density and coverage; those for which there are enough samples."""
+    """Unbiased forms, precision, recall, density and coverage; those for which there are enough
+    samples."""
     figures: list[Figure] = []
 
     def add(title: str, statistic: Statistic, limits: tuple[float, float]) -> None:
@@ -147,7 +175,14 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
     add("unbiased squared maximum mean discrepancy", polynomial_mmd(real, fake), ANY)
     try:
         value = extrapolated_frechet(real, fake)
-        figures.append((f"Frechet distance of {name}, infinitely many samples", lambda: value, lambda: None, ANY))
+        figures.append(
+            (
+                f"Frechet distance of {name}, infinitely many samples",
+                lambda: value,
+                lambda: None,
+                ANY,
+            )
+        )
     except DataError:
         pass  # too few samples to extrapolate from
     try:
@@ -161,4 +196,6 @@ def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floatin
 def describe_missing(missing: Mapping[str, str], protocol: Protocol) -> str:
     """One line per measure that could not be measured, with the reason."""
     measures = protocol.measures
-    return "\n".join(f"{measures[n].table or measures[n].title}: {reason}" for n, reason in missing.items())
+    return "\n".join(
+        f"{measures[n].table or measures[n].title}: {reason}" for n, reason in missing.items()
+    )

@@ -1,4 +1,5 @@
-"""Confidence intervals of distances between two sets, and the Fréchet distance of infinitely many samples."""
+"""Confidence intervals of distances between two sets, and the Fréchet distance of infinitely many
+samples."""
 
 from typing import NamedTuple
 
@@ -9,7 +10,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.lab.evaluate.distances import checked_features, frechet_distance
 from lidar_synth.lab.evaluate.statistics import Statistic
 
-REPLICATES, LEVEL = 200, 0.95
+REPLICATES = 200
+LEVEL = 0.95
 _BATCH = 50  # resamples that are evaluated at a time
 
 
@@ -31,21 +33,23 @@ def bootstrap(
     smallest: float = -np.inf,
     largest: float = np.inf,
 ) -> Interval | None:
-    """The basic bootstrap interval (Davison and Hinkley, 1997, section 5.2.1): twice the value less the quantiles of
-    its resamples. Both sets are resampled with replacement.
+    """The basic bootstrap interval (Davison and Hinkley, 1997, section 5.2.1): twice the value less
+    the quantiles of its resamples. Both sets are resampled with replacement.
 
-    Resampling biases a distance as sampling does; the basic interval takes that bias off, so that it can lie below a
-    value which too few samples raise.
+    Resampling biases a distance as sampling does; the basic interval takes that bias off, so that
+    it can lie below a value which too few samples raise.
 
     Args:
         statistic: of two sets.
         replicates: number of resamples.
         level: of confidence, in (0, 1).
         seed: of the resamples.
-        smallest, largest: the values between which the interval is cut, for instance 0 and 1 of a share.
+        smallest, largest: the values between which the interval is cut, for instance 0 and 1 of a
+            share.
 
     Returns:
-        The interval; None where the statistic of a resample is not a number, as those of few samples may be which
+        The interval; None where the statistic of a resample is not a number, as those of few
+        samples may be which
         compare different ones: a resample may hold copies of one only.
 
     Raises:
@@ -53,7 +57,10 @@ def bootstrap(
         DataError: with a set of one sample.
     """
     if not 0 < level < 1 or replicates < 20:
-        raise ConfigError(f"level {level} and {replicates} resamples", "a level in (0, 1) and at least 20 resamples")
+        raise ConfigError(
+            f"level {level} and {replicates} resamples",
+            "a level in (0, 1) and at least 20 resamples",
+        )
     if min(statistic.sizes) < 2:
         raise DataError(
             f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples",
@@ -63,7 +70,9 @@ def bootstrap(
     values = []
     for first in range(0, replicates, _BATCH):
         count = min(_BATCH, replicates - first)
-        values.append(statistic.at(*(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)))
+        values.append(
+            statistic.at(*(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes))
+        )
     if not np.isfinite(together := np.concatenate(values)).all():
         return None
     tails = np.quantile(together, [(1 - level) / 2, (1 + level) / 2])
@@ -72,12 +81,17 @@ def bootstrap(
 
 
 def extrapolated_frechet(
-    real: NDArray[np.floating], fake: NDArray[np.floating], sizes: int = 10, smallest: float = 0.5, seed: int = 0
+    real: NDArray[np.floating],
+    fake: NDArray[np.floating],
+    sizes: int = 10,
+    smallest: float = 0.5,
+    seed: int = 0,
 ) -> float:
     """The Fréchet distance extrapolated to infinitely many samples (Chong and Forsyth, CVPR 2020).
 
-    The distance of finite sets is too large by about c / n. It is measured on parts of both sets of several sizes, and
-    a line through the values over 1 / size gives the value at 0. It can fall below 0.
+    The distance of finite sets is too large by about c / n. It is measured on parts of both sets of
+    several sizes, and a line through the values over 1 / size gives the value at 0. It can fall
+    below 0.
 
     Args:
         real: (N, D) features.
@@ -87,8 +101,8 @@ def extrapolated_frechet(
         seed: of the choice of the parts.
 
     Raises:
-        DataError: as ``frechet_distance``, or where the smallest part does not have more samples than features: there
-            the distance is no line over 1 / size.
+        DataError: as ``frechet_distance``, or where the smallest part does not have more samples
+            than features: there the distance is no line over 1 / size.
     """
     real, fake = checked_features(real, fake)
     fewest = int(smallest * min(len(real), len(fake)))
@@ -100,7 +114,9 @@ def extrapolated_frechet(
     rng = np.random.default_rng(seed)
     shares = 1 / np.linspace(1, 1 / smallest, sizes)
     values = [
-        frechet_distance(*(s[rng.choice(len(s), round(share * len(s)), replace=False)] for s in (real, fake)))
+        frechet_distance(
+            *(s[rng.choice(len(s), round(share * len(s)), replace=False)] for s in (real, fake))
+        )
         for share in shares
     ]
     return float(np.polyfit(1 / shares, values, 1)[1])

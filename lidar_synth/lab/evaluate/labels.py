@@ -1,7 +1,9 @@
 """Bird's-eye histograms by class, for scans with labels: what S-JSD and S-MMD compare.
 
-SPIRAL (Zhu et al., NeurIPS 2025, https://arxiv.org/abs/2505.22643) compares one bird's-eye histogram per class. Its
-code could not be read: its grid and its normalisation are not known. Here the grid is R2Flow's, and a scan's histograms
+SPIRAL (Zhu et al., NeurIPS 2025, https://arxiv.org/abs/2505.22643) compares one bird's-eye
+histogram per class. Its
+code could not be read: its grid and its normalisation are not known. Here the grid is R2Flow's, and
+    a scan's histograms
 of all classes together sum to 1.
 """
 
@@ -17,8 +19,11 @@ from lidar_synth.lab.evaluate.statistics import Sparse
 CLASSES = len(NAMES)
 
 
-def class_histogram(scan: Scan, field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR) -> Sparse:
-    """The bins that are not empty of (19, bins, bins): class, then x, then y. Ignored points do not count.
+def class_histogram(
+    scan: Scan, field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR
+) -> Sparse:
+    """The bins that are not empty of (19, bins, bins): class, then x, then y. Ignored points do not
+    count.
 
     Args:
         scan: with labels.
@@ -33,23 +38,34 @@ def class_histogram(scan: Scan, field: float = FIELD, bins: int = BINS, near: fl
         raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
     distance = np.linalg.norm(scan.points, axis=1)
     cell = np.floor((scan.points[:, :2] / field + 0.5) * bins).astype(np.int64)
-    kept = (scan.label != IGNORE) & (distance > near) & (distance < far) & ((cell >= 0) & (cell < bins)).all(1)
+    kept = (
+        (scan.label != IGNORE)
+        & (distance > near)
+        & (distance < far)
+        & ((cell >= 0) & (cell < bins)).all(1)
+    )
     if not kept.any():
-        raise DataError(f"scan {scan.id!r} with no labelled return from {near:g} m to {far:g} m", "labelled returns")
+        raise DataError(
+            f"scan {scan.id!r} with no labelled return from {near:g} m to {far:g} m",
+            "labelled returns",
+        )
     index = (scan.label[kept].astype(np.int64) * bins + cell[kept, 0]) * bins + cell[kept, 1]
     where, amounts = np.unique(index, return_counts=True)
     return Sparse(where.astype(np.int32), amounts.astype(np.uint16))
 
 
 def class_shares(scan: Scan, bands: int = 16) -> NDArray[np.float64]:
-    """(bands * 19,) share of each class among the labelled points, in rings around the sensor of equal width to 56 m.
+    """(bands * 19,) share of each class among the labelled points, in rings around the sensor of
+    equal width to 56 m.
 
     Raises:
         DataError: on a scan without labels.
     """
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
-    ring = np.minimum(np.linalg.norm(scan.points[:, :2], axis=1) * bands / 56, bands - 1).astype(np.int64)
+    ring = np.minimum(np.linalg.norm(scan.points[:, :2], axis=1) * bands / 56, bands - 1).astype(
+        np.int64
+    )
     known = scan.label != IGNORE
     counts = np.bincount(ring[known] * CLASSES + scan.label[known], minlength=bands * CLASSES)
     table = counts.reshape(bands, CLASSES).astype(np.float64)

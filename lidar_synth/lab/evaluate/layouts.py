@@ -1,5 +1,5 @@
-"""Agreement of generated scans with the layouts that they were generated for: do boxes hold what they should, and does
-nothing of their classes lie elsewhere?"""
+"""Agreement of generated scans with the layouts that they were generated for: do boxes hold what
+they should, and does nothing of their classes lie elsewhere?"""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -15,7 +15,8 @@ from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 
-LEAST_RAYS, LEAST_POINTS = 20, 10
+LEAST_RAYS = 20
+LEAST_POINTS = 10
 """A box that so many rays meet first should hold so many points."""
 
 _SURFACE = 0.005  # metres; the depth of an image has steps of 2 mm
@@ -67,8 +68,11 @@ def rays_of_boxes(layout: Layout, sensor: Sensor) -> NDArray[np.int64]:
     return np.asarray(near.sum(1), np.int64)
 
 
-def layout_agreement(scans: Iterable[Scan], layouts: Iterable[Layout], own: Iterable[Scan]) -> LayoutAgreement:
-    """Compare generated scans with labels with their layouts, and with the scans ``own`` that the layouts are of.
+def layout_agreement(
+    scans: Iterable[Scan], layouts: Iterable[Layout], own: Iterable[Scan]
+) -> LayoutAgreement:
+    """Compare generated scans with labels with their layouts, and with the scans ``own`` that the
+    layouts are of.
 
     Example:
         >>> from lidar_synth import Town, layout_of
@@ -88,9 +92,11 @@ def layout_agreement(scans: Iterable[Scan], layouts: Iterable[Layout], own: Iter
     return LayoutAgreement(*total.tolist())
 
 
-def _inside(layout: Layout, scan: Scan) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]:
-    """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points in each box,
-    without those of the ground."""
+def _inside(
+    layout: Layout, scan: Scan
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]:
+    """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points
+    in each box, without those of the ground."""
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} has no labels", "labels, to compare it with its layout")
     inside = layout.boxes.enlarged(TOLERANCE).contain(scan.points)

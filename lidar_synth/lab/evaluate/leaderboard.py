@@ -1,4 +1,5 @@
-"""Published figures beside one's own: ``leaderboard.yaml`` has them with their protocol and source."""
+"""Published figures beside one's own: ``leaderboard.yaml`` has them with their protocol and
+source."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -20,7 +21,8 @@ class Table(BaseModel):
         dataset: that the scans are compared with.
         source: a key of the sources.
         note: what else is known of them.
-        rows: {"method": name, "steps": network evaluations if known, name of a figure: its value in the table}.
+        rows: {"method": name, "steps": network evaluations if known, name of a figure: its value in
+            the table}.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,29 +37,43 @@ class Table(BaseModel):
 @cache
 def leaderboard() -> tuple[tuple[Table, ...], Mapping[str, str]]:
     """All tables, and {source: what it is}."""
-    text = files("lidar_synth.lab.evaluate").joinpath("leaderboard.yaml").read_text(encoding="utf-8")
+    text = (
+        files("lidar_synth.lab.evaluate").joinpath("leaderboard.yaml").read_text(encoding="utf-8")
+    )
     values = yaml.safe_load(text)
     return tuple(Table(**table) for table in values["tables"]), values["sources"]
 
 
 def beside(scores: Sequence[Score]) -> str:
-    """The published figures of the scores' protocol as tables in Markdown, each with the scores as its last row, which
-    says how many scans they are of."""
+    """The published figures of the scores' protocol as tables in Markdown, each with the scores as
+    its last row, which says how many scans they are of."""
     named = {score.table: score for score in scores if score.table}
     tables, sources = leaderboard()
-    counts = ", ".join(f"{max((getattr(s, side) for s in scores), default=0)} {side}" for side in SIDES)
+    counts = ", ".join(
+        f"{max((getattr(s, side) for s in scores), default=0)} {side}" for side in SIDES
+    )
     parts = []
     for table in (t for t in tables if scores and t.protocol == scores[0].protocol):
         longest_first = sorted(table.rows, key=len, reverse=True)
-        columns = list(dict.fromkeys(key for row in longest_first for key in row if key not in ("method", "steps")))
-        head = [f"| method | steps | {' | '.join(columns)} |", f"|---|---:|{'---:|' * len(columns)}"]
+        columns = list(
+            dict.fromkeys(
+                key for row in longest_first for key in row if key not in ("method", "steps")
+            )
+        )
+        head = [
+            f"| method | steps | {' | '.join(columns)} |",
+            f"|---|---:|{'---:|' * len(columns)}",
+        ]
         rows = [
-            f"| {row['method']} | {row.get('steps', '')} | {' | '.join(str(row.get(c, '')) for c in columns)} |"
+            f"| {row['method']} | {row.get('steps', '')} | "
+            f"{' | '.join(str(row.get(c, '')) for c in columns)} |"
             for row in table.rows
         ]
         own = " | ".join(_shown(named[c]) if c in named else "" for c in columns)
         where = f"{table.dataset}, {table.task}. {sources[table.source]}. {table.note}".rstrip(". ")
-        parts.append("\n".join([f"{where}.", "", *head, *rows, f"| **these scans** ({counts}) | | {own} |"]))
+        parts.append(
+            "\n".join([f"{where}.", "", *head, *rows, f"| **these scans** ({counts}) | | {own} |"])
+        )
     return "\n\n".join(parts) or "No published figures of this protocol are known."
 
 

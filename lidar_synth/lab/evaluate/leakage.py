@@ -1,8 +1,10 @@
-"""Detection of data leakage: the recordings a model was trained on, and their overlap with evaluation data.
+"""Detection of data leakage: the recordings a model was trained on, and their overlap with
+evaluation data.
 
-A checkpoint's provenance lists under ``seen`` all recordings that influenced its weights: its own training data and
-those of its teacher, its initial weights and its autoencoder. Provenances of version 0.1.0 have no ``seen`` but a split
-or a path; a split with known drives is replaced by these drives, a path is kept as a path.
+A checkpoint's provenance lists under ``seen`` all recordings that influenced its weights: its own
+training data and those of its teacher, its initial weights and its autoencoder. Provenances of
+version 0.1.0 have no ``seen`` but a split or a path; a split with known drives is replaced by these
+drives, a path is kept as a path.
 """
 
 import hashlib
@@ -38,7 +40,8 @@ from lidar_synth.lab.town.export import SETTINGS
 
 
 def seen_by(provenance: Mapping[str, Any]) -> Recordings:
-    """All recordings that influenced weights, also through teachers, initial weights and autoencoders.
+    """All recordings that influenced weights, also through teachers, initial weights and
+    autoencoders.
 
     Raises:
         DataError: on invalid recordings.
@@ -57,11 +60,14 @@ def inherited(provenance: Mapping[str, Any]) -> Recordings:
 
 
 def seen_by_model_of(path: Path, source: ScanFiles | None = None) -> Recordings | None:
-    """The training data of the model that generated scans; empty if it is not known, None if no model did.
+    """The training data of the model that generated scans; empty if it is not known, None if no
+    model did.
 
     Args:
-        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were converted.
-        source: its scans; the first one may say that a model made it, where nothing beside the scans does.
+        path: a folder of ``lidar-synth sample``, a bank, or a folder into which such scans were
+            converted.
+        source: its scans; the first one may say that a model made it, where nothing beside the
+            scans does.
 
     Raises:
         FileError, DataError: if what stands beside them is damaged.
@@ -97,12 +103,16 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
 def measured(
     source: ScanFiles, layout: str, path: Path, split: str | None, seen: Recordings | None = None
 ) -> Recordings:
-    """The recordings of a reference, and its path: data on which an evaluated model must not have been trained.
+    """The recordings of a reference, and its path: data on which an evaluated model must not have
+    been trained.
 
-    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify: these may lie in the
+    The scans are read and hashed if the model has ``seen`` scans that only their hashes identify:
+        these may lie in the
     layout of any dataset now.
     """
-    found = recordings_of(source, layout, path) | whole(FILES, [str(path)] + ([f"{path}#{split}"] if split else []))
+    found = recordings_of(source, layout, path) | whole(
+        FILES, [str(path)] + ([f"{path}#{split}"] if split else [])
+    )
     hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
     return found | contents(map(content_of, source)) if hashed else found
 
@@ -120,12 +130,14 @@ def contents(hashes: Iterable[str]) -> Recordings:
 
 
 def overlap(seen: Recordings, reference: Recordings) -> Recordings:
-    """The recordings of a reference on which a model was trained; paths are resolved before comparison."""
+    """The recordings of a reference on which a model was trained; paths are resolved before
+    comparison."""
     return _resolved(seen) & _resolved(reference)
 
 
 def undecided(seen: Recordings, reference: Recordings) -> bool:
-    """Whether one is from KITTI's object set and the other from the raw drives from which that was sampled."""
+    """Whether one is from KITTI's object set and the other from the raw drives from which that was
+    sampled."""
     some, others = ({dataset for dataset, _ in part.drives} for part in (seen, reference))
     return (KITTI in some and KITTI_OBJECT in others) or (KITTI_OBJECT in some and KITTI in others)
 
@@ -150,12 +162,16 @@ def _older(provenance: Mapping[str, Any]) -> Recordings:
     """The recordings of a provenance without ``seen``, from its split, town or path."""
     if provenance.get("source") == lidm.SOURCE:
         return lidm.seen(str(provenance.get("data")), generates=True)
-    data, split = provenance.get("data"), provenance.get("split")
-    layout, path = None, None
+    data = provenance.get("data")
+    split = provenance.get("split")
+    layout = None
+    path = None
     if isinstance(data, Mapping):
         if data.get("town") is not None:
             return town(data.get("seed", 0))
-        layout, path, split = data.get("layout"), data.get("path"), data.get("split")
+        layout = data.get("layout")
+        path = data.get("path")
+        split = data.get("split")
     elif data == "KITTI-360":
         layout = "kitti360"
     if layout in (None, "kitti360") and (drives := KITTI360_SPLITS.get(str(split))):

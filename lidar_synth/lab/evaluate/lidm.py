@@ -1,7 +1,7 @@
 """Bird's-eye occupancy and the minimum matching distance as LiDM reports them:
 https://github.com/hancyran/LiDAR-Diffusion, ``lidm/eval``. R3DPA computes the same on finer cells
-(https://github.com/valeoai/R3DPA, ``evaluate.py``). The counts and limits are in ``protocols/lidm.yaml`` and
-``protocols/r3dpa.yaml``.
+(https://github.com/valeoai/R3DPA, ``evaluate.py``). The counts and limits are in
+``protocols/lidm.yaml`` and ``protocols/r3dpa.yaml``.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,20 @@ from lidar_synth.geometry.sensor import Sensor
 HALF = 50
 """Half the side of the bird's-eye square around the sensor, metres."""
 
-FINE, COARSE = 0.05, 0.5
-"""Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching distance."""
+FINE = 0.05
+COARSE = 0.5
+"""Size of cells in metres, for the Jensen-Shannon distance and for the minimum matching
+distance."""
 
-SENSOR = Sensor("lidm", 1024, float(np.nextafter(np.float32(1), np.float32(2))),
-                 float(np.nextafter(np.float32(56), np.float32(0))), rows=64, fov_up=3.0, fov_down=-25.0)  # fmt: skip
+SENSOR = Sensor(
+    "lidm",
+    1024,
+    float(np.nextafter(np.float32(1), np.float32(2))),
+    float(np.nextafter(np.float32(56), np.float32(0))),
+    rows=64,
+    fov_up=3.0,
+    fov_down=-25.0,
+)
 """The grid of LiDM's range images."""
 
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
@@ -28,7 +37,8 @@ _MOST_CELLS = 1 << 16  # cells of a grid up to which the maps of a block are hel
 
 
 def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
-    """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row along x.
+    """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row
+    along x.
 
     Args:
         points: (N, 3) float32 metres.
@@ -40,7 +50,9 @@ def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
     xy = points[:, :2]
     inside = xy[((xy > -HALF) & (xy < HALF)).all(1)]
     if len(inside) == 0:
-        raise DataError(f"a cloud of {len(points)} points with none within +-{HALF} m", "a scan with returns")
+        raise DataError(
+            f"a cloud of {len(points)} points with none within +-{HALF} m", "a scan with returns"
+        )
     side = round(2 * HALF / size)
     cell = np.floor(inside / np.float32(size)).astype(np.int32) + side // 2
     # Rounded up by float32 division, a coordinate just inside could be one cell outside.
@@ -58,9 +70,10 @@ def matching_distances(
 ) -> NDArray[np.float32]:
     """(N, M) Chamfer distance of every real cloud and every generated one.
 
-    The Chamfer distance of two clouds is the mean of both mean squared distances between nearest occupied cells, in
-    units of the side of the square. All clouds share one grid, so that the squared distance from every cell to a cloud
-    is one map. On a coarse grid all pairs are one matrix product; on a fine one the maps are made one after another.
+    The Chamfer distance of two clouds is the mean of both mean squared distances between nearest
+    occupied cells, in units of the side of the square. All clouds share one grid, so that the
+    squared distance from every cell to a cloud is one map. On a coarse grid all pairs are one
+    matrix product; on a fine one the maps are made one after another.
 
     Args:
         real, generated: occupied cells of each cloud.
@@ -75,12 +88,18 @@ def _by_product(
     real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], side: int
 ) -> NDArray[np.float32]:
     total = np.empty((len(real), len(generated)), np.float32)
-    maps = np.concatenate([_distance_maps(real[i : i + _BLOCK], side) for i in range(0, len(real), _BLOCK)])
+    maps = np.concatenate(
+        [_distance_maps(real[i : i + _BLOCK], side) for i in range(0, len(real), _BLOCK)]
+    )
     for j in range(0, len(generated), _BLOCK):
         block = generated[j : j + _BLOCK]
-        to_generated, of_generated = _distance_maps(block, side), _weights(block, side)
+        to_generated = _distance_maps(block, side)
+        of_generated = _weights(block, side)
         for i in range(0, len(real), _BLOCK):
-            pair = _weights(real[i : i + _BLOCK], side) @ to_generated.T + maps[i : i + _BLOCK] @ of_generated.T
+            pair = (
+                _weights(real[i : i + _BLOCK], side) @ to_generated.T
+                + maps[i : i + _BLOCK] @ of_generated.T
+            )
             total[i : i + _BLOCK, j : j + _BLOCK] = pair
     return total
 
@@ -99,7 +118,10 @@ def _by_lookup(
 
 @numba.njit(cache=True, nogil=True)
 def _add_means(
-    values: NDArray[np.float32], cells: NDArray[np.int32], starts: NDArray[np.int64], out: NDArray[np.float32]
+    values: NDArray[np.float32],
+    cells: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    out: NDArray[np.float32],
 ) -> None:
     """Add to ``out`` the mean value over the cells of each cloud."""
     for k in range(len(starts) - 1):
@@ -118,14 +140,15 @@ def _weights(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float
 
 
 def _distance_maps(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float32]:
-    """(n, side * side) squared distance, in cells, from every cell to the nearest that a cloud occupies."""
+    """(n, side * side) squared distance, in cells, from every cell to the nearest that a cloud
+    occupies."""
     return np.stack([_distance_map(cells, side).ravel() for cells in clouds])
 
 
 @numba.njit(cache=True, nogil=True)
 def _distance_map(cells: NDArray[np.int32], side: int) -> NDArray[np.float32]:
-    """(side, side) exact squared distances: along one axis, then the lower envelope of parabolas along the other
-    (Felzenszwalb and Huttenlocher, Theory of Computing 2012)."""
+    """(side, side) exact squared distances: along one axis, then the lower envelope of parabolas
+    along the other (Felzenszwalb and Huttenlocher, Theory of Computing 2012)."""
     gaps = np.full((side, side), 4 * side, np.int32)
     for cell in cells:
         gaps[cell // side, cell % side] = 0
@@ -136,11 +159,13 @@ def _distance_map(cells: NDArray[np.int32], side: int) -> NDArray[np.float32]:
         for j in range(side):
             gaps[i, j] = min(gaps[i, j], gaps[i + 1, j] + 1)
     result = np.empty((side, side), np.float32)
-    vertex, edge = np.empty(side, np.int64), np.empty(side + 1, np.float64)
+    vertex = np.empty(side, np.int64)
+    edge = np.empty(side + 1, np.float64)
     for i in range(side):
         last = -1
         for j in range(side):
-            height, crossing = np.int64(gaps[i, j]) ** 2 + j**2, -np.inf
+            height = np.int64(gaps[i, j]) ** 2 + j**2
+            crossing = -np.inf
             while last >= 0:
                 v = vertex[last]
                 crossing = (height - np.int64(gaps[i, v]) ** 2 - v**2) / (2 * (j - v))
@@ -148,7 +173,8 @@ def _distance_map(cells: NDArray[np.int32], side: int) -> NDArray[np.float32]:
                     break
                 last -= 1
             last += 1
-            vertex[last], edge[last] = j, crossing
+            vertex[last] = j
+            edge[last] = crossing
         k = 0
         for j in range(side):
             while k < last and edge[k + 1] < j:

@@ -1,6 +1,7 @@
 """The kinds of measures: what each keeps of a scan, and how it compares what it kept of two sets.
 
-To add a kind, write its two functions and add a line to ``KINDS``; a protocol in ``protocols/`` then names it.
+To add a kind, write its two functions and add a line to ``KINDS``; a protocol in ``protocols/``
+then names it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +34,8 @@ class Kind(NamedTuple):
     """A way to compare two sets of scans.
 
     Args:
-        describe: ``(prepared scan, options) -> description``; measures that share it share the description.
+        describe: ``(prepared scan, options) -> description``; measures that share it share the
+            description.
         compare: ``(real descriptions, generated descriptions, options) -> Statistic``.
         labels: whether scans need labels.
     """
@@ -59,7 +61,8 @@ def normalised_rows(histograms: Sequence[NDArray[Any]]) -> Rows:
 
 
 def normalised_sparse_rows(histograms: Sequence[Sparse], size: int) -> Rows:
-    """As ``normalised_rows``, of histograms of ``size`` bins that keep only the bins that are not empty."""
+    """As ``normalised_rows``, of histograms of ``size`` bins that keep only the bins that are not
+    empty."""
 
     def rows(first: int, last: int) -> Tensor:
         dense = torch.zeros(last - first, size)
@@ -96,7 +99,9 @@ def _jsd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statisti
 
 
 def _mmd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
-    return gaussian_mmd(normalised_rows(real), normalised_rows(fake), (len(real), len(fake)), real[0].size)
+    return gaussian_mmd(
+        normalised_rows(real), normalised_rows(fake), (len(real), len(fake)), real[0].size
+    )
 
 
 def _occupancy(
@@ -105,7 +110,10 @@ def _occupancy(
     """How often each cell is occupied."""
 
     def compare(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
-        once = [[Sparse(cells, np.ones(len(cells), np.uint8)) for cells in side] for side in (real, fake)]
+        once = [
+            [Sparse(cells, np.ones(len(cells), np.uint8)) for cells in side]
+            for side in (real, fake)
+        ]
         return distance(*once, lidm.cells_along(options["cell"]) ** 2, *more)
 
     return compare

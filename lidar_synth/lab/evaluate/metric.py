@@ -1,7 +1,9 @@
 """Metrics for a training loop: ``update`` with scans of both sets, ``compute``, ``reset``.
 
-They behave as those of torchmetrics: ``update(scans, real=True)`` collects, ``compute`` merges over the processes of
-torch.distributed where it is initialised, ``reset(real=False)`` keeps the real scans for the next epoch.
+They behave as those of torchmetrics: ``update(scans, real=True)`` collects, ``compute`` merges over
+    the processes of
+torch.distributed where it is initialised, ``reset(real=False)`` keeps the real scans for the next
+epoch.
 """
 
 import random
@@ -63,7 +65,9 @@ class Score:
     def __str__(self) -> str:
         interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
         setting = f"{self.protocol} protocol, {self.real} real, {self.generated} generated"
-        table = f", in its tables {self.table} = {self.value * self.times:.4g}" if self.table else ""
+        table = (
+            f", in its tables {self.table} = {self.value * self.times:.4g}" if self.table else ""
+        )
         return f"{self.metric} = {self.value:.6g}{interval} ({setting}){table}"
 
 
@@ -95,19 +99,20 @@ class _Kept:
 class Metric:
     """The figures of a protocol between real and generated scans that arrive in parts.
 
-    Measures of features whose weights are missing, and measures of labels where scans have none, are left out;
-    ``left_out`` says why.
+    Measures of features whose weights are missing, and measures of labels where scans have none,
+    are left out; ``left_out`` says why.
 
     Args:
         protocol: a name of ``PROTOCOLS``, or a protocol.
-        extractors: further feature extractors by name; each adds a Frechet distance and a squared maximum mean
-            discrepancy.
+        extractors: further feature extractors by name; each adds a Frechet distance and a squared
+            maximum mean discrepancy.
         weights: folder with published weights; by default the one that LIDAR_SYNTH_METRICS names.
         replicates: resamples for a 95 % interval of each value; 0 = no intervals.
         extended: add unbiased forms, precision, recall, density and coverage of all features.
         any_sensor: whether to compare scans of sensors that differ.
         batch: number of scans that extractors process at a time.
-        cache: folder in which features of published weights are kept, by the hash of scan and weights.
+        cache: folder in which features of published weights are kept, by the hash of scan and
+            weights.
 
     Raises:
         ConfigError: on an unknown protocol.
@@ -140,7 +145,10 @@ class Metric:
         self._published, missing = load_extractors(self.protocol, weights, cache)
         self._missing = missing
         self._extractors = dict(extractors or {})
-        self._replicates, self._extended, self._any_sensor, self._batch = replicates, extended, any_sensor, batch
+        self._replicates = replicates
+        self._extended = extended
+        self._any_sensor = any_sensor
+        self._batch = batch
         self.reset()
 
     @property
@@ -161,15 +169,16 @@ class Metric:
             real: whether they are real ones.
 
         Raises:
-            DataError: on a scan without returns in the protocol's area, scans of sensors that differ, scans some of
-                which have labels, and features that are not finite.
+            DataError: on a scan without returns in the protocol's area, scans of sensors that
+                differ, scans some of which have labels, and features that are not finite.
         """
         remaining = iter(scans)
         while batch := list(islice(remaining, self._batch)):
             self._add(batch, SIDES[not real])
 
     def _add(self, scans: Sequence[Scan], side: str) -> None:
-        part, generated = _Kept(count=len(scans)), side == "generated"
+        part = _Kept(count=len(scans))
+        generated = side == "generated"
         measured = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         for scan in scans:
             self._check_sensor(scan, side)
@@ -181,12 +190,15 @@ class Metric:
             part.features[_own(name)] = [checked(paired, scans, generated)]
         self._kept[side].add(part)
 
-    def _describe(self, scan: Scan, generated: bool, measures: Sequence[Measure], side: str) -> dict[str, Any]:
+    def _describe(
+        self, scan: Scan, generated: bool, measures: Sequence[Measure], side: str
+    ) -> dict[str, Any]:
         described: dict[str, Any] = {}
         try:
             prepared = self.protocol.prepare.apply(scan, generated)
             for measure in measures:
-                key, kind = _key(measure), KINDS[measure.kind]
+                key = _key(measure)
+                kind = KINDS[measure.kind]
                 if key not in described and (scan.label is not None or not kind.labels):
                     described[key] = kind.describe(prepared, measure.options)
         except DataError as error:
@@ -194,17 +206,24 @@ class Metric:
         return described
 
     def _check_sensor(self, scan: Scan, side: str) -> None:
-        grid, first = self.protocol.prepare.grid, self._kept["real"].sensor or self._kept[side].sensor
+        grid = self.protocol.prepare.grid
+        first = self._kept["real"].sensor or self._kept[side].sensor
         self._kept[side].sensor = self._kept[side].sensor or (scan.sensor, scan.id)
         if self._any_sensor:
             return
         given = f"{side} scan {scan.id!r} of sensor {_named(scan.sensor)}"
         if grid is not None and not alike(scan.sensor, grid):
-            raise DataError(given, f"{_named(grid)}, the sensor of the {self.protocol.name} protocol",
-                            "The protocol town takes any sensor.")  # fmt: skip
+            raise DataError(
+                given,
+                f"{_named(grid)}, the sensor of the {self.protocol.name} protocol",
+                "The protocol town takes any sensor.",
+            )
         if grid is None and first is not None and not alike(scan.sensor, first[0]):
-            raise DataError(given, f"that of scan {first[1]!r}, {_named(first[0])}",
-                            "Cast one set to the other's sensor first: docs/how-to/another-sensor.md.")  # fmt: skip
+            raise DataError(
+                given,
+                f"that of scan {first[1]!r}, {_named(first[0])}",
+                "Cast one set to the other's sensor first: docs/how-to/another-sensor.md.",
+            )
 
     def merge(self, *others: "Metric") -> None:
         """Add what other metrics of the same protocol collected, in their order."""
@@ -213,20 +232,26 @@ class Metric:
                 self._kept[side].add(other._kept[side])
 
     def compute(self) -> dict[str, float]:
-        """{name: value}; of all processes together where torch.distributed is initialised. Raises as ``scores``."""
+        """{name: value}; of all processes together where torch.distributed is initialised. Raises
+        as ``scores``."""
         return {score.metric: score.value for score in self.scores()}
 
     def scores(self) -> list[Score]:
         """The figures with their protocol, table names and intervals; of all processes together.
 
         Raises:
-            DataError: on an empty set, where no figure can be measured, or where an interval needs more scans.
+            DataError: on an empty set, where no figure can be measured, or where an interval needs
+                more scans.
         """
         kept = self._gathered()
         for side in SIDES:
             if kept[side].count == 0:
                 raise DataError(f"no {side} scans", "at least one")
-        scores = [score for name in self.protocol.measures if (score := self._score(name, kept)) is not None]
+        scores = [
+            score
+            for name in self.protocol.measures
+            if (score := self._score(name, kept)) is not None
+        ]
         for name in self._extractors:
             real, fake = (np.concatenate(kept[side].features[name]) for side in SIDES)
             scores += self._of_figures(figures_of(name, real, fake, self._extended), kept)
@@ -236,7 +261,10 @@ class Metric:
                 table = self.protocol.measures[name].table or name
                 scores += self._of_figures(more_figures(table, real, fake), kept)
         if not scores:
-            raise DataError(f"no figure of {self.protocol.name}: {'; '.join(self.left_out.values())}", "one at least")
+            raise DataError(
+                f"no figure of {self.protocol.name}: {'; '.join(self.left_out.values())}",
+                "one at least",
+            )
         return scores
 
     def _score(self, name: str, kept: Mapping[str, _Kept]) -> Score | None:
@@ -246,21 +274,38 @@ class Metric:
                 return None
             real, fake = (np.concatenate(kept[side].features[_own(name)]) for side in SIDES)
             statistic = statistic_of(real, fake) if self._replicates else None
-            return self._made(measure, frechet_distance(real, fake), statistic, len(real), len(fake))
+            return self._made(
+                measure, frechet_distance(real, fake), statistic, len(real), len(fake)
+            )
         both = [kept[side].descriptions.get(_key(measure), []) for side in SIDES]
         counts = [kept[side].count for side in SIDES]
         if KINDS[measure.kind].labels and [len(b) for b in both] != counts:
             if any(0 < len(b) < n for b, n in zip(both, counts, strict=True)):
-                raise DataError("a set in which only some scans have labels", "labels in all scans or in none")
+                raise DataError(
+                    "a set in which only some scans have labels", "labels in all scans or in none"
+                )
             self.left_out[name] = "scans without labels"
             return None
-        real_scans, fake_scans = chosen(both[0], measure.real), both[1][: measure.generated]
+        real_scans = chosen(both[0], measure.real)
+        fake_scans = both[1][: measure.generated]
         compared = KINDS[measure.kind].compare(real_scans, fake_scans, measure.options)
         return self._made(measure, compared.value, compared, *compared.sizes)
 
     def _made(self, measure: Measure, value: float, statistic: Any, real: int, fake: int) -> Score:
-        low, high = self._interval(statistic, (-np.inf if measure.least is None else measure.least, np.inf))
-        return Score(measure.title, value, self.protocol.name, real, fake, measure.table, measure.times, low, high)
+        low, high = self._interval(
+            statistic, (-np.inf if measure.least is None else measure.least, np.inf)
+        )
+        return Score(
+            measure.title,
+            value,
+            self.protocol.name,
+            real,
+            fake,
+            measure.table,
+            measure.times,
+            low,
+            high,
+        )
 
     def _of_figures(self, figures: Iterable[Figure], kept: Mapping[str, _Kept]) -> list[Score]:
         real, fake = (kept[side].count for side in SIDES)
@@ -270,10 +315,14 @@ class Metric:
             scores.append(Score(title, value(), self.protocol.name, real, fake, low=low, high=high))
         return scores
 
-    def _interval(self, statistic: Any, limits: tuple[float, float]) -> tuple[float | None, float | None]:
+    def _interval(
+        self, statistic: Any, limits: tuple[float, float]
+    ) -> tuple[float | None, float | None]:
         if statistic is None or not self._replicates:
             return None, None
-        return bootstrap(statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1]) or (None, None)
+        return bootstrap(
+            statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1]
+        ) or (None, None)
 
     def _gathered(self) -> dict[str, _Kept]:
         """Both sets of all processes, in the order of their ranks."""
@@ -309,7 +358,8 @@ def _key(measure: Measure) -> str:
 
 
 def _own(name: str) -> str:
-    """The features of a protocol's measure, told apart from those of a user's extractor of that name."""
+    """The features of a protocol's measure, told apart from those of a user's extractor of that
+    name."""
     return f"measure {name}"
 
 

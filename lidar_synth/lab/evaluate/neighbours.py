@@ -19,15 +19,17 @@ _BLOCK = 1000  # samples whose distances to all others are held at a time
 
 
 class Manifold(NamedTuple):
-    """Precision, recall (Kynkäänniemi et al., NeurIPS 2019), density and coverage (Naeem et al., ICML 2020).
+    """Precision, recall (Kynkäänniemi et al., NeurIPS 2019), density and coverage (Naeem et al.,
+    ICML 2020).
 
-    Each is a ``Statistic`` over the set that it is a mean of; the balls of the other set stay as they are, so that an
-    interval holds for these balls.
+    Each is a ``Statistic`` over the set that it is a mean of; the balls of the other set stay as
+    they are, so that an interval holds for these balls.
 
     Args:
         precision: share of generated samples within a ball of a real one, in [0, 1].
         recall: share of real samples within a ball of a generated one, in [0, 1].
-        density: mean number of real balls around a generated sample, divided by k; about 1 for equal sets.
+        density: mean number of real balls around a generated sample, divided by k; about 1 for
+            equal sets.
         coverage: share of real samples whose ball holds a generated one, in [0, 1].
     """
 
@@ -37,7 +39,9 @@ class Manifold(NamedTuple):
     coverage: Statistic
 
 
-def manifold(real: NDArray[np.floating], fake: NDArray[np.floating], k: int = NEIGHBOURS) -> Manifold:
+def manifold(
+    real: NDArray[np.floating], fake: NDArray[np.floating], k: int = NEIGHBOURS
+) -> Manifold:
     """Compare where two sets of features lie.
 
     Args:
@@ -53,12 +57,17 @@ def manifold(real: NDArray[np.floating], fake: NDArray[np.floating], k: int = NE
     if k < 1:
         raise ConfigError(f"neighbour k = {k}", "at least 1")
     if min(len(x), len(y)) <= k:
-        raise DataError(f"{len(x)} real and {len(y)} generated samples", f"more than k = {k} of each")
+        raise DataError(
+            f"{len(x)} real and {len(y)} generated samples", f"more than k = {k} of each"
+        )
     real_radii, fake_radii = (_by_rows(s, s, lambda d: d.kthvalue(k + 1).values) for s in (x, y))
-    balls = _by_rows(y, x, lambda d: (d <= real_radii).double().sum(1))  # real balls around each generated sample
+    balls = _by_rows(
+        y, x, lambda d: (d <= real_radii).double().sum(1)
+    )  # real balls around each generated sample
     recalled = _by_rows(x, y, lambda d: (d <= fake_radii).any(1).double())
     nearest = _by_rows(x, y, lambda d: d.min(1).values)
-    count, other = len(x), len(y)
+    count = len(x)
+    other = len(y)
     return Manifold(
         precision=share((balls > 0).double().numpy(), False, count),
         recall=share(recalled.numpy(), True, other),
@@ -73,8 +82,8 @@ class Novelty(NamedTuple):
     Args:
         generated: (M,) of the generated samples.
         held_out: (N,) of real samples that are no training data.
-        closer: share of the generated samples that lie closer to the training data than 95 % of the held-out ones do;
-            0.05 is expected of new samples, more points to copies.
+        closer: share of the generated samples that lie closer to the training data than 95 % of the
+            held-out ones do; 0.05 is expected of new samples, more points to copies.
     """
 
     generated: NDArray[np.float64]
@@ -97,13 +106,16 @@ def nearest_training(
     """
     known = torch.from_numpy(checked_features(training, fake)[0])
     generated, others = (
-        _by_rows(torch.from_numpy(checked_features(training, s)[1]), known, lambda d: d.min(1).values).numpy()
+        _by_rows(
+            torch.from_numpy(checked_features(training, s)[1]), known, lambda d: d.min(1).values
+        ).numpy()
         for s in (fake, held_out)
     )
     return Novelty(generated, others, float((generated < np.quantile(others, 0.05)).mean()))
 
 
 def _by_rows(a: Tensor, b: Tensor, reduce: Callable[[Tensor], Tensor]) -> Tensor:
-    """(N,) a function of the distances from each of N samples to all of another set, for bounded memory."""
+    """(N,) a function of the distances from each of N samples to all of another set, for bounded
+    memory."""
     parts = (torch.cdist(a[i : i + _BLOCK], b) for i in range(0, len(a), _BLOCK))
     return torch.cat([reduce(part) for part in parts])

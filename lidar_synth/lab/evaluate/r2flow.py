@@ -1,5 +1,6 @@
-"""Bird's-eye histograms as LiDARGen introduced and R2Flow reports them: https://github.com/kazuto1011/r2flow,
-``r2flow/metrics/bev.py``. The counts and limits of the protocol are in ``protocols/r2flow.yaml``.
+"""Bird's-eye histograms as LiDARGen introduced and R2Flow reports them:
+https://github.com/kazuto1011/r2flow, ``r2flow/metrics/bev.py``. The counts and limits of the
+protocol are in ``protocols/r2flow.yaml``.
 """
 
 import numpy as np
@@ -8,14 +9,23 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 
-FIELD, BINS, NEAR, FAR = 160.0, 100, 3.0, 70.0
-"""Side of the bird's-eye square around the sensor in metres, bins along it, and the ranges that count, exclusive."""
+FIELD = 160.0
+BINS = 100
+NEAR = 3.0
+FAR = 70.0
+"""Side of the bird's-eye square around the sensor in metres, bins along it, and the ranges that
+count, exclusive."""
 
 
 def bev_histogram(
-    points: NDArray[np.float32], field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR
+    points: NDArray[np.float32],
+    field: float = FIELD,
+    bins: int = BINS,
+    near: float = NEAR,
+    far: float = FAR,
 ) -> NDArray[np.uint32]:
-    """(bins, bins) number of points in each bin of x (first axis) and y; only points with near < range < far count.
+    """(bins, bins) number of points in each bin of x (first axis) and y; only points with near <
+    range < far count.
 
     Args:
         points: (N, 3) float32 metres.
@@ -33,6 +43,7 @@ def bev_histogram(
     histogram = torch.histogramdd(kept, bins, range=[-bound, bound, -bound, bound]).hist
     if not histogram.any():
         raise DataError(
-            f"a cloud of {len(points)} points with none from {near:g} m to {far:g} m", "a scan with returns"
+            f"a cloud of {len(points)} points with none from {near:g} m to {far:g} m",
+            "a scan with returns",
         )
     return histogram.numpy().astype(np.uint32)

@@ -1,7 +1,7 @@
 """Distributions of range and of its steps between neighbouring returns.
 
-R3DPA's public evaluation names such measures (djsd, gmmd) without defining them. These definitions are the package's
-own.
+R3DPA's public evaluation names such measures (djsd, gmmd) without defining them. These definitions
+are the package's own.
 """
 
 import numpy as np
@@ -11,7 +11,8 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 
-RANGE_STEP, RANGE_BINS = 0.5, 500
+RANGE_STEP = 0.5
+RANGE_BINS = 500
 """Width of a bin of the histogram of ranges in metres, and number of bins."""
 
 STEPS = np.concatenate([[0], np.logspace(-3, 2, 51), [np.inf]])
@@ -32,8 +33,8 @@ def range_histogram(scan: Scan) -> NDArray[np.uint32]:
 
 
 def step_histogram(scan: Scan) -> NDArray[np.uint32]:
-    """(2, 52) number of absolute range differences between neighbouring returns on the scan's own grid: along rows,
-    where the last column is next to the first, and along columns.
+    """(2, 52) number of absolute range differences between neighbouring returns on the scan's own
+    grid: along rows, where the last column is next to the first, and along columns.
 
     Raises:
         DataError: on a scan without two neighbouring returns.
@@ -41,7 +42,8 @@ def step_histogram(scan: Scan) -> NDArray[np.uint32]:
     image = project(scan, channels=())
     sides = []
     for axis in (1, 0):
-        step, both = np.abs(image.range - np.roll(image.range, 1, axis)), image.mask & np.roll(image.mask, 1, axis)
+        step = np.abs(image.range - np.roll(image.range, 1, axis))
+        both = image.mask & np.roll(image.mask, 1, axis)
         if axis == 0:
             both[0] = False
         sides.append(np.histogram(step[both], STEPS)[0])

@@ -1,4 +1,5 @@
-"""How well a network recognises the classes of scans: accuracy, IoU and the most frequent confusions, as a table."""
+"""How well a network recognises the classes of scans: accuracy, IoU and the most frequent
+confusions, as a table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,13 +45,16 @@ class Recognition:
         return {name: float(ious[i]) for i, name in enumerate(NAMES) if self.table[i].sum()}
 
     def confusions(self, name: str, most: int = 2, least: float = 0.05) -> list[tuple[str, float]]:
-        """The classes most often predicted instead of a class, with their share of its cells, largest first."""
+        """The classes most often predicted instead of a class, with their share of its cells,
+        largest first."""
         row = self.table[NAMES.index(name)] / max(1, self.table[NAMES.index(name)].sum())
         order = [i for i in np.argsort(-row) if NAMES[i] != name and row[i] >= least]
         return [(NAMES[i], float(row[i])) for i in order[:most]]
 
 
-def recognise(judge: StreetJudge, scans: Source, name: str = "scans", progress: bool = True) -> Recognition:
+def recognise(
+    judge: StreetJudge, scans: Source, name: str = "scans", progress: bool = True
+) -> Recognition:
     """Let a network predict the classes of labelled scans.
 
     Args:
@@ -69,19 +73,25 @@ def recognise(judge: StreetJudge, scans: Source, name: str = "scans", progress: 
         table += judge.confusion([scan])
         features.append(judge.features([scan]))
     if not table.sum():
-        raise DataError(f"{name}: no labelled return", "at least one label that is not 255 = ignore")
+        raise DataError(
+            f"{name}: no labelled return", "at least one label that is not 255 = ignore"
+        )
     return Recognition(table, np.concatenate(features))
 
 
 def compare(real: Recognition, fake: Recognition) -> dict[str, Any]:
-    """The figures of two sets as plain values; feature distances need at least two scans in each set."""
+    """The figures of two sets as plain values; feature distances need at least two scans in each
+    set."""
     figures: dict[str, Any] = {
         name: {
-            "scans": len(r.features), "accuracy": r.accuracy, "mean_iou": r.mean_iou, "iou": r.iou(),
+            "scans": len(r.features),
+            "accuracy": r.accuracy,
+            "mean_iou": r.mean_iou,
+            "iou": r.iou(),
             "confusions": {k: dict(r.confusions(k)) for k in r.iou()},
         }
         for name, r in (("real", real), ("fake", fake))
-    }  # fmt: skip
+    }
     if min(len(real.features), len(fake.features)) > 1:
         figures["frechet_distance"] = frechet_distance(real.features, fake.features)
         figures["squared_mmd"] = squared_mmd(real.features, fake.features)
@@ -90,16 +100,20 @@ def compare(real: Recognition, fake: Recognition) -> dict[str, Any]:
 
 def as_text(figures: Mapping[str, Any]) -> str:
     """The figures of ``compare`` as a table in Markdown."""
-    real, fake = figures["real"], figures["fake"]
+    real = figures["real"]
+    fake = figures["fake"]
     lines = [
-        f"| % | real ({real['scans']} scans) | fake ({fake['scans']} scans) | fake, predicted instead |",
+        f"| % | real ({real['scans']} scans) | fake ({fake['scans']} scans) | fake, predicted "
+        "instead |",
         "|---|---:|---:|---|",
         f"| accuracy | {100 * real['accuracy']:.1f} | {100 * fake['accuracy']:.1f} | |",
         f"| mean IoU | {100 * real['mean_iou']:.1f} | {100 * fake['mean_iou']:.1f} | |",
     ]
     for name in (n for n in NAMES if n in real["iou"] or n in fake["iou"]):
         values = (f"{100 * r['iou'][name]:.1f}" if name in r["iou"] else "" for r in (real, fake))
-        instead = ", ".join(f"{k} {100 * v:.0f}" for k, v in fake["confusions"].get(name, {}).items())
+        instead = ", ".join(
+            f"{k} {100 * v:.0f}" for k, v in fake["confusions"].get(name, {}).items()
+        )
         lines.append(f"| {name} | {' | '.join(values)} | {instead} |")
     for key, label in (("frechet_distance", "Frechet distance"), ("squared_mmd", "squared MMD")):
         if key in figures:

@@ -1,7 +1,9 @@
-"""Agreement of labels (IoU), and evaluation of scans by a segmentation network trained on scans of the town.
+"""Agreement of labels (IoU), and evaluation of scans by a segmentation network trained on scans of
+the town.
 
-Distances between two sets of scans can be computed on the features of this small range-view network, which ships with
-the package. If its predictions agree with the labels of a scan, the labels lie on the right objects.
+Distances between two sets of scans can be computed on the features of this small range-view
+network, which ships with the package. If its predictions agree with the labels of a scan, the
+labels lie on the right objects.
 """
 
 import json
@@ -29,8 +31,8 @@ from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 FORMAT = "lidar-synth-segmenter/1"
 
 Images = Mapping[str, Tensor]
-"""A batch of labelled range images, (B, H, W) each: "range" float32 metres, 0 = no return; "reflectance" float32 in
-[0, 1]; "label" uint8 train ids, 255 = ignore."""
+"""A batch of labelled range images, (B, H, W) each: "range" float32 metres, 0 = no return;
+"reflectance" float32 in [0, 1]; "label" uint8 train ids, 255 = ignore."""
 
 
 def confusion(network: nn.Module, batches: Iterable[Images], height: Tensor) -> NDArray[np.int64]:
@@ -39,7 +41,9 @@ def confusion(network: nn.Module, batches: Iterable[Images], height: Tensor) -> 
     table = torch.zeros(count * count, dtype=torch.int64)
     with torch.inference_mode():
         for batch in batches:
-            predicted = network(segmenter_input(batch["range"], batch["reflectance"], height)).argmax(1)
+            predicted = network(
+                segmenter_input(batch["range"], batch["reflectance"], height)
+            ).argmax(1)
             valid = batch["label"] != IGNORE
             pairs = batch["label"][valid].long() * count + predicted[valid]
             table += torch.bincount(pairs.cpu(), minlength=count * count)
@@ -47,7 +51,8 @@ def confusion(network: nn.Module, batches: Iterable[Images], height: Tensor) -> 
 
 
 def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(19,) intersection over union of every class; NaN for a class that is neither labelled nor predicted.
+    """(19,) intersection over union of every class; NaN for a class that is neither labelled nor
+    predicted.
 
     Args:
         table: (19, 19) the result of ``confusion``.
@@ -96,7 +101,8 @@ class Judge:
             return self.network.features(inputs).double().numpy()
 
     def agreement(self, scans: Iterable[Scan]) -> NDArray[np.int64]:
-        """(19, 19) number of cells by the scans' labels (row) and the network's prediction (column).
+        """(19, 19) number of cells by the scans' labels (row) and the network's prediction
+        (column).
 
         Raises:
             DataError: on a scan without labels.
@@ -111,10 +117,17 @@ class Judge:
         return confusion(self.network, labelled(), self.height)
 
     def _images(self, scans: Sequence[Scan]) -> Images:
-        names = ("reflectance", "label") if all(scan.label is not None for scan in scans) else ("reflectance",)
+        names = (
+            ("reflectance", "label")
+            if all(scan.label is not None for scan in scans)
+            else ("reflectance",)
+        )
         images = [project(scan, self.sensor, names) for scan in scans]
         stacked = {name: np.stack([image.channels[name] for image in images]) for name in names}
-        return {k: torch.from_numpy(v) for k, v in {"range": np.stack([i.range for i in images]), **stacked}.items()}
+        return {
+            k: torch.from_numpy(v)
+            for k, v in {"range": np.stack([i.range for i in images]), **stacked}.items()
+        }
 
     def save(self, path: Path) -> None:
         """Save the network atomically.
@@ -122,9 +135,15 @@ class Judge:
         Raises:
             FileError: if it cannot be written.
         """
-        header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "provenance": dict(self.provenance)}
+        header = {
+            "format": FORMAT,
+            "sensor": self.sensor.to_dict(),
+            "provenance": dict(self.provenance),
+        }
         state = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
-        write_file(path, save(state, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True)
+        write_file(
+            path, save(state, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True
+        )
 
 
 def load_judge(path: Path | None = None) -> Judge:
@@ -151,4 +170,6 @@ def load_judge(path: Path | None = None) -> Judge:
         network.load_state_dict(load(content))
         return Judge(network.eval(), Sensor.from_dict(header["sensor"]), header["provenance"])
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise DataError(f"{path} is not a segmenter of this version ({error})", f"a file of {FORMAT}") from error
+        raise DataError(
+            f"{path} is not a segmenter of this version ({error})", f"a file of {FORMAT}"
+        ) from error

@@ -1,8 +1,9 @@
-"""A small range-view segmenter: per-cell classes of a range image, and features for comparing sets of scans.
+"""A small range-view segmenter: per-cell classes of a range image, and features for comparing sets
+of scans.
 
-It is a U-Net with circular padding of columns. It serves to evaluate scans (do generated labels agree with the
-predictions of a segmenter trained on other scans?) and as the reference trainer's network; it is not tuned for
-benchmarks.
+It is a U-Net with circular padding of columns. It serves to evaluate scans (do generated labels
+agree with the predictions of a segmenter trained on other scans?) and as the reference trainer's
+network; it is not tuned for benchmarks.
 """
 
 from itertools import pairwise
@@ -15,11 +16,13 @@ from torch import Tensor, nn
 from lidar_synth.datasets.classes import NAMES
 
 ROW_BANDS = 4
-"""Bands of rows over which features are averaged separately, so that high and low objects are distinguished."""
+"""Bands of rows over which features are averaged separately, so that high and low objects are
+distinguished."""
 
 
 class _Wrapped(torch.autograd.Function):
-    """Circular padding by one column on each side; a third of the time of ``F.pad(mode="circular")`` on a CPU."""
+    """Circular padding by one column on each side; a third of the time of
+    ``F.pad(mode="circular")`` on a CPU."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -35,7 +38,8 @@ class _Wrapped(torch.autograd.Function):
 
 
 class CircularConv(nn.Module):
-    """3 x 3 convolution, norm and ReLU, with circular padding of columns and zero padding of rows."""
+    """3 x 3 convolution, norm and ReLU, with circular padding of columns and zero padding of
+    rows."""
 
     def __init__(self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> None:
         super().__init__()
@@ -55,11 +59,15 @@ class RangeSegmenter(nn.Module):
     Args:
         in_channels: channels of the input; ``segmenter_input`` gives 4.
         classes: number of classes.
-        widths: channels per level. Every level after the first halves the columns, and from the third on the rows too.
+        widths: channels per level. Every level after the first halves the columns, and from the
+            third on the rows too.
     """
 
     def __init__(
-        self, in_channels: int = 4, classes: int = len(NAMES), widths: tuple[int, ...] = (16, 32, 64, 96)
+        self,
+        in_channels: int = 4,
+        classes: int = len(NAMES),
+        widths: tuple[int, ...] = (16, 32, 64, 96),
     ) -> None:
         super().__init__()
         widths = tuple(widths)
@@ -88,8 +96,8 @@ class RangeSegmenter(nn.Module):
         return logits
 
     def features(self, x: Tensor) -> Tensor:
-        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last feature map over bands of
-        rows."""
+        """(B, in_channels, H, W) to (B, ROW_BANDS * widths[0]) means of the decoder's last feature
+        map over bands of rows."""
         return F.adaptive_avg_pool2d(self.decode(x), (ROW_BANDS, 1)).flatten(1)
 
 
@@ -105,4 +113,6 @@ def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Te
         (B, 4, H, W): log2(1 + d) / 6, z / 2, reflectance, and 1 where there is a return.
     """
     returned = (distance > 0).to(distance.dtype)
-    return torch.stack([torch.log2(1 + distance) / 6, distance * height / 2, reflectance * returned, returned], 1)
+    return torch.stack(
+        [torch.log2(1 + distance) / 6, distance * height / 2, reflectance * returned, returned], 1
+    )

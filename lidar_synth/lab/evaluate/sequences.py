@@ -1,10 +1,12 @@
-"""Consistency of sequences: does the world stand still between scans when the sensor moves as its poses say?
+"""Consistency of sequences: does the world stand still between scans when the sensor moves as its
+poses say?
 
-LiDARCrafter (https://github.com/worldbench/lidarcrafter, ``lidargen/metrics/temporal.py``) measures both errors: it
-registers scans three and four frames apart by ICP from the identity with matches within 2 m, and compares the
-translation with that of the poses (mean of the three absolute differences, metres); and it takes the mean of both mean
-squared nearest distances of scans one to four frames apart in world coordinates. Its figures are for nuScenes, of
-points more than 0.2 m from the sensor.
+LiDARCrafter (https://github.com/worldbench/lidarcrafter, ``lidargen/metrics/temporal.py``) measures
+both errors: it registers scans three and four frames apart by ICP from the identity with matches
+within 2 m, and compares the translation with that of the poses (mean of the three absolute
+differences, metres); and it takes the mean of both mean squared nearest distances of scans one to
+four frames apart in world coordinates. Its figures are for nuScenes, of points more than 0.2 m from
+the sensor.
 """
 
 from collections.abc import Sequence
@@ -16,16 +18,20 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.geometry.scan import Scan
 
-NEAR, MATCH = 0.2, 2.0
-"""Distance from the sensor up to which points are left out, and that of two matching points; metres."""
+NEAR = 0.2
+MATCH = 2.0
+"""Distance from the sensor up to which points are left out, and that of two matching points;
+metres."""
 
-ROUNDS, STILL = 30, 1e-6
-"""Most rounds of ICP, and the relative change of fitness and error at which it stops; Open3D's defaults."""
+ROUNDS = 30
+STILL = 1e-6
+"""Most rounds of ICP, and the relative change of fitness and error at which it stops; Open3D's
+defaults."""
 
 
 def registration_error(scans: Sequence[Scan], apart: int = 3) -> float:
-    """Mean over pairs of scans of the mean absolute difference between the translation that ICP finds and that of the
-    poses, metres.
+    """Mean over pairs of scans of the mean absolute difference between the translation that ICP
+    finds and that of the poses, metres.
 
     Args:
         scans: consecutive ones with poses.
@@ -33,7 +39,8 @@ def registration_error(scans: Sequence[Scan], apart: int = 3) -> float:
 
     Raises:
         ConfigError: on ``apart`` < 1.
-        DataError: on fewer than ``apart`` + 1 scans, scans without poses or points, or scans no part of which matches.
+        DataError: on fewer than ``apart`` + 1 scans, scans without poses or points, or scans no
+            part of which matches.
         LibraryError: without scipy.
     """
     errors = []
@@ -45,7 +52,8 @@ def registration_error(scans: Sequence[Scan], apart: int = 3) -> float:
 
 
 def chamfer_error(scans: Sequence[Scan], apart: int = 1) -> float:
-    """Mean over pairs of scans, in world coordinates, of the mean of both mean squared nearest distances, m^2.
+    """Mean over pairs of scans, in world coordinates, of the mean of both mean squared nearest
+    distances, m^2.
 
     Args, Raises: as ``registration_error``.
     """
@@ -57,8 +65,11 @@ def chamfer_error(scans: Sequence[Scan], apart: int = 1) -> float:
     return float(np.mean(errors))
 
 
-def register(source: NDArray[np.float64], target: NDArray[np.float64], match: float = MATCH) -> NDArray[np.float64]:
-    """(4, 4) transform from one cloud to another by point-to-point ICP from the identity (Besl and McKay, PAMI 1992).
+def register(
+    source: NDArray[np.float64], target: NDArray[np.float64], match: float = MATCH
+) -> NDArray[np.float64]:
+    """(4, 4) transform from one cloud to another by point-to-point ICP from the identity (Besl and
+    McKay, PAMI 1992).
 
     Args:
         source, target: (N, 3) and (M, 3) metres.
@@ -68,13 +79,18 @@ def register(source: NDArray[np.float64], target: NDArray[np.float64], match: fl
         DataError: where fewer than three points match.
         LibraryError: without scipy.
     """
-    tree, transform, before = _tree()(target), np.eye(4), (0.0, 0.0)
+    tree = _tree()(target)
+    transform = np.eye(4)
+    before = (0.0, 0.0)
     for _ in range(ROUNDS):
         moved = source @ transform[:3, :3].T + transform[:3, 3]
         distance, index = tree.query(moved, distance_upper_bound=match)
         near = np.isfinite(distance)
         if near.sum() < 3:
-            raise DataError(f"{int(near.sum())} of {len(source)} points match within {match:g} m", "at least three")
+            raise DataError(
+                f"{int(near.sum())} of {len(source)} points match within {match:g} m",
+                "at least three",
+            )
         now = float(near.mean()), float(np.sqrt((distance[near] ** 2).mean()))
         transform = _rigid(moved[near], target[index[near]]) @ transform
         if all(abs(a - b) < STILL for a, b in zip(now, before, strict=True)):
@@ -85,7 +101,8 @@ def register(source: NDArray[np.float64], target: NDArray[np.float64], match: fl
 
 def _rigid(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) rotation and translation of least squares from points to points (Kabsch, 1976)."""
-    mean_a, mean_b = a.mean(0), b.mean(0)
+    mean_a = a.mean(0)
+    mean_b = b.mean(0)
     u, _, vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
     flip = np.diag([1, 1, np.linalg.det(vt.T @ u.T)])
     result = np.eye(4)
@@ -120,6 +137,9 @@ def _tree() -> Any:
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
-        raise LibraryError("sequences are compared with scipy, which is not installed", "scipy",
-                           "pip install 'lidar_synth[metrics]'") from error  # fmt: skip
+        raise LibraryError(
+            "sequences are compared with scipy, which is not installed",
+            "scipy",
+            "pip install 'lidar_synth[metrics]'",
+        ) from error
     return cKDTree

@@ -1,7 +1,8 @@
-"""Distances between two sets as functions of how often each sample counts, from which ``intervals`` resamples.
+"""Distances between two sets as functions of how often each sample counts, from which ``intervals``
+resamples.
 
-A ``Statistic`` takes the counts of R resamples of both sets, (R, N) and (R, M), and returns R values. With every count
-1 it is the distance itself.
+A ``Statistic`` takes the counts of R resamples of both sets, (R, N) and (R, M), and returns R
+values. With every count 1 it is the distance itself.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidar_synth.lab.evaluate.distances import checked_features, frechet_of_moments, jensen_shannon_distance
+from lidar_synth.lab.evaluate.distances import (
+    checked_features,
+    frechet_of_moments,
+    jensen_shannon_distance,
+)
 
 Counts = NDArray[np.integer[Any]]
 
@@ -38,28 +43,40 @@ class Statistic(NamedTuple):
 
 
 def histogram_distance(
-    real: Sequence[NDArray[Any]], fake: Sequence[NDArray[Any]],
+    real: Sequence[NDArray[Any]],
+    fake: Sequence[NDArray[Any]],
     distance: Callable[[NDArray[Any], NDArray[Any]], float] = jensen_shannon_distance,
-) -> Statistic:  # fmt: skip
-    """A distance between the sums of two sets of histograms, each an array of counts of one shape."""
-    return sparse_histogram_distance([_sparse(h) for h in real], [_sparse(h) for h in fake], real[0].size, distance)
+) -> Statistic:
+    """A distance between the sums of two sets of histograms, each an array of counts of one
+    shape."""
+    return sparse_histogram_distance(
+        [_sparse(h) for h in real], [_sparse(h) for h in fake], real[0].size, distance
+    )
 
 
 def sparse_histogram_distance(
-    real: Sequence["Sparse"], fake: Sequence["Sparse"], size: int,
+    real: Sequence["Sparse"],
+    fake: Sequence["Sparse"],
+    size: int,
     distance: Callable[[NDArray[Any], NDArray[Any]], float] = jensen_shannon_distance,
-) -> Statistic:  # fmt: skip
-    """As ``histogram_distance``, of histograms of ``size`` bins that keep only the bins that are not empty.
+) -> Statistic:
+    """As ``histogram_distance``, of histograms of ``size`` bins that keep only the bins that are
+    not empty.
 
-    Only the bins that some histogram uses are compared: of the 4 million cells of LiDM's grid, the fewest.
+    Only the bins that some histogram uses are compared: of the 4 million cells of LiDM's grid, the
+        fewest.
     """
     filled = np.zeros(size, bool)
     for one in (*real, *fake):
         filled[one.bins] = True
-    place, used = np.cumsum(filled, dtype=np.int32) - 1, int(filled.sum())
+    place = np.cumsum(filled, dtype=np.int32) - 1
+    used = int(filled.sum())
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        sums = ((_sum(real, p, place, used), _sum(fake, q, place, used)) for p, q in zip(a, b, strict=True))
+        sums = (
+            (_sum(real, p, place, used), _sum(fake, q, place, used))
+            for p, q in zip(a, b, strict=True)
+        )
         return np.array([distance(p, q) for p, q in sums])
 
     return Statistic(at, (len(real), len(fake)))
@@ -77,12 +94,16 @@ def _sparse(histogram: NDArray[Any]) -> Sparse:
     return Sparse(bins.astype(np.int32), histogram.ravel()[bins])
 
 
-def _sum(histograms: Sequence[Sparse], counts: NDArray[Any], place: NDArray[np.int32], size: int) -> NDArray[np.int64]:
+def _sum(
+    histograms: Sequence[Sparse], counts: NDArray[Any], place: NDArray[np.int32], size: int
+) -> NDArray[np.int64]:
     """(size,) weighted sum of histograms; ``place`` says where each of their bins lies in it."""
     total = np.zeros(size, np.int64)
     for one, count in zip(histograms, counts, strict=True):
         if count:
-            total[place[one.bins]] += one.amounts * np.int64(count)  # a bin occurs once in a histogram
+            total[place[one.bins]] += one.amounts * np.int64(
+                count
+            )  # a bin occurs once in a histogram
     return total
 
 
@@ -90,12 +111,14 @@ Rows = Callable[[int, int], Tensor]
 """``(first, last) -> (last - first, D)`` samples as vectors, float32 or float64."""
 
 
-def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sigma: float = 0.5) -> Statistic:
-    """Squared maximum mean discrepancy, kernel exp(-|p - q|^2 / (2 sigma^2)), including pairs of a sample with itself
-    (Gretton et al., JMLR 2012, the biased form).
+def gaussian_mmd(
+    real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sigma: float = 0.5
+) -> Statistic:
+    """Squared maximum mean discrepancy, kernel exp(-|p - q|^2 / (2 sigma^2)), including pairs of a
+    sample with itself (Gretton et al., JMLR 2012, the biased form).
 
-    The kernel of normalised histograms is close to 1 everywhere and the ones cancel in the sum, so that float32
-    suffices without them.
+    The kernel of normalised histograms is close to 1 everywhere and the ones cancel in the sum, so
+    that float32 suffices without them.
 
     Args:
         real, fake: the samples.
@@ -110,8 +133,10 @@ def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sig
         return torch.expm1(squared.clamp_(min=0) / (-2 * sigma**2))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        mean = [_mean_kernel(less_one, *pair, block) for pair in (
-            (real, a, real, a), (fake, b, fake, b), (real, a, fake, b))]  # fmt: skip
+        mean = [
+            _mean_kernel(less_one, *pair, block)
+            for pair in ((real, a, real, a), (fake, b, fake, b), (real, a, fake, b))
+        ]
         return mean[0] + mean[1] - 2 * mean[2]
 
     return Statistic(at, sizes)
@@ -120,7 +145,8 @@ def gaussian_mmd(real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sig
 def _mean_kernel(
     kernel: Callable[[Tensor, Tensor], Tensor], p: Rows, a: Counts, q: Rows, b: Counts, size: int
 ) -> NDArray[np.float64]:
-    """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at a time."""
+    """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at
+    a time."""
     left, right = (torch.from_numpy(np.asarray(c, np.float32)) for c in (a, b))
     same = p is q and a is b
     total = torch.zeros(len(left), dtype=torch.float64)
@@ -129,14 +155,19 @@ def _mean_kernel(
         for j in range(i if same else 0, right.shape[1], size):
             y = x if same and j == i else q(j, min(j + size, right.shape[1]))
             block = kernel(x, y)
-            part = ((left[:, i : i + size].to(block) @ block) * right[:, j : j + size].to(block)).double().sum(1)
+            part = (
+                ((left[:, i : i + size].to(block) @ block) * right[:, j : j + size].to(block))
+                .double()
+                .sum(1)
+            )
             total += 2 * part if same and j > i else part
     pairs = left.double().sum(1) * right.double().sum(1)
     return (total / pairs).numpy()
 
 
 def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic:
-    """Squared Fréchet distance of the Gaussians that fit (N, D) and (M, D) features; see ``frechet_distance``.
+    """Squared Fréchet distance of the Gaussians that fit (N, D) and (M, D) features; see
+    ``frechet_distance``.
 
     Raises:
         DataError: as ``frechet_distance``.
@@ -144,23 +175,30 @@ def frechet(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic
     sets = checked_features(real, fake)
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        return np.array([
-            frechet_of_moments(*_moments(sets[0], p), *_moments(sets[1], q)) for p, q in zip(a, b, strict=True)
-        ])  # fmt: skip
+        return np.array(
+            [
+                frechet_of_moments(*_moments(sets[0], p), *_moments(sets[1], q))
+                for p, q in zip(a, b, strict=True)
+            ]
+        )
 
     return Statistic(at, (len(sets[0]), len(sets[1])))
 
 
-def _moments(features: NDArray[np.float64], counts: Counts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moments(
+    features: NDArray[np.float64], counts: Counts
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     kept = counts > 0
-    features, counts = features[kept], counts[kept]
+    features = features[kept]
+    counts = counts[kept]
     mean = np.average(features, axis=0, weights=counts)
     return mean, np.atleast_2d(np.cov(features, rowvar=False, fweights=counts))
 
 
 def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic:
-    """Unbiased squared maximum mean discrepancy under the kernel (x . y / D + 1)^3 over all pairs of different samples
-    (Binkowski et al., ICLR 2018). In a resample, copies of a sample are no pair of different samples either.
+    """Unbiased squared maximum mean discrepancy under the kernel (x . y / D + 1)^3 over all pairs
+    of different samples (Binkowski et al., ICLR 2018). In a resample, copies of a sample are no
+    pair of different samples either.
 
     Raises:
         DataError: as ``frechet_distance``.
@@ -174,19 +212,28 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
         return (p @ q.T / x.shape[1] + 1) ** 3
 
     def within(k: int, counts: Counts) -> NDArray[np.float64]:
-        pairs, own = counts.sum(1).astype(np.float64) ** 2, (counts.astype(np.float64) ** 2)
-        total = _mean_kernel(kernel, rows[k], counts, rows[k], counts, _BLOCK) * pairs - own @ diagonals[k]
-        with np.errstate(divide="ignore", invalid="ignore"):  # copies of one sample only: there is no pair
+        pairs = counts.sum(1).astype(np.float64) ** 2
+        own = counts.astype(np.float64) ** 2
+        total = (
+            _mean_kernel(kernel, rows[k], counts, rows[k], counts, _BLOCK) * pairs
+            - own @ diagonals[k]
+        )
+        with np.errstate(
+            divide="ignore", invalid="ignore"
+        ):  # copies of one sample only: there is no pair
             return np.asarray(total / (pairs - own.sum(1)))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        return within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)
+        return (
+            within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)
+        )
 
     return Statistic(at, (len(x), len(y)))
 
 
 def smallest_of_pairs(distances: NDArray[np.floating]) -> Statistic:
-    """Mean over N real samples of the smallest distance to a generated one (Achlioptas et al., ICML 2018).
+    """Mean over N real samples of the smallest distance to a generated one (Achlioptas et al., ICML
+    2018).
 
     Args:
         distances: (N, M) of every pair.
@@ -204,7 +251,8 @@ def smallest_of_pairs(distances: NDArray[np.floating]) -> Statistic:
 
 
 def share(hits: NDArray[np.floating], of_real: bool, other: int) -> Statistic:
-    """Mean of one value per sample of one set, for instance precision; the other set is taken as it is.
+    """Mean of one value per sample of one set, for instance precision; the other set is taken as it
+    is.
 
     Args:
         hits: (N,) values of the real samples or (M,) of the generated ones.

@@ -1,9 +1,10 @@
 """Firings per turn and the azimuth offset of each beam.
 
-The azimuths of a beam lie on a lattice where the sensor fires at fixed angles (Ouster) or reads its encoder in steps
-(Velodyne: 4000 per turn). On a lattice finer than the firings, firings skip steps in a pattern that changes with the
-rotation speed. All beams show the same pattern, each turned by its own offset, so correlation finds the offsets. With
-the time of each point, or points in the order of time, the offset is the azimuth beyond that of the turning head.
+The azimuths of a beam lie on a lattice where the sensor fires at fixed angles (Ouster) or reads its
+encoder in steps (Velodyne: 4000 per turn). On a lattice finer than the firings, firings skip steps
+in a pattern that changes with the rotation speed. All beams show the same pattern, each turned by
+its own offset, so correlation finds the offsets. With the time of each point, or points in the
+order of time, the offset is the azimuth beyond that of the turning head.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ FAR = 4.0
 """Metres; nearer points are left out where the time gives the offsets."""
 
 DISTANT = 20.0
-"""Metres; the azimuths of nearer points depend on the lasers' lateral offset too much to find a lattice."""
+"""Metres; the azimuths of nearer points depend on the lasers' lateral offset too much to find a
+lattice."""
 
 BINS = 1 << 17
 """Bins of a turn in the search for a lattice."""
@@ -47,10 +49,11 @@ class Azimuths:
         firings: of each beam in a turn; None if not found.
         lattice: steps of a turn on which the azimuths lie, None if they lie on none.
         offsets: (B,) degrees, clockwise, NaN for beams of which it is not known; None if not found.
-        known: how the offsets are known: "time", "encoder", "one firing" (up to a multiple of the angle between
-            firings) or "".
+        known: how the offsets are known: "time", "encoder", "one firing" (up to a multiple of the
+            angle between firings) or "".
         spread: degrees, the median disagreement of offsets between scans or within them.
-        sides: (B,) metres, by which each laser stands left of the axis, as it looks outward; zero if not found.
+        sides: (B,) metres, by which each laser stands left of the axis, as it looks outward; zero
+            if not found.
     """
 
     firings: int | None = None
@@ -63,7 +66,8 @@ class Azimuths:
 
 @dataclass(frozen=True)
 class Turn:
-    """One scan in the sensor's frame: (N,) azimuth in turns (clockwise), distance from the axis, beam, time or None."""
+    """One scan in the sensor's frame: (N,) azimuth in turns (clockwise), distance from the axis,
+    beam, time or None."""
 
     azimuth: Floats
     rho: Floats
@@ -102,14 +106,18 @@ def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
         return Azimuths(count)
     # Motion compensation blurs the lattice, so only scans that show it count.
     clear = [
-        turn for turn, (value, found) in zip(turns, lattices, strict=True) if value > COHERENT and found == lattice
+        turn
+        for turn, (value, found) in zip(turns, lattices, strict=True)
+        if value > COHERENT and found == lattice
     ]
     sides = np.median([_sides(turn, beams, lattice) for turn in clear], axis=0)
     phases = [_phases(turn, beams, lattice, sides) for turn in clear]
     if locked:
         by_scan = np.stack([(_wrap(phase - 0.5)) * 360 / lattice for phase in phases])
         return Azimuths(count, size, *_combined(by_scan, beams, "one firing", 360 / lattice), sides)
-    by_scan = np.stack([_by_pattern(t, beams, lattice, sides, p) for t, p in zip(clear, phases, strict=True)])
+    by_scan = np.stack(
+        [_by_pattern(t, beams, lattice, sides, p) for t, p in zip(clear, phases, strict=True)]
+    )
     return Azimuths(count, size, *_combined(by_scan, beams, "encoder"), sides)
 
 
@@ -118,8 +126,11 @@ def _wrap(turns: Floats) -> Floats:
     return np.asarray((turns + 0.5) % 1.0 - 0.5)
 
 
-def _combined(by_scan: Floats, beams: int, known: str, period: float = 360.0) -> tuple[Floats | None, str, float]:
-    """Offsets (B,) as the median over scans (S, B), how they are known, and the median disagreement.
+def _combined(
+    by_scan: Floats, beams: int, known: str, period: float = 360.0
+) -> tuple[Floats | None, str, float]:
+    """Offsets (B,) as the median over scans (S, B), how they are known, and the median
+    disagreement.
 
     A beam of which no scan knows the offset has NaN.
     """
@@ -135,7 +146,8 @@ def _combined(by_scan: Floats, beams: int, known: str, period: float = 360.0) ->
 
 
 def _firings(turn: Turn, beams: int) -> float:
-    """Firings per turn: one over the mean step between neighbouring points of a beam; 0 if there are too few."""
+    """Firings per turn: one over the mean step between neighbouring points of a beam; 0 if there
+    are too few."""
     steps = []
     for beam in range(beams):
         own = np.sort(turn.azimuth[turn.ring == beam])
@@ -152,7 +164,8 @@ def _firings(turn: Turn, beams: int) -> float:
 
 def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
     """Coherence and number of steps per turn of the coarsest lattice of the azimuths."""
-    power, rings = np.zeros(BINS // 2 + 1), 0
+    power = np.zeros(BINS // 2 + 1)
+    rings = 0
     for beam in range(beams):
         own = turn.azimuth[(turn.ring == beam) & (turn.rho > DISTANT)]
         if len(own) < FEW:
@@ -162,7 +175,8 @@ def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
         rings += 1
     if not rings:
         return 0.0, 0
-    first, last = int(0.9 * firings), int(min(4.5 * firings, BINS / 8))
+    first = int(0.9 * firings)
+    last = int(min(4.5 * firings, BINS / 8))
     coherence = np.sqrt(power[first:last] / rings)
     best = float(coherence.max(initial=0.0))
     strong = np.flatnonzero(coherence > 0.8 * best)
@@ -179,7 +193,8 @@ def _sides(turn: Turn, beams: int, lattice: int) -> Floats:
         own = turn.ring == beam
         if own.sum() < FEW:
             continue
-        azimuth, near = turn.azimuth[own][::2], 1 / (2 * np.pi * turn.rho[own][::2])
+        azimuth = turn.azimuth[own][::2]
+        near = 1 / (2 * np.pi * turn.rho[own][::2])
         phase = 2j * np.pi * lattice * (azimuth + SIDES[:, None] * near)
         value = np.abs(np.exp(phase).mean(1))
         best = int(np.argmax(value))
@@ -188,7 +203,8 @@ def _sides(turn: Turn, beams: int, lattice: int) -> Floats:
 
 
 def _phases(turn: Turn, beams: int, lattice: int, sides: Floats) -> Floats:
-    """(B,) the part of a lattice step by which each beam's azimuths differ from whole steps, in [-0.5, 0.5)."""
+    """(B,) the part of a lattice step by which each beam's azimuths differ from whole steps, in
+    [-0.5, 0.5)."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)
     wave = np.exp(2j * np.pi * lattice * seen)
     real, imaginary = (np.bincount(turn.ring, part, beams) for part in (wave.real, wave.imag))
@@ -202,7 +218,8 @@ def _by_pattern(turn: Turn, beams: int, lattice: int, sides: Floats, phases: Flo
     step = np.round(lattice * seen - np.nan_to_num(phases)[turn.ring]).astype(np.int64) % lattice
     hit = np.zeros((beams, lattice), bool)
     hit[turn.ring, step] = True
-    following, second = np.roll(hit, -1, 1), np.roll(hit, -2, 1)
+    following = np.roll(hit, -1, 1)
+    second = np.roll(hit, -2, 1)
     pattern = np.where(hit & following, 1.0, np.where(hit & second, -0.2, 0.0))
     spectrum = np.fft.rfft(pattern, axis=1)
     reach = round(LARGEST_OFFSET / 360 * lattice)
@@ -219,7 +236,8 @@ def _by_pattern(turn: Turn, beams: int, lattice: int, sides: Floats, phases: Flo
 
 
 def _offsets_by_time(turn: Turn, beams: int) -> Floats:
-    """(B,) degrees beyond the azimuth of the turning head, which is a smooth function of time; their median is 0."""
+    """(B,) degrees beyond the azimuth of the turning head, which is a smooth function of time;
+    their median is 0."""
     assert turn.time is not None
     beyond_near = turn.rho > FAR
     count = np.bincount(turn.ring[beyond_near], minlength=beams)
@@ -228,7 +246,8 @@ def _offsets_by_time(turn: Turn, beams: int) -> Floats:
     offsets = np.full(beams, np.nan)
     if len(far) < FEW:
         return offsets
-    ring, azimuth = turn.ring[far], turn.azimuth[far]
+    ring = turn.ring[far]
+    azimuth = turn.azimuth[far]
     offsets[np.unique(ring)] = 0.0
     part = np.minimum(np.arange(len(far)) * PARTS // len(far), PARTS - 1)
     time = turn.time[far]

@@ -1,4 +1,5 @@
-"""From points to beams: rings from the file, from the order of the points, or from peaks of the elevations."""
+"""From points to beams: rings from the file, from the order of the points, or from peaks of the
+elevations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +39,8 @@ POOR = 0.6
 """Quality below which the mounting is not known well enough to look for the start of the turn."""
 
 SETTLING = 8
-"""Largest number of times that the steps of the last fit are repeated while they raise the quality."""
+"""Largest number of times that the steps of the last fit are repeated while they raise the
+quality."""
 
 GOOD_ENOUGH = 0.995
 """Quality above which they are not."""
@@ -53,10 +55,12 @@ LOST = 15
 """A lost beam has at least as many points."""
 
 ROUNDS = 3
-"""Number of times that peaks are looked for, each time with what is known of mounting and motion."""
+"""Number of times that peaks are looked for, each time with what is known of mounting and
+motion."""
 
 ONE_TURN = (0.7, 1.3)
-"""Turns by which the azimuth changes from the first to the last point of a file in the order of time."""
+"""Turns by which the azimuth changes from the first to the last point of a file in the order of
+time."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ class Beams:
 
 
 def gather(scans: Sequence[Scan]) -> Cloud:
-    """The points of all scans, without rings; scans without ``time`` get the fraction of the turn instead.
+    """The points of all scans, without rings; scans without ``time`` get the fraction of the turn
+    instead.
 
     Raises:
         DataError: without points, or with points that are not finite.
@@ -86,7 +91,9 @@ def gather(scans: Sequence[Scan]) -> Cloud:
     if not np.isfinite(points).all():
         bad = next(scan.id for scan in scans if not np.isfinite(scan.points).all())
         raise DataError(
-            f"scan {bad!r} with NaN or infinite points", "finite metres", "Read it with on_bad='drop-points'."
+            f"scan {bad!r} with NaN or infinite points",
+            "finite metres",
+            "Read it with on_bad='drop-points'.",
         )
     number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     if all(scan.time is not None for scan in scans):
@@ -99,7 +106,8 @@ def gather(scans: Sequence[Scan]) -> Cloud:
 def turn_fraction(points: NDArray[np.float32]) -> Floats:
     """(N,) fraction of the turn at which each point was measured, about -0.5 to 0.5.
 
-    The turn starts where the file does, if its points are in the order of time; otherwise behind the sensor.
+    The turn starts where the file does, if its points are in the order of time; otherwise behind
+    the sensor.
     """
     if in_order_of_time(points):
         unwrapped = _unwrapped(points)
@@ -129,10 +137,16 @@ def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]
     found = [rings_in_order(scan.points) for scan in scans]
     most = max((int(ring.max()) + 1 for ring in found if ring is not None and len(ring)), default=0)
     # A scan with fewer rings is a crop; its rings have other numbers.
-    complete = [ring if ring is not None and len(ring) and ring.max() + 1 == most else None for ring in found]
+    complete = [
+        ring if ring is not None and len(ring) and ring.max() + 1 == most else None
+        for ring in found
+    ]
     if sum(ring is not None for ring in complete) <= len(scans) / 2:
         return "elevations", None
-    given = [np.full(len(scan), -1) if ring is None else ring for scan, ring in zip(scans, complete, strict=True)]
+    given = [
+        np.full(len(scan), -1) if ring is None else ring
+        for scan, ring in zip(scans, complete, strict=True)
+    ]
     return "order of the points", np.concatenate(given).astype(np.int64)
 
 
@@ -142,7 +156,9 @@ def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
     count = len(bounds) - 1
     if not 4 <= count <= 512:
         return None
-    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(np.float64))
+    elevation = np.degrees(
+        np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(np.float64)
+    )
     middle = np.sort([np.median(part) for part in np.split(elevation, bounds[1:-1])])[::-1]
     try:
         lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
@@ -161,7 +177,8 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
         seed: of the choice of points.
 
     Returns:
-        The beams, None if there are fewer than two; and all points with their rings of the file, if there are any.
+        The beams, None if there are fewer than two; and all points with their rings of the file, if
+        there are any.
 
     Raises:
         DataError: without points, or with points that are not finite.
@@ -173,11 +190,21 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     still = Model(np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6)))
     best, quality = _attempt(part, still, seed)
     if quality < GOOD:
-        offset, turn = find_mount([cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed)
-        moved, better = _attempt(part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"}))
+        offset, turn = find_mount(
+            [cloud.points[cloud.scan == scan] for scan in range(len(scans))], seed
+        )
+        moved, better = _attempt(
+            part, replace(still, offset=offset, turn=turn), seed, frozenset({"mount"})
+        )
         if better > quality:
-            best, quality = moved, better
-    if POOR < quality < GOOD and best and not cloud.kept and not any(scan.time is not None for scan in scans):
+            best = moved
+            quality = better
+    if (
+        POOR < quality < GOOD
+        and best
+        and not cloud.kept
+        and not any(scan.time is not None for scan in scans)
+    ):
         best = _with_another_seam(part, best, quality, seed)
     return (Beams(best[0], source, best[1]) if best else None), cloud
 
@@ -186,12 +213,15 @@ def _with_another_seam(
     cloud: Cloud, best: tuple[Model, frozenset[str]], quality: float, seed: int
 ) -> tuple[Model, frozenset[str]]:
     """The best fit with turns that start behind the sensor, as before, or on another side of it."""
-    still = replace(best[0], motion=np.zeros_like(best[0].motion), tangents=np.zeros(1), heights=np.zeros(1))
+    still = replace(
+        best[0], motion=np.zeros_like(best[0].motion), tangents=np.zeros(1), heights=np.zeros(1)
+    )
     for seam in (0.25, 0.5, 0.75):
         turned = replace(cloud, time=(cloud.time + seam + 0.5) % 1.0 - 0.5)
         other, better = _attempt(turned, still, seed, frozenset({"motion", "mount"}))
         if other and better > quality:
-            best, quality = other, better
+            best = other
+            quality = better
     return best
 
 
@@ -205,8 +235,11 @@ def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
 
 
 def _without_gaps(cloud: Cloud) -> Cloud:
-    """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may be dead."""
-    return replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1]) if cloud.kept else cloud
+    """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may
+    be dead."""
+    return (
+        replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1]) if cloud.kept else cloud
+    )
 
 
 def _attempt(
@@ -228,7 +261,8 @@ def _attempt(
     quality = 0.0
     for _ in range(SETTLING):
         model, fitted = refine(cloud, model, parts, 4)
-        before, quality = quality, quality_of(model, fitted)
+        before = quality
+        quality = quality_of(model, fitted)
         if quality > GOOD_ENOUGH or quality - before < 0.001:
             break
     model = _without_doubles(model, fitted)
@@ -252,7 +286,8 @@ def _without_doubles(model: Model, cloud: Cloud) -> Model:
 
 
 def quality_of(model: Model, cloud: Cloud) -> float:
-    """Share of points in the middle half between the borders of their beams; 0.5 for points anywhere."""
+    """Share of points in the middle half between the borders of their beams; 0.5 for points
+    anywhere."""
     residual = residuals(model.aligned(cloud), cloud.ring, model.tangents, model.heights)
     return float((np.abs(residual) < room_of(model.tangents)[cloud.ring] / 4).mean())
 
@@ -266,13 +301,17 @@ def room_of(tangents: Floats) -> Floats:
     return room
 
 
-def _choose_parts(cloud: Cloud, model: Model, parts: frozenset[str]) -> tuple[Model, frozenset[str]]:
+def _choose_parts(
+    cloud: Cloud, model: Model, parts: frozenset[str]
+) -> tuple[Model, frozenset[str]]:
     """Add the part that reduces the residuals most, as long as one does so clearly."""
     model, fitted = refine(cloud, model, parts, 5)
     now = _score(model, fitted)
     while others := [part for part in GAIN if part not in parts]:
         trials = {
-            part: refine(cloud, _with_motion(cloud, model) if part == "motion" else model, parts | {part}, 8)
+            part: refine(
+                cloud, _with_motion(cloud, model) if part == "motion" else model, parts | {part}, 8
+            )
             for part in others
         }
         scores = {part: _score(*trial) for part, trial in trials.items()}
@@ -285,7 +324,11 @@ def _choose_parts(cloud: Cloud, model: Model, parts: frozenset[str]) -> tuple[Mo
 
 def _with_motion(cloud: Cloud, model: Model) -> Model:
     """The model with a new first guess of the motion of scans whose points lie off the beams."""
-    ring = cloud.ring if cloud.kept else nearest_beams(model.aligned(cloud), model.tangents, model.heights)
+    ring = (
+        cloud.ring
+        if cloud.kept
+        else nearest_beams(model.aligned(cloud), model.tangents, model.heights)
+    )
     motion = model.motion.copy()
     for scan in np.unique(cloud.scan):
         use = cloud.scan == scan
@@ -310,7 +353,9 @@ def _from_rings(cloud: Cloud, still: Model) -> Model | None:
         return None
     tangents = np.zeros(int(cloud.ring.max()) + 1)
     for part in parts:
-        tangents[cloud.ring[part[0]]] = np.median(points[part, 2] / np.hypot(points[part, 0], points[part, 1]))
+        tangents[cloud.ring[part[0]]] = np.median(
+            points[part, 2] / np.hypot(points[part, 0], points[part, 1])
+        )
     return replace(still, tangents=tangents, heights=np.zeros(len(tangents)))
 
 
@@ -328,7 +373,8 @@ def with_peaks(cloud: Cloud, model: Model) -> Model | None:
 
 
 def concentration(elevation: Floats, beams: Floats) -> float:
-    """Share of points in the middle half between the borders of their beams, 0.5 for points anywhere; 0 for no beams.
+    """Share of points in the middle half between the borders of their beams, 0.5 for points
+    anywhere; 0 for no beams.
 
     Args:
         elevation: (N,) radians.
@@ -347,9 +393,11 @@ def concentration(elevation: Floats, beams: Floats) -> float:
 
 
 def with_lost_beams(model: Model, points: Floats) -> Model:
-    """The model with beams that have too few points to be peaks beside the others, such as those that see the sky.
+    """The model with beams that have too few points to be peaks beside the others, such as those
+    that see the sky.
 
-    A beam is found among the points beyond ``STRAY`` of all others: where they lie close together, with a valley
+    A beam is found among the points beyond ``STRAY`` of all others: where they lie close together,
+        with a valley
     between them and the next beam on either side, so that the tail of a strong beam is none.
 
     Args:
@@ -357,9 +405,11 @@ def with_lost_beams(model: Model, points: Floats) -> Model:
         points: (N, 3) metres, in the sensor's frame.
     """
     ring = nearest_beams(points, model.tangents, model.heights)
-    rho, above = np.hypot(points[:, 0], points[:, 1]), points[:, 2] - model.heights[ring]
+    rho = np.hypot(points[:, 0], points[:, 1])
+    above = points[:, 2] - model.heights[ring]
     elevation = np.sort(np.arctan2(above, rho)[rho > NEAREST])
-    beams, heights = list(np.arctan(model.tangents)), list(model.heights)
+    beams = list(np.arctan(model.tangents))
+    heights = list(model.heights)
     stray = elevation[_distance(elevation, np.array(beams)) > STRAY]
     while len(stray) >= LOST:
         count = _count(stray, stray)
@@ -388,7 +438,8 @@ def _count(elevation: Floats, places: Floats) -> NDArray[np.intp]:
 
 
 def _stands_alone(elevation: Floats, place: float, beams: Floats, points: int) -> bool:
-    """Whether fewer than a third as many points lie somewhere between a place and the next beam on either side."""
+    """Whether fewer than a third as many points lie somewhere between a place and the next beam on
+    either side."""
     for side in (1, -1):
         gaps = side * (beams - place)
         gap = min(gaps[gaps > 0], default=4 * STRAY)

@@ -23,13 +23,16 @@ STRAYS = 0.005
 """Share of points that lie on no beam, or too near to be fitted, which rounds to one per cent."""
 
 SAME = 0.2
-"""Beams within this part of their spacing of a vendor's table, or within 0.1 degrees, are those of the table."""
+"""Beams within this part of their spacing of a vendor's table, or within 0.1 degrees, are those of
+the table."""
 
 MOST_MISSING = 0.5
 """Share of a table's beams that may be missing for it to be named."""
 
 
-def doubts(elevations: Floats, points: NDArray[np.int64], within: Floats, near: float, known: Azimuths) -> list[str]:
+def doubts(
+    elevations: Floats, points: NDArray[np.int64], within: Floats, near: float, known: Azimuths
+) -> list[str]:
     """One sentence for each part of a fit that is not certain.
 
     Args:
@@ -43,7 +46,10 @@ def doubts(elevations: Floats, points: NDArray[np.int64], within: Floats, near: 
     if few := _listed(elevations[points < FEW_POINTS]):
         found.append(f"The beams at {few} degrees have fewer than {FEW_POINTS} points.")
     if wide := _listed(elevations[(points >= FEW_POINTS) & (within < LEAST_SHARE)]):
-        found.append(f"The beams at {wide} degrees have under {LEAST_SHARE:.0%} of their points within 0.05 degrees.")
+        found.append(
+            f"The beams at {wide} degrees have under {LEAST_SHARE:.0%} of their points within "
+            "0.05 degrees."
+        )
     strays = 1 - float((points * within).sum() / max(points.sum(), 1))
     if strays >= STRAYS:
         found.append(f"{strays:.1%} of the points lie farther than 0.05 degrees from every beam.")
@@ -61,14 +67,21 @@ def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
     if known.firings is None:
         found.append("The number of firings is not known: too few points for each beam.")
     if known.offsets is None:
-        return [*found, "The azimuth offsets are not known: the points have neither a time nor a common raster."]
+        return [
+            *found,
+            "The azimuth offsets are not known: the points have neither a time nor a common "
+            "raster.",
+        ]
     if missing := _listed(elevations[np.isnan(known.offsets)]):
         needed = f"{FEWEST} points beyond {FAR:.0f} m" if known.known == "time" else f"{FEW} points"
         found.append(
-            f"The azimuth offsets of the beams at {missing} degrees are not known: no scan has {needed} there."
+            f"The azimuth offsets of the beams at {missing} degrees are not known: no scan has "
+            f"{needed} there."
         )
     if known.known == "one firing" and np.nanmax(np.abs(known.offsets)) >= 0.005:
-        found.append("The azimuth offsets are known up to a multiple of the angle between two firings.")
+        found.append(
+            "The azimuth offsets are known up to a multiple of the angle between two firings."
+        )
     elif known.spread > 0.05:
         found.append(f"The azimuth offsets differ between scans by {known.spread:.2f} degrees.")
     return found
@@ -90,20 +103,25 @@ def _elevations(table: Any) -> Floats:
 
 
 def name_vendor(elevations: Floats, points: NDArray[np.int64]) -> str:
-    """The vendors' sensor with these beams and the fewest others, and how many it has that are missing; "" if none.
+    """The vendors' sensor with these beams and the fewest others, and how many it has that are
+    missing; "" if none.
 
     Args:
         elevations: (B,) degrees, highest first.
         points: (B,) number of points of each beam.
     """
-    best, missing = "", np.inf
+    best = ""
+    missing = np.inf
     for name, table in vendors().items():
         spacing = np.abs(np.gradient(table))
         nearest = np.abs(elevations[:, None] - table).argmin(1)
         off = np.abs(elevations - table[nearest])
-        if (off > np.minimum(SAME * spacing[nearest], 0.1)).any() or len(np.unique(nearest)) < len(elevations):
+        if (off > np.minimum(SAME * spacing[nearest], 0.1)).any() or len(np.unique(nearest)) < len(
+            elevations
+        ):
             continue
         few = len(table) - int((points >= FEW_POINTS).sum())
         if few < missing and few <= MOST_MISSING * len(table):
-            best, missing = name + (f"; {few} channels had few points or none" if few else ""), few
+            best = name + (f"; {few} channels had few points or none" if few else "")
+            missing = few
     return best

@@ -12,7 +12,14 @@ from lidar_synth.geometry.lines import Cloud, Model, nearest_beams, residuals
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
-from lidar_synth.lab.fitting.beams import NEAREST, Beams, fit_beams, in_order_of_time, room_of, with_lost_beams
+from lidar_synth.lab.fitting.beams import (
+    NEAREST,
+    Beams,
+    fit_beams,
+    in_order_of_time,
+    room_of,
+    with_lost_beams,
+)
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
 
@@ -28,10 +35,12 @@ LEAST_POINTS = 500
 """A fit needs as many points."""
 
 LEAST_QUALITY = 0.92
-"""Share of points in the middle half between the borders of their beams; less is no fit, and 0.5 are any points."""
+"""Share of points in the middle half between the borders of their beams; less is no fit, and 0.5
+are any points."""
 
 FRAME_HINT = (
-    "Give the points in the frame of the sensor, or of a vehicle within 2 m and 6 degrees of it, with the time of each "
+    "Give the points in the frame of the sensor, or of a vehicle within 2 m and 6 degrees of it, "
+    "with the time of each "
     "point where motion is compensated, and only those of one rotating sensor."
 )
 
@@ -45,20 +54,24 @@ class SensorFit:
 
     Args:
         sensor: the sensor; its elevations are those of the lasers, seen from their heights.
-        points: (B,) number of points of each beam, without those nearer than 0.5 m, which are not fitted.
+        points: (B,) number of points of each beam, without those nearer than 0.5 m, which are not
+            fitted.
         spread: (B,) degrees, the median distance of a beam's points from it.
         within: (B,) share of a beam's points within 0.05 degrees.
-        mount: (4, 4) the sensor's pose in the frame of the given points, metres; its heading is not fitted.
-        motion: (S, 6) velocity and turn rate that motion compensation has added to each scan: m/s and rad/s where scans
-            have ``time``, otherwise per turn; zero where it is not needed.
+        mount: (4, 4) the sensor's pose in the frame of the given points, metres; its heading is not
+            fitted.
+        motion: (S, 6) velocity and turn rate that motion compensation has added to each scan: m/s
+            and rad/s where scans have ``time``, otherwise per turn; zero where it is not needed.
         source: where rings come from: "ring field", "order of the points" or "elevations".
         nearest: metres, of all points.
         farthest: metres, of all points.
         azimuths: firings and azimuth offsets, with what they rest on.
-        rings: for each scan (N,) int16, the beam of each point; -1 for points at the origin: firings without a return.
+        rings: for each scan (N,) int16, the beam of each point; -1 for points at the origin:
+            firings without a return.
         off: for each scan (N,) float32 degrees, how far each point lies above its beam.
         uncertain: one sentence for each part that the fit is not sure of.
-        vendor: the sensor that a vendor sells with these beams, and how many of its channels are missing; "" if none.
+        vendor: the sensor that a vendor sells with these beams, and how many of its channels are
+            missing; "" if none.
 
     Example:
         >>> from lidar_synth import Town, fit_sensor
@@ -90,23 +103,27 @@ class SensorFit:
         return float((self.within * self.points).sum() / self.points.sum())
 
 
-def fit_sensor(scans: Source | Sequence[Scan], *, name: str = "fitted", columns: int | None = None) -> SensorFit:
-    """Fit a sensor to scans: elevation, height and azimuth offset of each beam, firings, range limits, quantisation.
+def fit_sensor(
+    scans: Source | Sequence[Scan], *, name: str = "fitted", columns: int | None = None
+) -> SensorFit:
+    """Fit a sensor to scans: elevation, height and azimuth offset of each beam, firings, range
+    limits, quantisation.
 
-    Rings are taken from ``scan.ring`` or from KITTI's order of points; otherwise beams are peaks of the elevations. The
-    frame of the points may be the sensor's or one up to a few metres and degrees away, such as the vehicle's. What
-    motion compensation has added is estimated from the points, with ``scan.time`` or, without, from the azimuth; undo
-    it with ``reskew`` where there are poses.
+    Rings are taken from ``scan.ring`` or from KITTI's order of points; otherwise beams are peaks of
+    the elevations. The frame of the points may be the sensor's or one up to a few metres and
+    degrees away, such as the vehicle's. What motion compensation has added is estimated from the
+    points, with ``scan.time`` or, without, from the azimuth; undo it with ``reskew`` where there
+    are poses.
 
     Args:
         scans: of one sensor, of different places where possible; at most 20 of them are used.
         name: of the fitted sensor.
-        columns: of its range images; by default as many as firings if they are at fixed angles, otherwise the next
-            lower power of two.
+        columns: of its range images; by default as many as firings if they are at fixed angles,
+            otherwise the next lower power of two.
 
     Raises:
-        DataError: without points, with one beam only, or if the points do not lie on beams, such as with a frame that
-            is too far from the sensor's.
+        DataError: without points, with one beam only, or if the points do not lie on beams, such as
+            with a frame that is too far from the sensor's.
 
     Example:
         >>> from lidar_synth import Town, fit_sensor
@@ -114,30 +131,45 @@ def fit_sensor(scans: Source | Sequence[Scan], *, name: str = "fitted", columns:
         >>> fit.sensor.shape, fit.sensor.elevations[:2], round(fit.share, 3)
         ((128, 1024), (22.3242, 21.9727), 1.0)
     """
-    given = [scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, min(SCANS, len(scans))).round().astype(int))]
+    given = [
+        scans[i]
+        for i in np.unique(
+            np.linspace(0, len(scans) - 1, min(SCANS, len(scans))).round().astype(int)
+        )
+    ]
     returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
-    scans = [scan if there.all() else scan[there] for scan, there in zip(given, returned, strict=True)]
+    scans = [
+        scan if there.all() else scan[there] for scan, there in zip(given, returned, strict=True)
+    ]
     count = sum(len(scan) for scan in scans)
     if count < LEAST_POINTS:
-        raise DataError(f"{len(scans)} scans with {count} points", f"at least {LEAST_POINTS} points to fit a sensor to")
+        raise DataError(
+            f"{len(scans)} scans with {count} points",
+            f"at least {LEAST_POINTS} points to fit a sensor to",
+        )
     beams, cloud = fit_beams(scans)
     if beams is None:
         given_points = f"{count} points whose elevations show fewer than two beams"
         raise DataError(given_points, "two beams or more", FRAME_HINT)
     found = _described(beams, cloud, scans, name, columns)
-    rings = tuple(_spread(there, part, -1) for there, part in zip(returned, found.rings, strict=True))
+    rings = tuple(
+        _spread(there, part, -1) for there, part in zip(returned, found.rings, strict=True)
+    )
     off = tuple(_spread(there, part, 0) for there, part in zip(returned, found.off, strict=True))
     return replace(found, rings=rings, off=off)
 
 
 def _spread(there: NDArray[np.bool_], values: NDArray[Any], other: int) -> NDArray[Any]:
-    """Values of the points that are there, as values of all points, with another one for the rest."""
+    """Values of the points that are there, as values of all points, with another one for the
+    rest."""
     spread = np.full(len(there), other, values.dtype)
     spread[there] = values
     return spread
 
 
-def _described(beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, columns: int | None) -> SensorFit:
+def _described(
+    beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, columns: int | None
+) -> SensorFit:
     points = beams.model.aligned(cloud)
     lost = beams.model if cloud.kept else with_lost_beams(beams.model, points)
     model = _highest_first(lost)
@@ -152,7 +184,9 @@ def _described(beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, col
     degrees = np.abs(np.degrees(off))[usable]
     within = np.array([np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order])
     azimuths = _azimuths(scans, cloud, points, ring, rows)
-    distance = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + (points[:, 2] - model.heights[ring]) ** 2)
+    distance = np.sqrt(
+        points[:, 0] ** 2 + points[:, 1] ** 2 + (points[:, 2] - model.heights[ring]) ** 2
+    )
     nearest, farthest = range_limits(np.linalg.norm(points[usable], axis=1))
     elevations = tuple(np.degrees(np.arctan(model.tangents)).round(4).tolist())
     sensor = Sensor(
@@ -173,26 +207,38 @@ def _described(beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, col
     mount[:3, :3], mount[:3, 3] = model.turn, model.offset
     splits = np.cumsum([len(scan) for scan in scans])[:-1]
     return SensorFit(
-        sensor, number,
+        sensor,
+        number,
         spread=np.array([np.median(degrees[part]) if len(part) else 0.0 for part in order]),
         within=within,
-        mount=mount, motion=model.motion, source=beams.source, nearest=nearest, farthest=farthest, azimuths=azimuths,
+        mount=mount,
+        motion=model.motion,
+        source=beams.source,
+        nearest=nearest,
+        farthest=farthest,
+        azimuths=azimuths,
         rings=tuple(np.split(ring.astype(np.int16), splits)),
         off=tuple(np.split(np.degrees(off).astype(np.float32), splits)),
-        uncertain=tuple(doubts(np.array(elevations), number, within, 1 - float(usable.mean()), azimuths)),
+        uncertain=tuple(
+            doubts(np.array(elevations), number, within, 1 - float(usable.mean()), azimuths)
+        ),
         vendor=name_vendor(np.array(elevations), number),
-    )  # fmt: skip
+    )
 
 
 def _highest_first(model: Model) -> Model:
-    """The model with its beams in order, and with heights about the origin of a frame that is close to the sensor's."""
+    """The model with its beams in order, and with heights about the origin of a frame that is close
+    to the sensor's."""
     order = np.argsort(-model.tangents)
-    tangents, heights, offset = model.tangents[order], model.heights[order], model.offset
+    tangents = model.tangents[order]
+    heights = model.heights[order]
+    offset = model.offset
     if heights.any():
         # A common height and a vertical offset are the same; a small one belongs to the lasers.
         inside = np.abs(offset).max() < 0.5 and model.turn[2, 2] > np.cos(np.radians(0.5))
         common = -float(offset @ model.turn[:, 2]) if inside else float(np.median(heights))
-        heights, offset = heights - common, offset + model.turn[:, 2] * common
+        heights = heights - common
+        offset = offset + model.turn[:, 2] * common
     return Model(tangents, heights, offset, model.turn, model.motion)
 
 
@@ -204,19 +250,28 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
     """
     room = room_of(model.tangents)
     quality = float((np.abs(off) < room[ring] / 4).mean()) if len(off) else 0.0
-    if quality < LEAST_QUALITY or room.min() < np.radians(0.005) or np.abs(model.heights).max() >= 1:
+    if (
+        quality < LEAST_QUALITY
+        or room.min() < np.radians(0.005)
+        or np.abs(model.heights).max() >= 1
+    ):
         raise DataError(
-            f"no beams found: {quality:.0%} of the points lie near the middle of {len(room)} bands of elevation "
+            f"no beams found: {quality:.0%} of the points lie near the middle of {len(room)} "
+            "bands of elevation "
             f"(anywhere: 50%)",
             f"at least {LEAST_QUALITY:.0%}",
             FRAME_HINT,
         )
 
 
-def _azimuths(scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int) -> Azimuths:
+def _azimuths(
+    scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int
+) -> Azimuths:
     turns = []
     for number in range(min(TURNS, len(scans))):
-        use = np.flatnonzero((cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > NEAREST))
+        use = np.flatnonzero(
+            (cloud.scan == number) & (np.hypot(points[:, 0], points[:, 1]) > NEAREST)
+        )
         time: Floats | None = None
         if scans[number].time is not None:
             time = cloud.time[use]

@@ -21,7 +21,8 @@ def range_limits(distance: Floats) -> tuple[float, float]:
 
 
 def range_step(distance: Floats, ring: NDArray[np.int64], beams: int) -> float | None:
-    """The largest step in which the ranges of each beam are given, metres; None if they are in none.
+    """The largest step in which the ranges of each beam are given, metres; None if they are in
+    none.
 
     Args:
         distance: (N,) metres from the laser's own origin.
@@ -34,7 +35,9 @@ def range_step(distance: Floats, ring: NDArray[np.int64], beams: int) -> float |
         return None
     for step in STEPS:
         wave = np.exp(2j * np.pi * distance / step)
-        total = np.abs(np.bincount(ring, wave.real, beams) + 1j * np.bincount(ring, wave.imag, beams))
+        total = np.abs(
+            np.bincount(ring, wave.real, beams) + 1j * np.bincount(ring, wave.imag, beams)
+        )
         if np.median(total[use] / count[use]) > COHERENT:
             return step
     return None

@@ -11,14 +11,16 @@ BIN = np.radians(0.004)
 """Width of a bin of the histogram of elevations, radians."""
 
 CONTRAST = 2.0
-"""A peak is a beam if the density falls to less than this fraction of it, 1 / CONTRAST, on both sides."""
+"""A peak is a beam if the density falls to less than this fraction of it, 1 / CONTRAST, on both
+sides."""
 
 SMALLEST = 0.04
 """A beam's peak has at least this share of the median peak's points."""
 
 
 def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
-    """The smoothed histogram of elevations: (K,) points per bin, and (K,) the bins' centres, radians.
+    """The smoothed histogram of elevations: (K,) points per bin, and (K,) the bins' centres,
+    radians.
 
     Args:
         elevations: (N,) radians.
@@ -33,7 +35,8 @@ def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
 
 
 def sharpness(elevations: Floats, width: float) -> float:
-    """How much the elevations concentrate: the mean density at a point, relative to that of a five times wider one."""
+    """How much the elevations concentrate: the mean density at a point, relative to that of a five
+    times wider one."""
     fine, _ = density(elevations, width)
     coarse, _ = density(elevations, 5 * width)
     return float((fine**2).sum() / max((coarse**2).sum(), 1e-9))
@@ -71,8 +74,10 @@ def _extrema(values: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def _persistent(
     values: Floats, top: NDArray[np.intp], bottom: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The peaks that remain when those without contrast to a neighbour are merged into it, weakest first."""
-    top, bottom = top.copy(), bottom.copy()
+    """The peaks that remain when those without contrast to a neighbour are merged into it, weakest
+    first."""
+    top = top.copy()
+    bottom = bottom.copy()
     while len(bottom):
         lower = np.minimum(values[top[:-1]], values[top[1:]])
         noise = 4 * np.sqrt(lower)  # of the count in a bin

@@ -1,8 +1,9 @@
 """A first guess of where the sensor stands in the frame of the points, from points alone.
 
-Seen from the sensor, elevations concentrate on the beams; seen from elsewhere, they do not. A tilt hides this all
-around, but within a narrow sector of azimuth it is only a constant. So offset and tilt are tried on a grid first, by
-the sharpness of the elevations within many narrow sectors, and made exact as sectors are joined.
+Seen from the sensor, elevations concentrate on the beams; seen from elsewhere, they do not. A tilt
+hides this all around, but within a narrow sector of azimuth it is only a constant. So offset and
+tilt are tried on a grid first, by the sharpness of the elevations within many narrow sectors, and
+made exact as sectors are joined.
 """
 
 import itertools
@@ -37,7 +38,8 @@ MOTION_POINTS = 4000
 """Number of points with which it does."""
 
 GRID_POINTS = 9000
-"""Number of points with which the grid is searched; they fill whole sectors, where pairs of points tell beams."""
+"""Number of points with which the grid is searched; they fill whole sectors, where pairs of points
+tell beams."""
 
 _BIN = np.radians(0.05)
 _NARROW = 128  # sectors within which a tilt of a degree moves no point by more than 0.05 degrees
@@ -47,13 +49,16 @@ _SECTORS = (64, 32, 16, 8, 4, 2, 1)
 def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
     """(3,) offset and (3, 3) rotation of the sensor in the frame of the points.
 
-    Each of some scans is searched alone, because the car's motion blurs some of them; the sharpest one decides.
+    Each of some scans is searched alone, because the car's motion blurs some of them; the sharpest
+    one decides.
 
     Args:
         scans: (N, 3) metres each.
         seed: of the choice of points.
     """
-    chosen = [scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))]
+    chosen = [
+        scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
+    ]
     found = [_place_in(scan, seed) for scan in chosen if len(scan)]
     _, place = max(found, key=lambda item: item[0])
     return place[:3], tilt_of(place[3:])
@@ -69,11 +74,21 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
     """
     use = np.flatnonzero(cloud.scan == scan)
     use = use[:: max(len(use) // MOTION_POINTS, 1)]
-    part = Cloud(cloud.points[use], np.zeros(len(use), np.int64), cloud.time[use], cloud.ring[use], cloud.kept)
+    part = Cloud(
+        cloud.points[use],
+        np.zeros(len(use), np.int64),
+        cloud.time[use],
+        cloud.ring[use],
+        cloud.kept,
+    )
     duration = max(float(np.ptp(part.time)), 1e-6)
     angles = np.arange(12) * np.pi / 6
     tried = [model.motion[scan], np.zeros(6)]
-    tried += [np.array([s * np.cos(a), s * np.sin(a), 0, 0, 0, 0]) / duration for s in SHIFTS for a in angles]
+    tried += [
+        np.array([s * np.cos(a), s * np.sin(a), 0, 0, 0, 0]) / duration
+        for s in SHIFTS
+        for a in angles
+    ]
 
     def mean_residual(motion: Floats) -> float:
         moved = replace(model, motion=motion[None])
@@ -97,7 +112,9 @@ def _place_in(points: Floats, seed: int) -> tuple[float, Floats]:
     for sectors in _SECTORS:
         step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
         step = step * (1 if sectors < 32 else 4)
-        place = climb(partial(_sharpness_within, dense if sectors > 32 else points, sectors), place, step)
+        place = climb(
+            partial(_sharpness_within, dense if sectors > 32 else points, sectors), place, step
+        )
     return sector_sharpness(points, place, 1), place
 
 
@@ -107,7 +124,8 @@ def tilt_of(angles: Floats) -> Floats:
 
 
 def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
-    """How much the elevations concentrate within each of some sectors of azimuth, seen from a place.
+    """How much the elevations concentrate within each of some sectors of azimuth, seen from a
+    place.
 
     Args:
         points: (N, 3) metres.
@@ -123,7 +141,8 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     fine = np.bincount(sector * rows + row, minlength=rows * sectors).astype(np.float64)
     total = np.concatenate([[0.0], np.cumsum(fine)])
     coarse = total[5:] - total[:-5]
-    # Pairs of points in a bin; counting a point with itself would reward emptiness where points are few.
+    # Pairs of points in a bin; counting a point with itself would reward emptiness where points are
+    # few.
     return float(25 * (fine * (fine - 1)).sum() / max((coarse * (coarse - 1)).sum(), 1.0))
 
 
@@ -133,14 +152,18 @@ def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
 
 
 def _best_on_grid(points: Floats) -> Floats:
-    sides, heights = (-1.2, 0.0, 1.2), (-0.2, 0.6, 1.4, 2.2)
+    sides = (-1.2, 0.0, 1.2)
+    heights = (-0.2, 0.6, 1.4, 2.2)
     tilts = np.radians([-5.0, -2.5, 0.0, 2.5, 5.0])
     places = [np.array(place) for place in itertools.product(sides, sides, heights, tilts, tilts)]
     return max(places, key=lambda place: sector_sharpness(points, place, _NARROW))
 
 
-def climb(value: Callable[[Floats], float], place: Floats, step: Floats, halvings: int = 6) -> Floats:
-    """Pattern search: the best neighbour along each axis, with steps that halve when none is better.
+def climb(
+    value: Callable[[Floats], float], place: Floats, step: Floats, halvings: int = 6
+) -> Floats:
+    """Pattern search: the best neighbour along each axis, with steps that halve when none is
+    better.
 
     Args:
         value: what to make as large as possible.
@@ -156,6 +179,7 @@ def climb(value: Callable[[Floats], float], place: Floats, step: Floats, halving
             values = [value(other) for other in near]
             if max(values) <= best + 1e-6 * abs(best):
                 break
-            best, place = max(values), near[int(np.argmax(values))]
+            best = max(values)
+            place = near[int(np.argmax(values))]
         moves = moves / 2
     return place

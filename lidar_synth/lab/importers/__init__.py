@@ -1,4 +1,5 @@
-"""Importers of weights released by other projects (peers), one file per peer, which translate their conventions.
+"""Importers of weights released by other projects (peers), one file per peer, which translate their
+conventions.
 
 To add a peer: write its file and enter its reader in ``IMPORTERS``.
 """

@@ -1,16 +1,20 @@
-"""LiDM's released weights (https://github.com/hancyran/LiDAR-Diffusion) as checkpoints of this package.
+"""LiDM's released weights (https://github.com/hancyran/LiDAR-Diffusion) as checkpoints of this
+package.
 
 A release is a folder with ``model.ckpt`` and its ``config.yaml``. Two kinds are supported:
 
-    first stage     an autoencoder: one part, the codec; weights under ``loss.`` belong to its training and are skipped
-    diffusion       ``model.diffusion_model.`` the U-Net, ``first_stage_model.`` the autoencoder, ``cond_stage_model.``
-                    the condition's encoder, ``model_ema.`` the U-Net's averaged weights (by names without dots), which
-                    are preferred; the tensors of the schedule are checked and recomputed
+    first stage     an autoencoder: one part, the codec; weights under ``loss.`` belong to its
+        training and are skipped
+    diffusion       ``model.diffusion_model.`` the U-Net, ``first_stage_model.`` the autoencoder,
+                    ``cond_stage_model.`` the condition's encoder, ``model_ema.`` the U-Net's
+                    averaged weights (by names without dots), which are preferred; the tensors of
+                    the schedule are checked and recomputed
 
-LiDM's U-Net predicts the noise of a diffusion step; ``models.lidm.diffusion`` converts it to the velocity of a
-rectified flow, so that it can be sampled and distilled without training. The file of a camera model repeats the frozen
-CLIP weights, which are skipped (see ``models.encoders.clip_views``). LiDM's label maps use 0 for "unlabelled" and
-number the classes from 1; the weights are permuted to our order.
+LiDM's U-Net predicts the noise of a diffusion step; ``models.lidm.diffusion`` converts it to the
+velocity of a rectified flow, so that it can be sampled and distilled without training. The file of
+a camera model repeats the frozen CLIP weights, which are skipped (see
+``models.encoders.clip_views``). LiDM's label maps use 0 for "unlabelled" and number the classes
+from 1; the weights are permuted to our order.
 """
 
 import math
@@ -49,20 +53,21 @@ SEEN = {
     IMAGES: whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
     | frames_of("semantic_kitti", (*_LABELLED, *map(str, range(11, 22)))),
 }
-"""LiDM's training data by the name under ``data`` of a provenance (from its lidm/data/kitti.py). All of its
-autoencoders are trained on range images of both datasets, including the test sequences of the odometry benchmark."""
+"""LiDM's training data by the name under ``data`` of a provenance (from its lidm/data/kitti.py).
+All of its autoencoders are trained on range images of both datasets, including the test sequences
+of the odometry benchmark."""
 OFFSET = 1.0001
 """LiDM's logarithmic scale is log2(d + 0.0001 + 1)."""
 
 
 def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
-    """Read a released ``model.ckpt`` and the ``config.yaml`` in its folder as header and networks for
-    ``save_checkpoint``.
+    """Read a released ``model.ckpt`` and the ``config.yaml`` in its folder as header and networks
+    for ``save_checkpoint``.
 
     Raises:
         FileError: if one of the two files cannot be read.
-        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose keys or
-            configuration do not fit.
+        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose
+            keys or configuration do not fit.
     """
     config = _config(path.with_name("config.yaml"))
     content = load_pickle(path, "LiDM")
@@ -71,9 +76,12 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             f"{path} holds {type(content).__name__}",
             "LiDM's dictionary with state_dict among its keys, or a state dictionary",
         )
-    weights = {k: v for k, v in state_of(content, "state_dict", path).items() if not k.startswith("loss.")}
+    weights = {
+        k: v for k, v in state_of(content, "state_dict", path).items() if not k.startswith("loss.")
+    }
     try:
-        model, data = config["model"]["params"], config["data"]["params"]
+        model = config["model"]["params"]
+        data = config["data"]["params"]
         parts, conditioning = _parts(model, data["dataset"], data.get("aug") or {}, path)
         header = Header(
             networks=parts,
@@ -88,16 +96,23 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
     except DataError:
         raise
     except MISFITS as error:
-        raise DataError(f"{path}: a configuration that does not fit ({error!r})", "LiDM's own config.yaml") from error
+        raise DataError(
+            f"{path}: a configuration that does not fit ({error!r})", "LiDM's own config.yaml"
+        ) from error
 
 
 def _config(path: Path) -> dict[str, Any]:
     try:
         config = read_yaml(path, "the config.yaml that LiDM releases with its weights")
     except ConfigError as error:
-        raise DataError(str(error), "the config.yaml that LiDM releases with its weights") from error
+        raise DataError(
+            str(error), "the config.yaml that LiDM releases with its weights"
+        ) from error
     if not isinstance(config, dict):
-        raise DataError(f"{path} holds {type(config).__name__}", "the config.yaml that LiDM releases with its weights")
+        raise DataError(
+            f"{path} holds {type(config).__name__}",
+            "the config.yaml that LiDM releases with its weights",
+        )
     return config
 
 
@@ -110,15 +125,20 @@ def _parts(
     codec = codec_part(model["first_stage_config"]["params"], dataset["size"], path)
     unet = unet_part(model["unet_config"]["params"], path)
     unet.arguments.update(
-        beta_start=model["linear_start"], beta_end=model["linear_end"], steps=model.get("timesteps", 1000)
+        beta_start=model["linear_start"],
+        beta_end=model["linear_end"],
+        steps=model.get("timesteps", 1000),
     )
-    parts, condition = {VELOCITY: unet, CODEC: codec}, model.get("cond_stage_config") or {}
+    parts = {VELOCITY: unet, CODEC: codec}
+    condition = model.get("cond_stage_config") or {}
     if not isinstance(condition, dict):  # a string that stands for no condition
         condition = {}
     kind = condition.get("target", "").rpartition(".")[2]
     if kind == "SpatialRescaler":
         channels = condition["params"]["out_channels"]
-        unet.arguments.update(channels=unet.arguments["channels"] - channels, condition_channels=channels)
+        unet.arguments.update(
+            channels=unet.arguments["channels"] - channels, condition_channels=channels
+        )
         sizes = {"resolution": list(dataset["size"]), "target": unet.arguments["resolution"]}
         return parts | {ENCODER: NetworkSpec("semantic_map", sizes | {"channels": channels})}, {
             "semantic": {"dropout": 0.0}
@@ -126,48 +146,79 @@ def _parts(
     if kind == "FrozenClipMultiImageEmbedder":
         given = condition["params"]
         arguments = {"views": given["split_per_view"], "channels": given.get("out_dim", 512)}
-        options = {"dropout": 0.0, "view_dropout": augment.get("camera_drop", 0.0), "image": list(CAMERA_SIZE)}
+        options = {
+            "dropout": 0.0,
+            "view_dropout": augment.get("camera_drop", 0.0),
+            "image": list(CAMERA_SIZE),
+        }
         return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {"camera": options}
     if kind:
         raise DataError(
             f"{path}: a condition encoded by {kind}",
-            "label maps (SpatialRescaler), camera images (FrozenClipMultiImageEmbedder) or no condition",
+            "label maps (SpatialRescaler), camera images (FrozenClipMultiImageEmbedder) or no "
+            "condition",
         )
     return parts, {}
 
 
 def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> NetworkSpec:
     """The autoencoder of LiDM's configuration, for images of ``size`` rows and columns."""
-    inner, mask = params["ddconfig"], bool(params.get("use_mask"))
-    wanted = {"double_z": False, "z_channels": params["embed_dim"], "out_ch": inner["in_channels"] + mask}
+    inner = params["ddconfig"]
+    mask = bool(params.get("use_mask"))
+    wanted = {
+        "double_z": False,
+        "z_channels": params["embed_dim"],
+        "out_ch": inner["in_channels"] + mask,
+    }
     unsupported = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
     if unsupported or params.get("lib_name") != "lidm":
         raise DataError(
-            f"{path}: an autoencoder with {unsupported or dict(params)}", "one of LiDM's published configurations"
+            f"{path}: an autoencoder with {unsupported or dict(params)}",
+            "one of LiDM's published configurations",
         )
     # LiDM ignores attention levels that do not exist.
     attends = sorted(set(inner["attn_levels"]) & set(range(len(inner["ch_mult"]))))
-    extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | ({"mask": True} if mask else {})
-    return NetworkSpec("vqvae", {
-        "resolution": list(size), "channels": inner["in_channels"], "latent_channels": params["embed_dim"],
-        "codes": params["n_embed"], "width": inner["ch"], "multipliers": list(inner["ch_mult"]),
-        "strides": [list(s) for s in inner["strides"]], "blocks": inner["num_res_blocks"],
-    } | extra)  # fmt: skip
+    extra: dict[str, Any] = ({"attention_levels": attends} if attends else {}) | (
+        {"mask": True} if mask else {}
+    )
+    return NetworkSpec(
+        "vqvae",
+        {
+            "resolution": list(size),
+            "channels": inner["in_channels"],
+            "latent_channels": params["embed_dim"],
+            "codes": params["n_embed"],
+            "width": inner["ch"],
+            "multipliers": list(inner["ch_mult"]),
+            "strides": [list(s) for s in inner["strides"]],
+            "blocks": inner["num_res_blocks"],
+        }
+        | extra,
+    )
 
 
 def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
-    """The U-Net of LiDM's configuration; ``channels`` includes those of a condition that is concatenated with the
-    state."""
+    """The U-Net of LiDM's configuration; ``channels`` includes those of a condition that is
+    concatenated with the state."""
     levels = [1 << i for i in range(len(params["channel_mult"]))]
     if params.get("lib_name") != "lidm" or not set(params["attention_resolutions"]) <= set(levels):
-        raise DataError(f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations")
-    return NetworkSpec("diffusion_unet", {
-        "resolution": list(params["image_size"]), "channels": params["in_channels"],
-        "context_channels": params.get("context_dim") or 0, "width": params["model_channels"],
-        "multipliers": list(params["channel_mult"]), "blocks": params["num_res_blocks"],
-        "attention": [i for i, d in enumerate(levels) if d in params["attention_resolutions"]],
-        "head_channels": params["num_head_channels"], "position": False,
-    })  # fmt: skip
+        raise DataError(
+            f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations"
+        )
+    return NetworkSpec(
+        "diffusion_unet",
+        {
+            "resolution": list(params["image_size"]),
+            "channels": params["in_channels"],
+            "context_channels": params.get("context_dim") or 0,
+            "width": params["model_channels"],
+            "multipliers": list(params["channel_mult"]),
+            "blocks": params["num_res_blocks"],
+            "attention": [i for i, d in enumerate(levels) if d in params["attention_resolutions"]],
+            "head_channels": params["num_head_channels"],
+            "position": False,
+        },
+    )
 
 
 def _normalisation(dataset: Mapping[str, Any]) -> Normalisation:
@@ -188,7 +239,9 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     (rows, columns), (up, down) = dataset["size"], dataset["fov"]
     if (rows, columns, up, down) == (*sensor.shape, sensor.up, sensor.down):
         return sensor
-    return Sensor("lidm", columns, float(low), float(high), rows=rows, fov_up=float(up), fov_down=float(down))
+    return Sensor(
+        "lidm", columns, float(low), float(high), rows=rows, fov_up=float(up), fov_down=float(down)
+    )
 
 
 def _semantic_kitti(data: Mapping[str, Any]) -> bool:
@@ -207,7 +260,8 @@ def seen(data: str, generates: bool) -> Recordings:
 
     Args:
         data: a key of ``SEEN``; the recordings of other data are unknown.
-        generates: whether the weights are those of a diffusion model, whose autoencoder was trained on ``IMAGES``.
+        generates: whether the weights are those of a diffusion model, whose autoencoder was trained
+            on ``IMAGES``.
     """
     return SEEN.get(data, Recordings()) | (SEEN[IMAGES] if generates else Recordings())
 
@@ -238,22 +292,30 @@ def convert(
         what: name of the weights in an error.
 
     Raises:
-        DataError: on missing or unexpected keys, other shapes, or another noise schedule than the part's.
+        DataError: on missing or unexpected keys, other shapes, or another noise schedule than the
+            part's.
     """
-    weights, nested = dict(weights), set(parts) != {CODEC}
+    weights = dict(weights)
+    nested = set(parts) != {CODEC}
     if VELOCITY in parts:
         _check_schedule(weights, parts[VELOCITY].arguments, what)
         weights = _averaged(weights)
     sources = {name: peer_names(name, part, nested) for name, part in parts.items()}
     known = {theirs for names in sources.values() for some in names.values() for theirs in some}
-    missing, unexpected = sorted(known - set(weights)), sorted(k for k in set(weights) - known if not _frozen(k))
+    missing = sorted(known - set(weights))
+    unexpected = sorted(k for k in set(weights) - known if not _frozen(k))
     if missing or unexpected:
-        raise DataError(f"{what}: missing keys {missing}, unexpected keys {unexpected}", "the keys of LiDM's networks")
+        raise DataError(
+            f"{what}: missing keys {missing}, unexpected keys {unexpected}",
+            "the keys of LiDM's networks",
+        )
     networks = {}
     for name, part in parts.items():
         state = _statistics(part) if name == CODEC else {}
         for ours, theirs in sources[name].items():
-            tensor = torch.cat([weights[t] for t in theirs]) if len(theirs) > 1 else weights[theirs[0]]
+            tensor = (
+                torch.cat([weights[t] for t in theirs]) if len(theirs) > 1 else weights[theirs[0]]
+            )
             state[ours] = _arranged(ours, tensor, part)
         networks[name] = assemble(*part, state, f"{what}: {name}")
     return networks
@@ -280,44 +342,62 @@ def _averaged(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     average = {k: v for k, v in weights.items() if k.startswith(UNET_EMA) and k not in _COUNTERS}
     if not average:
         return plain
-    names = {k: UNET_EMA + k.removeprefix("model.").replace(".", "") for k in plain if k.startswith(UNET)}
+    names = {
+        k: UNET_EMA + k.removeprefix("model.").replace(".", "") for k in plain if k.startswith(UNET)
+    }
     averaged = {k: average.pop(name) for k, name in names.items() if name in average}
     return {k: v for k, v in plain.items() if k not in names} | averaged | average
 
 
 _COUNTERS = (f"{UNET_EMA}decay", f"{UNET_EMA}num_updates")
 _SCHEDULE = (
-    "logvar betas alphas_cumprod alphas_cumprod_prev sqrt_alphas_cumprod sqrt_one_minus_alphas_cumprod "
-    "log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod sqrt_recipm1_alphas_cumprod posterior_variance "
+    "logvar betas alphas_cumprod alphas_cumprod_prev sqrt_alphas_cumprod "
+    "sqrt_one_minus_alphas_cumprod "
+    "log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod sqrt_recipm1_alphas_cumprod "
+    "posterior_variance "
     "posterior_log_variance_clipped posterior_mean_coef1 posterior_mean_coef2 scale_factor"
 ).split()
 
 
 def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any], what: str) -> None:
     if "scale_factor" in weights and float(weights["scale_factor"]) != 1:
-        raise DataError(f"{what}: latents scaled by {float(weights['scale_factor'])}", "1, as in LiDM's releases")
+        raise DataError(
+            f"{what}: latents scaled by {float(weights['scale_factor'])}",
+            "1, as in LiDM's releases",
+        )
     if (signal := weights.get("alphas_cumprod")) is None:
         return
     times = schedule_times(arguments["beta_start"], arguments["beta_end"], arguments["steps"])
     if signal.shape != times.shape:
-        raise DataError(f"{what}: a noise schedule of shape {tuple(signal.shape)}", f"{tuple(times.shape)}")
+        raise DataError(
+            f"{what}: a noise schedule of shape {tuple(signal.shape)}", f"{tuple(times.shape)}"
+        )
     signal = signal.double()
     stored = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
     if not torch.allclose(stored, times, atol=1e-4):
         raise DataError(
-            f"{what}: another noise schedule than in its config.yaml", "linear_start, linear_end, timesteps"
+            f"{what}: another noise schedule than in its config.yaml",
+            "linear_start, linear_end, timesteps",
         )
 
 
 def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
     """LiDM's tensor in our order of dimensions and classes."""
-    if part.architecture == "semantic_map":  # LiDM: unlabelled, then 19 classes; ours: 19 classes, then unlabelled
+    if (
+        part.architecture == "semantic_map"
+    ):  # LiDM: unlabelled, then 19 classes; ours: 19 classes, then unlabelled
         return tensor[:, [*range(1, len(NAMES) + 1), 0]]
     if ours == "view_embedding":
         return tensor[0]
-    if part.architecture == "diffusion_unet" and ".attention.qkv." in ours and not part.arguments["context_channels"]:
+    if (
+        part.architecture == "diffusion_unet"
+        and ".attention.qkv." in ours
+        and not part.arguments["context_channels"]
+    ):
         # In LiDM, heads are outermost: query, key and value of the first head, then of the next.
         width = part.arguments["head_channels"]
-        tensor = tensor.reshape(-1, 3, width, *tensor.shape[1:]).transpose(0, 1).reshape(tensor.shape)
+        tensor = (
+            tensor.reshape(-1, 3, width, *tensor.shape[1:]).transpose(0, 1).reshape(tensor.shape)
+        )
     linear = (".qkv.", ".out.", ".enter.", ".leave.")
     return tensor.flatten(1) if tensor.ndim > 2 and any(name in ours for name in linear) else tensor

@@ -7,24 +7,39 @@ import torch
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.generate.models import bounded, build_network
 
-UNET, UNET_EMA = "model.diffusion_model.", "model_ema."
-FIRST_STAGE, COND_STAGE = "first_stage_model.", "cond_stage_model."
+UNET = "model.diffusion_model."
+UNET_EMA = "model_ema."
+FIRST_STAGE = "first_stage_model."
+COND_STAGE = "cond_stage_model."
 
 Sources = dict[str, tuple[str, ...]]
 """{our name: LiDM's names, whose tensors are concatenated}."""
 
-RESIDUAL = {"norm1": "in_layers.0", "conv1": "in_layers.2", "time": "emb_layers.1", "norm2": "out_layers.0",
-            "conv2": "out_layers.3", "shortcut": "skip_connection"}  # fmt: skip
+RESIDUAL = {
+    "norm1": "in_layers.0",
+    "conv1": "in_layers.2",
+    "time": "emb_layers.1",
+    "norm2": "out_layers.0",
+    "conv2": "out_layers.3",
+    "shortcut": "skip_connection",
+}
 ATTENTION: Sources = {"norm": ("norm",), "qkv": ("qkv",), "out": ("proj_out",)}
 INNER = "transformer_blocks.0"
 CONTEXT: Sources = {
-    "norm": ("norm",), "enter": ("proj_in",), "leave": ("proj_out",),
-    "norms.0": (f"{INNER}.norm1",), "norms.1": (f"{INNER}.norm2",), "norms.2": (f"{INNER}.norm3",),
-    "qkv": tuple(f"{INNER}.attn1.to_{x}" for x in "qkv"), "out": (f"{INNER}.attn1.to_out.0",),
-    "query": (f"{INNER}.attn2.to_q",), "key_value": tuple(f"{INNER}.attn2.to_{x}" for x in "kv"),
+    "norm": ("norm",),
+    "enter": ("proj_in",),
+    "leave": ("proj_out",),
+    "norms.0": (f"{INNER}.norm1",),
+    "norms.1": (f"{INNER}.norm2",),
+    "norms.2": (f"{INNER}.norm3",),
+    "qkv": tuple(f"{INNER}.attn1.to_{x}" for x in "qkv"),
+    "out": (f"{INNER}.attn1.to_out.0",),
+    "query": (f"{INNER}.attn2.to_q",),
+    "key_value": tuple(f"{INNER}.attn2.to_{x}" for x in "kv"),
     "context_out": (f"{INNER}.attn2.to_out.0",),
-    "expand": (f"{INNER}.ff.net.0.proj",), "contract": (f"{INNER}.ff.net.2",),
-}  # fmt: skip
+    "expand": (f"{INNER}.ff.net.0.proj",),
+    "contract": (f"{INNER}.ff.net.2",),
+}
 """Names inside the U-Net's blocks: residual, self-attention, cross-attention to a context."""
 
 CODEC_RESIDUAL = {"shortcut": "nin_shortcut"}
@@ -32,7 +47,8 @@ CODEC_ATTENTION: Sources = {"norm": ("norm",), "qkv": ("q", "k", "v"), "out": ("
 """Names inside the autoencoder's blocks; all other names are the same in both."""
 MIDDLE = ("mid.block_1", "mid.attn_1", "mid.block_2")
 MOST_MODULES = 4_000
-"""Maximum number of modules of a network; a configuration may ask for 10^9 blocks. LiDM's have about 1,000."""
+"""Maximum number of modules of a network; a configuration may ask for 10^9 blocks. LiDM's have
+about 1,000."""
 STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
 """Buffers that only our autoencoder has."""
 
@@ -63,12 +79,14 @@ def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
 
 
 def _unet(key: str, attending: set[str], attention: Sources) -> tuple[str, ...]:
-    """LiDM's names of a U-Net key, given the blocks that have attention and the names inside attention."""
+    """LiDM's names of a U-Net key, given the blocks that have attention and the names inside
+    attention."""
     top = {"time": "time_embed", "stem": "input_blocks.0.0", "norm": "out.0", "head": "out.2"}
     where, number, *rest = key.split(".")
     if where in top:
         return (_renamed(key, top),)
-    kind, inside = rest[0], ".".join(rest[1:])
+    kind = rest[0]
+    inside = ".".join(rest[1:])
     if where == "middle":  # residual, attention, residual
         place = f"middle_block.{1 if kind == 'attention' else 2 * int(number)}"
     else:
@@ -86,20 +104,27 @@ def _unet(key: str, attending: set[str], attention: Sources) -> tuple[str, ...]:
 
 
 def _codec(key: str, levels: int, attending: Collection[int]) -> tuple[str, ...]:
-    """LiDM's names of an autoencoder key, given the number of levels and the levels with attention."""
+    """LiDM's names of an autoencoder key, given the number of levels and the levels with
+    attention."""
     top = {"to_latent": "quant_conv", "from_latent": "post_quant_conv"}
     if key == "codebook.codes":
         return ("quantize.embedding.weight",)
     where, *rest = key.split(".")
     if where in top:
         return (_renamed(key, top),)
-    kind, number, inside = rest[0], rest[1], ".".join(rest[2:])
+    kind = rest[0]
+    number = rest[1]
+    inside = ".".join(rest[2:])
     if kind in ("stem", "norm", "head"):
         name = {"stem": "conv_in", "norm": "norm_out", "head": "conv_out"}[kind]
         return (f"{where}.{name}.{number}",)
     if kind == "middle":
         place = f"{where}.{MIDDLE[int(number)]}"
-        return _attention(place, inside) if int(number) == 1 else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
+        return (
+            _attention(place, inside)
+            if int(number) == 1
+            else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
+        )
     side = "down" if where == "encoder" else "up"
     level = (
         int(number) if side == "down" else levels - 1 - int(number)

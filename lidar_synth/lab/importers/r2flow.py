@@ -1,11 +1,11 @@
 """R2Flow's released weights (https://github.com/kazuto1011/r2flow) as a checkpoint of this package.
 
-R2Flow's network predicts u(s, x) = data - noise at s = 1 - t, so that ours is v(y, t) = -u(1 - t, y). Both changes are
-linear and are folded into the weights::
+R2Flow's network predicts u(s, x) = data - noise at s = 1 - t, so that ours is v(y, t) = -u(1 - t,
+y). Both changes are linear and are folded into the weights::
 
     sign   the last layer is negated
-    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise the sine:
-           the layer after the Fourier features of time absorbs this rotation
+    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise
+           the sine: the layer after the Fourier features of time absorbs this rotation
 
 R2Flow stores the rotary harmonics in every block; here they are stored once per level.
 """
@@ -32,8 +32,8 @@ from lidar_synth.geometry.sensor import Sensor, presets
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2
-"""These are fixed in R2Flow's loader and not part of its configuration, like patch, window and ratio, whose values are
-our defaults."""
+"""These are fixed in R2Flow's loader and not part of its configuration, like patch, window and
+ratio, whose values are our defaults."""
 
 POSITIONS = {"learnable_embedding": LEARNED, **{name: name for name in BASES}}
 NORMALISATIONS: dict[str, Literal["log", "linear", "inverse"]] = {
@@ -66,12 +66,15 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
 
     Raises:
         FileError: if the file cannot be read.
-        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose keys do not fit.
+        DataError: on a file that is not such a checkpoint, is truncated or contains code, or whose
+            keys do not fit.
     """
     content, weights = _load(path)
     try:
-        data, model = content["cfg"]["data"], content["cfg"]["model"]
-        part, normalisation = _network(data, model, path), _normalisation(data, path)
+        data = content["cfg"]["data"]
+        model = content["cfg"]["model"]
+        part = _network(data, model, path)
+        normalisation = _normalisation(data, path)
         header = Header(
             networks={VELOCITY: part},
             sensor=_sensor(data),
@@ -84,15 +87,21 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
     except DataError:
         raise
     except MISFITS as error:
-        raise DataError(f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys") from error
+        raise DataError(
+            f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys"
+        ) from error
 
 
 def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The content of a file, and its weights."""
     content = load_pickle(path, "R2Flow")
     if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
-        given = sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
-        raise DataError(f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys")
+        given = (
+            sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
+        )
+        raise DataError(
+            f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys"
+        )
     return content, state_of(content, "weights", path)
 
 
@@ -100,7 +109,10 @@ def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> N
     if model["architecture"] != "nat_hdit":
         raise DataError(f"{path}: architecture {model['architecture']!r}", "nat_hdit, R2Flow's own")
     if model["coords_encoding"] not in POSITIONS:
-        raise DataError(f"{path}: coords_encoding {model['coords_encoding']!r}", f"one of {', '.join(POSITIONS)}")
+        raise DataError(
+            f"{path}: coords_encoding {model['coords_encoding']!r}",
+            f"one of {', '.join(POSITIONS)}",
+        )
     arguments = {
         "resolution": list(data["resolution"]),
         "channels": 1 + bool(data["train_reflectance"]),
@@ -116,7 +128,9 @@ def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> N
 
 def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
     if data["data_format"] not in NORMALISATIONS:
-        raise DataError(f"{path}: data_format {data['data_format']!r}", f"one of {', '.join(NORMALISATIONS)}")
+        raise DataError(
+            f"{path}: data_format {data['data_format']!r}", f"one of {', '.join(NORMALISATIONS)}"
+        )
     return Normalisation(NORMALISATIONS[data["data_format"]], data["min_depth"], data["max_depth"])
 
 
@@ -126,7 +140,9 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     if data["projection"].startswith("unfolding"):
         sensor = sensor.by_beams()
     rows, columns = data["resolution"]
-    sensor = replace(sensor, columns=columns, range_min=data["min_depth"], range_max=data["max_depth"])
+    sensor = replace(
+        sensor, columns=columns, range_min=data["min_depth"], range_max=data["max_depth"]
+    )
     if rows != sensor.shape[0]:
         linear = {"rows": rows, "fov_up": sensor.up, "fov_down": sensor.down, "elevations": None}
         sensor = replace(sensor, **linear, beams=None, heights=None, azimuths=None)
@@ -156,7 +172,9 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
 
 
-def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flow's weights") -> nn.Module:
+def convert(
+    weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flow's weights"
+) -> nn.Module:
     """Convert R2Flow's state dict to an ``HDiT`` in our convention.
 
     Args:
@@ -165,22 +183,36 @@ def convert(weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2Flo
         what: name of the weights in an error.
 
     Raises:
-        DataError: on missing or unexpected keys, other shapes, or buffers with values that R2Flow never writes.
+        DataError: on missing or unexpected keys, other shapes, or buffers with values that R2Flow
+            never writes.
     """
-    depths, position = part.arguments["depths"], part.arguments["position"]
+    depths = part.arguments["depths"]
+    position = part.arguments["position"]
     if sum(depths) > len(weights):
-        raise DataError(f"{what}: {sum(depths)} blocks in {len(weights)} weights", "the weights of its configuration")
+        raise DataError(
+            f"{what}: {sum(depths)} blocks in {len(weights)} weights",
+            "the weights of its configuration",
+        )
     names = peer_names(depths, position)
-    known = {*names.values(), *(f"{block}.{name}" for block in block_names(depths).values() for name in HARMONICS)}
+    known = {
+        *names.values(),
+        *(f"{block}.{name}" for block in block_names(depths).values() for name in HARMONICS),
+    }
     known |= set(FOURIER) if position == "fourier_features" else set()
-    missing, unexpected = sorted(known - set(weights)), sorted(set(weights) - known)
+    missing = sorted(known - set(weights))
+    unexpected = sorted(set(weights) - known)
     if missing or unexpected:
-        raise DataError(f"{what}: missing keys {missing}, unexpected keys {unexpected}", "the keys of R2Flow's HDiT")
+        raise DataError(
+            f"{what}: missing keys {missing}, unexpected keys {unexpected}",
+            "the keys of R2Flow's HDiT",
+        )
     state = {ours: weights[theirs] for ours, theirs in names.items()}
     state["angles.cells"] = state["angles.cells"][0]
     state["tokenize.weight"] = state["tokenize.weight"].movedim(1, -1).flatten(1)
     state["detokenize.weight"] = -state["detokenize.weight"]
-    state["time.linear.weight"] = _reverse_time(state["time.linear.weight"], state["time.features.frequencies"])
+    state["time.linear.weight"] = _reverse_time(
+        state["time.linear.weight"], state["time.features.frequencies"]
+    )
     if position == LEARNED:
         state["position.table"] = state["position.table"][0]
     state |= _harmonics(weights, depths, what)
@@ -235,14 +267,17 @@ def _mapping_names(ours: str, theirs: str) -> dict[str, str]:
 
 
 def _reverse_time(weight: Tensor, frequencies: Tensor) -> Tensor:
-    """Convert an (E, E) layer over cosines and sines of 2 pi f (1 - t) to one over those of 2 pi f t."""
+    """Convert an (E, E) layer over cosines and sines of 2 pi f (1 - t) to one over those of 2 pi f
+    t."""
     turn = 2 * math.pi * frequencies.double()
     cosine, sine = weight.double().chunk(2, 1)
     reverse = (cosine * turn.cos() + sine * turn.sin(), cosine * turn.sin() - sine * turn.cos())
     return torch.cat(reverse, 1).to(weight.dtype)
 
 
-def _harmonics(weights: Mapping[str, Tensor], depths: Sequence[int], what: str) -> dict[str, Tensor]:
+def _harmonics(
+    weights: Mapping[str, Tensor], depths: Sequence[int], what: str
+) -> dict[str, Tensor]:
     """The rotary harmonics of each level, (2, heads, D / 4), which all its blocks have to share."""
     state: dict[str, Tensor] = {}
     for ours, theirs in block_names(depths).items():
@@ -261,6 +296,12 @@ def _check_octaves(weights: Mapping[str, Tensor], what: str) -> None:
     stored, phase = (weights[name] for name in FOURIER)
     rows = int((stored[:, 0] > 0).sum())
     octaves = torch.zeros(len(stored), 2)
-    octaves[:rows, 0], octaves[rows:, 1] = torch.arange(rows).exp2(), torch.arange(len(stored) - rows).exp2()
+    octaves[:rows, 0], octaves[rows:, 1] = (
+        torch.arange(rows).exp2(),
+        torch.arange(len(stored) - rows).exp2(),
+    )
     if phase.any() or not torch.equal(stored[..., 0, 0], octaves):
-        raise DataError(f"{what}: Fourier features other than octaves of the angles", "those of R2Flow's encoding")
+        raise DataError(
+            f"{what}: Fourier features other than octaves of the angles",
+            "those of R2Flow's encoding",
+        )

@@ -3,14 +3,16 @@
 Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php, "3D Data Format")::
 
     data_3d_semantics/train/DRIVE/static/FFFFFFFFFF_LLLLLLLLLL.ply     what stands still
-    data_3d_semantics/train/DRIVE/dynamic/FFFFFFFFFF_LLLLLLLLLL.ply    what moves; may have no points
+    data_3d_semantics/train/DRIVE/dynamic/FFFFFFFFFF_LLLLLLLLLL.ply    what moves; may have no
+    points
 
-A window covers the frames FFFFFFFFFF to LLLLLLLLLL, about 200 m of road, and overlaps its neighbours by about 10 m.
-Early releases have no folder ``train``. Each point has ``float x, y, z``, ``uchar red, green, blue``, ``int semantic``
-(the id of the label images), ``int instance`` (semantic * 1000 + number; number 0 = none), ``uchar visible`` (1 if a
-camera saw it), in dynamic files ``int timestamp`` (the frame in which it was measured, which may lie after the window),
-and ``float confidence`` of the label in [0, 1]. Neighbouring points are at least about 2 cm apart, and every point was
-measured from at most 30 m.
+A window covers the frames FFFFFFFFFF to LLLLLLLLLL, about 200 m of road, and overlaps its
+neighbours by about 10 m. Early releases have no folder ``train``. Each point has ``float x, y, z``,
+``uchar red, green, blue``, ``int semantic`` (the id of the label images), ``int instance``
+(semantic * 1000 + number; number 0 = none), ``uchar visible`` (1 if a camera saw it), in dynamic
+files ``int timestamp`` (the frame in which it was measured, which may lie after the window), and
+``float confidence`` of the label in [0, 1]. Neighbouring points are at least about 2 cm apart, and
+every point was measured from at most 30 m.
 """
 
 import re
@@ -35,9 +37,18 @@ REACH = 30.0
 """Maximum distance from which a point of a window was measured, metres."""
 
 PROPERTIES = {
-    "x": "<f4", "y": "<f4", "z": "<f4", "red": "u1", "green": "u1", "blue": "u1", "semantic": "<i4",
-    "instance": "<i4", "visible": "u1", "timestamp": "<i4", "confidence": "<f4",
-}  # fmt: skip
+    "x": "<f4",
+    "y": "<f4",
+    "z": "<f4",
+    "red": "u1",
+    "green": "u1",
+    "blue": "u1",
+    "semantic": "<i4",
+    "instance": "<i4",
+    "visible": "u1",
+    "timestamp": "<i4",
+    "confidence": "<f4",
+}
 """{property: type} of the points; files of static points have no ``timestamp``."""
 
 READ = ("x", "y", "z", "semantic", "instance", "confidence")
@@ -75,14 +86,20 @@ def find_windows(root: Path, drive: str) -> list[Window]:
     for path in list_files(folder / "static", ".ply") if folder is not None else []:
         match = re.fullmatch(r"([0-9]{1,10})_([0-9]{1,10})", path.stem)
         if not match or int(match[1]) > int(match[2]):
-            raise DataError(f"{path} is no window of KITTI-360", "first and last frame: 0000000002_0000000385.ply")
+            raise DataError(
+                f"{path} is no window of KITTI-360",
+                "first and last frame: 0000000002_0000000385.ply",
+            )
         moving = path.parents[1] / "dynamic" / path.name
-        windows.append(Window(int(match[1]), int(match[2]), path, moving if moving.is_file() else None))
+        windows.append(
+            Window(int(match[1]), int(match[2]), path, moving if moving.is_file() else None)
+        )
     return sorted(windows, key=lambda w: (w.first, w.last))
 
 
 def read_cloud(path: Path) -> NDArray[np.void]:
-    """The points of a window's file, mapped into memory: (N,) records with the properties of ``PROPERTIES``.
+    """The points of a window's file, mapped into memory: (N,) records with the properties of
+    ``PROPERTIES``.
 
     Raises:
         FileError: if it cannot be read.
@@ -100,15 +117,20 @@ def read_cloud(path: Path) -> NDArray[np.void]:
 
 
 def cloud_values(points: NDArray[np.void], where: str = "the cloud") -> NDArray[np.uint32]:
-    """(N,) the values of a label file for points of a cloud: the class, and above it the instance, 0 = none.
+    """(N,) the values of a label file for points of a cloud: the class, and above it the instance,
+    0 = none.
 
     Raises:
-        DataError: on a class that KITTI-360 does not define, or an instance that a label file cannot hold.
+        DataError: on a class that KITTI-360 does not define, or an instance that a label file
+            cannot hold.
     """
-    semantic, instance = points["semantic"], points["instance"]
+    semantic = points["semantic"]
+    instance = points["instance"]
     CLASSES.decode(np.flatnonzero(np.bincount(np.clip(semantic, -1, 1 << 15) + 1)) - 1, where)
     if len(instance) and not 0 <= instance.min() <= instance.max() <= 0xFFFF:
-        raise DataError(f"{where} has instances from {instance.min()} to {instance.max()}", "0..65535")
+        raise DataError(
+            f"{where} has instances from {instance.min()} to {instance.max()}", "0..65535"
+        )
     numbered = np.where(instance % MAX_INSTANCES > 0, instance, 0)
     return semantic.astype(np.uint32) | numbered.astype(np.uint32) << np.uint32(16)
 
@@ -118,7 +140,8 @@ def write_cloud(path: Path, values: Mapping[str, NDArray[Any]]) -> None:
 
     Args:
         path: the file.
-        values: {property: (N,)}; those of ``PROPERTIES`` that are absent are 0, except that ``timestamp`` is left out.
+        values: {property: (N,)}; those of ``PROPERTIES`` that are absent are 0, except that
+            ``timestamp`` is left out.
 
     Raises:
         FileError: if it cannot be written.

@@ -2,14 +2,16 @@
 
 Output, which ``KITTI360(root, labels=out)`` reads::
 
-    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label     uint32 per point: KITTI-360's id, instance above; 0 = none
-    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin   uint8 per point: 255 times the confidence of the label
-    data_3d_semantics_scan/DRIVE/windows/WINDOW.json         counts of a complete window, and what it was made of
-    data_3d_semantics_scan/report.json                       counts of all windows
+    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label     uint32 per point: KITTI-360's id,
+    instance above; 0 = none data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin   uint8 per
+    point: 255 times the confidence of the label data_3d_semantics_scan/DRIVE/windows/WINDOW.json
+    counts of a complete window, and what it was made of data_3d_semantics_scan/report.json
+    counts of all windows
 
-The unit of work is a window. A rerun repeats windows without a record, and those whose clouds, poses or boxes changed.
-A frame gets labels if a window covers it, it has a pose (or the car hardly moved between two poses), and its scan lies
-on the clouds, or could be laid onto them; frames without labels have no file.
+The unit of work is a window. A rerun repeats windows without a record, and those whose clouds,
+poses or boxes changed. A frame gets labels if a window covers it, it has a pose (or the car hardly
+moved between two poses), and its scan lies on the clouds, or could be laid onto them; frames
+without labels have no file.
 """
 
 import json
@@ -102,20 +104,28 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
 
     Raises:
         ConfigError: on an unknown split.
-        DataError: if no drive of the split has windows, or one with windows has no poses; on a bad file.
+        DataError: if no drive of the split has windows, or one with windows has no poses; on a bad
+            file.
     """
     root = Path(root)
     jobs: list[WindowJob] = []
-    without_pose, outside, without_clouds = {}, {}, []
+    without_pose = {}
+    outside = {}
+    without_clouds = []
     for drive in drives_of(root, split):
         windows = find_windows(root, drive)
         if not windows:
             without_clouds.append(drive)
             continue
-        frames = [int(p.stem) for p in list_files(scans_folder(root, drive), ".bin") if p.stem.isdecimal()]
+        frames = [
+            int(p.stem) for p in list_files(scans_folder(root, drive), ".bin") if p.stem.isdecimal()
+        ]
         poses = _poses(root, drive)
         if not poses:
-            raise DataError(f"{drive} has no poses", f"{root / 'data_poses' / drive / 'poses.txt'} and calibration/")
+            raise DataError(
+                f"{drive} has no poses",
+                f"{root / 'data_poses' / drive / 'poses.txt'} and calibration/",
+            )
         owner = {f: _owner(windows, f) for f in frames}
         placed = fill_poses(poses, [f for f in frames if owner[f] is not None])
         outside[drive] = sum(owner[f] is None for f in frames)
@@ -126,17 +136,21 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
                 jobs.append(WindowJob(drive, tuple(windows[max(i - 1, 0) : i + 2]), window, own))
     if not jobs:
         raise DataError(
-            f"{root} has no frame inside an accumulated cloud ({len(without_clouds)} drives without clouds, "
+            f"{root} has no frame inside an accumulated cloud ({len(without_clouds)} drives "
+            "without clouds, "
             f"{sum(outside.values())} frames outside, {sum(without_pose.values())} without a pose)",
             "data_3d_semantics/train/DRIVE/static/FFFFFFFFFF_LLLLLLLLLL.ply",
-            "Download 'Accumulated Point Clouds for Train & Val' and unpack it into the dataset's folder.",
+            "Download 'Accumulated Point Clouds for Train & Val' and unpack it into the "
+            "dataset's folder.",
         )
     return Plan(tuple(jobs), without_pose, outside, tuple(without_clouds))
 
 
 def _owner(windows: Sequence[Window], frame: int) -> int | None:
     covering = [i for i, w in enumerate(windows) if w.first <= frame <= w.last]
-    return max(covering, key=lambda i: min(frame - windows[i].first, windows[i].last - frame), default=None)
+    return max(
+        covering, key=lambda i: min(frame - windows[i].first, windows[i].last - frame), default=None
+    )
 
 
 def label_scans(
@@ -151,19 +165,23 @@ def label_scans(
     """Recover labels for the scans of KITTI-360; a rerun resumes an interrupted run.
 
     Args:
-        root: the dataset's folder, with scans, poses, calibration, accumulated clouds and, for moving objects, boxes.
+        root: the dataset's folder, with scans, poses, calibration, accumulated clouds and, for
+            moving objects, boxes.
         out: the folder to write to; it may be ``root``.
         split: the drives, as for ``KITTI360``.
-        against: a folder with known labels in ``data_3d_semantics_scan``, to which the recovered ones are compared.
+        against: a folder with known labels in ``data_3d_semantics_scan``, to which the recovered
+            ones are compared.
         jobs: number of processes; each holds the clouds of one window and its neighbours.
         progress: whether to show a progress bar.
 
     Raises:
-        ConfigError: on an unknown split, less than one job, or an output folder with labels from elsewhere.
+        ConfigError: on an unknown split, less than one job, or an output folder with labels from
+            elsewhere.
         DataError: as ``plan_labels``; also if most frames of a drive do not lie on its clouds.
         FileError: if the output cannot be written.
     """
-    root, out = Path(root), Path(out)
+    root = Path(root)
+    out = Path(out)
     if jobs < 1:
         raise ConfigError(f"{jobs} jobs", "at least 1")
     for cached in (_poses, _boxes, _hash):
@@ -180,37 +198,51 @@ def label_scans(
         for job, record in zip(plan.jobs, results, strict=True):
             report.add(job.drive, record)
             bar.update(len(job.frames))
-    write_file(out / "data_3d_semantics_scan" / "report.json", json.dumps(report.to_dict(), indent=1).encode())
+    write_file(
+        out / "data_3d_semantics_scan" / "report.json",
+        json.dumps(report.to_dict(), indent=1).encode(),
+    )
     report.check()
     return report
 
 
 def _claim(labels: Path) -> None:
-    """Mark a folder of labels as one of this command, before there is a label, so that a killed run can be resumed."""
+    """Mark a folder of labels as one of this command, before there is a label, so that a killed run
+    can be resumed."""
     records = labels.parent / "windows"
     if labels.is_dir() and not records.is_dir():
         raise ConfigError(f"{labels} holds labels from elsewhere", "a folder without labels")
     try:
         records.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"{records} cannot be made ({error.strerror})", "a folder to write labels to") from error
+        raise FileError(
+            f"{records} cannot be made ({error.strerror})", "a folder to write labels to"
+        ) from error
 
 
 def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
-    """Label the frames of a window, unless its record shows that this is done; return the record."""
+    """Label the frames of a window, unless its record shows that this is done; return the
+    record."""
     folder = labels_folder(out, job.drive)
     path = folder.parent / "windows" / f"{job.window.name}.json"
     made_of = _inputs(root, against, job)
     record = _read_record(path)
-    if record.get("inputs") == made_of and all((folder / f"{int(f):010d}.label").is_file() for f in record["fitting"]):
+    if record.get("inputs") == made_of and all(
+        (folder / f"{int(f):010d}.label").is_file() for f in record["fitting"]
+    ):
         return record | {"kept": True}
     poses = fill_poses(_poses(root, job.drive), range(min(job.frames) - 1, max(job.frames) + 2))
     recovery = Recovery(job.windows, _boxes(root, job.drive), poses, job.frames)
     points = partial(_points, root, job.drive)
-    recovery.choose_motion({f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]})
+    recovery.choose_motion(
+        {f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]}
+    )
     for frame in job.frames:  # labels of an earlier run with other clouds or poses
         (folder / f"{frame:010d}.label").unlink(missing_ok=True)
-    counts, fitting, misfits, moved = Counts(), [], [], {}
+    counts = Counts()
+    fitting = []
+    misfits = []
+    moved = {}
     for frame in job.frames:
         scan = points(frame)[:, :3]
         found = recovery.label(scan, frame)
@@ -221,7 +253,10 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
         if found.moved:
             moved[frame] = round(found.moved, 3)
         name = f"{frame:010d}"
-        write_file(confidence_path(out, job.drive, name), np.rint(found.confidence * 255).astype(np.uint8).tobytes())
+        write_file(
+            confidence_path(out, job.drive, name),
+            np.rint(found.confidence * 255).astype(np.uint8).tobytes(),
+        )
         write_labels(folder / f"{name}.label", found.values)
         train = CLASSES.decode((found.values & 0xFFFF).astype(np.uint16))
         reasons = {"far": found.far, "disputed": found.disputed, "moving": found.moving}
@@ -236,9 +271,12 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
     return record
 
 
-def _moving(recovery: Recovery, scan: NDArray[np.float32], frame: int, truth: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _moving(
+    recovery: Recovery, scan: NDArray[np.float32], frame: int, truth: NDArray[np.uint8]
+) -> NDArray[np.bool_]:
     """Which points belong to moving objects, by their known class and the boxes that move."""
-    placed, moving = recovery.place(scan, frame), np.zeros(len(scan), bool)
+    placed = recovery.place(scan, frame)
+    moving = np.zeros(len(scan), bool)
     for track in recovery.movers.present(frame):
         moving[inside(track.boxes[frame], placed, 0.1)] = True
     return moving & _OBJECTS[truth]
@@ -251,7 +289,10 @@ def _inputs(root: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
     return {
         "version": VERSION,
         "frames": [job.frames[0], job.frames[-1], len(job.frames)],
-        "sizes": [[f"{p.parent.name}/{p.name}", p.stat().st_size] for p in (*files, *([boxes] if boxes else []))],
+        "sizes": [
+            [f"{p.parent.name}/{p.name}", p.stat().st_size]
+            for p in (*files, *([boxes] if boxes else []))
+        ],
         "poses": _hash(root / "data_poses" / job.drive / "poses.txt"),
         "calibration": {p.name: _hash(p) for p in sorted((root / "calibration").glob("*.txt"))},
         "against": None if against is None else str(against.resolve()),

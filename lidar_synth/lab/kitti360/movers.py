@@ -1,7 +1,8 @@
 """Moving objects of KITTI-360 at any frame: their accumulated points, moved with their boxes.
 
-The points of an object that were measured in different frames are gathered in the frame of its box. At each frame with
-a box, also at one whose points were not accumulated, they are put back where the box is then.
+The points of an object that were measured in different frames are gathered in the frame of its box.
+At each frame with a box, also at one whose points were not accumulated, they are put back where the
+box is then.
 """
 
 from collections.abc import Iterable
@@ -23,7 +24,10 @@ MOVED = 0.5
 """Distance, metres, by which a box without points has to move to count as moving."""
 
 _SPACING = 0.03  # of the points of one object, metres
-_GAP, _JUMP = 10, 15.0  # frames, and metres per frame, above which the same instance number is another object
+_GAP, _JUMP = (
+    10,
+    15.0,
+)  # frames, and metres per frame, above which the same instance number is another object
 
 
 @dataclass
@@ -46,7 +50,9 @@ class Track:
     def moves(self) -> bool:
         """Whether it has points of moving objects, or its box moves."""
         centres = np.array([box[:3, 3] for box in self.boxes.values()])
-        return len(self.points) > 0 or bool(np.linalg.norm(centres - centres[0], axis=1).max() > MOVED)
+        return len(self.points) > 0 or bool(
+            np.linalg.norm(centres - centres[0], axis=1).max() > MOVED
+        )
 
     @property
     def semantic(self) -> int:
@@ -59,12 +65,18 @@ class Movers:
 
     Args:
         clouds: the dynamic points of the windows, as ``read_cloud`` returns them.
-        boxes: the boxes of the drive; None = none, so that only points measured in the same frame count.
+        boxes: the boxes of the drive; None = none, so that only points measured in the same frame
+            count.
         frames: the frames of the windows.
     """
 
-    def __init__(self, clouds: Iterable[NDArray[np.void]], boxes: WorldBoxes | None, frames: range) -> None:
-        found = [(_points(cloud), cloud_values(cloud), cloud["timestamp"].astype(np.int64)) for cloud in clouds]
+    def __init__(
+        self, clouds: Iterable[NDArray[np.void]], boxes: WorldBoxes | None, frames: range
+    ) -> None:
+        found = [
+            (_points(cloud), cloud_values(cloud), cloud["timestamp"].astype(np.int64))
+            for cloud in clouds
+        ]
         empty = np.zeros((0, 3)), np.zeros(0, np.uint32), np.zeros(0, np.int64)
         points, values, frame = (np.concatenate(parts) for parts in zip(empty, *found, strict=True))
         tracks = [] if boxes is None else _tracks(boxes, frames)
@@ -77,7 +89,8 @@ class Movers:
     def at(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """(N, 3) points in the world and (N,) label values of all moving objects at a frame."""
         now = self._rest[2] == frame
-        points, values = [self._rest[0][now]], [self._rest[1][now]]
+        points = [self._rest[0][now]]
+        values = [self._rest[1][now]]
         for track in self.present(frame):
             box = track.boxes[frame]
             points.append(track.points @ _rigid(box)[:3, :3].T + box[:3, 3])
@@ -101,7 +114,9 @@ def inside(
         floor: metres above the box's bottom, below which points are outside.
     """
     size = np.linalg.norm(box[:3, :3], axis=0)
-    near = np.flatnonzero((np.abs(points[:, :2] - box[:2, 3]) < np.linalg.norm(size) / 2 + margin).all(axis=1))
+    near = np.flatnonzero(
+        (np.abs(points[:, :2] - box[:2, 3]) < np.linalg.norm(size) / 2 + margin).all(axis=1)
+    )
     local = (points[near] - box[:3, 3]) @ (box[:3, :3] / size)
     kept = (np.abs(local) <= size / 2 + margin).all(axis=1)
     if floor:
@@ -121,16 +136,22 @@ def _rigid(box: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _tracks(boxes: WorldBoxes, frames: range) -> list[Track]:
-    """The objects with one box per frame; an instance number that is used again is another object."""
+    """The objects with one box per frame; an instance number that is used again is another
+    object."""
     stamped = (boxes.windows[:, 0] == boxes.windows[:, 1]) & np.isin(boxes.windows[:, 0], frames)
     order = np.flatnonzero(stamped)
     order = order[np.lexsort((boxes.windows[order, 0], boxes.instances[order]))]
-    instance, frame, place = boxes.instances[order], boxes.windows[order, 0], boxes.transforms[order, :3, 3]
+    instance = boxes.instances[order]
+    frame = boxes.windows[order, 0]
+    place = boxes.transforms[order, :3, 3]
     gap = np.diff(frame)
     jump = np.linalg.norm(np.diff(place, axis=0), axis=1) > _JUMP * np.maximum(gap, 1)
     parts = np.split(order, np.flatnonzero((np.diff(instance) != 0) | (gap > _GAP) | jump) + 1)
     return [
-        Track(int(boxes.instances[part[0]]), {int(boxes.windows[i, 0]): boxes.transforms[i] for i in part})
+        Track(
+            int(boxes.instances[part[0]]),
+            {int(boxes.windows[i, 0]): boxes.transforms[i] for i in part},
+        )
         for part in parts
         if len(part)
     ]
@@ -143,8 +164,10 @@ def _gather(
     frame: NDArray[np.int64],
     free: NDArray[np.bool_],
 ) -> None:
-    """Move the points that lie in a track's boxes into its own frame, thinned, and mark them as taken."""
-    local, own = [track.points], [track.values]
+    """Move the points that lie in a track's boxes into its own frame, thinned, and mark them as
+    taken."""
+    local = [track.points]
+    own = [track.values]
     for moment, box in track.boxes.items():
         candidates = np.flatnonzero(free & (frame == moment))
         taken = candidates[inside(box, points[candidates], MARGIN)]
@@ -153,4 +176,5 @@ def _gather(
         own.append(values[taken])
     gathered = np.concatenate(local)
     _, first = np.unique(np.floor(gathered / _SPACING).astype(np.int64), axis=0, return_index=True)
-    track.points, track.values = gathered[first], np.concatenate(own)[first]
+    track.points = gathered[first]
+    track.values = np.concatenate(own)[first]

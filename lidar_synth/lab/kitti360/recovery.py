@@ -1,10 +1,12 @@
 """Labels of KITTI-360's scans, recovered from the accumulated clouds of one window.
 
-A point of a scan takes the label on which its nearest neighbours agree: in the static clouds of the window and of the
-ones before and after it, or among the moving objects of that very frame, whichever is nearer. A scan that lies up to
-``FARTHEST`` off the clouds, because its pose is wrong, is laid onto them first (kitti360_registration.py). Clouds of
-other windows are left out, because cars that are parked now may be gone when the drive comes by again. A point keeps
-no label (0) where no neighbour lies within ``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
+A point of a scan takes the label on which its nearest neighbours agree: in the static clouds of the
+    window and of the
+ones before and after it, or among the moving objects of that very frame, whichever is nearer. A
+scan that lies up to ``FARTHEST`` off the clouds, because its pose is wrong, is laid onto them first
+(kitti360_registration.py). Clouds of other windows are left out, because cars that are parked now
+may be gone when the drive comes by again. A point keeps no label (0) where no neighbour lies within
+``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,19 +33,23 @@ VIEW = 100.0
 """Distance from the car, metres, within which clouds are indexed."""
 
 FIT = 0.6
-"""Minimum share of a scan's upright points that lie on the clouds; below it, pose and clouds do not fit.
+"""Minimum share of a scan's upright points that lie on the clouds; below it, pose and clouds do not
+fit.
 
 In the town it is 0.97 to 0.99; with poses 0.5 m off, without registration, 0.3 to 0.43.
 """
 
-NEAREST, FARTHEST = (0.15, np.radians(0.4)), (1.4, np.radians(4))
-"""Metres and radians by which a scan may lie off the clouds as it is, and up to which it is corrected.
+NEAREST = (0.15, np.radians(0.4))
+FARTHEST = (1.4, np.radians(4))
+"""Metres and radians by which a scan may lie off the clouds as it is, and up to which it is
+corrected.
 
 Scans of the town whose poses are 2.1 m off were moved by 1.5 to 1.9 m, to wrong places.
 """
 
 ON_SURFACE = 0.1
-"""Distance, metres, up to which a point lies on a static surface, also inside a box of a moving object."""
+"""Distance, metres, up to which a point lies on a static surface, also inside a box of a moving
+object."""
 
 BOX_CONFIDENCE = 0.5
 """Confidence of a label that only a box of a moving object supports."""
@@ -51,8 +57,13 @@ BOX_CONFIDENCE = 0.5
 _WIDEST = 3000.0  # metres around the frames of a window
 _CHUNK = 1 << 20  # points of a cloud read at a time
 _HEIGHTS = (-50.0, 60.0)  # metres relative to the car
-_PROBES, _PROBED = 1000, (3.0, 25.0)  # points that measure the fit, and their distance from the sensor, metres
-_UPRIGHT = -1.0  # height in the sensor's frame, metres, above which a point does not lie on the road
+_PROBES, _PROBED = (
+    1000,
+    (3.0, 25.0),
+)  # points that measure the fit, and their distance from the sensor, metres
+_UPRIGHT = (
+    -1.0
+)  # height in the sensor's frame, metres, above which a point does not lie on the road
 _CLOSE, _ABOUT = 0.2, 1.0  # metres: a probe on the clouds, and a probe that the clouds reach at all
 _FEW = 50  # probes that the clouds reach, below which a frame has too little structure to be judged
 _COVERED = 0.2  # minimum share of the points within reach that have neighbours, in such a frame
@@ -108,7 +119,8 @@ class Recovery:
         high = places.max(axis=0) + np.array([VIEW, VIEW, _HEIGHTS[1]])
         if (high - low)[:2].max() > _WIDEST or (high - low)[2] > _WIDEST / 4:
             raise DataError(
-                f"the poses of window {windows[0].name} and its neighbours spread over {(high - low).max():.0f} m",
+                f"the poses of window {windows[0].name} and its neighbours spread over "
+                f"{(high - low).max():.0f} m",
                 f"at most {_WIDEST:.0f} m: a window of KITTI-360 covers about 200 m",
                 "Check data_poses.",
             )
@@ -122,7 +134,8 @@ class Recovery:
         self._moves: dict[int, NDArray[np.float64]] = {}
 
     def choose_motion(self, scans: Mapping[int, NDArray[np.float32]]) -> None:
-        """Find out whether scans were measured while the car moved, or are compensated, by what fits the clouds.
+        """Find out whether scans were measured while the car moved, or are compensated, by what
+        fits the clouds.
 
         Args:
             scans: {frame: points (N, 3)} of some frames.
@@ -132,7 +145,11 @@ class Recovery:
             self.turns = turns
             for frame, points in scans.items():
                 self._lay(points, frame)
-            fits.append(sum(self._on_clouds(self.place(points, f), points)[0] for f, points in scans.items()))
+            fits.append(
+                sum(
+                    self._on_clouds(self.place(points, f), points)[0] for f, points in scans.items()
+                )
+            )
         self.turns = fits[0] >= fits[1]
 
     def place(self, points: NDArray[np.float32], frame: int) -> NDArray[np.float64]:
@@ -143,7 +160,8 @@ class Recovery:
         return apply(self._moves[frame], placed) if frame in self._moves else placed
 
     def _lay(self, points: NDArray[np.float32], frame: int) -> float:
-        """Lay a scan onto the clouds, if it lies off; metres by which it was moved, infinite if it would be too far."""
+        """Lay a scan onto the clouds, if it lies off; metres by which it was moved, infinite if it
+        would be too far."""
         self._moves.pop(frame, None)
         probes = points[_probes(points)]
         if not len(probes):
@@ -164,8 +182,11 @@ class Recovery:
         vote = self._static.vote(placed, RADIUS)
         values, share, trust, distance = vote
         moving = self._vote_of_movers(placed, frame, *vote)
-        far, disputed = ~np.isfinite(distance), share < AGREEMENT
-        confidence = (share * trust * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))).astype(np.float32)
+        far = ~np.isfinite(distance)
+        disputed = share < AGREEMENT
+        confidence = (share * trust * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))).astype(
+            np.float32
+        )
         values[far | disputed] = 0
         confidence[values == 0] = 0
         boxed = self._label_boxed(placed, frame, values, confidence, distance)
@@ -195,13 +216,16 @@ class Recovery:
         nearer = np.zeros(len(placed), bool)
         cloud, labels = self.movers.at(frame)
         if len(cloud):
-            low, high = cloud.min(axis=0) - RADIUS, cloud.max(axis=0) + RADIUS
+            low = cloud.min(axis=0) - RADIUS
+            high = cloud.max(axis=0) + RADIUS
             near = np.flatnonzero(((placed > low) & (placed < high)).all(axis=1))
             index = index_cloud([(cloud, labels, np.ones(len(cloud), np.float32))], low, high)
             vote = index.vote(placed[near], RADIUS)
             closer = vote.distance < distance[near]
             chosen = near[closer]
-            values[chosen], share[chosen], trust[chosen], distance[chosen] = (v[closer] for v in vote)
+            values[chosen], share[chosen], trust[chosen], distance[chosen] = (
+                v[closer] for v in vote
+            )
             nearer[chosen] = True
         return nearer
 
@@ -213,22 +237,30 @@ class Recovery:
         confidence: NDArray[np.float32],
         distance: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
-        """Give points off the clouds the class of the moving object in whose box they lie, and mark them.
+        """Give points off the clouds the class of the moving object in whose box they lie, and mark
+        them.
 
-        An object without accumulated points has no other evidence; its points may be near to static ones.
+        An object without accumulated points has no other evidence; its points may be near to static
+        ones.
         """
         boxed = np.zeros(len(placed), bool)
         for track in self.movers.present(frame):
             own = inside(track.boxes[frame], placed, MARGIN / 2, FLOOR)
             own = own[distance[own] > (RADIUS if len(track.points) else ON_SURFACE)]
-            values[own], confidence[own] = track.semantic | track.instance << 16, BOX_CONFIDENCE
+            values[own] = track.semantic | track.instance << 16
+            confidence[own] = BOX_CONFIDENCE
             boxed[own] = True
         return boxed
 
-    def _on_clouds(self, placed: NDArray[np.float64], points: NDArray[np.float32]) -> tuple[int, int]:
-        """Of some upright points, the numbers of those on the clouds, and of those that the clouds reach."""
+    def _on_clouds(
+        self, placed: NDArray[np.float64], points: NDArray[np.float32]
+    ) -> tuple[int, int]:
+        """Of some upright points, the numbers of those on the clouds, and of those that the clouds
+        reach."""
         distance = np.linalg.norm(points, axis=1)
-        upright = np.flatnonzero((points[:, 2] > _UPRIGHT) & (distance > _PROBED[0]) & (distance < _PROBED[1]))
+        upright = np.flatnonzero(
+            (points[:, 2] > _UPRIGHT) & (distance > _PROBED[0]) & (distance < _PROBED[1])
+        )
         probes = placed[upright[:: max(1, len(upright) // _PROBES)]]
         nearest = self._static.vote(probes, _ABOUT).distance
         return int((nearest < _CLOSE).sum()), int(np.isfinite(nearest).sum())
@@ -237,7 +269,8 @@ class Recovery:
 def _probes(points: NDArray[np.float32]) -> NDArray[np.intp]:
     """Some points that show how a scan lies: upright ones and ones on the road."""
     distance = np.linalg.norm(points, axis=1)
-    near, upright = (distance > _PROBED[0]) & (distance < _PROBED[1]), points[:, 2] > _UPRIGHT
+    near = (distance > _PROBED[0]) & (distance < _PROBED[1])
+    upright = points[:, 2] > _UPRIGHT
     parts = (np.flatnonzero(near & upright), np.flatnonzero(near & ~upright))
     return np.concatenate([part[:: max(1, len(part) // _PROBES)] for part in parts])
 

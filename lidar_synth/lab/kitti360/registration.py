@@ -1,11 +1,14 @@
 """How far a scan lies from the accumulated clouds: a registration that starts at its given pose.
 
-The clouds are divided into cubes. The points of a cube have a mean m and a covariance; along its axes a in which their
-standard deviation s is small (across a wall or the road, across a pole), the cube says where a point p near it should
-lie: (p - m) a / s is small. Along the others it says nothing. This is the normal distributions transform (Magnusson
-2009) without those axes. The sum of robust squares of these residuals is minimised by Gauss-Newton steps over a
-rotation and a translation, with smaller and smaller distances between points and cubes. Along a street little tells
-one place from another, so the least certain direction is searched.
+The clouds are divided into cubes. The points of a cube have a mean m and a covariance; along its
+axes a in which their standard deviation s is small (across a wall or the road, across a pole), the
+cube says where a point p near it should
+lie: (p - m) a / s is small. Along the others it says nothing. This is the normal distributions
+    transform (Magnusson
+2009) without those axes. The sum of robust squares of these residuals is minimised by Gauss-Newton
+steps over a rotation and a translation, with smaller and smaller distances between points and
+cubes. Along a street little tells one place from another, so the least certain direction is
+searched.
 """
 
 from dataclasses import dataclass
@@ -20,8 +23,14 @@ _FEWEST = 6  # points of a cube that show its shape
 _THIN = 0.08  # metres, standard deviation up to which a cube says where points lie
 _NOISE = 0.03  # metres, of points across a surface
 _MOST = 4_000_000  # points of a cloud that are used
-_WIDE, _CLOSE = (2.0, 1.5, 1.0, 0.7), (0.7, 0.5)  # metres between a point and its cube, for three steps each
-_STEPS, _STILL = 3, 2e-3  # steps, and metres (or radians times 10 m) below which there is no further one
+_WIDE, _CLOSE = (
+    (2.0, 1.5, 1.0, 0.7),
+    (0.7, 0.5),
+)  # metres between a point and its cube, for three steps each
+_STEPS, _STILL = (
+    3,
+    2e-3,
+)  # steps, and metres (or radians times 10 m) below which there is no further one
 _PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2  # of errors of a pose: metres and radians
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction
 _GAIN = 1.03  # factor of the score by which a transform has to be better than none
@@ -36,7 +45,8 @@ class Surfaces:
     Args:
         index: finds the cube of a point; its values are the cubes' numbers.
         means: (M, 3) metres, relative to ``origin``.
-        axes: (M, 3, 3) rows are axes, divided by the standard deviation of the points along them, or 0.
+        axes: (M, 3, 3) rows are axes, divided by the standard deviation of the points along them,
+            or 0.
         origin: (3,) metres.
     """
 
@@ -45,8 +55,11 @@ class Surfaces:
     axes: NDArray[np.float64]
     origin: NDArray[np.float64]
 
-    def residuals(self, points: NDArray[np.float64], radius: float) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """The points (of N, 3) with a cube, as (K,) indices, and (K, 3, 4): the scaled axes, and the residual."""
+    def residuals(
+        self, points: NDArray[np.float64], radius: float
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """The points (of N, 3) with a cube, as (K,) indices, and (K, 3, 4): the scaled axes, and
+        the residual."""
         found = self.index.nearest(points, radius)[0][:, 0]
         hit = np.flatnonzero(found >= 0)
         number = self.index.values[found[hit]]
@@ -70,18 +83,24 @@ def find_surfaces(cloud: NearestLabels) -> Surfaces:
     spread = np.stack(products, axis=1) - mean[:, :, None] * mean[:, None, :]
     variance, axes = np.linalg.eigh(spread)
     deviation = np.sqrt(np.maximum(variance, 0))
-    weights = np.where((deviation <= _THIN) & (counts >= _FEWEST)[:, None], 1 / np.hypot(deviation, _NOISE), 0)
+    weights = np.where(
+        (deviation <= _THIN) & (counts >= _FEWEST)[:, None], 1 / np.hypot(deviation, _NOISE), 0
+    )
     kept = weights.any(axis=1)
-    means, scaled = (corner + mean)[kept], (weights[:, :, None] * axes.transpose(0, 2, 1))[kept]
-    numbers, trust = np.arange(len(means), dtype=np.uint32), np.ones(len(means), np.float32)
+    means = (corner + mean)[kept]
+    scaled = (weights[:, :, None] * axes.transpose(0, 2, 1))[kept]
+    numbers = np.arange(len(means), dtype=np.uint32)
+    trust = np.ones(len(means), np.float32)
     high = means.max(axis=0, initial=0) + _SIDE
     index = index_cloud([(means + cloud.low, numbers, trust)], cloud.low, cloud.low + high)
     return Surfaces(index, means, scaled, cloud.low)
 
 
 def register(points: NDArray[np.float64], surfaces: Surfaces) -> NDArray[np.float64]:
-    """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it gains too little."""
-    given, few = np.eye(4), points[::_THINNED]
+    """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it
+    gains too little."""
+    given = np.eye(4)
+    few = points[::_THINNED]
     moved, certain = _descend(given, few, surfaces, _WIDE)
     if certain is None:
         return given
@@ -96,18 +115,26 @@ def register(points: NDArray[np.float64], surfaces: Surfaces) -> NDArray[np.floa
 
 
 def _descend(
-    transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: Surfaces, radii: tuple[float, ...]
+    transform: NDArray[np.float64],
+    points: NDArray[np.float64],
+    surfaces: Surfaces,
+    radii: tuple[float, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """The transform after some steps, and its (6, 6) certainty, translation first; None without enough points."""
-    centre, certain = points.mean(axis=0), None
+    """The transform after some steps, and its (6, 6) certainty, translation first; None without
+    enough points."""
+    centre = points.mean(axis=0)
+    certain = None
     for radius in radii:
         for _ in range(_STEPS):
             moved = apply(transform, points)
             hit, found = surfaces.residuals(moved, radius)
             if len(hit) < _FEW:
                 return transform, certain
-            axes, off = found[:, :, :3], found[:, :, 3]
-            slopes = np.concatenate([axes, np.cross((moved[hit] - centre)[:, None, :], axes)], axis=2)
+            axes = found[:, :, :3]
+            off = found[:, :, 3]
+            slopes = np.concatenate(
+                [axes, np.cross((moved[hit] - centre)[:, None, :], axes)], axis=2
+            )
             weights = _robust(off, 5 * radius)
             certain = np.einsum("n,nij,nik->jk", weights, slopes, slopes)
             pull = np.einsum("n,nij,ni->j", weights, slopes, off)
@@ -118,8 +145,14 @@ def _descend(
     return transform, certain
 
 
-def _score(transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: Surfaces) -> float:
-    return float(_robust(surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3], 5 * _CLOSE[0]).sum())
+def _score(
+    transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: Surfaces
+) -> float:
+    return float(
+        _robust(
+            surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3], 5 * _CLOSE[0]
+        ).sum()
+    )
 
 
 def _robust(off: NDArray[np.float64], scale: float) -> NDArray[np.float64]:

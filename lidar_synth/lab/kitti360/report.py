@@ -10,8 +10,8 @@ from lidar_synth.datasets.classes import IGNORE, NAMES, TRAIN_ID
 from lidar_synth.errors import DataError
 
 CLASS_COUNTS = ("points", "confidence", "known", "covered", "right")
-"""Counts of each class: labelled points, the sum of their confidence, and, compared with known labels of this class:
-all points, those that got a label, and those that got the right one."""
+"""Counts of each class: labelled points, the sum of their confidence, and, compared with known
+labels of this class: all points, those that got a label, and those that got the right one."""
 
 
 @dataclass
@@ -52,7 +52,8 @@ class Counts:
         disputed: int,
         moving: int,
     ) -> None:
-        """Add a scan: (N,) train ids and confidence; its fit, and numbers of points as in the class."""
+        """Add a scan: (N,) train ids and confidence; its fit, and numbers of points as in the
+        class."""
         labelled = train != IGNORE
         self.scans += 1
         self.fit += fit
@@ -65,10 +66,17 @@ class Counts:
         self.classes["confidence"] += _by_class(train, confidence)
 
     def compare(
-        self, frame: int, train: NDArray[np.uint8], truth: NDArray[np.uint8], moving: NDArray[np.bool_]
+        self,
+        frame: int,
+        train: NDArray[np.uint8],
+        truth: NDArray[np.uint8],
+        moving: NDArray[np.bool_],
     ) -> None:
-        """Add the comparison of a scan with its known train ids (N,); ``moving`` marks what moves."""
-        known, covered, right = truth != IGNORE, (truth != IGNORE) & (train != IGNORE), truth == train
+        """Add the comparison of a scan with its known train ids (N,); ``moving`` marks what
+        moves."""
+        known = truth != IGNORE
+        covered = (truth != IGNORE) & (train != IGNORE)
+        right = truth == train
         cars = moving & (truth == TRAIN_ID["car"])
         for name, mask in (("known", known), ("covered", covered), ("right", covered & right)):
             self.classes[name] += _by_class(truth[mask])
@@ -84,7 +92,9 @@ class Counts:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values; ``from_dict`` is the inverse."""
-        return vars(self) | {"classes": {name: values.tolist() for name, values in self.classes.items()}}
+        return vars(self) | {
+            "classes": {name: values.tolist() for name, values in self.classes.items()}
+        }
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Counts":
@@ -95,7 +105,9 @@ class Counts:
         """
         try:
             classes = {name: np.array(values["classes"][name], np.float64) for name in CLASS_COUNTS}
-            compared = {int(frame): [int(n) for n in counts] for frame, counts in values["compared"].items()}
+            compared = {
+                int(frame): [int(n) for n in counts] for frame, counts in values["compared"].items()
+            }
             return cls(**values | {"classes": classes, "compared": compared})
         except (TypeError, KeyError, ValueError, AttributeError) as error:
             given = f"counts of labels {str(values)[:200]} ({error!r})"
@@ -107,7 +119,8 @@ class LabelReport:
     """The result of a run.
 
     Args:
-        without_pose, outside: {drive: frames without labels because they have no pose, or lie in no window}.
+        without_pose, outside: {drive: frames without labels because they have no pose, or lie in no
+            window}.
         without_clouds: drives without windows.
         labelled: {drive: number of frames with labels}.
         misfits: {drive: frames whose scans do not lie on the clouds}.
@@ -146,7 +159,8 @@ class LabelReport:
         for drive, frames in self.misfits.items():
             if len(frames) > self.labelled[drive]:
                 raise DataError(
-                    f"{len(frames)} of {len(frames) + self.labelled[drive]} scans of {drive} do not lie on its "
+                    f"{len(frames)} of {len(frames) + self.labelled[drive]} scans of {drive} do "
+                    "not lie on its "
                     "accumulated clouds",
                     "poses, calibration, scans and clouds of the same drive",
                     "Check data_poses and calibration; those scans got no labels.",
@@ -155,20 +169,29 @@ class LabelReport:
     def totals(self) -> dict[str, float]:
         """Shares of all points, and, if known labels were compared, of the points that have one."""
         counts = self.counts
-        shares = {name: getattr(counts, name) / max(counts.points, 1) for name in ("far", "disputed", "void", "moving")}
+        shares = {
+            name: getattr(counts, name) / max(counts.points, 1)
+            for name in ("far", "disputed", "void", "moving")
+        }
         labelled = float(counts.classes["points"].sum()) / max(counts.points, 1)
         shares = {"on_clouds": counts.fit / max(counts.scans, 1), "labelled": labelled} | shares
         if self.compared:
             known, covered, right, *cars = np.sum(list(self.compared.values()), axis=0).tolist()
             shares |= {"covered": covered / max(known, 1), "right": right / max(covered, 1)}
-            shares |= {"cars_covered": cars[1] / max(cars[0], 1), "cars_right": cars[2] / max(cars[1], 1)}
+            shares |= {
+                "cars_covered": cars[1] / max(cars[0], 1),
+                "cars_right": cars[2] / max(cars[1], 1),
+            }
         return shares
 
     def classes(self) -> dict[str, dict[str, float | int | None]]:
-        """{class: labelled points, mean confidence, and the shares of known points that were covered and right}."""
+        """{class: labelled points, mean confidence, and the shares of known points that were
+        covered and right}."""
         table: dict[str, dict[str, float | int | None]] = {}
         for i, name in enumerate(NAMES):
-            points, confidence, known, covered, right = (float(self.counts.classes[n][i]) for n in CLASS_COUNTS)
+            points, confidence, known, covered, right = (
+                float(self.counts.classes[n][i]) for n in CLASS_COUNTS
+            )
             if points or known:
                 table[name] = {
                     "points": int(points),
@@ -186,7 +209,9 @@ class LabelReport:
                 "without_pose": self.without_pose,
                 "outside_windows": self.outside,
                 "not_on_the_clouds": self.misfits,
-                "laid_onto_the_clouds": {drive: len(metres) for drive, metres in self.moved.items()},
+                "laid_onto_the_clouds": {
+                    drive: len(metres) for drive, metres in self.moved.items()
+                },
                 "drives_without_clouds": list(self.without_clouds),
             },
             "points": self.counts.points,
@@ -196,7 +221,9 @@ class LabelReport:
         }
 
 
-def _by_class(train: NDArray[np.uint8], weights: NDArray[np.float32] | None = None) -> NDArray[np.float64]:
+def _by_class(
+    train: NDArray[np.uint8], weights: NDArray[np.float32] | None = None
+) -> NDArray[np.float64]:
     known = train != IGNORE
     part = None if weights is None else weights[known]
     return np.bincount(train[known], part, len(NAMES)).astype(np.float64)

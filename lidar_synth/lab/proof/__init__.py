@@ -1,6 +1,8 @@
-"""What synthetic scans add to your labelled scans: trainings with and without them, tested on places left out.
+"""What synthetic scans add to your labelled scans: trainings with and without them, tested on
+places left out.
 
-``prove`` runs the comparison that ``lidar-synth prove`` runs. ``ARMS`` has the trainings that are compared.
+``prove`` runs the comparison that ``lidar-synth prove`` runs. ``ARMS`` has the trainings that are
+compared.
 """
 
 from lidar_synth.lab.proof.arms import ARMS, Arm, Row, Stage
@@ -11,6 +13,16 @@ from lidar_synth.lab.proof.summary import Proof
 from lidar_synth.lab.proof.trial import Job, Outcome, Trainer, reference
 
 __all__ = [
-    "ARMS", "Arm", "CommandTrainer", "Job", "Outcome", "Proof", "ProofSettings", "Row", "Stage", "Trainer", "prove",
+    "ARMS",
+    "Arm",
+    "CommandTrainer",
+    "Job",
+    "Outcome",
+    "Proof",
+    "ProofSettings",
+    "Row",
+    "Stage",
+    "Trainer",
+    "prove",
     "reference",
-]  # fmt: skip
+]

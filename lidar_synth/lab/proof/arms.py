@@ -1,7 +1,9 @@
-"""The trainings that are compared. Each is an *arm*: one or more stages, each with a mixture of its own.
+"""The trainings that are compared. Each is an *arm*: one or more stages, each with a mixture of its
+own.
 
-All arms have the same network, batch size, augmentation and optimiser, and the same number of iterations, except where
-an arm's ``iterations`` says so. Each stage has one cycle of the learning rate. To add an arm, enter it in ``ARMS``.
+All arms have the same network, batch size, augmentation and optimiser, and the same number of
+iterations, except where an arm's ``iterations`` says so. Each stage has one cycle of the learning
+rate. To add an arm, enter it in ``ARMS``.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +15,8 @@ from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
 
 REAL = "real"
-"""The name of the labelled scans themselves, where a stage takes them in the place of synthetic ones."""
+"""The name of the labelled scans themselves, where a stage takes them in the place of synthetic
+ones."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Stage:
         ratio: share of synthetic samples in each batch, 0 to 1.
         pool: of the synthetic scans: a name of ``POOLS``, or ``REAL``.
         labels: their label policy.
-        options: of the policy. ``objects: True`` stands for the pasted objects of the pool ``skin``.
+        options: of the policy. ``objects: True`` stands for the pasted objects of the pool
+            ``skin``.
         rate: the highest learning rate, as a share of the trainer's own.
     """
 
@@ -44,7 +48,8 @@ class Arm:
     Args:
         title: its row in tables.
         stages: from the share of synthetic samples to the stages.
-        swept: whether the share matters, so that the arm is trained once for each of the given shares.
+        swept: whether the share matters, so that the arm is trained once for each of the given
+            shares.
         iterations: factor of the number of iterations.
         synthetic: whether it uses scans that were not recorded.
         budget: what it uses besides the labelled scans.
@@ -60,7 +65,9 @@ class Arm:
     def pools(self) -> set[str]:
         """Names of the pools whose scans or objects it needs."""
         found = {stage.pool for stage in self.stages(0.5)} - {"", REAL}
-        return found | ({"skin"} if any("objects" in stage.options for stage in self.stages(0.5)) else set())
+        return found | (
+            {"skin"} if any("objects" in stage.options for stage in self.stages(0.5)) else set()
+        )
 
 
 _EXCHANGE = {"kind": "exchange"}
@@ -83,32 +90,48 @@ def _then_real(pool: str) -> tuple[Stage, Stage]:
 
 ARMS: dict[str, Arm] = {
     "real": Arm("real scans only", lambda ratio: (Stage(),), synthetic=False),
-    "longer": Arm("real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False),
+    "longer": Arm(
+        "real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False
+    ),
     "exchange": Arm(
         "real scans, PolarMix and LaserMix",
-        lambda ratio: (Stage(1, 0.5, REAL, "mix", _EXCHANGE),), synthetic=False,
+        lambda ratio: (Stage(1, 0.5, REAL, "mix", _EXCHANGE),),
+        synthetic=False,
     ),
-    "town": Arm("with scans of the town", lambda ratio: (Stage(1, ratio, "town"),), swept=True, budget=_TOWN),
+    "town": Arm(
+        "with scans of the town", lambda ratio: (Stage(1, ratio, "town"),), swept=True, budget=_TOWN
+    ),
     "skin": Arm(
         "with scans of the town in your skin",
-        lambda ratio: (Stage(1, ratio, "skin"),), swept=True, budget=_SKIN,
+        lambda ratio: (Stage(1, ratio, "skin"),),
+        swept=True,
+        budget=_SKIN,
     ),
     "generator": Arm(
-        "with generated scans", lambda ratio: (Stage(1, ratio, "generator"),), swept=True,
+        "with generated scans",
+        lambda ratio: (Stage(1, ratio, "generator"),),
+        swept=True,
         budget=GENERATOR_BUDGET,
     ),
-    "pretrain": Arm("the town first, then half your scans", lambda ratio: _then_real("town"), budget=_TOWN),
+    "pretrain": Arm(
+        "the town first, then half your scans", lambda ratio: _then_real("town"), budget=_TOWN
+    ),
     "pretrain-skin": Arm(
-        "the town in your skin first, then half your scans", lambda ratio: _then_real("skin"), budget=_SKIN,
+        "the town in your skin first, then half your scans",
+        lambda ratio: _then_real("skin"),
+        budget=_SKIN,
     ),
     "pretrain-generator": Arm(
-        "generated scans first, then half your scans", lambda ratio: _then_real("generator"), budget=GENERATOR_BUDGET,
+        "generated scans first, then half your scans",
+        lambda ratio: _then_real("generator"),
+        budget=GENERATOR_BUDGET,
     ),
     "paste": Arm(
         "real scans, rare objects pasted",
-        lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),), budget=_SKIN,
+        lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),),
+        budget=_SKIN,
     ),
-}  # fmt: skip
+}
 """Arms by name."""
 
 BASE = "real"
@@ -148,7 +171,8 @@ class Row:
 
     @property
     def pretraining(self) -> Stage | None:
-        """The first of several stages if it has no real scan, so that all labelled scans can share it."""
+        """The first of several stages if it has no real scan, so that all labelled scans can share
+        it."""
         first, *later = self.stages()
         return first if later and first.ratio == 1 else None
 
@@ -163,12 +187,20 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
         given = f"arm {', '.join(map(repr, unknown))}"
         raise ConfigError(given, f"some of {', '.join(ARMS)}", suggest(unknown[0], ARMS))
     if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
-        raise ConfigError(f"ratio {wrong[0]}", "shares of synthetic scans between 0 and 1, such as 0.5")
+        raise ConfigError(
+            f"ratio {wrong[0]}", "shares of synthetic scans between 0 and 1, such as 0.5"
+        )
     ordered = [name for name in ARMS if name in {BASE, *names}]
-    return [Row(name, r) for name in ordered for r in (sorted(set(ratios)) if ARMS[name].swept else (None,))]
+    return [
+        Row(name, r)
+        for name in ordered
+        for r in (sorted(set(ratios)) if ARMS[name].swept else (None,))
+    ]
 
 
-def policy_of(stage: Stage, real: Any, objects: ObjectBank | None, fields: frozenset[str]) -> LabelPolicy:
+def policy_of(
+    stage: Stage, real: Any, objects: ObjectBank | None, fields: frozenset[str]
+) -> LabelPolicy:
     """The label policy of a stage.
 
     Args:
@@ -185,8 +217,13 @@ def options_of(stage: Stage, real: Any, objects: ObjectBank | None) -> dict[str,
     options = dict(stage.options)
     if options.pop("objects", False):
         assert objects is not None
-        there = {n for n, points in zip(objects.boxes.names, objects.counts, strict=True) if points >= 5}
-        options |= {"objects": objects, "count": {name: most for name, most in RARE.items() if name in there}}
+        there = {
+            n for n, points in zip(objects.boxes.names, objects.counts, strict=True) if points >= 5
+        }
+        options |= {
+            "objects": objects,
+            "count": {name: most for name, most in RARE.items() if name in there},
+        }
     elif options.get("kind") == "exchange" and real[0].instance is None:
         options["objects"] = 0  # PolarMix turns whole objects, which needs instances
     return options

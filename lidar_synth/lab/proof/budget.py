@@ -16,15 +16,19 @@ from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.train.precision import faster_in_bfloat16
 from lidar_synth.lab.train.segmentation import train_segmenter
 
-TOWN_SECONDS, SKIN_SECONDS, GENERATOR_SECONDS = 0.5, 1.5, 1.0
-"""Processor time for a scan of the town, a scan that a skin is learnt from, and a generated scan."""
+TOWN_SECONDS = 0.5
+SKIN_SECONDS = 1.5
+GENERATOR_SECONDS = 1.0
+"""Processor time for a scan of the town, a scan that a skin is learnt from, and a generated
+scan."""
 OVERHEAD = 1.3
 """Time of a training over that of its steps: loading, tests, a busy machine."""
 
 
 def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     """The time that some pairs take, with the pools that they need."""
-    settings, pools = plan.settings, {pool for row in plan.rows for pool in row.arm.pools()}
+    settings = plan.settings
+    pools = {pool for row in plan.rows for pool in row.arm.pools()}
     seconds = sum(map(plan.seconds, plan.rows)) * len(pairs)
     for row in plan.rows:
         if (stage := row.pretraining) is not None:
@@ -36,7 +40,9 @@ def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
         for place in {place for place, _ in pairs}:
             scans = len(plan.skin_scans(place))
             seconds += town + scans * SKIN_SECONDS + 2 * SKIN_STREETS * TOWN_SECONDS
-    seconds += town * ("town" in pools) + settings.synthetic * GENERATOR_SECONDS * ("generator" in pools)
+    seconds += town * ("town" in pools) + settings.synthetic * GENERATOR_SECONDS * (
+        "generator" in pools
+    )
     return seconds / 60 / plan.jobs
 
 
@@ -84,7 +90,9 @@ def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> 
     return 0
 
 
-def measured_step(scans: list[Scan], settings: ProofSettings, half: bool | None) -> tuple[bool, float]:
+def measured_step(
+    scans: list[Scan], settings: ProofSettings, half: bool | None
+) -> tuple[bool, float]:
     """Whether bfloat16 is faster on this machine, and the seconds of an iteration."""
     if settings.columns is None:
         return False, 0.0
@@ -99,8 +107,13 @@ def measured_step(scans: list[Scan], settings: ProofSettings, half: bool | None)
     half = faster_in_bfloat16() if half is None else half
     times: list[float] = []
     train_segmenter(
-        RangeSegmenter(widths=settings.widths), [batch] * 4, height, 4, progress=False, half=half,
+        RangeSegmenter(widths=settings.widths),
+        [batch] * 4,
+        height,
+        4,
+        progress=False,
+        half=half,
         watch=lambda step: times.append(time.perf_counter()),
-    )  # fmt: skip
+    )
     torch.set_num_threads(threads)
     return half, float(np.diff(times).min())

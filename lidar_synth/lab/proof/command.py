@@ -1,4 +1,5 @@
-"""A trainer of your own as a command: it reads the mixture from a YAML file and writes predictions."""
+"""A trainer of your own as a command: it reads the mixture from a YAML file and writes
+predictions."""
 
 import shlex
 import subprocess
@@ -29,12 +30,13 @@ _TAIL = 2000
 class CommandTrainer:
     """Trains by a command.
 
-    ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the folder of the
-    labelled scans; ``stages``, one after the other, each with ``iterations``, ``ratio``, ``synthetic`` (a folder, or
-    null), ``labels`` and ``label_options``, which are arguments of ``MixedScans``, and ``rate``, its learning rate as a
-    share of yours; ``held_out``, a folder of scans without labels; and ``predictions``, the folder to write one
-    ``NNNNNN.label`` to for each of them. All folders of scans have SemanticKITTI's layout, and predictions its values:
-    (N,) uint32, one for each point.
+    ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the
+    folder of the labelled scans; ``stages``, one after the other, each with ``iterations``,
+    ``ratio``, ``synthetic`` (a folder, or null), ``labels`` and ``label_options``, which are
+    arguments of ``MixedScans``, and ``rate``, its learning rate as a share of yours; ``held_out``,
+    a folder of scans without labels; and ``predictions``, the folder to write one ``NNNNNN.label``
+    to for each of them. All folders of scans have SemanticKITTI's layout, and predictions its
+    values: (N,) uint32, one for each point.
 
     Args:
         command: the words of the command, as a shell would split them.
@@ -47,7 +49,10 @@ class CommandTrainer:
 
     def __post_init__(self) -> None:
         if FIELD not in self.command:
-            raise ConfigError(f"trainer {self.command!r}", f"a command with {FIELD}, such as 'python my.py {FIELD}'")
+            raise ConfigError(
+                f"trainer {self.command!r}",
+                f"a command with {FIELD}, such as 'python my.py {FIELD}'",
+            )
 
     def __call__(self, job: Job) -> NDArray[np.int64]:
         """(19, 19) confusion table of the predictions.
@@ -57,15 +62,19 @@ class CommandTrainer:
             FileError, DataError: on missing or wrong predictions.
         """
         write_scans(job.real, job.folder / "real")
-        write_scans([replace(s, label=None, raw_label=None, instance=None) for s in job.held_out],
-                    job.folder / "held_out")  # fmt: skip
+        write_scans(
+            [replace(s, label=None, raw_label=None, instance=None) for s in job.held_out],
+            job.folder / "held_out",
+        )
         path = job.folder / "job.yaml"
         write_file(path, yaml.safe_dump(describe(job), sort_keys=False).encode())
         words = [word.replace(FIELD, str(path)) for word in shlex.split(self.command)]
         try:
             done = subprocess.run(words, capture_output=True, text=True, errors="replace")
         except OSError as error:
-            raise ProcessError(f"trainer {words[0]!r} does not start ({error.strerror})", "a command") from error
+            raise ProcessError(
+                f"trainer {words[0]!r} does not start ({error.strerror})", "a command"
+            ) from error
         if done.returncode:
             raise ProcessError(
                 f"trainer {shlex.join(words)} ended with status {done.returncode}: "
@@ -83,11 +92,16 @@ def describe(job: Job) -> dict[str, Any]:
         options = options_of(stage, list(job.real), job.objects)
         if isinstance(options.get("objects"), ObjectBank):
             options["objects"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
-        stages.append({
-            "iterations": iterations, "ratio": float(stage.ratio),
-            "synthetic": None if not stage.ratio or folder is None else str(folder.resolve()),
-            "labels": stage.labels, "label_options": options, "rate": stage.rate,
-        })  # fmt: skip
+        stages.append(
+            {
+                "iterations": iterations,
+                "ratio": float(stage.ratio),
+                "synthetic": None if not stage.ratio or folder is None else str(folder.resolve()),
+                "labels": stage.labels,
+                "label_options": options,
+                "rate": stage.rate,
+            }
+        )
     home = job.folder.resolve()
     folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}
     plain = {"arm": job.row.key, "place": job.place, "seed": job.seed, "batch": job.batch}
@@ -110,10 +124,13 @@ def _table(scans: Sequence[Scan], folder: Path) -> NDArray[np.int64]:
         raw = read_values(path, "<u4")
         assert scan.label is not None
         if len(raw) != len(scan):
-            raise DataError(f"{path} with {len(raw)} predictions", f"{len(scan)}, one for each point")
+            raise DataError(
+                f"{path} with {len(raw)} predictions", f"{len(scan)}, one for each point"
+            )
         predicted = SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
         valid = scan.label != IGNORE
-        # A return without a prediction is an error: it counts as a class with which its own is never pooled.
+        # A return without a prediction is an error: it counts as a class with which its own is
+        # never pooled.
         wrong = np.where(scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"])
         given = np.where(predicted == IGNORE, wrong, predicted)
         pairs = scan.label[valid].astype(np.int64) * count + given[valid]

@@ -6,9 +6,22 @@ from typing import Any
 
 import numpy as np
 
-WIDTH, LEFT, RIGHT = 980, 300, 40
+WIDTH = 980
+LEFT = 300
+RIGHT = 40
 ROW = 30
-COLOURS = ("#7a8494", "#1f6feb", "#11733a", "#b3261e", "#8a4fd3", "#c77700", "#0b7285", "#a1286a", "#5c6f00", "#333")
+COLOURS = (
+    "#7a8494",
+    "#1f6feb",
+    "#11733a",
+    "#b3261e",
+    "#8a4fd3",
+    "#c77700",
+    "#0b7285",
+    "#a1286a",
+    "#5c6f00",
+    "#333",
+)
 
 
 def differences(arms: Sequence[Mapping[str, Any]]) -> str:
@@ -17,31 +30,48 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
     if not shown:
         return ""
     ends = [v for row in shown for v in (row["difference"], *(row["interval"] or ()))]
-    low, high = min(-1.0, *ends), max(1.0, *ends)
+    low = min(-1.0, *ends)
+    high = max(1.0, *ends)
     margin = 0.06 * (high - low)
-    low, high = low - margin, high + margin
+    low = low - margin
+    high = high + margin
 
     def x(value: float) -> float:
         return float(LEFT + (WIDTH - LEFT - RIGHT) * (value - low) / (high - low))
 
     height = ROW * len(shown) + 30
-    parts = [f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences of the mIoU">']
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences of the mIoU">'
+    ]
     for tick in ticks(low, high):
         colour, width = ("#1b1f27", 1.4) if tick == 0 else ("#d8dce4", 1)
-        parts.append(f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="4" y2="{height - 22}" stroke="{colour}" '
-                     f'stroke-width="{width}"/>')  # fmt: skip
-        parts.append(f'<text x="{x(tick):.1f}" y="{height - 6}" text-anchor="middle" fill="#5d6573">{tick:+g}</text>')
+        parts.append(
+            f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="4" y2="{height - 22}" stroke="{colour}" '
+            f'stroke-width="{width}"/>'
+        )
+        parts.append(
+            f'<text x="{x(tick):.1f}" y="{height - 6}" text-anchor="middle" fill="#5d6573">{tick:+g}</text>'
+        )
     for number, row in enumerate(shown):
         y = 4 + ROW * (number + 0.5)
         colour = "#1f6feb" if row["synthetic"] else "#7a8494"
-        parts.append(f'<text x="{LEFT - 14}" y="{y + 4:.1f}" text-anchor="end">{html.escape(row["title"])}</text>')
+        parts.append(
+            f'<text x="{LEFT - 14}" y="{y + 4:.1f}" text-anchor="end">{html.escape(row["title"])}</text>'
+        )
         if row["interval"] is not None:
             a, b = row["interval"]
-            parts.append(f'<line x1="{x(a):.1f}" x2="{x(b):.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{colour}" '
-                         'stroke-width="5" stroke-opacity=".35" stroke-linecap="round"/>')  # fmt: skip
-        parts += [f'<circle cx="{x(v):.1f}" cy="{y:.1f}" r="2.5" fill="{colour}" fill-opacity=".45"/>'
-                  for v in row["by_place"].values() if v is not None and low <= v <= high]  # fmt: skip
-        parts.append(f'<circle cx="{x(row["difference"]):.1f}" cy="{y:.1f}" r="6" fill="{colour}"/>')
+            parts.append(
+                f'<line x1="{x(a):.1f}" x2="{x(b):.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{colour}" '
+                'stroke-width="5" stroke-opacity=".35" stroke-linecap="round"/>'
+            )
+        parts += [
+            f'<circle cx="{x(v):.1f}" cy="{y:.1f}" r="2.5" fill="{colour}" fill-opacity=".45"/>'
+            for v in row["by_place"].values()
+            if v is not None and low <= v <= high
+        ]
+        parts.append(
+            f'<circle cx="{x(row["difference"]):.1f}" cy="{y:.1f}" r="6" fill="{colour}"/>'
+        )
     return "".join([*parts, "</svg>"])
 
 
@@ -52,30 +82,46 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
         return ""
     last = max(step for row in shown for step, _ in row["curve"])
     top = max(value for row in shown for _, value in row["curve"]) * 1.08
-    left, bottom, width, height = 46, 300, 560, 280
+    left = 46
+    bottom = 300
+    width = 560
+    height = 280
 
     def at(step: float, value: float) -> str:
         return f"{left + width * step / last:.1f},{bottom - height * value / top:.1f}"
 
     legend = 24 * len(shown)
-    parts = [f'<svg viewBox="0 0 {WIDTH} {max(bottom + 34, legend + 20)}" role="img" aria-label="mIoU by iterations">']
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {max(bottom + 34, legend + 20)}" role="img" aria-label="mIoU by iterations">'
+    ]
     for tick in ticks(0, top):
         y = bottom - height * tick / top
-        parts.append(f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" stroke="#d8dce4"/>')
-        parts.append(f'<text x="{left - 8}" y="{y + 4:.1f}" text-anchor="end" fill="#5d6573">{tick:g}</text>')
+        parts.append(
+            f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" stroke="#d8dce4"/>'
+        )
+        parts.append(
+            f'<text x="{left - 8}" y="{y + 4:.1f}" text-anchor="end" fill="#5d6573">{tick:g}</text>'
+        )
     for tick in ticks(0, last):
         x = left + width * tick / last
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" fill="#5d6573">{tick:g}</text>')
+        parts.append(
+            f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" fill="#5d6573">{tick:g}</text>'
+        )
     parts.append(
         f'<text x="{left + width / 2}" y="{bottom + 33}" text-anchor="middle" fill="#5d6573">iterations</text>'
     )
     for number, row in enumerate(shown):
-        colour, dash = COLOURS[number % len(COLOURS)], "" if row["synthetic"] else ' stroke-dasharray="5 4"'
+        colour = COLOURS[number % len(COLOURS)]
+        dash = "" if row["synthetic"] else ' stroke-dasharray="5 4"'
         line = " ".join(at(step, value) for step, value in row["curve"])
-        parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"{dash}/>')
+        parts.append(
+            f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"{dash}/>'
+        )
         y = 18 + 24 * number
-        parts.append(f'<line x1="{left + width + 24}" x2="{left + width + 50}" y1="{y}" y2="{y}" stroke="{colour}" '
-                     f'stroke-width="2"{dash}/>')  # fmt: skip
+        parts.append(
+            f'<line x1="{left + width + 24}" x2="{left + width + 50}" y1="{y}" y2="{y}" stroke="{colour}" '
+            f'stroke-width="2"{dash}/>'
+        )
         words = html.escape(row["title"] if len(row["title"]) < 48 else row["title"][:46] + " …")
         parts.append(f'<text x="{left + width + 58}" y="{y + 4}">{words}</text>')
     return "".join([*parts, "</svg>"])

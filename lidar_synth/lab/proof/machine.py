@@ -15,10 +15,14 @@ def machine() -> str:
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     name = names[0] if names else platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores, no GPU used, torch {torch.__version__.partition('+')[0]}"
+    return (
+        f"{name}, {os.cpu_count()} cores, no GPU used, torch {torch.__version__.partition('+')[0]}"
+    )
 
 
 def command_line() -> str:
     """The command of this process, as a user would type it."""
     program = Path(sys.argv[0]).name
-    return shlex.join(["lidar-synth" if program in ("lidar-synth", "__main__.py") else program, *sys.argv[1:]])
+    return shlex.join(
+        ["lidar-synth" if program in ("lidar-synth", "__main__.py") else program, *sys.argv[1:]]
+    )

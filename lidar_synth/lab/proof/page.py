@@ -1,4 +1,5 @@
-"""The page of a comparison: one HTML file that needs no network, for a reader who decides and does not train."""
+"""The page of a comparison: one HTML file that needs no network, for a reader who decides and does
+not train."""
 
 import html
 import re
@@ -29,23 +30,32 @@ def body(values: Values) -> str:
     """The HTML of the page's content."""
     first, _, rest = _sentences(values["headline"])
     parts = [
-        f'<p class="headline">{_text(first)}</p>', f'<p class="more">{_text(rest)}</p>' if rest else "",
+        f'<p class="headline">{_text(first)}</p>',
+        f'<p class="more">{_text(rest)}</p>' if rest else "",
         f"<p>{_text(what_was_done(values))}</p>",
-        _section("Change of the mIoU against real scans only", differences(values["arms"]), _DIFFERENCE),
+        _section(
+            "Change of the mIoU against real scans only", differences(values["arms"]), _DIFFERENCE
+        ),
         _section("Table", _table(values)),
         _section("During the training", curves(values["arms"]), "Mean mIoU on the places left out.")
-        if any(len(row["curve"]) > 1 for row in values["arms"]) else "",
-        _section("IoU by class, %", _classes(values), "Over all tested scans together. – : no label of this class."),
+        if any(len(row["curve"]) > 1 for row in values["arms"])
+        else "",
+        _section(
+            "IoU by class, %",
+            _classes(values),
+            "Over all tested scans together. – : no label of this class.",
+        ),
         _section("By place: change of the mIoU", _places(values)),
         _section("What was not tested", _list(values["limits"])),
         _section("How it was measured", _list(protocol(values))),
-    ]  # fmt: skip
+    ]
     return "\n".join(filter(None, parts))
 
 
 _USES = "what it uses"
 _DIFFERENCE = (
-    "Percentage points. A dot is the mean over places and seeds, the bar its 95 % interval (bootstrap over places and "
+    "Percentage points. A dot is the mean over places and seeds, the bar its 95 % interval "
+    "(bootstrap over places and "
     "seeds). Where the bar crosses 0, the difference may be chance."
 )
 
@@ -53,10 +63,14 @@ _DIFFERENCE = (
 def what_was_done(values: Values) -> str:
     """One paragraph for a reader who has never seen such a comparison."""
     return (
-        f"The same small network was trained in {len(values['arms'])} ways on the same {values['labelled']} labelled "
-        f"scans, and tested on places that it had not seen: each of {len(values['tested_places'])} places was left out "
-        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations "
-        "and augmentation, unless the table says otherwise. mIoU is the mean over classes of the share of "
+        f"The same small network was trained in {len(values['arms'])} ways on the same "
+        f"{values['labelled']} labelled "
+        "scans, and tested on places that it had not seen: each of "
+        f"{len(values['tested_places'])} places was left out "
+        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have "
+        "the same iterations "
+        "and augmentation, unless the table says otherwise. mIoU is the mean over classes of the "
+        "share of "
         "correctly labelled returns (intersection over union)."
     )
 
@@ -64,37 +78,63 @@ def what_was_done(values: Values) -> str:
 def protocol(values: Values) -> list[str]:
     """The facts that another person needs to repeat it."""
     settings = values["settings"]
-    used = [f"{name} ({facts['scans']} scans, {facts['tested']} tested)" for name, facts in values["places"].items()]
+    used = [
+        f"{name} ({facts['scans']} scans, {facts['tested']} tested)"
+        for name, facts in values["places"].items()
+    ]
     return [
         f"Places: {', '.join(used)}. Tested: {', '.join(values['tested_places'])}.",
-        f"Label budget: {values['labelled']} labelled scans in each training, from as many places as possible; another "
+        f"Label budget: {values['labelled']} labelled scans in each training, from as many places "
+        "as possible; another "
         "choice with each place and seed. The table says what else an arm uses.",
-        f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} scans, grid of "
-        f"{settings['columns']} columns, {values['precision']}; turned and mirrored at random in all arms.",
-        f"Classes: {', '.join(values['classes'])}." + (f" Not in your labels: {', '.join(values['absent'])}."
-                                                      if values["absent"] else ""),
+        f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} "
+        "scans, grid of "
+        f"{settings['columns']} columns, {values['precision']}; turned and mirrored at random in "
+        "all arms.",
+        f"Classes: {', '.join(values['classes'])}."
+        + (f" Not in your labels: {', '.join(values['absent'])}." if values["absent"] else ""),
         f"Sensor: {values['sensor']}. Machine: {values['machine']}. Date: {values['date']}.",
         f"Command: {values['command']}",
-    ]  # fmt: skip
+    ]
 
 
 def _sentences(text: str) -> tuple[str, str, str]:
     """The first sentence of a text, and the rest."""
     match = re.search(r"\. (?=[A-Z])", text)
-    return (text, "", "") if match is None else (text[: match.start() + 1], " ", text[match.end() :])
+    return (
+        (text, "", "") if match is None else (text[: match.start() + 1], " ", text[match.end() :])
+    )
 
 
 def _table(values: Values) -> str:
-    head = ("training", "mIoU, %", "change", "95 % interval", "better in", "iterations", "minutes", _USES)
-    gains = [row["difference"] for row in values["arms"] if row["difference"] is not None and row["synthetic"]]
+    head = (
+        "training",
+        "mIoU, %",
+        "change",
+        "95 % interval",
+        "better in",
+        "iterations",
+        "minutes",
+        _USES,
+    )
+    gains = [
+        row["difference"]
+        for row in values["arms"]
+        if row["difference"] is not None and row["synthetic"]
+    ]
     rows = []
     for row in values["arms"]:
         best = bool(gains) and row["synthetic"] and row["difference"] == max(gains)
         cells = [
-            _cell(row["title"]), _cell(f"{row['miou']:.1f}"), _cell(signed(row["difference"]), _sign(row)),
-            _cell(span(row["interval"]) if row["arm"] != BASE else ""), _cell(row["better_in"]),
-            _cell(str(row["iterations"])), _cell(f"{row['minutes']:.1f}"), _cell(row["budget"], "text"),
-        ]  # fmt: skip
+            _cell(row["title"]),
+            _cell(f"{row['miou']:.1f}"),
+            _cell(signed(row["difference"]), _sign(row)),
+            _cell(span(row["interval"]) if row["arm"] != BASE else ""),
+            _cell(row["better_in"]),
+            _cell(str(row["iterations"])),
+            _cell(f"{row['minutes']:.1f}"),
+            _cell(row["budget"], "text"),
+        ]
         rows.append(f"<tr{' class=best' * best}>{''.join(cells)}</tr>")
     return _grid(head, rows)
 
@@ -103,7 +143,9 @@ def _classes(values: Values) -> str:
     arms = values["arms"]
     rows = []
     for name in arms[0]["iou"]:
-        cells = [_cell(name)] + [_cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}") for row in arms]
+        cells = [_cell(name)] + [
+            _cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}") for row in arms
+        ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _grid(["class", *(row["title"] for row in arms)], rows)
 

@@ -1,7 +1,8 @@
 """The places of a labelled dataset: groups of scans that show nothing of each other.
 
-A network that is tested on a street on which it was trained looks better than it is, and neighbouring frames show one
-street. Scans of one place are therefore all trained on or all tested on.
+A network that is tested on a street on which it was trained looks better than it is, and
+neighbouring frames show one street. Scans of one place are therefore all trained on or all tested
+on.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +33,8 @@ def by_drive(source: Source, names: Sequence[str]) -> Places:
 
 
 def by_pose(source: Source, names: Sequence[str]) -> Places:
-    """A place for each cluster of poses; different clusters are at least ``APART`` metres from each other.
+    """A place for each cluster of poses; different clusters are at least ``APART`` metres from each
+    other.
 
     Drives are kept apart, because many datasets give the poses of each drive from its own start.
 
@@ -52,7 +54,8 @@ def by_pose(source: Source, names: Sequence[str]) -> Places:
 
 
 def by_stretch(source: Source, names: Sequence[str], count: int = STRETCHES) -> Places:
-    """Equal stretches of each drive in the order of its frames; a share of ``LEFT_OUT`` between them is left out."""
+    """Equal stretches of each drive in the order of its frames; a share of ``LEFT_OUT`` between
+    them is left out."""
     places: Places = {}
     for drive, indices in by_drive(source, names).items():
         gap = LEFT_OUT * len(indices) / (count - 1)
@@ -65,8 +68,10 @@ def by_stretch(source: Source, names: Sequence[str], count: int = STRETCHES) -> 
 
 
 SPLITS: dict[str, Callable[[Source, Sequence[str]], Places]] = {
-    "drive": by_drive, "pose": by_pose, "stretch": by_stretch,
-}  # fmt: skip
+    "drive": by_drive,
+    "pose": by_pose,
+    "stretch": by_stretch,
+}
 """Ways to find places, by name."""
 
 
@@ -75,8 +80,8 @@ def find_places(source: Source, by: str = "auto") -> Places:
 
     Args:
         source: scans; their names are its ``ids`` or those of the scans.
-        by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise clusters of poses.
-            ``"stretch:2"`` is the split with two stretches.
+        by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise
+            clusters of poses. ``"stretch:2"`` is the split with two stretches.
 
     Raises:
         ConfigError: on an unknown split.
@@ -85,7 +90,9 @@ def find_places(source: Source, by: str = "auto") -> Places:
     by, mark, count = by.partition(":")
     counted = by == "stretch" and count.isdigit() and int(count) > 1
     if (by != "auto" and by not in SPLITS) or (count and not counted):
-        raise ConfigError(f"places by {by + mark + count!r}", f"one of auto, {', '.join(SPLITS)}, or stretch:2")
+        raise ConfigError(
+            f"places by {by + mark + count!r}", f"one of auto, {', '.join(SPLITS)}, or stretch:2"
+        )
     names = names_of(source)
     if by == "auto":
         by = "drive" if len(by_drive(source, names)) > 1 or not _has_pose(source) else "pose"
@@ -93,9 +100,11 @@ def find_places(source: Source, by: str = "auto") -> Places:
     if len(places) < 2:
         raise DataError(
             f"{len(source)} scans of one place ({next(iter(places))})",
-            "scans of at least two places, better of five or more: networks are tested on places that they have not "
+            "scans of at least two places, better of five or more: networks are tested on places "
+            "that they have not "
             "seen",
-            "Add drives or sequences. If a single drive is all there is, split it: --places stretch "
+            "Add drives or sequences. If a single drive is all there is, split it: --places "
+            "stretch "
             "(places='stretch').",
         )
     return dict(sorted(places.items()))
@@ -108,11 +117,14 @@ def names_of(source: Source) -> list[str]:
 
 
 def clusters(positions: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
-    """(N,) number of the cluster of each position (N, 3); two clusters are at least ``apart`` from each other.
+    """(N,) number of the cluster of each position (N, 3); two clusters are at least ``apart`` from
+    each other.
 
     Positions in the same or in neighbouring squares of side ``apart`` are of one cluster.
     """
-    squares, square = np.unique(np.floor(positions[:, :2] / apart).astype(np.int64), axis=0, return_inverse=True)
+    squares, square = np.unique(
+        np.floor(positions[:, :2] / apart).astype(np.int64), axis=0, return_inverse=True
+    )
     numbers = {tuple(s): i for i, s in enumerate(squares.tolist())}
     cluster = np.full(len(squares), -1, np.int64)
     count = 0
@@ -136,13 +148,16 @@ def _position(source: Source, index: int) -> NDArray[np.float64]:
     scan = source[index]
     if scan.pose is None:
         raise DataError(
-            f"scan {scan.id!r} without a pose", "poses, to find places by", "Use --places drive or --places stretch."
+            f"scan {scan.id!r} without a pose",
+            "poses, to find places by",
+            "Use --places drive or --places stretch.",
         )
     return scan.pose[:3, 3]
 
 
 def choose(places: Places, without: str, count: int | None, rng: np.random.Generator) -> list[int]:
-    """The labelled scans to train on: at random, from as many places as possible, none from the place left out.
+    """The labelled scans to train on: at random, from as many places as possible, none from the
+    place left out.
 
     Args:
         places: the places.
@@ -153,12 +168,17 @@ def choose(places: Places, without: str, count: int | None, rng: np.random.Gener
     Raises:
         ConfigError: on more scans than there are.
     """
-    piles = [rng.permutation(indices).tolist() for name, indices in places.items() if name != without]
+    piles = [
+        rng.permutation(indices).tolist() for name, indices in places.items() if name != without
+    ]
     there = sum(map(len, piles))
     if count is None:
         return sorted(i for pile in piles for i in pile)
     if not 1 <= count <= there:
-        raise ConfigError(f"{count} labelled scans", f"1 to {there}, the scans of the places other than {without!r}")
+        raise ConfigError(
+            f"{count} labelled scans",
+            f"1 to {there}, the scans of the places other than {without!r}",
+        )
     order = [piles[i] for i in rng.permutation(len(piles))]
     dealt = [pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)]
     return sorted(dealt[:count])
@@ -166,5 +186,7 @@ def choose(places: Places, without: str, count: int | None, rng: np.random.Gener
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
     """At most ``count`` of the indices, evenly spread."""
-    picks = np.unique(np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int))
+    picks = np.unique(
+        np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
+    )
     return [indices[i] for i in picks]

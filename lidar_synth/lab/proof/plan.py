@@ -1,7 +1,7 @@
 """The plan of a comparison: places, labelled scans and trainings.
 
-A *pair* is a place that is left out and a seed; it has one training of every arm, on the same labelled scans. Only
-whole pairs are compared.
+A *pair* is a place that is left out and a seed; it has one training of every arm, on the same
+labelled scans. Only whole pairs are compared.
 """
 
 from dataclasses import asdict, dataclass
@@ -70,24 +70,36 @@ class ProofPlan:
         return len(next(iter(self.labelled.values())))
 
     def skin_scans(self, place: str) -> list[int]:
-        """Indices of the scans, of other places than this, that a skin is learnt from; their labels are not used."""
+        """Indices of the scans, of other places than this, that a skin is learnt from; their labels
+        are not used."""
         indices = [i for name, members in self.places.items() if name != place for i in members]
         return spread(indices, MOST_SKIN_SCANS)
 
     def seconds(self, row: Row) -> float:
-        """Expected seconds of the iterations of a training, without a pretraining that it shares with others."""
+        """Expected seconds of the iterations of a training, without a pretraining that it shares
+        with others."""
         shared = row.pretraining.share if row.pretraining and self.step else 0
         return self.settings.iterations * row.arm.iterations * (1 - shared) * self.step
 
     def identity(self) -> dict[str, Any]:
-        """Plain values that determine every training, to tell whether one that exists may be kept."""
+        """Plain values that determine every training, to tell whether one that exists may be
+        kept."""
         own = asdict(self.settings)
-        free = ("arms", "ratios", "seeds", "classes", "only")  # they add trainings, or score the same ones
+        free = (
+            "arms",
+            "ratios",
+            "seeds",
+            "classes",
+            "only",
+        )  # they add trainings, or score the same ones
         digest = hash_of_names(self.names)
         return {
-            "format": FORMAT, "scans": digest, "sensor": self.sensor.name, "half": self.half,
+            "format": FORMAT,
+            "scans": digest,
+            "sensor": self.sensor.name,
+            "half": self.half,
             **{name: value for name, value in own.items() if name not in free},
-        }  # fmt: skip
+        }
 
 
 def describe(plan: ProofPlan) -> str:
@@ -96,14 +108,22 @@ def describe(plan: ProofPlan) -> str:
     lines = [
         f"{len(plan.names)} scans of {plan.sensor.name} in {len(plan.places)} places: "
         + ", ".join(f"{name} ({len(members)})" for name, members in plan.places.items()),
-        f"each training gets {plan.budget} labelled scans and is tested on a place that was left out",
+        f"each training gets {plan.budget} labelled scans and is tested on a place that was left "
+        "out",
         f"tested places: {', '.join(tested)}; seeds: {len({seed for _, seed in plan.pairs})}; "
         f"{len(plan.pairs)} of {plan.wanted} pairs of place and seed",
-        f"classes without a label: {', '.join(plan.absent) or 'none'}", "trainings of each pair:",
-    ]  # fmt: skip
+        f"classes without a label: {', '.join(plan.absent) or 'none'}",
+        "trainings of each pair:",
+    ]
     for row in plan.rows:
         count = round(plan.settings.iterations * row.arm.iterations)
         uses = f" (uses {row.arm.budget})" if row.arm.budget else ""
-        lines.append(f"  {row.key:<16}{count} iterations of {plan.settings.batch}: {row.title}{uses}")
-    time = f"about {plan.minutes:.0f} minutes with {plan.jobs} processes" if plan.step else "time: that of your trainer"
+        lines.append(
+            f"  {row.key:<16}{count} iterations of {plan.settings.batch}: {row.title}{uses}"
+        )
+    time = (
+        f"about {plan.minutes:.0f} minutes with {plan.jobs} processes"
+        if plan.step
+        else "time: that of your trainer"
+    )
     return "\n".join([*lines, f"{len(plan.rows) * len(plan.pairs)} trainings; {time}"])

@@ -1,4 +1,5 @@
-"""Making the plan of a comparison: scans are read and checked, the labelled ones chosen, the time measured."""
+"""Making the plan of a comparison: scans are read and checked, the labelled ones chosen, the time
+measured."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -39,15 +40,16 @@ def make_plan(
         settings: what is asked for.
         minutes: limit of the time; None for all places and seeds.
         jobs: processes.
-        earlier: ``ProofPlan.identity`` of the comparison that is resumed. It computed in bfloat16 or not, as the
-            machine was faster then, and had fewer iterations if the time was short.
+        earlier: ``ProofPlan.identity`` of the comparison that is resumed. It computed in bfloat16
+            or not, as the machine was faster then, and had fewer iterations if the time was short.
 
     Returns:
         The plan, and {index: scan on the grid} of all labelled and tested scans.
 
     Raises:
         ConfigError: on settings that do not fit the scans, or too short a time.
-        DataError: on one place only, on scans without labels, or on a class that nothing is labelled as.
+        DataError: on one place only, on scans without labels, or on a class that nothing is
+            labelled as.
     """
     arms = rows(settings.arms, settings.ratios)
     groups = groups_of(_classes(source, settings.classes), settings.only)
@@ -68,9 +70,24 @@ def make_plan(
         settings = replace(settings, iterations=min(settings.iterations, earlier["iterations"]))
     names = tuple(names_of(source))
     plan = ProofPlan(
-        settings, places, names, sensor, grid, arms, groups, absent, pairs, len(pairs), labelled, tested,
-        recordings_of_scans(source, [names[i] for part in tested.values() for i in part]), half, step, 0.0, jobs,
-    )  # fmt: skip
+        settings,
+        places,
+        names,
+        sensor,
+        grid,
+        arms,
+        groups,
+        absent,
+        pairs,
+        len(pairs),
+        labelled,
+        tested,
+        recordings_of_scans(source, [names[i] for part in tested.values() for i in part]),
+        half,
+        step,
+        0.0,
+        jobs,
+    )
     return within(plan, minutes, resumed=bool(earlier)), scans
 
 
@@ -91,8 +108,9 @@ def _labelled(places: Places, pair: Pair, settings: ProofSettings) -> list[int]:
     if count < settings.batch:
         raise ConfigError(
             f"{count} labelled scans for batches of {settings.batch}, where {place!r} is left out",
-            "at least as many scans as a batch has", f"Use --batch {count} (batch={count}), or label more scans.",
-        )  # fmt: skip
+            "at least as many scans as a batch has",
+            f"Use --batch {count} (batch={count}), or label more scans.",
+        )
     number = sorted(places).index(place)
     return choose(places, place, count, np.random.default_rng((settings.seed, seed, number)))
 
@@ -101,9 +119,11 @@ def _read(source: Source, index: int, grid: Sensor | None) -> Scan:
     scan = source[index]
     if scan.label is None:
         raise DataError(
-            f"scan {scan.id!r} without labels", "labelled scans",
-            "lidar-synth label kitti360 makes labels for KITTI-360; other scans need a folder of labels.",
-        )  # fmt: skip
+            f"scan {scan.id!r} without labels",
+            "labelled scans",
+            "lidar-synth label kitti360 makes labels for KITTI-360; other scans need a folder of "
+            "labels.",
+        )
     wrong = (scan.label >= len(NAMES)) & (scan.label != IGNORE)
     if wrong.any():
         raise DataError(

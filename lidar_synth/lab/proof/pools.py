@@ -1,7 +1,8 @@
-"""Pools of synthetic scans, which all arms and seeds share: made once, kept in SemanticKITTI's layout.
+"""Pools of synthetic scans, which all arms and seeds share: made once, kept in SemanticKITTI's
+layout.
 
-A pool is a folder; ``objects.npz`` in the pool ``skin`` holds the objects that are pasted. An interrupted pool is
-continued where it stopped.
+A pool is a folder; ``objects.npz`` in the pool ``skin`` holds the objects that are pasted. An
+interrupted pool is continued where it stopped.
 """
 
 import json
@@ -40,7 +41,10 @@ TOWN_SEED = 4242
 """Seed of the towns in pools; the next one is taken where the dataset is that town."""
 MOST_SKIN_SCANS = 60
 SKIN_STREETS = 16
-SETTINGS, DONE, OBJECTS, SKIN = "pool.json", "complete", "objects.npz", "own.skin"
+SETTINGS = "pool.json"
+DONE = "complete"
+OBJECTS = "objects.npz"
+SKIN = "own.skin"
 
 
 @dataclass(frozen=True)
@@ -86,25 +90,31 @@ def skinned_town(task: PoolTask) -> Iterator[Scan]:
                 f"{len(scans)} scans to learn a skin from",
                 f"at least {FEWEST_SCANS} in the places that are trained on",
                 "Leave out the arms with a skin: --arm real --arm exchange --arm town.",
-            )  # fmt: skip
+            )
         fit_skin(scans, task.sensor, streets=SKIN_STREETS, progress=False).save(path)
     yield from _streets(task, load_skin(path))
 
 
 def generated(task: PoolTask) -> Iterator[Scan]:
-    """Scans of a generator, turned into scans of the user's sensor where theirs is another one. What a model with a
-    condition needs, the town gives: label maps or layouts of its streets."""
+    """Scans of a generator, turned into scans of the user's sensor where theirs is another one.
+    What a model with a condition needs, the town gives: label maps or layouts of its streets."""
     generator = load_generator(task.model)
     change = None if _alike(generator.sensor, task.sensor) else Transfer(task.sensor)
-    streets = repeat(None) if generator.condition is None else _streets(replace(task, sensor=generator.sensor), None)
+    streets = (
+        repeat(None)
+        if generator.condition is None
+        else _streets(replace(task, sensor=generator.sensor), None)
+    )
     for index, street in zip(range(task.count), streets, strict=False):
         [scan] = generator.scans(0, [index], street)
         yield scan if change is None else change(scan, keyed_rng(0, index))
 
 
 POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
-    "town": raw_town, "skin": skinned_town, "generator": generated,
-}  # fmt: skip
+    "town": raw_town,
+    "skin": skinned_town,
+    "generator": generated,
+}
 """Makers of pools by name."""
 
 
@@ -120,7 +130,8 @@ def make_pool(task: PoolTask) -> Path:
     if (task.folder / DONE).is_file():
         return task.folder
     writer = SemanticKITTIWriter(task.folder)
-    made, boxed = 0, []
+    made = 0
+    boxed = []
     for scan in POOLS[task.kind](task):
         kept = scan if task.grid is None else thinned(scan, task.grid)
         writer.write(kept, made, name=f"00/{made:06d}")
@@ -128,7 +139,10 @@ def make_pool(task: PoolTask) -> Path:
         boxed += [kept] if task.kind == "skin" and kept.boxes is not None else []
     if boxed:
         _save_objects(boxed, task.folder / OBJECTS)
-    write_file(task.folder / DONE, json.dumps({"scans": made, "seconds": time.monotonic() - start}).encode())
+    write_file(
+        task.folder / DONE,
+        json.dumps({"scans": made, "seconds": time.monotonic() - start}).encode(),
+    )
     return task.folder
 
 
@@ -153,14 +167,19 @@ def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> 
     Args:
         model: its name or path.
         tested: the recordings of the tested scans.
-        scans: those of them that are known by their content only; read if the generator has learnt from such scans.
+        scans: those of them that are known by their content only; read if the generator has learnt
+            from such scans.
 
     Raises:
-        ConfigError: if it was; the message names drives and frames. On a model that needs camera images.
+        ConfigError: if it was; the message names drives and frames. On a model that needs camera
+            images.
     """
     generator = load_generator(model)
     if generator.condition == "camera":
-        raise ConfigError(f"generator {model!r}, which needs camera images", "one that needs none, such as town-dense")
+        raise ConfigError(
+            f"generator {model!r}, which needs camera images",
+            "one that needs none, such as town-dense",
+        )
     seen = seen_by(generator.header.provenance)
     if any(dataset == CONTENT for dataset, _ in seen.drives):
         tested = tested | contents(map(content_of, scans))
@@ -187,7 +206,11 @@ def _settings(task: PoolTask) -> dict[str, Any]:
     streets = {"seed": task.town_seed}
     if task.kind == "generator":
         header, checkpoint = read_header(find_model(task.model))
-        return plain | {"model": task.model, "checkpoint": checkpoint} | (streets if header.conditioning else {})
+        return (
+            plain
+            | {"model": task.model, "checkpoint": checkpoint}
+            | (streets if header.conditioning else {})
+        )
     learnt = hash_of_names(task.learnt)
     return plain | streets | ({"learnt_from": learnt} if task.kind == "skin" else {})
 
@@ -208,5 +231,6 @@ def _save_objects(scans: list[Scan], path: Path) -> None:
 
 def _alike(some: Sensor, other: Sensor) -> bool:
     """Whether two sensors have beams of the same elevations."""
-    a, b = some.laser_elevations, other.laser_elevations
+    a = some.laser_elevations
+    b = other.laser_elevations
     return a.shape == b.shape and bool(np.abs(a - b).max() < np.radians(0.1))

@@ -1,4 +1,5 @@
-"""From confusion tables to what can be said: IoU by class, paired differences, and intervals over places and seeds."""
+"""From confusion tables to what can be said: IoU by class, paired differences, and intervals over
+places and seeds."""
 
 from collections.abc import Mapping, Sequence
 from math import sqrt
@@ -27,7 +28,11 @@ GROUPS: dict[str, Groups] = {
         "traffic-sign": ("traffic-sign",),
     },
     "kitti360": {
-        **{name: (name,) for name in NAMES if name not in ("bicyclist", "motorcyclist", "vegetation", "trunk")},
+        **{
+            name: (name,)
+            for name in NAMES
+            if name not in ("bicyclist", "motorcyclist", "vegetation", "trunk")
+        },
         "rider": ("bicyclist", "motorcyclist"),
         "vegetation": ("vegetation", "trunk"),
     },
@@ -49,7 +54,8 @@ GROUPS: dict[str, Groups] = {
 """The classes that a dataset labels as the package does, once they are pooled; by its layout."""
 
 FEWEST_PLACES = 6
-"""Places from which an interval is given: with fewer, even the range of all differences is no 95 % interval."""
+"""Places from which an interval is given: with fewer, even the range of all differences is no 95 %
+interval."""
 DRAWS = 10_000
 
 
@@ -67,7 +73,9 @@ def groups_of(classes: str, only: Sequence[str] = ()) -> Groups:
         raise ConfigError(f"classes {classes!r}", f"one of {', '.join(GROUPS)}")
     groups = GROUPS[classes]
     if unknown := [name for name in only if name not in groups]:
-        raise ConfigError(f"class {', '.join(map(repr, unknown))} of {classes}", f"some of {', '.join(groups)}")
+        raise ConfigError(
+            f"class {', '.join(map(repr, unknown))} of {classes}", f"some of {', '.join(groups)}"
+        )
     return {name: members for name, members in groups.items() if not only or name in only}
 
 
@@ -82,21 +90,27 @@ def require_labels(table: NDArray[np.int64], groups: Groups, only: Sequence[str]
     Raises:
         DataError: if none of the groups, or one that was asked for, is labelled.
     """
-    absent = [name for name, members in groups.items() if not sum(table[TRAIN_ID[m]] for m in members)]
+    absent = [
+        name for name, members in groups.items() if not sum(table[TRAIN_ID[m]] for m in members)
+    ]
     if missing := [name for name in absent if name in only]:
         raise DataError(
-            f"class {', '.join(missing)}, which no label of your scans has", "classes that are labelled",
+            f"class {', '.join(missing)}, which no label of your scans has",
+            "classes that are labelled",
             f"These are: {', '.join(n for n in groups if n not in absent) or 'none'}.",
-        )  # fmt: skip
+        )
     if len(absent) == len(groups):
         raise DataError(
-            "scans without a label of any scored class", "labelled scans", "Check --classes, and the table of labels."
+            "scans without a label of any scored class",
+            "labelled scans",
+            "Check --classes, and the table of labels.",
         )
     return absent
 
 
 def group_ious(table: NDArray[np.int64], groups: Groups) -> NDArray[np.float64]:
-    """(G,) IoU of every group from a confusion table (19, 19); NaN for a group that no label has."""
+    """(G,) IoU of every group from a confusion table (19, 19); NaN for a group that no label
+    has."""
     count = len(groups)
     group = np.full(len(NAMES), count)
     for i, members in enumerate(groups.values()):
@@ -118,11 +132,12 @@ def mean_group_iou(table: NDArray[np.int64], groups: Groups) -> float:
 def interval(
     differences: NDArray[np.float64], level: float = 0.95, seed: int = 0, draws: int = DRAWS
 ) -> tuple[float, float] | None:
-    """Interval of the mean of paired differences, by a bootstrap over places and, within each, over seeds.
+    """Interval of the mean of paired differences, by a bootstrap over places and, within each, over
+    seeds.
 
-    Places are drawn with replacement, then as many seeds of each as it has. The quantiles are those at which the
-    interval of a mean has the right width for few places (the expanded percentile interval of Hesterberg, "What
-    Teachers Should Know About the Bootstrap", 2015, section 5.4).
+    Places are drawn with replacement, then as many seeds of each as it has. The quantiles are those
+    at which the interval of a mean has the right width for few places (the expanded percentile
+    interval of Hesterberg, "What Teachers Should Know About the Bootstrap", 2015, section 5.4).
 
     Args:
         differences: (P, S) of every place and seed; NaN where there is none.

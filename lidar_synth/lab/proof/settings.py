@@ -13,8 +13,8 @@ class ProofSettings:
     """The settings of ``prove``.
 
     Args:
-        labelled: number of labelled scans that each training gets; by default all of the training places, at most
-            ``MOST_LABELLED``.
+        labelled: number of labelled scans that each training gets; by default all of the training
+            places, at most ``MOST_LABELLED``.
         arms: names of ``ARMS``; "real" is always among them.
         ratios: shares of synthetic scans, for the arms in which they matter.
         iterations: of each training.
@@ -24,9 +24,11 @@ class ProofSettings:
         tested: largest number of scans of a place that are tested on, evenly spread.
         synthetic: scans of a pool.
         model: of the arms with a generator: a name or a path.
-        columns: of the grid that the reference network sees; None keeps scans as they are, for your own trainer.
+        columns: of the grid that the reference network sees; None keeps scans as they are, for your
+            own trainer.
         widths: channels of the reference network by level.
-        classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's layout.
+        classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's
+            layout.
         only: names of the classes that the mean IoU is over; all that occur by default.
         seed: of the choice of labelled scans and of the order of places.
 
@@ -64,6 +66,8 @@ class ProofSettings:
             raise ConfigError(f"iterations={self.iterations}", "10 or more")
         if self.labelled is not None and self.labelled < self.batch:
             raise ConfigError(
-                f"{self.labelled} labelled scans for batches of {self.batch}", "at least as many scans as a batch has",
-                f"Use --batch {max(1, self.labelled)} (batch={max(1, self.labelled)}), or label more scans.",
-            )  # fmt: skip
+                f"{self.labelled} labelled scans for batches of {self.batch}",
+                "at least as many scans as a batch has",
+                f"Use --batch {max(1, self.labelled)} (batch={max(1, self.labelled)}), or label "
+                "more scans.",
+            )

@@ -1,4 +1,5 @@
-"""``prove``: what synthetic scans add to a labelled dataset, measured on places that were left out."""
+"""``prove``: what synthetic scans add to a labelled dataset, measured on places that were left
+out."""
 
 import json
 import os
@@ -39,11 +40,25 @@ from lidar_synth.lab.proof.pools import (
 )
 from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.summary import Proof, Results, summarise
-from lidar_synth.lab.proof.trial import Job, Outcome, Trainer, pretrain, pretraining_seconds, reference, run_trainer
+from lidar_synth.lab.proof.trial import (
+    Job,
+    Outcome,
+    Trainer,
+    pretrain,
+    pretraining_seconds,
+    reference,
+    run_trainer,
+)
 from lidar_synth.labels import ObjectBank
 
-STUDY, GENERATOR, RUNS, POOLS, STARTS, JOBS = "study.json", "generator.json", "runs", "pools", "starts", "jobs"
-PAGE, RESULTS = "index.html", "results.json"
+STUDY = "study.json"
+GENERATOR = "generator.json"
+RUNS = "runs"
+POOLS = "pools"
+STARTS = "starts"
+JOBS = "jobs"
+PAGE = "index.html"
+RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
@@ -69,18 +84,28 @@ class Trainings:
     def path(self, row: Row, pair: Pair) -> Path:
         """The file of an outcome."""
         place, seed = pair
-        return self.out / RUNS / row.key / f"{seed}-{sorted(self.plan.places).index(place):03d}.json"
+        return (
+            self.out / RUNS / row.key / f"{seed}-{sorted(self.plan.places).index(place):03d}.json"
+        )
 
     def pool_folder(self, kind: str, place: str) -> Path:
-        """The folder of a pool: one for all places, but for skins, which must not know the place that is tested on."""
-        return self.pools / (kind if kind != "skin" else f"skin-{sorted(self.plan.places).index(place):03d}")
+        """The folder of a pool: one for all places, but for skins, which must not know the place
+        that is tested on."""
+        return self.pools / (
+            kind if kind != "skin" else f"skin-{sorted(self.plan.places).index(place):03d}"
+        )
 
     def start(self, row: Row, pair: Pair) -> Path | None:
-        """The file of the reference network after the row's pretraining, which all places of a seed share."""
+        """The file of the reference network after the row's pretraining, which all places of a seed
+        share."""
         stage, (place, seed) = row.pretraining, pair
         if stage is None or self.trainer is not reference:
             return None
-        return self.out / STARTS / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
+        return (
+            self.out
+            / STARTS
+            / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
+        )
 
     def pretrain(self, task: tuple[Row, Pair]) -> None:
         """Write the file of ``start``."""
@@ -106,16 +131,21 @@ class Trainings:
         folders = {kind: self.pool_folder(kind, place) for kind in kinds}
         used = {stage.pool for stage in row.stages()}
         return Job(
-            row, place, seed,
+            row,
+            place,
+            seed,
             real=[self.scans[i] for i in plan.labelled[pair]],
             held_out=[self.scans[i] for i in plan.tested[place]],
             pools={kind: _pool(folder) for kind, folder in folders.items() if kind in used},
             objects=_objects(folders["skin"]) if row.name == "paste" else None,
             iterations=round(plan.settings.iterations * row.arm.iterations),
-            batch=plan.settings.batch, widths=plan.settings.widths, half=plan.half,
+            batch=plan.settings.batch,
+            widths=plan.settings.widths,
+            half=plan.half,
             folder=self.out / JOBS / row.key / self.path(row, pair).stem,
-            pool_folders=folders, start=self.start(row, pair),
-        )  # fmt: skip
+            pool_folders=folders,
+            start=self.start(row, pair),
+        )
 
 
 @contextmanager
@@ -136,9 +166,10 @@ def _objects(folder: Path) -> ObjectBank | None:
     bank = read_objects(folder)
     if bank is None:
         raise DataError(
-            f"{folder} without objects to paste", "people, cyclists or trucks in the scans of the town",
+            f"{folder} without objects to paste",
+            "people, cyclists or trucks in the scans of the town",
             "Use more --synthetic scans, or leave out the arm 'paste'.",
-        )  # fmt: skip
+        )
     return bank
 
 
@@ -155,28 +186,32 @@ def prove(
 ) -> Proof:
     """Measure what synthetic scans add to your labelled scans, on places that no training has seen.
 
-    Every place is left out in turn. The same small network is trained on labelled scans of the other places in several
-    ways (``ARMS``), with the same scans, seeds, iterations, augmentation and schedule, and tested on the place left
-    out. The result is a page, ``index.html`` in ``out``. Run it again to resume, or to add arms and seeds.
+    Every place is left out in turn. The same small network is trained on labelled scans of the
+    other places in several ways (``ARMS``), with the same scans, seeds, iterations, augmentation
+    and schedule, and tested on the place left out. The result is a page, ``index.html`` in ``out``.
+    Run it again to resume, or to add arms and seeds.
 
     Args:
         scans: labelled scans: what ``open_scans`` opens, or a source.
         out: folder to write to.
         settings: of the comparison.
-        minutes: limit of the time; places and seeds are chosen so that it is kept, and if not even two fit,
-            the iterations of a training.
+        minutes: limit of the time; places and seeds are chosen so that it is kept, and if not even
+            two fit, the iterations of a training.
         jobs: processes of one thread each; by default one for each core.
-        trainer: your own in the place of the small network: a function that can be pickled, or a ``CommandTrainer``.
-        pools: folder of the synthetic scans, which several comparisons may share; by default in ``out``.
+        trainer: your own in the place of the small network: a function that can be pickled, or a
+            ``CommandTrainer``.
+        pools: folder of the synthetic scans, which several comparisons may share; by default in
+            ``out``.
         progress: whether to show progress bars.
 
     Returns:
         The result; ``print`` shows its table.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, a folder with another comparison, or a generator that was
-            trained on places that are tested.
-        DataError: on one place only, on scans without labels, or a class that nothing is labelled as.
+        ConfigError: on settings that do not fit the scans, a folder with another comparison, or a
+            generator that was trained on places that are tested.
+        DataError: on one place only, on scans without labels, or a class that nothing is labelled
+            as.
 
     Example:
         >>> from lidar_synth import ProofSettings, prove
@@ -202,7 +237,10 @@ def prove(
     work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
     _make_pools(work, source, progress)
     tasks = [
-        (row, pair) for pair in plan.pairs for row in plan.rows if not _is_there(work.path(row, pair), read_outcome)
+        (row, pair)
+        for pair in plan.pairs
+        for row in plan.rows
+        if not _is_there(work.path(row, pair), read_outcome)
     ]
     _pretrain(work, tasks, progress)
     with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
@@ -229,7 +267,9 @@ def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
         if all(path.is_file() for path in paths.values()):
             found[pair] = {row: read_outcome(path) for row, path in paths.items()}
     if not found:
-        raise DataError("no place with trainings of all arms", "at least one", "Give more --minutes.")
+        raise DataError(
+            "no place with trainings of all arms", "at least one", "Give more --minutes."
+        )
     costs = {row.key: _preparation(work, row) for row in plan.rows}
     proof = summarise(plan, found, costs, trainer, seen)
     write_file(work.out / RESULTS, (json.dumps(proof.values, indent=1) + "\n").encode())
@@ -241,8 +281,11 @@ def to_values(outcome: Outcome) -> dict[str, Any]:
     """An outcome as plain values."""
     curve = [[step, table.tolist()] for step, table in outcome.curve]
     return {
-        "table": outcome.table.tolist(), "curve": curve, "losses": outcome.losses, "seconds": outcome.seconds,
-    }  # fmt: skip
+        "table": outcome.table.tolist(),
+        "curve": curve,
+        "losses": outcome.losses,
+        "seconds": outcome.seconds,
+    }
 
 
 def read_outcome(path: Path) -> Outcome:
@@ -258,11 +301,14 @@ def read_outcome(path: Path) -> Outcome:
         curve = [(int(step), np.array(part, np.int64)) for step, part in values["curve"]]
         return Outcome(table, curve, [float(v) for v in values["losses"]], float(values["seconds"]))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it.") from error
+        raise DataError(
+            f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it."
+        ) from error
 
 
 def _is_there(path: Path, read: Callable[[Path], object]) -> bool:
-    """Whether a file is there and intact; a damaged one is set aside with a warning, to be made again."""
+    """Whether a file is there and intact; a damaged one is set aside with a warning, to be made
+    again."""
     if not path.is_file():
         return False
     try:
@@ -285,7 +331,8 @@ def _earlier(out: Path) -> dict[str, Any] | None:
 
 
 def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
-    plan, tasks = work.plan, {}
+    plan = work.plan
+    tasks = {}
     kinds = {kind for row in plan.rows for kind in row.arm.pools()}
     seed = town_seed(plan.recordings)
     for place in dict.fromkeys(place for place, _ in plan.pairs):
@@ -293,11 +340,20 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
             folder = work.pool_folder(kind, place)
             indices = plan.skin_scans(place)
             tasks[folder] = PoolTask(
-                kind, folder, plan.sensor, plan.grid, plan.settings.synthetic, seed, plan.settings.model,
-                partial(_scans, source, indices), tuple(plan.names[i] for i in indices),
-            )  # fmt: skip
+                kind,
+                folder,
+                plan.sensor,
+                plan.grid,
+                plan.settings.synthetic,
+                seed,
+                plan.settings.model,
+                partial(_scans, source, indices),
+                tuple(plan.names[i] for i in indices),
+            )
     with in_processes(make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))) as done:
-        for _ in tqdm(done, total=len(tasks), desc="synthetic scans", unit="pool", disable=not progress):
+        for _ in tqdm(
+            done, total=len(tasks), desc="synthetic scans", unit="pool", disable=not progress
+        ):
             pass
 
 
@@ -308,7 +364,9 @@ def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool
         for task in tasks
         if (path := work.start(*task)) is not None and not _is_there(path, pretraining_seconds)
     }
-    with in_processes(work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))) as done:
+    with in_processes(
+        work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))
+    ) as done:
         for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
             pass
 
@@ -331,5 +389,11 @@ def _preparation(work: Trainings, row: Row) -> float:
     for kind in row.arm.pools():
         folders = {work.pool_folder(kind, place) for place, _ in work.plan.pairs}
         total += float(np.mean([seconds_of(folder) for folder in folders]))
-    starts = {path for pair in work.plan.pairs if (path := work.start(row, pair)) is not None and path.is_file()}
-    return total + (float(np.mean([pretraining_seconds(path) for path in starts])) if starts else 0.0)
+    starts = {
+        path
+        for pair in work.plan.pairs
+        if (path := work.start(row, pair)) is not None and path.is_file()
+    }
+    return total + (
+        float(np.mean([pretraining_seconds(path) for path in starts])) if starts else 0.0
+    )

@@ -1,4 +1,5 @@
-"""The result of a comparison: what each arm reached, by how much it differs from real scans only, and a headline."""
+"""The result of a comparison: what each arm reached, by how much it differs from real scans only,
+and a headline."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -37,15 +38,22 @@ class Proof:
 
     def __str__(self) -> str:
         lines = [
-            self.headline, "",
-            f"| training | mIoU, % | against real only | 95 % interval | better in | {_BUDGET} | minutes |",
+            self.headline,
+            "",
+            f"| training | mIoU, % | against real only | 95 % interval | better in | {_BUDGET} | "
+            "minutes |",
             "|---|---:|---:|---|---|---|---:|",
-        ]  # fmt: skip
+        ]
         for row in self.values["arms"]:
             cells = (
-                row["title"], f"{row['miou']:.1f}", signed(row["difference"]), span(row["interval"]), row["better_in"],
-                row["budget"], f"{row['minutes']:.1f}",
-            )  # fmt: skip
+                row["title"],
+                f"{row['miou']:.1f}",
+                signed(row["difference"]),
+                span(row["interval"]),
+                row["better_in"],
+                row["budget"],
+                f"{row['minutes']:.1f}",
+            )
             lines.append(f"| {' | '.join(cells)} |")
         return "\n".join(lines)
 
@@ -63,7 +71,9 @@ def span(ends: Sequence[float] | None) -> str:
     return "–" if ends is None else f"[{ends[0]:+.1f}, {ends[1]:+.1f}]"
 
 
-def summarise(plan: ProofPlan, found: Results, preparation: Mapping[str, float], trainer: str, seen: str = "") -> Proof:
+def summarise(
+    plan: ProofPlan, found: Results, preparation: Mapping[str, float], trainer: str, seen: str = ""
+) -> Proof:
     """The result of some complete pairs.
 
     Args:
@@ -77,22 +87,40 @@ def summarise(plan: ProofPlan, found: Results, preparation: Mapping[str, float],
     seeds = sorted({seed for _, seed in found})
     scores = {row: _scores(plan, found, row, places, seeds) for row in plan.rows}
     base = scores[plan.rows[0]]
-    arms = [_arm(plan, found, row, scores, base, preparation.get(row.key, 0.0), places) for row in plan.rows]
+    arms = [
+        _arm(plan, found, row, scores, base, preparation.get(row.key, 0.0), places)
+        for row in plan.rows
+    ]
     for row in arms:
         row["budget"] = row["budget"].replace(GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}")
-    sizes = {name: {"scans": len(part), "tested": len(plan.tested[name])} for name, part in plan.places.items()}
+    sizes = {
+        name: {"scans": len(part), "tested": len(plan.tested[name])}
+        for name, part in plan.places.items()
+    }
     values: dict[str, Any] = {
         "labelled": plan.budget,
-        "labelled_scans": {f"{place}, seed {seed}": [plan.names[i] for i in plan.labelled[place, seed]]
-                           for place, seed in found},
+        "labelled_scans": {
+            f"{place}, seed {seed}": [plan.names[i] for i in plan.labelled[place, seed]]
+            for place, seed in found
+        },
         "places": sizes,
-        "tested_places": places, "seeds": len(seeds), "pairs": len(found), "planned_pairs": plan.wanted,
-        "classes": [name for name in plan.groups if name not in plan.absent], "absent": plan.absent,
-        "arms": arms, "trainer": trainer, "sensor": plan.sensor.name,
-        "settings": plan.identity() | {"columns": plan.settings.columns}, "iterations": plan.settings.iterations,
-        "batch": plan.settings.batch, "precision": "bfloat16" if plan.half else "float32",
-        "machine": machine(), "date": time.strftime("%Y-%m-%d"), "command": command_line(),
-    }  # fmt: skip
+        "tested_places": places,
+        "seeds": len(seeds),
+        "pairs": len(found),
+        "planned_pairs": plan.wanted,
+        "classes": [name for name in plan.groups if name not in plan.absent],
+        "absent": plan.absent,
+        "arms": arms,
+        "trainer": trainer,
+        "sensor": plan.sensor.name,
+        "settings": plan.identity() | {"columns": plan.settings.columns},
+        "iterations": plan.settings.iterations,
+        "batch": plan.settings.batch,
+        "precision": "bfloat16" if plan.half else "float32",
+        "machine": machine(),
+        "date": time.strftime("%Y-%m-%d"),
+        "command": command_line(),
+    }
     values["chosen_elsewhere"] = _chosen_elsewhere(plan, scores)
     values["over_best_real"] = _over_best_real(plan, scores)
     values["headline"] = headline(values)
@@ -127,13 +155,18 @@ def _arm(
 ) -> dict[str, Any]:
     """A row of the table, as plain values."""
     difference = scores[row] - base
-    by_place, scored = np.nanmean(difference, 1), np.nanmean(scores[row], 1)
+    by_place = np.nanmean(difference, 1)
+    scored = np.nanmean(scores[row], 1)
     judged = by_place[~np.isnan(by_place)]  # a place may have none of the classes
     outcomes = [outcomes[row] for outcomes in found.values()]
     first = row.name == BASE
     seconds = float(np.mean([outcome.seconds for outcome in outcomes]))
     return {
-        "key": row.key, "arm": row.name, "ratio": row.ratio, "title": row.title, "synthetic": row.arm.synthetic,
+        "key": row.key,
+        "arm": row.name,
+        "ratio": row.ratio,
+        "title": row.title,
+        "synthetic": row.arm.synthetic,
         "miou": _mean(scores[row]),
         "difference": None if first else _mean(difference),
         "interval": None if first else interval(difference),
@@ -141,10 +174,14 @@ def _arm(
         "by_place": dict(zip(places, map(_known, by_place), strict=True)),
         "miou_by_place": dict(zip(places, map(_known, scored), strict=True)),
         "iou": _class_ious(plan, outcomes),
-        "curve": _curve(plan, outcomes), "loss": [o.losses for o in outcomes if o.losses][:1],
-        "budget": _budget(plan, row), "minutes": (seconds + preparation) / 60, "training_seconds": seconds,
-        "preparation_seconds": preparation, "iterations": round(plan.settings.iterations * row.arm.iterations),
-    }  # fmt: skip
+        "curve": _curve(plan, outcomes),
+        "loss": [o.losses for o in outcomes if o.losses][:1],
+        "budget": _budget(plan, row),
+        "minutes": (seconds + preparation) / 60,
+        "training_seconds": seconds,
+        "preparation_seconds": preparation,
+        "iterations": round(plan.settings.iterations * row.arm.iterations),
+    }
 
 
 def _known(value: float) -> float | None:
@@ -158,7 +195,9 @@ def _budget(plan: ProofPlan, row: Row) -> str:
     extra = row.arm.budget
     if any(pool == "skin" for pool in row.arm.pools()):
         scans = len(plan.skin_scans(plan.pairs[0][0]))
-        extra = extra.replace("scans of the training places", f"{scans} scans of the training places")
+        extra = extra.replace(
+            "scans of the training places", f"{scans} scans of the training places"
+        )
     return f"{text}; {extra}"
 
 
@@ -166,7 +205,9 @@ def _class_ious(plan: ProofPlan, outcomes: Sequence[Outcome]) -> dict[str, float
     """IoU of every class in per cent, over the returns of all tested scans together."""
     total = np.sum([outcome.table for outcome in outcomes], 0)
     ious = 100 * group_ious(total, plan.groups)
-    return {name: None if np.isnan(v) else float(v) for name, v in zip(plan.groups, ious, strict=True)}
+    return {
+        name: None if np.isnan(v) else float(v) for name, v in zip(plan.groups, ious, strict=True)
+    }
 
 
 def _curve(plan: ProofPlan, outcomes: Sequence[Outcome]) -> list[tuple[int, float]]:
@@ -178,7 +219,9 @@ def _curve(plan: ProofPlan, outcomes: Sequence[Outcome]) -> list[tuple[int, floa
     return [(step, float(np.nanmean(values))) for step, values in sorted(points.items())][:LOOKS]
 
 
-def _chosen_elsewhere(plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]) -> dict[str, Any] | None:
+def _chosen_elsewhere(
+    plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
+) -> dict[str, Any] | None:
     """The gain in each place of the arm with synthetic scans that is best in the other places."""
     base = scores[plan.rows[0]]
     rows = [row for row in plan.rows if row.arm.synthetic]
@@ -186,21 +229,35 @@ def _chosen_elsewhere(plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
         return None
     gains = np.stack([scores[row] - base for row in rows])
     means = np.nanmean(gains, 2)
-    picked = [int(np.argmax(np.nanmean(np.delete(means, place, 1), 1))) for place in range(len(base))]
+    picked = [
+        int(np.argmax(np.nanmean(np.delete(means, place, 1), 1))) for place in range(len(base))
+    ]
     chosen = np.stack([gains[arm, place] for place, arm in enumerate(picked)])
-    return {"difference": _mean(chosen), "interval": interval(chosen), "arms": [rows[i].key for i in picked]}
+    return {
+        "difference": _mean(chosen),
+        "interval": interval(chosen),
+        "arms": [rows[i].key for i in picked],
+    }
 
 
-def _over_best_real(plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]) -> dict[str, Any] | None:
-    """The best arm with synthetic scans against the best arm with real scans only and as many iterations."""
+def _over_best_real(
+    plan: ProofPlan, scores: Mapping[Row, NDArray[np.float64]]
+) -> dict[str, Any] | None:
+    """The best arm with synthetic scans against the best arm with real scans only and as many
+    iterations."""
     real = [row for row in plan.rows if not row.arm.synthetic and row.arm.iterations == 1]
     synthetic = [row for row in plan.rows if row.arm.synthetic]
     if not synthetic:
         return None
     best, other = (max(rows, key=lambda row: _mean(scores[row])) for rows in (synthetic, real))
     difference = scores[best] - scores[other]
-    return {"arm": best.key, "title": best.title, "real": other.title, "difference": _mean(difference),
-            "interval": interval(difference)}  # fmt: skip
+    return {
+        "arm": best.key,
+        "title": best.title,
+        "real": other.title,
+        "difference": _mean(difference),
+        "interval": interval(difference),
+    }
 
 
 def headline(values: Mapping[str, Any]) -> str:
@@ -210,27 +267,38 @@ def headline(values: Mapping[str, Any]) -> str:
     base = arms[BASE]
     start = f"With {values['labelled']} labelled scans"
     if over is None:
-        return f"{start}, real scans only reach {base['miou']:.1f} % mIoU; no arm with synthetic scans was trained."
+        return (
+            f"{start}, real scans only reach {base['miou']:.1f} % mIoU; no arm with synthetic "
+            "scans was trained."
+        )
     best = arms[over["arm"]]
-    ends, gain = best["interval"], best["difference"]
+    ends = best["interval"]
+    gain = best["difference"]
     change = f"{gain:+.1f} mIoU" + (f" {span(ends)}" if ends is not None else "")
     if ends is not None and ends[0] > 0:
-        text = f"{start}: {change} by “{best['title']}”, over {base['miou']:.1f} % with real scans only."
+        text = (
+            f"{start}: {change} by “{best['title']}”, over {base['miou']:.1f} % with real scans "
+            "only."
+        )
     elif ends is None:
         text = (
             f"{start}, “{best['title']}” changes the mIoU by {change}, from {base['miou']:.1f} %; "
-            f"{len(values['tested_places'])} places are too few for an interval ({FEWEST_PLACES} are needed)."
+            f"{len(values['tested_places'])} places are too few for an interval ({FEWEST_PLACES} "
+            "are needed)."
         )
     else:
         text = (
-            f"{start}, no gain is shown: the best arm with synthetic scans, “{best['title']}”, changes the mIoU "
+            f"{start}, no gain is shown: the best arm with synthetic scans, “{best['title']}”, "
+            "changes the mIoU "
             f"by {change}, from {base['miou']:.1f} %."
         )
     if over["real"] != base["title"]:
         text += f" Against “{over['real']}”: {signed(over['difference'])} {span(over['interval'])}."
     if "longer" in arms:
         text += f" More iterations alone: {signed(arms['longer']['difference'])} {span(arms['longer']['interval'])}."
-    swept = [row for row in values["arms"] if row["arm"] == best["arm"] and row["ratio"] is not None]
+    swept = [
+        row for row in values["arms"] if row["arm"] == best["arm"] and row["ratio"] is not None
+    ]
     if len(swept) > 1:
         text += f" Best share of synthetic scans: {100 * best['ratio']:g} %."
     return text
@@ -241,24 +309,35 @@ def limits(values: Mapping[str, Any]) -> list[str]:
     found = []
     if values["pairs"] < values["planned_pairs"]:
         found.append(
-            f"{values['pairs']} of {values['planned_pairs']} trainings per arm fitted into the time: "
-            f"{len(values['tested_places'])} of {len(values['places'])} places were tested, with {values['seeds']} "
-            f"seed{'s' * (values['seeds'] > 1)}. Run the same command with more --minutes to add the others."
+            f"{values['pairs']} of {values['planned_pairs']} trainings per arm fitted into the "
+            "time: "
+            f"{len(values['tested_places'])} of {len(values['places'])} places were tested, with "
+            f"{values['seeds']} "
+            f"seed{'s' * (values['seeds'] > 1)}. Run the same command with more --minutes to add "
+            "the others."
         )
     if values["absent"]:
-        found.append(f"Classes that no label of the scans used here has: {', '.join(values['absent'])}.")
+        found.append(
+            f"Classes that no label of the scans used here has: {', '.join(values['absent'])}."
+        )
     if values["chosen_elsewhere"] is not None:
         chosen = values["chosen_elsewhere"]
         found.append(
-            "The best of several arms looks better than it is, because it was chosen on the places that it is "
+            "The best of several arms looks better than it is, because it was chosen on the "
+            "places that it is "
             f"measured on. Chosen on the other places each time: {signed(chosen['difference'])} "
             f"{span(chosen['interval'])}."
         )
     if values["trainer"] == "reference":
         found.append(
-            f"The network is small and the training short ({values['iterations']} iterations of {values['batch']} "
-            f"scans of {values['settings']['columns']} columns): a full training starts from a higher mIoU and may "
+            f"The network is small and the training short ({values['iterations']} iterations of "
+            f"{values['batch']} "
+            f"scans of {values['settings']['columns']} columns): a full training starts from a "
+            "higher mIoU and may "
             "gain less. Test your own trainer with --trainer."
         )
-    found.append("Tested on single scans of this dataset only: another sensor, country or season was not tested.")
+    found.append(
+        "Tested on single scans of this dataset only: another sensor, country or season was not "
+        "tested."
+    )
     return found

@@ -1,6 +1,7 @@
 """One training and its test: an arm, a place that is left out, a seed.
 
-``reference`` trains the package's small range-view segmenter. A trainer of your own is a function of the same form.
+``reference`` trains the package's small range-view segmenter. A trainer of your own is a function
+of the same form.
 """
 
 import time
@@ -36,8 +37,10 @@ from lidar_synth.mixing import MixedScans
 
 LOOKS = 8
 """Points of the curve of a training."""
-SETTLING, SETTLING_LOOK = 16, 4
-"""Batches of real scans over which the statistics of the normalisation are taken, after a training and during it."""
+SETTLING = 16
+SETTLING_LOOK = 4
+"""Batches of real scans over which the statistics of the normalisation are taken, after a training
+and during it."""
 SECONDS = "seconds"
 
 
@@ -79,7 +82,8 @@ class Job:
 
     def stages(self) -> Iterator[tuple[Stage, int]]:
         """The stages with their iterations, which add up to ``iterations``."""
-        stages, done = self.row.stages(), 0
+        stages = self.row.stages()
+        done = 0
         for number, stage in enumerate(stages):
             last = number + 1 == len(stages)
             count = self.iterations - done if last else round(stage.share * self.iterations)
@@ -94,14 +98,28 @@ class Job:
         """
         for number, (stage, iterations) in enumerate(self.stages()):
             real = None if stage.ratio == 1 else list(self.real)
-            synthetic, labels = None, None
+            synthetic = None
+            labels = None
             if stage.ratio:
                 synthetic = list(self.real) if stage.pool == REAL else self.pools[stage.pool]
-                labels = policy_of(stage, list(self.real), self.objects, frozenset(synthetic[0].fields()))
-            yield MixedScans(
-                real, synthetic, stage.ratio, labels or "generated", seed=1000 * self.seed + number,
-                epoch_size=iterations * self.batch, balanced=True, augment=turned, augment_real=True, **options,
-            ), iterations  # fmt: skip
+                labels = policy_of(
+                    stage, list(self.real), self.objects, frozenset(synthetic[0].fields())
+                )
+            yield (
+                MixedScans(
+                    real,
+                    synthetic,
+                    stage.ratio,
+                    labels or "generated",
+                    seed=1000 * self.seed + number,
+                    epoch_size=iterations * self.batch,
+                    balanced=True,
+                    augment=turned,
+                    augment_real=True,
+                    **options,
+                ),
+                iterations,
+            )
 
 
 @dataclass(frozen=True)
@@ -109,9 +127,11 @@ class Outcome:
     """What came of a training.
 
     Args:
-        table: (19, 19) number of returns of the held-out scans by label (row) and prediction (column).
+        table: (19, 19) number of returns of the held-out scans by label (row) and prediction
+            (column).
         curve: (iterations, table) during the training; empty if the trainer does not tell.
-        losses: mean training losses of ten equal parts of the training; empty if the trainer does not tell.
+        losses: mean training losses of ten equal parts of the training; empty if the trainer does
+            not tell.
         seconds: that the training took.
     """
 
@@ -122,11 +142,13 @@ class Outcome:
 
 
 Trainer = Callable[[Job], "Outcome | NDArray[np.int64]"]
-"""Trains as a job says and tests on its held-out scans; returns an ``Outcome``, or its table alone."""
+"""Trains as a job says and tests on its held-out scans; returns an ``Outcome``, or its table
+alone."""
 
 
 def turned(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Turn a scan by a whole number of columns, and mirror it left and right with probability one half.
+    """Turn a scan by a whole number of columns, and mirror it left and right with probability one
+    half.
 
     Returns stay within their cells, so that the range image of a thinned scan loses none.
     """
@@ -145,12 +167,15 @@ def run_trainer(trainer: Trainer, job: Job) -> Outcome:
     outcome = result if isinstance(result, Outcome) else Outcome(np.asarray(result, np.int64))
     expected = (len(NAMES), len(NAMES))
     if outcome.table.shape != expected:
-        raise DataError(f"a trainer that returns a table of shape {outcome.table.shape}", f"{expected}")
+        raise DataError(
+            f"a trainer that returns a table of shape {outcome.table.shape}", f"{expected}"
+        )
     return replace(outcome, seconds=time.monotonic() - start)
 
 
 def reference(job: Job) -> Outcome:
-    """Train the package's range-view segmenter on the grid of the scans, and test it on the held-out scans."""
+    """Train the package's range-view segmenter on the grid of the scans, and test it on the
+    held-out scans."""
     network, height = _fresh(job)
     held_out = images(job.held_out, job.held_out[0].sensor)
     looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {job.iterations}
@@ -178,7 +203,8 @@ def reference(job: Job) -> Outcome:
 
 
 def pretrain(job: Job, path: Path) -> None:
-    """Write the reference network after a job's first stage, which has no real scan, and the seconds that it took.
+    """Write the reference network after a job's first stage, which has no real scan, and the
+    seconds that it took.
 
     Raises:
         FileError: if it cannot be written.
@@ -212,17 +238,26 @@ def pretraining_seconds(path: Path) -> float:
 def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
     """A network that has learnt nothing, and the (H, W) sine of the elevations of the grid."""
     torch.manual_seed(job.seed)
-    return RangeSegmenter(widths=job.widths), torch.from_numpy(np.sin(job.held_out[0].sensor.ray_angles()[0]))
+    return RangeSegmenter(widths=job.widths), torch.from_numpy(
+        np.sin(job.held_out[0].sensor.ray_angles()[0])
+    )
 
 
 def _learn(
-    network: RangeSegmenter, job: Job, stage: Stage, mixed: MixedScans, count: int, height: Tensor,
+    network: RangeSegmenter,
+    job: Job,
+    stage: Stage,
+    mixed: MixedScans,
+    count: int,
+    height: Tensor,
     watch: Callable[[int], object] | None = None,
-) -> list[float]:  # fmt: skip
+) -> list[float]:
     """Train one stage; returns its losses."""
     batches = endless_batches(mixed, job.batch)
     rate = RATE * stage.rate
-    return train_segmenter(network, batches, height, count, rate, progress=False, half=job.half, watch=watch)
+    return train_segmenter(
+        network, batches, height, count, rate, progress=False, half=job.half, watch=watch
+    )
 
 
 def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
@@ -230,28 +265,42 @@ def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
     made: list[Images] = []
     for scan in scans:
         image = project(scan, sensor, ("reflectance", "label"))
-        arrays = {"range": image.range, **{name: image.channels[name] for name in ("reflectance", "label")}}
+        arrays = {
+            "range": image.range,
+            **{name: image.channels[name] for name in ("reflectance", "label")},
+        }
         made.append({name: torch.from_numpy(values[None]) for name, values in arrays.items()})
     return made
 
 
-def _test(network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool) -> NDArray[np.int64]:
+def _test(
+    network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool
+) -> NDArray[np.int64]:
     network.eval()
     with torch.autocast("cpu", torch.bfloat16, enabled=half):
         return confusion(network, held_out, height)
 
 
 def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) -> RangeSegmenter:
-    """A copy whose statistics of the normalisation are those of the labelled real scans; the same in every arm.
+    """A copy whose statistics of the normalisation are those of the labelled real scans; the same
+    in every arm.
 
     Those of the training are of real and synthetic scans together, and the test has only real ones.
     """
     mixed = MixedScans(
-        list(job.real), ratio=0, seed=job.seed, epoch_size=SETTLING * job.batch, augment=turned, augment_real=True,
+        list(job.real),
+        ratio=0,
+        seed=job.seed,
+        epoch_size=SETTLING * job.batch,
+        augment=turned,
+        augment_real=True,
         collate="range",
-    )  # fmt: skip
+    )
     some = islice(endless_batches(mixed, job.batch), batches)
     network = deepcopy(network)
     with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
-        update_bn((segmenter_input(batch["range"], batch["reflectance"], height) for batch in some), network)
+        update_bn(
+            (segmenter_input(batch["range"], batch["reflectance"], height) for batch in some),
+            network,
+        )
     return network.eval()

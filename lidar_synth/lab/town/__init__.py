@@ -1,4 +1,5 @@
-"""The procedural town: synthetic streets, ray-cast with a sensor's beams (no download, no neural network)."""
+"""The procedural town: synthetic streets, ray-cast with a sensor's beams (no download, no neural
+network)."""
 
 from lidar_synth.lab.town.export import LAYOUTS, export_town
 from lidar_synth.lab.town.skin import Skin, load_skin

@@ -1,9 +1,11 @@
-"""The town's scans as accumulated, labelled clouds in KITTI-360's layout (formats/kitti360_accumulated.py).
+"""The town's scans as accumulated, labelled clouds in KITTI-360's layout
+(formats/kitti360_accumulated.py).
 
-Made as the dataset's own tool makes them (kitti360Scripts, devkits/accumuLaser): points measured from 3 to 30 m,
-thinned to 2 cm, the nearest measurement first; what moves is separate and carries its frame. They are no copy of the
-scans' labels: only every second frame is accumulated, and with errors of the poses, so that labels recovered from the
-clouds can be compared with those of frames which the clouds hold and of frames which they do not hold.
+Made as the dataset's own tool makes them (kitti360Scripts, devkits/accumuLaser): points measured
+from 3 to 30 m, thinned to 2 cm, the nearest measurement first; what moves is separate and carries
+its frame. They are no copy of the scans' labels: only every second frame is accumulated, and with
+errors of the poses, so that labels recovered from the clouds can be compared with those of frames
+which the clouds hold and of frames which they do not hold.
 """
 
 from pathlib import Path
@@ -24,14 +26,18 @@ from lidar_synth.noise import keyed_rng
 STEP = 2
 """Every frame whose number is a multiple of this is accumulated."""
 
-LENGTH, STRIDE = 12, 8
+LENGTH = 12
+STRIDE = 8
 """Frames of a window, and from the first frame of a window to that of the next."""
 
-POSITION, ANGLE = 0.02, np.radians(0.03)
-"""Standard deviations of the errors of the poses with which scans are accumulated, metres and radians."""
+POSITION = 0.02
+ANGLE = np.radians(0.03)
+"""Standard deviations of the errors of the poses with which scans are accumulated, metres and
+radians."""
 
 MOST = 2000
-"""Maximum number of scans: farther from the origin, the layout's float32 would be coarser than ``SPACING``."""
+"""Maximum number of scans: farther from the origin, the layout's float32 would be coarser than
+``SPACING``."""
 
 NEAREST = 3.0
 """Minimum distance from which a point is accumulated, metres."""
@@ -59,14 +65,17 @@ def windows_of(town: Town) -> list[tuple[int, int]]:
     windows = []
     for begin in range(0, len(town), STRETCH_FRAMES):
         end = min(begin + STRETCH_FRAMES, len(town)) - 1
-        starts = [s for s in range(begin, end + 1, STRIDE) if s == begin or s + LENGTH - STRIDE <= end]
+        starts = [
+            s for s in range(begin, end + 1, STRIDE) if s == begin or s + LENGTH - STRIDE <= end
+        ]
         windows += [(s, min(s + LENGTH - 1, end)) for s in starts]
     return windows
 
 
 def window_paths(root: Path, drive: str, window: tuple[int, int]) -> tuple[Path, Path]:
     """The files of the static and of the moving points of a window."""
-    folder, name = root / "data_3d_semantics" / "train" / drive, f"{window[0]:010d}_{window[1]:010d}.ply"
+    folder = root / "data_3d_semantics" / "train" / drive
+    name = f"{window[0]:010d}_{window[1]:010d}.ply"
     return folder / "static" / name, folder / "dynamic" / name
 
 
@@ -90,15 +99,21 @@ def write_window(town: Town, root: Path, drive: str, window: tuple[int, int]) ->
 
 
 def _measured(scan: Scan, frame: int, rng: np.random.Generator) -> Cloud:
-    """The points of a scan in the world, from ``NEAREST`` to ``REACH``, with an error of the pose."""
+    """The points of a scan in the world, from ``NEAREST`` to ``REACH``, with an error of the
+    pose."""
     assert scan.raw_label is not None and scan.pose is not None
     distance = np.linalg.norm(scan.points, axis=1)
     near = (distance > NEAREST) & (distance < REACH)
     a, b, c = rng.normal(0, ANGLE, 3)
     turn = np.eye(3) + np.array([(0, -c, b), (c, 0, -a), (-b, a, 0)])
-    points = scan.points[near] @ (scan.pose[:3, :3] @ turn).T + scan.pose[:3, 3] + rng.normal(0, POSITION, 3)
+    points = (
+        scan.points[near] @ (scan.pose[:3, :3] @ turn).T
+        + scan.pose[:3, 3]
+        + rng.normal(0, POSITION, 3)
+    )
     values = label_values(scan)[near]
-    semantic, instance = (values & 0xFFFF).astype(np.int32), (values >> 16).astype(np.int32)
+    semantic = (values & 0xFFFF).astype(np.int32)
+    instance = (values >> 16).astype(np.int32)
     return dict(zip("xyz", points.T, strict=True)) | {
         "semantic": semantic,
         "instance": np.where(instance > 0, instance, semantic * MAX_INSTANCES),
@@ -119,6 +134,8 @@ def _thin(cloud: Cloud) -> Cloud:
     cubes -= cubes.min(axis=0, initial=0)
     order = np.argsort(cloud["range"], kind="stable")
     sides = cubes.max(axis=0, initial=0) + 1
-    _, first = np.unique(np.ravel_multi_index(tuple(cubes[order].T), tuple(sides)), return_index=True)
+    _, first = np.unique(
+        np.ravel_multi_index(tuple(cubes[order].T), tuple(sides)), return_index=True
+    )
     kept = np.sort(order[first])
     return {name: values[kept] for name, values in cloud.items()}

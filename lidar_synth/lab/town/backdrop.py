@@ -37,7 +37,8 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
 
 
 def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
-    """Put boundaries, houses and trees along the side streets, in full detail where the ego vehicle turns into one."""
+    """Put boundaries, houses and trees along the side streets, in full detail where the ego vehicle
+    turns into one."""
     for c in street.crossings:
         for side in c.sides:
             if street.kind == "edge" or street.plaza == side:
@@ -52,13 +53,16 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
                     width = rng.uniform(9, 14)
                     _line(scene, (t, t + width + 3), edge, side, kind, rng)
                     near = street.turn == (c, side) and t < 60
-                    style, depth = str(rng.choice(["house", "house", "row", "block"])), rng.uniform(8, 10)
+                    style = str(rng.choice(["house", "house", "row", "block"]))
+                    depth = rng.uniform(8, 10)
                     plan = sample_house(style, width, depth, rng)
                     mesh = building(plan, rng) if near else _plain_house(int(rng.integers(12)))
                     low = t if side == LEFT else -t - width
                     at = low if direction < 0 else low + width
                     house = StaticObject(mesh, finishes(rng), HOUSE)
-                    scene.put(house, edge + direction * rng.uniform(2.5, 6), at, -direction * np.pi / 2)
+                    scene.put(
+                        house, edge + direction * rng.uniform(2.5, 6), at, -direction * np.pi / 2
+                    )
                     for _ in range(rng.poisson(3)):
                         species = str(rng.choice(["bush", "bush", "thuja", "fruit", "round"]))
                         place = (2 * side - 1) * rng.uniform(t, t + width + 3)
@@ -70,7 +74,9 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
                     t += width + rng.uniform(3, 6)
 
 
-def _line(scene: Scene, ends: tuple[float, float], at: float, side: int, kind: str, rng: Rng) -> None:
+def _line(
+    scene: Scene, ends: tuple[float, float], at: float, side: int, kind: str, rng: Rng
+) -> None:
     """Put a boundary along t on one side of the street; ``ends`` are |t|, ``at`` is s, metres."""
     put_boundary(scene, kind, ends if side == LEFT else (-ends[1], -ends[0]), at, False, rng)
 
@@ -80,12 +86,18 @@ def _plain_house(variant: int) -> Mesh:
     """One of the house meshes without window recesses, for houses that are only seen from afar."""
     rng = np.random.Generator(np.random.Philox(key=variant))
     roof = ("gable", "cross", "hip")[variant % 3]
-    return building(BuildingPlan(rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False), rng)
+    return building(
+        BuildingPlan(
+            rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False
+        ),
+        rng,
+    )
 
 
 def second_row(street: Street, scene: Scene, rng: Rng) -> None:
     """Put distant houses and trees behind the lots and around the far ends of the street."""
-    low, high = -REACH - 70, street.length + REACH + 70
+    low = -REACH - 70
+    high = street.length + REACH + 70
     for side in (RIGHT, LEFT):
         sign = 2 * side - 1
         open_land = street.kind == "edge" and rng.random() < 0.6
@@ -93,7 +105,10 @@ def second_row(street: Street, scene: Scene, rng: Rng) -> None:
             for s in np.arange(low, high, 9.0 + depth / 8):
                 far = not -REACH <= s <= street.length + REACH
                 t = street.front(side) + (12 if far and depth < 40 else depth) + rng.uniform(-4, 4)
-                crossed = any(side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 20 for c in street.crossings)
+                crossed = any(
+                    side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 20
+                    for c in street.crossings
+                )
                 if crossed or (street.plaza == side and t < street.front(side) + PLAZA_DEPTH + 20):
                     continue
                 if not open_land and rng.random() < 0.55:
@@ -103,7 +118,10 @@ def second_row(street: Street, scene: Scene, rng: Rng) -> None:
                 elif rng.random() < (0.5 if open_land else 0.8):
                     scene.put(
                         furniture.random_plant(
-                            str(rng.choice(["round", "birch", "spruce", "poplar"])), rng, 1.2, near=False
+                            str(rng.choice(["round", "birch", "spruce", "poplar"])),
+                            rng,
+                            1.2,
+                            near=False,
                         ),
                         s,
                         sign * t,

@@ -10,8 +10,15 @@ from lidar_synth.lab.town.materials import Finish
 from lidar_synth.lab.town.scene import Scene
 
 KINDS = {
-    "hedge": 5, "thicket": 5, "wall": 1, "bars": 2, "boards": 1, "wire": 1, "wallhedge": 2, "none": 7,
-}  # fmt: skip
+    "hedge": 5,
+    "thicket": 5,
+    "wall": 1,
+    "bars": 2,
+    "boards": 1,
+    "wire": 1,
+    "wallhedge": 2,
+    "none": 7,
+}
 """{kind of boundary: weight}."""
 
 
@@ -22,7 +29,12 @@ def sample_kind(rng: np.random.Generator) -> str:
 
 
 def put_boundary(
-    scene: Scene, kind: str, ends: tuple[float, float], at: float, along: bool, rng: np.random.Generator
+    scene: Scene,
+    kind: str,
+    ends: tuple[float, float],
+    at: float,
+    along: bool,
+    rng: np.random.Generator,
 ) -> None:
     """Put a boundary into the scene.
 
@@ -36,9 +48,14 @@ def put_boundary(
     """
     if kind == "none" or ends[1] - ends[0] < 0.8:
         return
-    height, shade = rng.uniform(0.7, 1.25), float(rng.uniform(0.1, 0.5))
+    height = rng.uniform(0.7, 1.25)
+    shade = float(rng.uniform(0.1, 0.5))
     built = rng.random() < 0.6
-    stone = Finish(str(rng.choice(["stone", "concrete", "brick"]))) if built else Finish("render", (0.8, 0.78, 0.72))
+    stone = (
+        Finish(str(rng.choice(["stone", "concrete", "brick"])))
+        if built
+        else Finish("render", (0.8, 0.78, 0.72))
+    )
     pieces = np.linspace(*ends, max(1, int(np.ceil((ends[1] - ends[0]) / 7))) + 1)
     for a, b in pairwise(pieces):
         for item, aside, lift in _piece(kind, b - a, height, stone, shade, rng):
@@ -68,5 +85,11 @@ def _piece(
             return [(wire_fence(length, height), 0.0, 0.0)]
         case "wallhedge":
             behind = 0.4 if shade > 0.3 else 0.0
-            return [(low_wall(length, 0.4, stone), 0.0, 0.0), (clipped_hedge(length, rng), behind, 0.35)]
-    return [(low_wall(length, 0.45, stone), 0.0, 0.0), (bar_fence(length, 0.7, 0.13, iron, False), 0.0, 0.5)]
+            return [
+                (low_wall(length, 0.4, stone), 0.0, 0.0),
+                (clipped_hedge(length, rng), behind, 0.35),
+            ]
+    return [
+        (low_wall(length, 0.45, stone), 0.0, 0.0),
+        (bar_fence(length, 0.7, 0.13, iron, False), 0.0, 0.5),
+    ]

@@ -1,7 +1,8 @@
 """The town's camera: its calibration and the rays of its pixels.
 
-The camera is mounted 0.8 m in front of the LiDAR and 0.3 m to its left; it points straight ahead and five degrees
-down. Focal length, principal point and image size are those of KITTI-360's rectified image_00.
+The camera is mounted 0.8 m in front of the LiDAR and 0.3 m to its left; it points straight ahead
+and five degrees down. Focal length, principal point and image size are those of KITTI-360's
+rectified image_00.
 """
 
 import numpy as np
@@ -16,11 +17,14 @@ _PLACE = (0.80, 0.30, -0.18)
 
 def _calibration() -> Calibration:
     """The calibration from the position, pitch and intrinsics of the camera."""
-    c, s = np.cos(_PITCH), np.sin(_PITCH)
+    c = np.cos(_PITCH)
+    s = np.sin(_PITCH)
     level = np.eye(4)
     level[:3, 3] = np.negative(_PLACE)
     down = np.array([(c, 0, -s, 0), (0, 1, 0, 0), (s, 0, c, 0), (0, 0, 0, 1)])
-    projection = np.array([(552.554261, 0, 682.049453, 0), (0, 552.554261, 238.769549, 0), (0, 0, 1, 0)])
+    projection = np.array(
+        [(552.554261, 0, 682.049453, 0), (0, 552.554261, 238.769549, 0), (0, 0, 1, 0)]
+    )
     return Calibration(projection, AXES_CAMERA_FROM_SENSOR @ down @ level, (1408, 376))
 
 
@@ -28,7 +32,9 @@ CAMERA = _calibration()
 """The calibration of the town's camera."""
 
 
-def pixel_rays(pose: Pose, pixels: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def pixel_rays(
+    pose: Pose, pixels: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The position of the camera and the directions of its pixels in the world frame.
 
     Args:
@@ -40,7 +46,8 @@ def pixel_rays(pose: Pose, pixels: NDArray[np.floating]) -> tuple[NDArray[np.flo
     """
     camera = (pose @ CAMERA.sensor_from_camera).astype(np.float32)
     (fx, _, cx, _), (_, fy, cy, _), _ = CAMERA.projection.astype(np.float32)
-    x, y = (pixels[:, 0].astype(np.float32) - cx) / fx, (pixels[:, 1].astype(np.float32) - cy) / fy
+    x = (pixels[:, 0].astype(np.float32) - cx) / fx
+    y = (pixels[:, 1].astype(np.float32) - cy) / fy
     ahead = np.stack([x, y, np.ones_like(x)], 1) / np.sqrt(x * x + y * y + 1)[:, None]
     return camera[:3, 3], ahead @ camera[:3, :3].T
 

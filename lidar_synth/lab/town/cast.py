@@ -1,7 +1,8 @@
 """Ray casting with Embree against the static world and the movers.
 
-The static world is one Embree scene per stretch. Each prototype of a mover is another one, built once per process.
-For each frame, the few rays that can hit a mover are transformed into its own frame, so that nothing is rebuilt.
+The static world is one Embree scene per stretch. Each prototype of a mover is another one, built
+once per process. For each frame, the few rays that can hit a mover are transformed into its own
+frame, so that nothing is rebuilt.
 """
 
 from collections.abc import Iterator
@@ -37,7 +38,8 @@ class Hits(NamedTuple):
 class _Shape(NamedTuple):
     """A prototype as an Embree scene, with its bounding sphere.
 
-    It holds a reference to its mesh: ``_SHAPES`` is keyed by ``id(mesh)``, which must not be reused.
+    It holds a reference to its mesh: ``_SHAPES`` is keyed by ``id(mesh)``, which must not be
+        reused.
     """
 
     mesh: Mesh
@@ -69,12 +71,18 @@ class Snapshot:
     """
 
     def __init__(self, world: World, movers: list[PlacedObject]) -> None:
-        self._solid, self._faces = world.solid, world.faces
+        self._solid = world.solid
+        self._faces = world.faces
         self.movers = movers
         shapes = [_shape(m.prototype.mesh) for m in movers]
-        middles = [m.pose[:3, :3] @ (m.scale * s.middle) + m.pose[:3, 3] for m, s in zip(movers, shapes, strict=True)]
+        middles = [
+            m.pose[:3, :3] @ (m.scale * s.middle) + m.pose[:3, 3]
+            for m, s in zip(movers, shapes, strict=True)
+        ]
         self._middles = np.array(middles, np.float32).reshape(-1, 3)
-        self._radii = np.array([m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32)
+        self._radii = np.array(
+            [m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32
+        )
 
     def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> Hits:
         """Find the first hit of each ray.
@@ -82,20 +90,24 @@ class Snapshot:
         Args:
             origins: (N, 3) metres, world frame.
             directions: (N, 3) unit vectors.
-            eye: (3,) a point near the origin of every ray, such as the sensor; with it, the rays that can hit a mover
-                are found faster.
+            eye: (3,) a point near the origin of every ray, such as the sensor; with it, the rays
+                that can hit a mover are found faster.
         """
         distance, face, normal = self._solid.first(origins, directions)
         surface = np.where(face >= 0, self._faces[face], MISS)
         candidate_rays = (
             self._candidates_of_any_rays(origins, directions)
             if eye is None
-            else self._candidates(directions, eye, float(np.abs(origins - eye).sum(1).max(initial=0)))
+            else self._candidates(
+                directions, eye, float(np.abs(origins - eye).sum(1).max(initial=0))
+            )
         )
         for mover, is_candidate in zip(self.movers, candidate_rays, strict=True):
             candidates = np.flatnonzero(is_candidate)
             if len(candidates):
-                mover_distance, mover_surface, mover_normal = trace(mover, origins[candidates], directions[candidates])
+                mover_distance, mover_surface, mover_normal = trace(
+                    mover, origins[candidates], directions[candidates]
+                )
                 nearer = mover_distance < distance[candidates]
                 hit = candidates[nearer]
                 distance[hit], surface[hit], normal[hit] = (
@@ -108,26 +120,40 @@ class Snapshot:
         return Hits(distance, surface, normal)
 
     def _candidates(self, directions: Floats, eye: Floats, margin: float) -> NDArray[np.bool_]:
-        """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's bounding sphere; may
-        include a few more."""
+        """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's
+        bounding sphere; may include a few more."""
         offset = self._middles - eye
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
         sine = np.minimum((self._radii[:, None] + margin) / np.maximum(distance, 1e-3), 1)
         smallest_cosine = np.where(sine < 0.95, np.sqrt(1 - sine * sine), -2).astype(np.float32)
         return np.asarray((offset / np.maximum(distance, 1e-3)) @ directions.T > smallest_cosine)
 
-    def _candidates_of_any_rays(self, origins: Floats, directions: Floats) -> Iterator[NDArray[np.bool_]]:
-        """Which of any rays can hit each mover's bounding sphere: (N,) for one mover after another."""
+    def _candidates_of_any_rays(
+        self, origins: Floats, directions: Floats
+    ) -> Iterator[NDArray[np.bool_]]:
+        """Which of any rays can hit each mover's bounding sphere: (N,) for one mover after
+        another."""
         for middle, radius in zip(self._middles, self._radii, strict=True):
             offset = middle - origins
             along = np.einsum("ij,ij->i", offset, directions)
-            yield (np.einsum("ij,ij->i", offset, offset) - along * along < radius**2) & (along > -radius)
+            yield (np.einsum("ij,ij->i", offset, offset) - along * along < radius**2) & (
+                along > -radius
+            )
 
 
-def trace(placed: PlacedObject, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-    """Distance (inf = no hit), surface number and normal (world frame, not unit) of rays cast at one object alone."""
+def trace(
+    placed: PlacedObject, origins: Floats, directions: Floats
+) -> tuple[Floats, NDArray[np.int32], Floats]:
+    """Distance (inf = no hit), surface number and normal (world frame, not unit) of rays cast at
+    one object alone."""
     shape = _shape(placed.prototype.mesh)
     rotation = placed.pose[:3, :3].astype(np.float32)
-    start = ((origins - placed.pose[:3, 3].astype(np.float32)) @ rotation) / np.float32(placed.scale)
+    start = ((origins - placed.pose[:3, 3].astype(np.float32)) @ rotation) / np.float32(
+        placed.scale
+    )
     distance, face, normal = shape.solid.first(start, directions @ rotation)
-    return distance * np.float32(placed.scale), placed.surfaces[shape.mesh.slot[face]], normal @ rotation.T
+    return (
+        distance * np.float32(placed.scale),
+        placed.surfaces[shape.mesh.slot[face]],
+        normal @ rotation.T,
+    )

@@ -21,7 +21,8 @@ class Course:
     def __init__(self, start: float, end: float, bend: float, rng: np.random.Generator) -> None:
         self._s = np.arange(start, end + 1.0)
         waves = sum(
-            rng.normal() * np.sin(2 * np.pi * self._s / rng.uniform(90, 260) + rng.uniform(0, 6.3)) for _ in range(3)
+            rng.normal() * np.sin(2 * np.pi * self._s / rng.uniform(90, 260) + rng.uniform(0, 6.3))
+            for _ in range(3)
         )
         curvature = bend * np.tanh(waves)
         self._yaw = np.cumsum(curvature) - curvature.sum() / 2
@@ -60,9 +61,12 @@ class Relief:
 
     def __call__(self, s: ArrayLike, t: ArrayLike) -> Array:
         """Height at street coordinates, metres."""
-        s, t = np.asarray(s, float), np.asarray(t, float)
+        s = np.asarray(s, float)
+        t = np.asarray(t, float)
         along = (s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)) / self._length
         hills = (self._height * np.sin(2 * np.pi * along + self._phase)).sum(-1)
         bank = np.where(t > 0, self._banks[0], self._banks[1]) * np.clip(np.abs(t) - 9, 0, 40)
-        far = np.where(t > 0, self._far[0], self._far[1]) * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
+        far = (
+            np.where(t > 0, self._far[0], self._far[1]) * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
+        )
         return np.asarray(hills + self._slope * s + bank + far)

@@ -15,7 +15,13 @@ def _ring(x: float, radius: float, thick: float, slot: int) -> Mesh:
     out = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
     across = np.array([0.0, 1.0, 0.0])
     sections = np.stack(
-        [hub - thick * out, hub + thick * across - thick * out, hub, hub - thick * across - thick * out], 1
+        [
+            hub - thick * out,
+            hub + thick * across - thick * out,
+            hub,
+            hub - thick * across - thick * out,
+        ],
+        1,
     )
     return loft(np.concatenate([sections, sections[:1]]), slot, closed=True)
 
@@ -23,16 +29,32 @@ def _ring(x: float, radius: float, thick: float, slot: int) -> Mesh:
 @cache
 def bicycle_mesh() -> Mesh:
     """A city bicycle."""
-    hub, seat, head, pedal = (-0.53, 0, 0.34), (-0.22, 0, 0.92), (0.40, 0, 0.85), (-0.08, 0, 0.30)
+    hub = (-0.53, 0, 0.34)
+    seat = (-0.22, 0, 0.92)
+    head = (0.40, 0, 0.85)
+    pedal = (-0.08, 0, 0.30)
     frame: list[tuple[list[tuple[float, float, float]], float]] = [
-        ([hub, pedal], 0.018), ([pedal, seat], 0.02), ([pedal, head], 0.022), ([(-0.18, 0, 0.70), head], 0.022),
-        ([(-0.18, 0, 0.70), hub], 0.014), ([(0.53, 0, 0.34), head, (0.34, 0, 1.02)], 0.02),
+        ([hub, pedal], 0.018),
+        ([pedal, seat], 0.02),
+        ([pedal, head], 0.022),
+        ([(-0.18, 0, 0.70), head], 0.022),
+        ([(-0.18, 0, 0.70), hub], 0.014),
+        ([(0.53, 0, 0.34), head, (0.34, 0, 1.02)], 0.02),
         ([(0.30, -0.28, 1.02), (0.36, 0, 1.04), (0.30, 0.28, 1.02)], 0.016),
         ([(-0.08, -0.12, 0.18), (-0.08, 0.12, 0.42)], 0.02),
-    ]  # fmt: skip
-    saddle = boxes([(-0.36, -0.08, 0.92), (-0.70, -0.07, 0.70)], [(-0.10, 0.08, 0.98), (-0.32, 0.07, 0.73)], TRIM)
-    guard = loft([[(-0.53 + 0.37 * np.cos(a), y, 0.34 + 0.37 * np.sin(a)) for y in (-0.03, 0.03)]
-                  for a in np.linspace(0.3, 2.6, 6)], PAINT)  # fmt: skip
+    ]
+    saddle = boxes(
+        [(-0.36, -0.08, 0.92), (-0.70, -0.07, 0.70)],
+        [(-0.10, 0.08, 0.98), (-0.32, 0.07, 0.73)],
+        TRIM,
+    )
+    guard = loft(
+        [
+            [(-0.53 + 0.37 * np.cos(a), y, 0.34 + 0.37 * np.sin(a)) for y in (-0.03, 0.03)]
+            for a in np.linspace(0.3, 2.6, 6)
+        ],
+        PAINT,
+    )
     rings = [_ring(x, 0.34, 0.022, TYRE) for x in (-0.53, 0.53)]
     return merge([tubes(frame, 5, PAINT), saddle, guard, *rings])
 
@@ -48,18 +70,27 @@ def motorcycle_mesh() -> Mesh:
         ([(-0.5, -0.18, 0.35), (0.1, -0.16, 0.35)], 0.05),
         ([(-0.72, 0, 0.31), (-0.1, 0, 0.45)], 0.05),
     ]
-    stations = ((-0.95, 0.06, 0.72, 0.84), (-0.5, 0.14, 0.60, 0.84), (-0.1, 0.15, 0.48, 0.82),
-                (0.1, 0.18, 0.45, 0.98), (0.40, 0.14, 0.55, 0.98), (0.56, 0.09, 0.75, 0.95))  # fmt: skip
+    stations = (
+        (-0.95, 0.06, 0.72, 0.84),
+        (-0.5, 0.14, 0.60, 0.84),
+        (-0.1, 0.15, 0.48, 0.82),
+        (0.1, 0.18, 0.45, 0.98),
+        (0.40, 0.14, 0.55, 0.98),
+        (0.56, 0.09, 0.75, 0.95),
+    )
     outlines = [
-        [(x, y * w, z) for y, z in ((-1, low), (-0.9, high), (0.9, high), (1, low))] for x, w, low, high in stations
+        [(x, y * w, z) for y, z in ((-1, low), (-0.9, high), (0.9, high), (1, low))]
+        for x, w, low, high in stations
     ]
     plate = [(-0.97, -0.1, 0.55), (-0.97, 0.1, 0.55), (-0.96, 0.1, 0.70), (-0.96, -0.1, 0.70)]
-    return merge([
-        *wheels,
-        *rims,
-        tubes(bars, 6, RIM),
-        loft(outlines, PAINT, closed=True),
-        boxes([(-0.25, -0.16, 0.22)], [(0.30, 0.16, 0.52)], TRIM),
-        disc((0.58, 0, 0.86), (1, 0, 0), 0.09, 8, HEAD),
-        quads([plate], PLATE),
-    ])  # fmt: skip
+    return merge(
+        [
+            *wheels,
+            *rims,
+            tubes(bars, 6, RIM),
+            loft(outlines, PAINT, closed=True),
+            boxes([(-0.25, -0.16, 0.22)], [(0.30, 0.16, 0.52)], TRIM),
+            disc((0.58, 0, 0.86), (1, 0, 0), 0.09, 8, HEAD),
+            quads([plate], PLATE),
+        ]
+    )

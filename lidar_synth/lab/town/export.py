@@ -1,6 +1,8 @@
-"""Export of the town to a dataset on disk, in the layout of KITTI-360, SemanticKITTI or KITTI; parallel, resumable.
+"""Export of the town to a dataset on disk, in the layout of KITTI-360, SemanticKITTI or KITTI;
+parallel, resumable.
 
-The unit of work is a stretch of road or a part of one, because each process has to build the world of a stretch.
+The unit of work is a stretch of road or a part of one, because each process has to build the world
+of a stretch.
 """
 
 from functools import partial
@@ -17,7 +19,12 @@ from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.formats.writer import Writer
-from lidar_synth.lab.town.accumulate import check_accumulation, window_paths, windows_of, write_window
+from lidar_synth.lab.town.accumulate import (
+    check_accumulation,
+    window_paths,
+    windows_of,
+    write_window,
+)
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES
 
@@ -64,7 +71,8 @@ def export_town(
         layout: one of ``LAYOUTS``.
         sequence: number of the drive or sequence to write, 0 to 99; ``SEQUENCES`` by default.
         camera: whether to render and write the camera image of each scan.
-        accumulate: whether to write accumulated clouds beside the scans of layout ``kitti360``, see accumulate.py.
+        accumulate: whether to write accumulated clouds beside the scans of layout ``kitti360``, see
+            accumulate.py.
         jobs: number of worker processes, at least 1.
         progress: whether to show a progress bar.
 
@@ -72,13 +80,15 @@ def export_town(
         The number of scans written by this call, and the number of scans that already existed.
 
     Raises:
-        ConfigError: on an unknown layout, a sequence or number of jobs out of range, clouds of another layout or of
-            too many scans, or a folder that holds another town.
+        ConfigError: on an unknown layout, a sequence or number of jobs out of range, clouds of
+            another layout or of too many scans, or a folder that holds another town.
         FileError: if the output cannot be written.
     """
     if layout not in LAYOUTS or jobs < 1:
         expected = f"one of {', '.join(LAYOUTS)}, and at least 1 job"
-        raise ConfigError(f"layout {layout!r}, {jobs} jobs", expected, suggest(layout, set(LAYOUTS) - {layout}))
+        raise ConfigError(
+            f"layout {layout!r}, {jobs} jobs", expected, suggest(layout, set(LAYOUTS) - {layout})
+        )
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
         raise ConfigError(f"sequence {number}", "0 to 99")
@@ -126,19 +136,25 @@ def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: boo
 
 
 def _groups(indices: list[int], jobs: int) -> list[list[int]]:
-    """The indices in groups that do not cross stretches, small enough that every process gets some; one index per
-    group with one process, which keeps its stretch in memory anyway."""
+    """The indices in groups that do not cross stretches, small enough that every process gets some;
+    one index per group with one process, which keeps its stretch in memory anyway."""
     limit = 1 if jobs == 1 else max(1, min(STRETCH_FRAMES, -(-len(indices) // jobs)))
     parts: list[list[int]] = []
     for i in indices:
-        if parts and len(parts[-1]) < limit and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES:
+        if (
+            parts
+            and len(parts[-1]) < limit
+            and parts[-1][-1] // STRETCH_FRAMES == i // STRETCH_FRAMES
+        ):
             parts[-1].append(i)
         else:
             parts.append([i])
     return parts
 
 
-def _write_group(town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]) -> int:
+def _write_group(
+    town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]
+) -> int:
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)

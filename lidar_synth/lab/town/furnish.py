@@ -1,4 +1,5 @@
-"""Objects on the street: parked vehicles, trees, lamps, signs, traffic lights and small street furniture."""
+"""Objects on the street: parked vehicles, trees, lamps, signs, traffic lights and small street
+furniture."""
 
 import numpy as np
 
@@ -13,10 +14,22 @@ from lidar_synth.lab.town.vehicles import vehicles
 
 Rng = np.random.Generator
 _PARKED = {
-    "hatchback": 0.17, "compact": 0.16, "small": 0.08, "sedan": 0.11, "old_sedan": 0.05, "estate": 0.14, "suv": 0.08,
-    "mpv": 0.09, "minivan": 0.035, "van": 0.03, "panel_van": 0.025, "small_lorry": 0.008, "flatbed": 0.007,
-    "trailer": 0.008, "caravan": 0.007,
-}  # fmt: skip
+    "hatchback": 0.17,
+    "compact": 0.16,
+    "small": 0.08,
+    "sedan": 0.11,
+    "old_sedan": 0.05,
+    "estate": 0.14,
+    "suv": 0.08,
+    "mpv": 0.09,
+    "minivan": 0.035,
+    "van": 0.03,
+    "panel_van": 0.025,
+    "small_lorry": 0.008,
+    "flatbed": 0.007,
+    "trailer": 0.008,
+    "caravan": 0.007,
+}
 
 
 def sample_vehicle(rng: Rng, shares: dict[str, float] = _PARKED) -> str:
@@ -47,7 +60,8 @@ def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: R
     how = street.parking[side]
     if how == "none":
         return
-    sign, edge = 2 * side - 1, street.edge[side]
+    sign = 2 * side - 1
+    edge = street.edge[side]
     at = {"street": edge - 1.02, "bay": edge + 1.05, "kerb": edge + 0.25}[how]
     density = rng.uniform(0.0, 0.5)
     drives = [lot.driveway for lot in lots if lot.side == side and lot.driveway]
@@ -61,9 +75,19 @@ def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: R
             s += length / 2
             blocked = any(a - length / 2 - 0.3 < s < b + length / 2 + 0.3 for a, b in drives)
             if rng.random() < density and not blocked and s + length / 2 < high:
-                yaw = (0.0 if side == RIGHT else np.pi) if rng.random() < 0.85 else (np.pi if side == RIGHT else 0.0)
+                yaw = (
+                    (0.0 if side == RIGHT else np.pi)
+                    if rng.random() < 0.85
+                    else (np.pi if side == RIGHT else 0.0)
+                )
                 place = sign * (at + rng.normal(0, 0.08))
-                scene.park(kinds[kind], PAINTS[rng.integers(len(PAINTS))], s, place, yaw + rng.normal(0, 0.02))
+                scene.park(
+                    kinds[kind],
+                    PAINTS[rng.integers(len(PAINTS))],
+                    s,
+                    place,
+                    yaw + rng.normal(0, 0.02),
+                )
             s += length / 2 + rng.uniform(0.6, 1.6)
 
 
@@ -97,7 +121,8 @@ def _put_trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     verge = street.band(side, "grass")
     bay = street.band(side, "parking")
     if street.kind != "edge" and verge is not None and rng.random() < 0.8:
-        step, at = rng.uniform(7, 16), (verge[0] + verge[1]) / 2
+        step = rng.uniform(7, 16)
+        at = (verge[0] + verge[1]) / 2
         species = str(rng.choice(["round", "birch", "poplar"]))
         for low, high in street.gaps(side, 3.0):
             for s in np.arange(low + 2, high - 2, step):
@@ -118,7 +143,12 @@ def _put_trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
                         sign * (verge[0] + verge[1]) / 2,
                     )
                 elif bay is not None and rng.random() < 0.2:
-                    scene.put(furniture.random_plant("bush", rng, 0.6), s, sign * (verge[0] + verge[1]) / 2, solid=0.5)
+                    scene.put(
+                        furniture.random_plant("bush", rng, 0.6),
+                        s,
+                        sign * (verge[0] + verge[1]) / 2,
+                        solid=0.5,
+                    )
 
 
 def _put_lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
@@ -136,9 +166,20 @@ def _put_lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     )
     for low, high in street.gaps(side, 0.5):
         for s in np.arange(low + rng.uniform(0, step), high, step):
-            scene.put(furniture.lamp_post(height, rng.uniform(0.6, 1.6)), s, sign * at, -sign * np.pi / 2, solid=0.3)
+            scene.put(
+                furniture.lamp_post(height, rng.uniform(0.6, 1.6)),
+                s,
+                sign * at,
+                -sign * np.pi / 2,
+                solid=0.3,
+            )
             if wood:
-                scene.put(furniture.mast(8.5, 0.13, True), s + step / 2, sign * (street.front(side) - 0.3), solid=0.3)
+                scene.put(
+                    furniture.mast(8.5, 0.13, True),
+                    s + step / 2,
+                    sign * (street.front(side) - 0.3),
+                    solid=0.3,
+                )
     if street.median > 1 and side == RIGHT:
         for s in np.arange(-REACH, street.length + REACH, 28.0):
             scene.put(furniture.mast(7.5, 0.11, False), s, 0.0)
@@ -152,33 +193,55 @@ def _put_signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     for low, high in street.gaps(side, 0.3):
         for s in np.arange(low + rng.uniform(0, 30), high, rng.uniform(28, 55)):
             kind = str(rng.choice(list(BOARDS)[:6], p=[0.2, 0.3, 0.12, 0.23, 0.12, 0.03]))
-            scene.put(road_sign(kind, rng.uniform(1.9, 2.4)), s, sign * at, facing + rng.normal(0, 0.15), solid=0.3)
+            scene.put(
+                road_sign(kind, rng.uniform(1.9, 2.4)),
+                s,
+                sign * at,
+                facing + rng.normal(0, 0.15),
+                solid=0.3,
+            )
 
 
 def _put_corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> None:
-    """Put traffic lights at large junctions, and street-name and right-of-way signs at other ones."""
+    """Put traffic lights at large junctions, and street-name and right-of-way signs at other
+    ones."""
     for side in c.sides:
         sign = 2 * side - 1
         for direction in (-1, 1):
-            s, t = c.s + direction * (c.half + 0.9), sign * (street.edge[side] + 0.9)
+            s = c.s + direction * (c.half + 0.9)
+            t = sign * (street.edge[side] + 0.9)
             if street.kind == "junction" and street.marked:
                 if direction == -sign or rng.random() < 0.5:
                     towards = np.pi if direction < 0 else 0.0
                     reach = 3.5 if direction == sign and rng.random() < 0.6 else 0.0
                     scene.put(traffic_light(5.2 if reach else 3.2, reach), s, t, towards, solid=0.3)
-                scene.put(traffic_light(3.2, 0.0), s - direction * 0.5, t + sign * 1.2, sign * np.pi / 2, solid=0.3)
+                scene.put(
+                    traffic_light(3.2, 0.0),
+                    s - direction * 0.5,
+                    t + sign * 1.2,
+                    sign * np.pi / 2,
+                    solid=0.3,
+                )
             elif rng.random() < 0.35:
                 scene.put(road_sign("street", 2.5), s, t, rng.choice([0.0, np.pi / 2]), solid=0.3)
             elif rng.random() < 0.3:
-                scene.put(road_sign(str(rng.choice(["warning", "priority"])), 2.1), s, t, sign * np.pi / 2, solid=0.3)
+                scene.put(
+                    road_sign(str(rng.choice(["warning", "priority"])), 2.1),
+                    s,
+                    t,
+                    sign * np.pi / 2,
+                    solid=0.3,
+                )
             if rng.random() < 0.25:
                 for k in range(3):
                     scene.put(furniture.bollard(), s + direction * 1.5 * k, t, solid=0.2)
 
 
 def _put_street_furniture(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Put bins, cabinets, bicycles, motorcycles, bus stops and advertising columns along the front of the lots."""
-    sign, front = 2 * side - 1, street.front(side)
+    """Put bins, cabinets, bicycles, motorcycles, bus stops and advertising columns along the front
+    of the lots."""
+    sign = 2 * side - 1
+    front = street.front(side)
     if street.kind == "edge":
         return
     kinds = vehicles()
@@ -189,7 +252,11 @@ def _put_street_furniture(street: Street, side: int, scene: Scene, rng: Rng) -> 
             if draw < 0.10:
                 for k in range(int(rng.integers(1, 4))):
                     scene.put(
-                        furniture.bin_(rng), s + 0.75 * k, sign * (front - 0.4), away + rng.normal(0, 0.1), solid=0.4
+                        furniture.bin_(rng),
+                        s + 0.75 * k,
+                        sign * (front - 0.4),
+                        away + rng.normal(0, 0.1),
+                        solid=0.4,
                     )
             elif draw < 0.14:
                 scene.put(furniture.cabinet(), s, sign * (front - 0.3), away, solid=0.6)

@@ -1,6 +1,7 @@
 """Static objects along a street: plants, lamps, benches, bins, bus shelters, market stalls.
 
-Every function returns a ``StaticObject`` whose origin is on the ground and whose front (or long side) is along +x.
+Every function returns a ``StaticObject`` whose origin is on the ground and whose front (or long
+side) is along +x.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,14 @@ from lidar_synth.lab.town.materials import RGB, Finish
 from lidar_synth.lab.town.meshes import Mesh, boxes, merge, prism, quads, tube, tubes
 from lidar_synth.lab.town.plants import SPECIES, TREE_CLASSES, VARIANTS, coarse_plant, plant, tufts
 
-BUILDING, FENCE, STRUCTURE, VEGETATION, TERRAIN, POLE, SIGN, OTHER = 50, 51, 52, 70, 72, 80, 81, 99
+BUILDING = 50
+FENCE = 51
+STRUCTURE = 52
+VEGETATION = 70
+TERRAIN = 72
+POLE = 80
+SIGN = 81
+OTHER = 99
 GALVANISED = Finish("metal", (0.55, 0.57, 0.58))
 
 
@@ -30,8 +38,11 @@ class StaticObject:
     raw: tuple[int, ...]
 
 
-def random_plant(species: str, rng: np.random.Generator, size: float = 1.0, near: bool = True) -> StaticObject:
-    """A tree or bush of a species with a random shape, size and tint; with fewer leaves unless it is ``near``."""
+def random_plant(
+    species: str, rng: np.random.Generator, size: float = 1.0, near: bool = True
+) -> StaticObject:
+    """A tree or bush of a species with a random shape, size and tint; with fewer leaves unless it
+    is ``near``."""
     mesh = (plant if near else coarse_plant)(species, int(rng.integers(VARIANTS)))
     mesh = mesh.moved(yaw=rng.uniform(0, 2 * np.pi), scale=size * rng.uniform(0.85, 1.15, 3))
     leaf, *rest = SPECIES[species]
@@ -45,15 +56,23 @@ def random_plant(species: str, rng: np.random.Generator, size: float = 1.0, near
 
 def weeds(length: float, depth: float, height: float, rng: np.random.Generator) -> StaticObject:
     """A strip of high grass along +x."""
-    return StaticObject(tufts(length, depth, height, 26, rng), (Finish("leaf", (0.36, 0.45, 0.18)),), (TERRAIN,))
+    return StaticObject(
+        tufts(length, depth, height, 26, rng), (Finish("leaf", (0.36, 0.45, 0.18)),), (TERRAIN,)
+    )
 
 
 def lamp_post(height: float, reach: float) -> StaticObject:
     """A street lamp with its arm towards +x."""
-    pole = tube([(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)], (0.085, 0.085, 0.06, 0.045), 8)
-    arm = tube([(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)], 0.035, 6)
+    pole = tube(
+        [(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)], (0.085, 0.085, 0.06, 0.045), 8
+    )
+    arm = tube(
+        [(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)], 0.035, 6
+    )
     head = boxes([(reach - 0.1, -0.14, height + 0.22)], [(reach + 0.6, 0.14, height + 0.36)], 1)
-    return StaticObject(merge([pole, arm, head]), (GALVANISED, Finish("lamp", (0.6, 0.6, 0.6))), (POLE, POLE))
+    return StaticObject(
+        merge([pole, arm, head]), (GALVANISED, Finish("lamp", (0.6, 0.6, 0.6))), (POLE, POLE)
+    )
 
 
 def mast(height: float, radius: float, wood: bool) -> StaticObject:
@@ -68,28 +87,45 @@ def mast(height: float, radius: float, wood: bool) -> StaticObject:
 def bench() -> StaticObject:
     """A park bench facing +x, its seat 0.45 m high."""
     slats = [(-0.22 + 0.11 * i, 0.43) for i in range(4)] + [(-0.27, 0.60), (-0.30, 0.76)]
-    low, high = (
-        [(x, -0.85, z) for x, z in slats],
-        [(x + (0.09 if z < 0.5 else 0.03), 0.85, z + (0.04 if z < 0.5 else 0.11)) for x, z in slats],
+    low = [(x, -0.85, z) for x, z in slats]
+    high = [
+        (x + (0.09 if z < 0.5 else 0.03), 0.85, z + (0.04 if z < 0.5 else 0.11)) for x, z in slats
+    ]
+    legs = boxes(
+        [(-0.25, y, -0.05) for y in (-0.7, 0.64)], [(0.2, y + 0.06, 0.43) for y in (-0.7, 0.64)], 1
     )
-    legs = boxes([(-0.25, y, -0.05) for y in (-0.7, 0.64)], [(0.2, y + 0.06, 0.43) for y in (-0.7, 0.64)], 1)
     return StaticObject(
-        merge([boxes(low, high), legs]), (Finish("wood"), Finish("metal", (0.2, 0.2, 0.2))), (OTHER, OTHER)
+        merge([boxes(low, high), legs]),
+        (Finish("wood"), Finish("metal", (0.2, 0.2, 0.2))),
+        (OTHER, OTHER),
     )
 
 
 def bin_(rng: np.random.Generator) -> StaticObject:
     """A wheeled rubbish bin."""
-    colours: tuple[RGB, ...] = ((0.10, 0.11, 0.12), (0.10, 0.22, 0.12), (0.10, 0.16, 0.35), (0.55, 0.45, 0.10))
+    colours: tuple[RGB, ...] = (
+        (0.10, 0.11, 0.12),
+        (0.10, 0.22, 0.12),
+        (0.10, 0.16, 0.35),
+        (0.55, 0.45, 0.10),
+    )
     mesh = merge(
-        [boxes([(-0.26, -0.24, 0.04)], [(0.26, 0.24, 0.98)]), boxes([(-0.30, -0.28, 0.98)], [(0.32, 0.28, 1.06)])]
+        [
+            boxes([(-0.26, -0.24, 0.04)], [(0.26, 0.24, 0.98)]),
+            boxes([(-0.30, -0.28, 0.98)], [(0.32, 0.28, 1.06)]),
+        ]
     )
     return StaticObject(mesh, (Finish("plastic", colours[rng.integers(4)]),), (OTHER,))
 
 
 def cabinet() -> StaticObject:
     """A roadside cabinet of a telephone or power company."""
-    mesh = merge([boxes([(-0.2, -0.5, -0.1)], [(0.2, 0.5, 1.15)]), boxes([(-0.24, -0.54, 1.15)], [(0.24, 0.54, 1.22)])])
+    mesh = merge(
+        [
+            boxes([(-0.2, -0.5, -0.1)], [(0.2, 0.5, 1.15)]),
+            boxes([(-0.24, -0.54, 1.15)], [(0.24, 0.54, 1.22)]),
+        ]
+    )
     return StaticObject(mesh, (Finish("plastic", (0.50, 0.53, 0.50)),), (OTHER,))
 
 
@@ -111,12 +147,19 @@ def shelter() -> StaticObject:
         [(-0.7, 2, 0.15), (0.5, 2, 0.15), (0.5, 2, 2.2), (-0.7, 2, 2.2)],
     ]
     posts = [(x, y) for x in (-0.7, 0.5) for y in (-2.0, 2.0)]
-    mesh = merge([
-        quads(glass, 1),
-        boxes([(x - 0.04, y - 0.04, -0.1) for x, y in posts], [(x + 0.04, y + 0.04, 2.3) for x, y in posts]),
-        boxes([(-0.9, -2.2, 2.3), (-0.65, -1.2, 0.42)], [(0.8, 2.2, 2.42), (-0.3, 1.2, 0.47)]),
-    ])  # fmt: skip
-    return StaticObject(mesh, (Finish("metal", (0.25, 0.27, 0.28)), Finish("glass")), (STRUCTURE, STRUCTURE))
+    mesh = merge(
+        [
+            quads(glass, 1),
+            boxes(
+                [(x - 0.04, y - 0.04, -0.1) for x, y in posts],
+                [(x + 0.04, y + 0.04, 2.3) for x, y in posts],
+            ),
+            boxes([(-0.9, -2.2, 2.3), (-0.65, -1.2, 0.42)], [(0.8, 2.2, 2.42), (-0.3, 1.2, 0.47)]),
+        ]
+    )
+    return StaticObject(
+        mesh, (Finish("metal", (0.25, 0.27, 0.28)), Finish("glass")), (STRUCTURE, STRUCTURE)
+    )
 
 
 def advertising_column() -> StaticObject:
@@ -130,7 +173,9 @@ def advertising_column() -> StaticObject:
             prism(0.5 * circle, 2.8, 3.1, 1, 1),
         ]
     )
-    return StaticObject(mesh, (Finish("cloth", (0.75, 0.55, 0.40)), Finish("concrete")), (OTHER, OTHER))
+    return StaticObject(
+        mesh, (Finish("cloth", (0.75, 0.55, 0.40)), Finish("concrete")), (OTHER, OTHER)
+    )
 
 
 def fountain() -> StaticObject:
@@ -145,24 +190,35 @@ def fountain() -> StaticObject:
             prism(0.9 * circle, 1.5, 1.65),
         ]
     )
-    return StaticObject(mesh, (Finish("stone"), Finish("plastic", (0.2, 0.3, 0.34))), (STRUCTURE, STRUCTURE))
+    return StaticObject(
+        mesh, (Finish("stone"), Finish("plastic", (0.2, 0.3, 0.34))), (STRUCTURE, STRUCTURE)
+    )
 
 
 def stall(rng: np.random.Generator) -> StaticObject:
     """A market stall: counter, posts and an awning."""
-    colours: tuple[RGB, ...] = ((0.72, 0.10, 0.09), (0.85, 0.83, 0.78), (0.18, 0.38, 0.22), (0.2, 0.3, 0.55))
+    colours: tuple[RGB, ...] = (
+        (0.72, 0.10, 0.09),
+        (0.85, 0.83, 0.78),
+        (0.18, 0.38, 0.22),
+        (0.2, 0.3, 0.55),
+    )
     posts = [(x, y) for x in (-1.0, 1.0) for y in (-1.5, 1.5)]
     awning = [
         [(-1.3, -1.7, 2.3), (-1.3, 1.7, 2.3), (0, 1.7, 2.8), (0, -1.7, 2.8)],
         [(1.3, -1.7, 2.3), (1.3, 1.7, 2.3), (0, 1.7, 2.8), (0, -1.7, 2.8)],
     ]
-    mesh = merge([
-        quads(awning, 1),
-        tubes([([(x, y, -0.1), (x, y, 2.4)], 0.025) for x, y in posts], 4, 0),
-        boxes([(0.2, -1.5, 0.0)], [(1.0, 1.5, 0.9)], 2),
-    ])  # fmt: skip
+    mesh = merge(
+        [
+            quads(awning, 1),
+            tubes([([(x, y, -0.1), (x, y, 2.4)], 0.025) for x, y in posts], 4, 0),
+            boxes([(0.2, -1.5, 0.0)], [(1.0, 1.5, 0.9)], 2),
+        ]
+    )
     return StaticObject(
-        mesh, (GALVANISED, Finish("cloth", colours[rng.integers(4)]), Finish("wood")), (STRUCTURE, STRUCTURE, STRUCTURE)
+        mesh,
+        (GALVANISED, Finish("cloth", colours[rng.integers(4)]), Finish("wood")),
+        (STRUCTURE, STRUCTURE, STRUCTURE),
     )
 
 
@@ -171,5 +227,7 @@ def planter(rng: np.random.Generator) -> StaticObject:
     bush = random_plant("bush", rng, 0.45)
     tub = boxes([(-0.45, -0.45, -0.05)], [(0.45, 0.45, 0.5)], 3)
     return StaticObject(
-        merge([bush.mesh.moved((0, 0, 0.4)), tub]), (*bush.finishes, Finish("concrete")), (*bush.raw, OTHER)
+        merge([bush.mesh.moved((0, 0, 0.4)), tub]),
+        (*bush.finishes, Finish("concrete")),
+        (*bush.raw, OTHER),
     )

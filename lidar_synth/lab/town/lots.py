@@ -1,6 +1,7 @@
 """The plan of the lots along a street: houses, driveways and front boundaries.
 
-Lots are sampled before the ground is built, because driveways and yards are painted on it; ``yards`` then builds them.
+Lots are sampled before the ground is built, because driveways and yards are painted on it;
+``yards`` then builds them.
 """
 
 from dataclasses import dataclass, replace
@@ -49,28 +50,58 @@ class Lot:
 
 
 def sample_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
-    """The sampled plan of a house, row, block, shop or hall of the given width and depth in metres."""
+    """The sampled plan of a house, row, block, shop or hall of the given width and depth in
+    metres."""
     match style:
         case "house":
             roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
             floors = int(rng.choice([1, 2, 3], p=[0.3, 0.55, 0.15]))
             return BuildingPlan(
-                width, depth, floors, rng.uniform(2.6, 2.9), rng.uniform(0.2, 1.1), roof, rng.random() < 0.15
+                width,
+                depth,
+                floors,
+                rng.uniform(2.6, 2.9),
+                rng.uniform(0.2, 1.1),
+                roof,
+                rng.random() < 0.15,
             )
         case "row":
-            return BuildingPlan(width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8))
+            return BuildingPlan(
+                width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8)
+            )
         case "block":
             roof = str(rng.choice(["gable", "hip", "flat"]))
             return BuildingPlan(
-                width, depth, int(rng.integers(3, 6)), 2.8, rng.uniform(0.5, 1.2), roof, rng.random() < 0.6
+                width,
+                depth,
+                int(rng.integers(3, 6)),
+                2.8,
+                rng.uniform(0.5, 1.2),
+                roof,
+                rng.random() < 0.6,
             )
         case "shop":
             roof = str(rng.choice(["gable", "hip", "flat"]))
-            return BuildingPlan(width, depth, int(rng.integers(2, 5)), 3.1, 0.15, roof, rng.random() < 0.2, shop=True)
+            return BuildingPlan(
+                width,
+                depth,
+                int(rng.integers(2, 5)),
+                3.1,
+                0.15,
+                roof,
+                rng.random() < 0.2,
+                shop=True,
+            )
     return BuildingPlan(width, depth, 1, rng.uniform(4, 7), 0.2, "flat")
 
 
-_SIZES = {"house": (8.5, 13.5), "row": (6.0, 8.5), "block": (15.0, 26.0), "shop": (10.0, 18.0), "hall": (18.0, 34.0)}
+_SIZES = {
+    "house": (8.5, 13.5),
+    "row": (6.0, 8.5),
+    "block": (15.0, 26.0),
+    "shop": (10.0, 18.0),
+    "hall": (18.0, 34.0),
+}
 
 
 def _style(street: Street, side: int, rng: Rng) -> str:
@@ -81,7 +112,9 @@ def _style(street: Street, side: int, rng: Rng) -> str:
         return str(rng.choice(["house", "hall"], p=[0.6, 0.4]))
     if street.plaza == side:
         return "shop"
-    return str(rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]))
+    return str(
+        rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08])
+    )
 
 
 def sample_lots(street: Street, rng: Rng) -> list[Lot]:
@@ -90,13 +123,24 @@ def sample_lots(street: Street, rng: Rng) -> list[Lot]:
     for side in (RIGHT, LEFT):
         front = street.front(side)
         boundary = sample_kind(rng)
-        setback = rng.uniform(2.0, 8.0) if street.kind in ("residential", "edge") else rng.uniform(0.0, 6.0)
+        setback = (
+            rng.uniform(2.0, 8.0)
+            if street.kind in ("residential", "edge")
+            else rng.uniform(0.0, 6.0)
+        )
         for low, high in street.gaps(side, 1.0):
             s = low
             while high - s > 7:
                 on_plaza = street.plaza == side and s + 9 > -12 and s < street.length + 12
                 lot = _sample_lot(
-                    street, side, s, high, front + (PLAZA_DEPTH if on_plaza else 0.0), setback, boundary, rng
+                    street,
+                    side,
+                    s,
+                    high,
+                    front + (PLAZA_DEPTH if on_plaza else 0.0),
+                    setback,
+                    boundary,
+                    rng,
                 )
                 lots.append(lot)
                 s = lot.end
@@ -104,7 +148,14 @@ def sample_lots(street: Street, rng: Rng) -> list[Lot]:
 
 
 def _sample_lot(
-    street: Street, side: int, s: float, high: float, front: float, setback: float, boundary: str, rng: Rng
+    street: Street,
+    side: int,
+    s: float,
+    high: float,
+    front: float,
+    setback: float,
+    boundary: str,
+    rng: Rng,
 ) -> Lot:
     """A sampled lot that starts at s and ends at ``high`` at the latest."""
     style = _style(street, side, rng)
@@ -155,10 +206,20 @@ def paint_lots(lots: list[Lot], paint: Paint, rng: Rng) -> None:
     """Paint driveways, yards and flower beds onto the ground."""
     for lot in lots:
         if lot.plan is not None and lot.garden < 0.25:
-            paint((lot.start, lot.end), (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)), "yard")
+            paint(
+                (lot.start, lot.end),
+                (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)),
+                "yard",
+            )
         elif lot.plan is not None and rng.random() < 0.3:
             paint(
-                (lot.start + 1, lot.end - 1), (lot.sign * lot.front, lot.sign * (lot.front + 0.4 * lot.setback)), "soil"
+                (lot.start + 1, lot.end - 1),
+                (lot.sign * lot.front, lot.sign * (lot.front + 0.4 * lot.setback)),
+                "soil",
             )
         if lot.driveway:
-            paint(lot.driveway, (lot.sign * lot.front, lot.sign * (lot.front + lot.setback + 9)), "driveway")
+            paint(
+                lot.driveway,
+                (lot.sign * lot.front, lot.sign * (lot.front + lot.setback + 9)),
+                "driveway",
+            )

@@ -1,8 +1,9 @@
 """Triangle meshes and functions that build them.
 
-A mesh is a list of triangles without shared vertices, as Embree takes it; meshes are merged by concatenating arrays,
-and each triangle has a slot number for its finish. Coordinates are metres, right-handed, z up; an object's own frame
-has x forward, y left and its origin on the ground below its centre.
+A mesh is a list of triangles without shared vertices, as Embree takes it; meshes are merged by
+concatenating arrays, and each triangle has a slot number for its finish. Coordinates are metres,
+right-handed, z up; an object's own frame has x forward, y left and its origin on the ground below
+its centre.
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,9 +32,13 @@ class Mesh:
     def __len__(self) -> int:
         return len(self.slot)
 
-    def moved(self, offset: ArrayLike = (0, 0, 0), yaw: float = 0.0, scale: ArrayLike = 1.0) -> "Mesh":
-        """The mesh scaled (one factor or one per axis), then rotated about z (radians), then translated (metres)."""
-        c, s = np.cos(yaw), np.sin(yaw)
+    def moved(
+        self, offset: ArrayLike = (0, 0, 0), yaw: float = 0.0, scale: ArrayLike = 1.0
+    ) -> "Mesh":
+        """The mesh scaled (one factor or one per axis), then rotated about z (radians), then
+        translated (metres)."""
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         turn = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)], np.float32)
         shape = np.asarray(scale, np.float32)
         points = (self.triangles * shape).reshape(-1, 3) @ turn + np.asarray(offset, np.float32)
@@ -41,7 +46,9 @@ class Mesh:
 
     def posed(self, pose: NDArray[np.float64]) -> "Mesh":
         """The mesh transformed by a rigid motion (4, 4)."""
-        points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
+        points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32) + pose[
+            :3, 3
+        ].astype(np.float32)
         return Mesh(points.reshape(-1, 3, 3), self.slot)
 
     @cached_property
@@ -52,7 +59,8 @@ class Mesh:
 
     @cached_property
     def outline(self) -> Points:
-        """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image boxes."""
+        """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image
+        boxes."""
         angle = np.pi * (1 + 5**0.5) * np.arange(160)
         up = 1 - 2 * (np.arange(160) + 0.5) / 160
         flat = np.sqrt(1 - up * up)
@@ -67,7 +75,9 @@ def merge(parts: Iterable[Mesh]) -> Mesh:
     parts = list(parts)
     if not parts:
         return Mesh(np.zeros((0, 3, 3), np.float32), np.zeros(0, np.int32))
-    return Mesh(np.concatenate([p.triangles for p in parts]), np.concatenate([p.slot for p in parts]))
+    return Mesh(
+        np.concatenate([p.triangles for p in parts]), np.concatenate([p.slot for p in parts])
+    )
 
 
 def _slots(slot: Slots, shape: tuple[int, ...]) -> NDArray[np.int32]:
@@ -88,12 +98,16 @@ def quads(corners: ArrayLike, slot: Slots = 0) -> Mesh:
     return Mesh(triangles, np.repeat(_slots(slot, (len(points),)), 2))
 
 
-_BOX_FACES = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+_BOX_FACES = np.array(
+    [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+)
 
 
 def boxes(low: ArrayLike, high: ArrayLike, slot: Slots = 0) -> Mesh:
     """Axis-aligned boxes, given by their lowest and highest corners, each (B, 3) metres."""
-    ends = np.stack([np.asarray(low, np.float32).reshape(-1, 3), np.asarray(high, np.float32).reshape(-1, 3)])
+    ends = np.stack(
+        [np.asarray(low, np.float32).reshape(-1, 3), np.asarray(high, np.float32).reshape(-1, 3)]
+    )
     pick = np.array([(i >> 2, i >> 1 & 1, i & 1) for i in range(8)])
     corners = np.stack([ends[pick[:, axis], :, axis] for axis in range(3)], -1)
     faces = corners[_BOX_FACES].transpose(2, 0, 1, 3)
@@ -118,20 +132,30 @@ def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
 def fan(outline: ArrayLike, slot: int = 0) -> Mesh:
     """A flat convex polygon with corners (P, 3), metres."""
     points = np.asarray(outline, np.float32)
-    triangles = np.stack([np.broadcast_to(points[0], points[2:].shape), points[1:-1], points[2:]], 1)
+    triangles = np.stack(
+        [np.broadcast_to(points[0], points[2:].shape), points[1:-1], points[2:]], 1
+    )
     return Mesh(triangles, np.full(len(triangles), slot, np.int32))
 
 
-def prism(outline: ArrayLike, bottom: float, top: float, slot: int = 0, cap: int | None = None) -> Mesh:
-    """Vertical walls over a convex outline (P, 2) with a flat top (of slot ``cap``), open at the bottom."""
+def prism(
+    outline: ArrayLike, bottom: float, top: float, slot: int = 0, cap: int | None = None
+) -> Mesh:
+    """Vertical walls over a convex outline (P, 2) with a flat top (of slot ``cap``), open at the
+    bottom."""
     plan = np.asarray(outline, np.float32)
-    low, high = np.c_[plan, np.full(len(plan), bottom)], np.c_[plan, np.full(len(plan), top)]
+    low = np.c_[plan, np.full(len(plan), bottom)]
+    high = np.c_[plan, np.full(len(plan), top)]
     return merge([loft([low, high], slot, closed=True), fan(high, slot if cap is None else cap)])
 
 
-def disc(centre: ArrayLike, normal: ArrayLike, radius: float, sides: int = 8, slot: int = 0) -> Mesh:
+def disc(
+    centre: ArrayLike, normal: ArrayLike, radius: float, sides: int = 8, slot: int = 0
+) -> Mesh:
     """A flat regular polygon around ``centre``."""
-    return fan(np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0], slot)
+    return fan(
+        np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0], slot
+    )
 
 
 def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
@@ -145,11 +169,15 @@ def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
     u, v, w = across.T
     other = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
     angle = 2 * np.pi * np.arange(sides) / sides
-    ring: NDArray[np.float64] = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None]
+    ring: NDArray[np.float64] = (
+        np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None]
+    )
     return ring
 
 
-def tube(path: ArrayLike, radius: ArrayLike, sides: int = 6, slot: int = 0, caps: bool = True) -> Mesh:
+def tube(
+    path: ArrayLike, radius: ArrayLike, sides: int = 6, slot: int = 0, caps: bool = True
+) -> Mesh:
     """A tube along a path.
 
     Args:
@@ -187,18 +215,26 @@ def leaves(centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: 
     axes = rng.standard_normal((2, len(middle), 3)).astype(np.float32)
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     (x, y, z), (u, v, w) = axes[0].T, axes[1].T
-    first, second = axes[0], np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
+    first = axes[0]
+    second = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
     second /= np.linalg.norm(second, axis=-1, keepdims=True) + 1e-6
     reach = np.broadcast_to(np.asarray(size, np.float32), (len(middle),))[:, None]
     corners = [first, -0.5 * first + 0.87 * second, -0.5 * first - 0.87 * second]
     return Mesh(np.stack([middle + reach * c for c in corners], 1), _slots(slot, (len(middle),)))
 
 
-def ball(centre: ArrayLike, radii: ArrayLike, slot: int = 0, rings: int = 4, sides: int = 8) -> Mesh:
+def ball(
+    centre: ArrayLike, radii: ArrayLike, slot: int = 0, rings: int = 4, sides: int = 8
+) -> Mesh:
     """An ellipsoid with semi-axes ``radii`` (one or three, metres)."""
     polar = np.linspace(0, np.pi, rings + 1)[:, None]
     angle = 2 * np.pi * np.arange(sides) / sides
     unit = np.stack(
-        [np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar) * np.ones_like(angle)], -1
+        [
+            np.sin(polar) * np.cos(angle),
+            np.sin(polar) * np.sin(angle),
+            np.cos(polar) * np.ones_like(angle),
+        ],
+        -1,
     )
     return loft(np.asarray(centre) + unit * np.asarray(radii, float), slot, closed=True)

@@ -1,4 +1,5 @@
-"""Motion: the path of the ego vehicle, and movers with constant speed along a line of the street."""
+"""Motion: the path of the ego vehicle, and movers with constant speed along a line of the
+street."""
 
 from dataclasses import dataclass
 
@@ -39,7 +40,8 @@ class Mover:
     scale: float
 
     def place(self, time: float) -> tuple[float, float, float]:
-        """Its s and t (metres) and its yaw relative to the street (radians) at a time in seconds."""
+        """Its s and t (metres) and its yaw relative to the street (radians) at a time in
+        seconds."""
         moving = self.start + self.direction * self.speed * time
         yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.direction < 0 else 0.0)
         return (moving, self.at, yaw) if self.along else (self.at, moving, yaw)
@@ -47,14 +49,16 @@ class Mover:
     def shape(self, time: float) -> Prototype:
         """Its prototype at a time in seconds."""
         return self.shapes[
-            int((abs(self.start) + self.speed * time) / self.stride * len(self.shapes)) % len(self.shapes)
+            int((abs(self.start) + self.speed * time) / self.stride * len(self.shapes))
+            % len(self.shapes)
         ]
 
 
 def place_movers(
     movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float
 ) -> list[PlacedObject]:
-    """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a time in seconds."""
+    """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a
+    time in seconds."""
     places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
     near = np.flatnonzero(np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach)
     lengths = [2.0 if len(movers[i].shapes) == 1 else 0.5 for i in near]
@@ -67,11 +71,14 @@ def place_movers(
 
 
 def ego_place(street: Street, time: float) -> tuple[float, float, float]:
-    """Street coordinates of the ego vehicle at a time in seconds, and its yaw (radians) relative to the street.
+    """Street coordinates of the ego vehicle at a time in seconds, and its yaw (radians) relative to
+    the street.
 
-    The vehicle follows its lane with a small lateral drift, or turns in an arc into the right lane of a side street.
+    The vehicle follows its lane with a small lateral drift, or turns in an arc into the right lane
+    of a side street.
     """
-    travelled, lane = street.speed * time, street.lanes[0].t
+    travelled = street.speed * time
+    lane = street.lanes[0].t
     if street.turn is None:
         return travelled, float(lane + 0.15 * np.sin(0.11 * travelled)), 0.0
     crossing, side = street.turn
@@ -84,7 +91,9 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
     return float(s), float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)), sign * angle
 
 
-def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDArray[np.float64]) -> Pose:
+def ego_pose(
+    street: Street, scene: Scene, time: float, height: float, sway: NDArray[np.float64]
+) -> Pose:
     """(4, 4) sensor to world at a time in seconds.
 
     Args:
@@ -95,8 +104,12 @@ def ego_pose(street: Street, scene: Scene, time: float, height: float, sway: NDA
     """
     pose = scene.poses(*ego_place(street, time), 4.0)
     roll, pitch = sway
-    rolled = np.array([(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))])
-    pitched = np.array([(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))])
+    rolled = np.array(
+        [(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))]
+    )
+    pitched = np.array(
+        [(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))]
+    )
     pose[:3, :3] = pose[:3, :3] @ pitched @ rolled
     pose[:3, 3] += height * pose[:3, 2]
     return pose

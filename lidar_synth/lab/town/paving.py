@@ -1,4 +1,5 @@
-"""The kinds of ground of a street: verges, pavements, parking bays, carriageways, markings, crossings."""
+"""The kinds of ground of a street: verges, pavements, parking bays, carriageways, markings,
+crossings."""
 
 from dataclasses import dataclass, field
 
@@ -28,7 +29,8 @@ class Paint:
     corners: list[Corner] = field(default_factory=list)
 
     def __call__(self, s: tuple[float, float], t: tuple[float, float], kind: str) -> None:
-        """Paint a rectangle with a kind of ground; ``s`` and ``t`` are its intervals in metres, in either order."""
+        """Paint a rectangle with a kind of ground; ``s`` and ``t`` are its intervals in metres, in
+        either order."""
         self.rects.append((min(s), max(s), min(t), max(t), NAMES.index(kind)))
 
 
@@ -70,17 +72,25 @@ def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
     if not c.pavement:
         return
     for side in c.sides:
-        sign, edge = 2 * side - 1, street.edge[side]
+        sign = 2 * side - 1
+        edge = street.edge[side]
         out = c.half + c.pavement
         paint((c.s - out, c.s + out), (sign * edge, sign * BEYOND), "sidewalk")
         for direction in (-1, 1):
-            paint((c.s + direction * c.half, c.s + direction * (c.half + 0.13)), (sign * edge, sign * BEYOND), "kerb")
+            paint(
+                (c.s + direction * c.half, c.s + direction * (c.half + 0.13)),
+                (sign * edge, sign * BEYOND),
+                "kerb",
+            )
             paint((c.s, c.s + direction * out), (sign * edge, sign * (edge + 0.13)), "kerb")
-            paint.corners.append(Corner(c.s + direction * c.half, sign * edge, direction, sign, min(c.pavement, 3.0)))
+            paint.corners.append(
+                Corner(c.s + direction * c.half, sign * edge, direction, sign, min(c.pavement, 3.0))
+            )
 
 
 def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> None:
-    """Paint the asphalt of a side street, and on larger streets its lines, stop lines and zebra crossings."""
+    """Paint the asphalt of a side street, and on larger streets its lines, stop lines and zebra
+    crossings."""
     low = -BEYOND if RIGHT in c.sides else -street.edge[RIGHT]
     high = BEYOND if LEFT in c.sides else street.edge[LEFT]
     if len(c.sides) == 1 and street.median:
@@ -92,7 +102,8 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
     if not street.marked or street.kind not in ("junction", "main", "square"):
         return
     for side in c.sides:
-        sign, edge = 2 * side - 1, street.edge[side]
+        sign = 2 * side - 1
+        edge = street.edge[side]
         paint((c.s, c.s - sign * c.half), (sign * (edge + 1.0), sign * (edge + 1.4)), "marking")
         for t in np.arange(edge + 3, 60, 6.0):
             paint((c.s - 0.06, c.s + 0.06), (sign * t, sign * (t + 3)), "marking")
@@ -127,4 +138,8 @@ def _markings(street: Street, paint: Paint) -> None:
             paint(full_length, (t, t + 0.12), "marking")
     for side, sign in ((RIGHT, -1), (LEFT, 1)):
         if street.parking[side] == "street":
-            paint(full_length, (sign * (street.edge[side] - 2.15), sign * (street.edge[side] - 2.05)), "marking")
+            paint(
+                full_length,
+                (sign * (street.edge[side] - 2.15), sign * (street.edge[side] - 2.05)),
+                "marking",
+            )

@@ -1,4 +1,5 @@
-"""Objects of special places: the verges of a road at the edge of town, and the furniture and people of a square."""
+"""Objects of special places: the verges of a road at the edge of town, and the furniture and people
+of a square."""
 
 import numpy as np
 
@@ -13,15 +14,24 @@ Rng = np.random.Generator
 
 
 def edge_of_town(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Put high grass, thickets, crash barriers and single trees beside a road at the edge of town."""
-    sign, front = 2 * side - 1, street.front(side)
-    rail, bushes, belt = rng.random() < 0.25, rng.uniform(0, 0.8), rng.random() < 0.6
-    depth, away = rng.uniform(2, 5), rng.uniform(2, 7)
+    """Put high grass, thickets, crash barriers and single trees beside a road at the edge of
+    town."""
+    sign = 2 * side - 1
+    front = street.front(side)
+    rail = rng.random() < 0.25
+    bushes = rng.uniform(0, 0.8)
+    belt = rng.random() < 0.6
+    depth = rng.uniform(2, 5)
+    away = rng.uniform(2, 7)
     for low, high in street.gaps(side, 2.0):
         for s in np.arange(low, high - 8, 8.0):
             if rail:
                 scene.put(guard_rail(8.0), s, sign * (street.edge[side] + 0.9))
-            scene.put(furniture.weeds(8.0, 1.6, rng.uniform(0.2, 0.6), rng), s, sign * (street.edge[side] + 2.2))
+            scene.put(
+                furniture.weeds(8.0, 1.6, rng.uniform(0.2, 0.6), rng),
+                s,
+                sign * (street.edge[side] + 2.2),
+            )
             for _ in range(rng.poisson(3 * bushes)):
                 scene.put(
                     furniture.random_plant("bush", rng, rng.uniform(0.8, 1.7)),
@@ -34,14 +44,19 @@ def edge_of_town(street: Street, side: int, scene: Scene, rng: Rng) -> None:
             if rng.random() < 0.45:
                 species = str(rng.choice(["round", "birch", "poplar", "spruce"]))
                 scene.put(
-                    furniture.random_plant(species, rng), s + rng.uniform(0, 8), sign * (front + rng.uniform(1, 14))
+                    furniture.random_plant(species, rng),
+                    s + rng.uniform(0, 8),
+                    sign * (front + rng.uniform(1, 14)),
                 )
 
 
 def square(street: Street, side: int, scene: Scene, rng: Rng) -> None:
-    """Put rows of trees, benches with sitting people, stalls, a fountain and standing people onto a square."""
-    sign, front = 2 * side - 1, street.front(side)
-    low, high = -8.0, street.length + 8
+    """Put rows of trees, benches with sitting people, stalls, a fountain and standing people onto a
+    square."""
+    sign = 2 * side - 1
+    front = street.front(side)
+    low = -8.0
+    high = street.length + 8
     middle = sign * (front + 0.5 * PLAZA_DEPTH)
     scene.put(furniture.fountain(), rng.uniform(low + 5, high - 5), middle, solid=3.0)
     for row in (4.0, PLAZA_DEPTH - 5):
@@ -49,7 +64,9 @@ def square(street: Street, side: int, scene: Scene, rng: Rng) -> None:
         for s in np.arange(low, high, rng.uniform(8, 12)):
             scene.put(furniture.random_plant(species, rng), s, sign * (front + row), solid=0.5)
             if rng.random() < 0.6 and scene.is_free(s + 2.5, sign * (front + row), (1.2, 1.2)):
-                scene.put(furniture.bench(), s + 2.5, sign * (front + row), -sign * np.pi / 2, solid=0.9)
+                scene.put(
+                    furniture.bench(), s + 2.5, sign * (front + row), -sign * np.pi / 2, solid=0.9
+                )
                 if rng.random() < 0.6:
                     scene.park(
                         sitter(),
@@ -66,7 +83,15 @@ def square(street: Street, side: int, scene: Scene, rng: Rng) -> None:
         if rng.random() < 0.7:
             scene.put(furniture.bollard(), s, sign * (front + 0.3), solid=0.2)
     for _ in range(int(rng.integers(4, 14))):
-        s, t = rng.uniform(low, high), middle + rng.uniform(-14, 14)
+        s = rng.uniform(low, high)
+        t = middle + rng.uniform(-14, 14)
         if scene.is_free(s, t, (0.6, 0.6)):
             person = walker(int(rng.integers(8)), standing=True, bag=rng.random() < 0.3)
-            scene.park(person, CLOTHES[rng.integers(len(CLOTHES))], s, t, rng.uniform(0, 6.28), rng.uniform(0.9, 1.06))
+            scene.park(
+                person,
+                CLOTHES[rng.integers(len(CLOTHES))],
+                s,
+                t,
+                rng.uniform(0, 6.28),
+                rng.uniform(0.9, 1.06),
+            )

@@ -1,4 +1,5 @@
-"""Relief of soft surfaces: value noise in three octaves, fixed in the world, so that all scans of a stretch agree."""
+"""Relief of soft surfaces: value noise in three octaves, fixed in the world, so that all scans of a
+stretch agree."""
 
 import numpy as np
 from numba import njit
@@ -23,14 +24,24 @@ def _corner(x: int, y: int, z: int, octave: int) -> float:
 
 
 @njit(cache=True)
-def _noise(points: Floats, sizes: NDArray[np.float64], weights: NDArray[np.float64], out: Floats) -> None:
+def _noise(
+    points: Floats, sizes: NDArray[np.float64], weights: NDArray[np.float64], out: Floats
+) -> None:
     for i in range(len(points)):
         total = 0.0
         for k in range(len(sizes)):
-            u, v, w = points[i, 0] / sizes[k], points[i, 1] / sizes[k], points[i, 2] / sizes[k]
-            x, y, z = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
-            u, v, w = u - x, v - y, w - z
-            u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+            u = points[i, 0] / sizes[k]
+            v = points[i, 1] / sizes[k]
+            w = points[i, 2] / sizes[k]
+            x = int(np.floor(u))
+            y = int(np.floor(v))
+            z = int(np.floor(w))
+            u = u - x
+            v = v - y
+            w = w - z
+            u = u * u * (3 - 2 * u)
+            v = v * v * (3 - 2 * v)
+            w = w * w * (3 - 2 * w)
             value = 0.0
             for a in range(2):
                 for b in range(2):
@@ -42,7 +53,8 @@ def _noise(points: Floats, sizes: NDArray[np.float64], weights: NDArray[np.float
 
 
 def relief(points: Floats) -> Floats:
-    """(N,) displacement at points (N, 3) of the world in metres, with mean 0 and standard deviation 1."""
+    """(N,) displacement at points (N, 3) of the world in metres, with mean 0 and standard deviation
+    1."""
     out = np.empty(len(points), np.float32)
     _noise(points, np.array(SIZES), np.array(WEIGHTS) * _SCALE, out)
     return out

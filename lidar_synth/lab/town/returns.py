@@ -1,11 +1,13 @@
 """The sensor model: from ray hits to returns with range and reflectance, or to no return.
 
-The model is fitted to 28 labelled street scans of an HDL-64E (SemanticKITTI; docs/research/judge.md). Reflectance is
-corrected for distance up to about 20 m and then decreases; below a knee it falls to 0 faster than the signal, so that
-dark paint and distant asphalt give 0, and above a shoulder it rises faster; it hardly depends on the angle of incidence
-except near grazing incidence; glossy paint and glass return light only at normal incidence; number plates and signs are
-retroreflectors; each laser has its own gain. Rays are dropped at random, with a probability that grows as the returned
-signal falls. Soft surfaces (leaves, grass) have relief: their returns lie before or behind the triangle, along the ray.
+The model is fitted to 28 labelled street scans of an HDL-64E (SemanticKITTI;
+docs/research/judge.md). Reflectance is corrected for distance up to about 20 m and then decreases;
+below a knee it falls to 0 faster than the signal, so that dark paint and distant asphalt give 0,
+and above a shoulder it rises faster; it hardly depends on the angle of incidence except near
+grazing incidence; glossy paint and glass return light only at normal incidence; number plates and
+signs are retroreflectors; each laser has its own gain. Rays are dropped at random, with a
+probability that grows as the returned signal falls. Soft surfaces (leaves, grass) have relief:
+their returns lie before or behind the triangle, along the ray.
 """
 
 from dataclasses import dataclass
@@ -22,23 +24,36 @@ Floats = NDArray[np.float32]
 LEVELS = 256
 """Reflectance is stored as k / 256, as KITTI-360 does."""
 
-_TRANSMISSION, _DROPOUT, _SPECKLE = column("transmission"), column("dropout"), column("speckle")
-_GLOSS, _ROUGHNESS = column("gloss"), column("roughness")
-_GRAZING, _RELIEF = column("grazing"), column("relief")
+_TRANSMISSION = column("transmission")
+_DROPOUT = column("dropout")
+_SPECKLE = column("speckle")
+_GLOSS = column("gloss")
+_ROUGHNESS = column("roughness")
+_GRAZING = column("grazing")
+_RELIEF = column("relief")
 _STEP = 0.25
 _RANGES = np.array([0, 5, 8, 12, 20, 25, 30, 35, 40, 50, 65, 80, 130])
 _DISTANCE_FACTOR = np.interp(
-    np.arange(0, 130, _STEP), _RANGES, [1.0, 1.0, 1.0, 1.0, 1.0, 0.95, 0.87, 0.81, 0.77, 0.71, 0.65, 0.60, 0.45]
+    np.arange(0, 130, _STEP),
+    _RANGES,
+    [1.0, 1.0, 1.0, 1.0, 1.0, 0.95, 0.87, 0.81, 0.77, 0.71, 0.65, 0.60, 0.45],
 ).astype(np.float32)
 """Factor of reflectance by distance, in steps of ``_STEP`` metres."""
-_KNEE, _SLOPE = 0.30, 3.0
-"""Below this value the measured reflectance falls ``_SLOPE`` times as fast, to 0: dark and distant surfaces give 0."""
-_SHOULDER, _RISE = 0.42, 1.6
-"""Above this value it rises ``_RISE`` times as fast: white paint and bright leaves give more than 0.5."""
+_KNEE = 0.30
+_SLOPE = 3.0
+"""Below this value the measured reflectance falls ``_SLOPE`` times as fast, to 0: dark and distant
+surfaces give 0."""
+_SHOULDER = 0.42
+_RISE = 1.6
+"""Above this value it rises ``_RISE`` times as fast: white paint and bright leaves give more than
+0.5."""
 _TAIL = 0.8
-"""Logarithmic standard deviation of the roughness from return to return: most are small, a few are large."""
-_FLATTEST, _DEEPEST = 0.06, 0.1
-"""Least cosine by which relief is divided to give a shift along the ray; largest shift as a share of the range."""
+"""Logarithmic standard deviation of the roughness from return to return: most are small, a few are
+large."""
+_FLATTEST = 0.06
+_DEEPEST = 0.1
+"""Least cosine by which relief is divided to give a shift along the ray; largest shift as a share
+of the range."""
 _ZERO_SHARE = 0.02
 """Share of returns whose reflectance is 0 at random."""
 
@@ -69,12 +84,17 @@ def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
 
 
 def cell_noise(points: Floats, size: float) -> Floats:
-    """(N,) pseudo-random values, uniform in [0, 1), one per cube of ``size`` metres in which the points (N, 3) lie.
+    """(N,) pseudo-random values, uniform in [0, 1), one per cube of ``size`` metres in which the
+    points (N, 3) lie.
 
     A hash of the cube's indices, so that all points of a window pane get the same value.
     """
     x, y, z = np.floor(points / np.float32(size)).astype(np.int64).astype(np.uint64).T
-    mixed = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9)
+    mixed = (
+        x * np.uint64(0x9E3779B97F4A7C15)
+        ^ y * np.uint64(0xC2B2AE3D27D4EB4F)
+        ^ z * np.uint64(0x165667B19E3779F9)
+    )
     mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
     upper = (mixed ^ (mixed >> np.uint64(32))) >> np.uint64(40)
     return np.asarray(upper.astype(np.float32) / np.float32(2**24))
@@ -89,20 +109,26 @@ def see_through(
     surfaces: SurfaceTable,
     rng: np.random.Generator,
 ) -> None:
-    """Continue, in place, the rays that pass through glass, wire mesh and leaves, through at most three layers."""
+    """Continue, in place, the rays that pass through glass, wire mesh and leaves, through at most
+    three layers."""
     rays = np.flatnonzero(hits.surface != MISS)
     for _ in range(3):
         share = _TRANSMISSION[surfaces.material[hits.surface[rays]]]
-        rays, share = rays[share > 0], share[share > 0]
+        rays = rays[share > 0]
+        share = share[share > 0]
         pane = _GLOSS[surfaces.material[hits.surface[rays]]] > 0
         sample = rng.random(len(rays), np.float32)
         glass = rays[pane]
-        sample[pane] = cell_noise(origins[glass] + hits.distance[glass, None] * directions[glass], 0.4)
+        sample[pane] = cell_noise(
+            origins[glass] + hits.distance[glass, None] * directions[glass], 0.4
+        )
         rays = rays[sample < share]
         if not len(rays):
             return
         start = hits.distance[rays] + np.float32(0.004)
-        beyond = snapshot.cast(origins[rays] + start[:, None] * directions[rays], directions[rays], eye)
+        beyond = snapshot.cast(
+            origins[rays] + start[:, None] * directions[rays], directions[rays], eye
+        )
         hits.distance[rays] = start + beyond.distance
         hits.surface[rays] = beyond.surface
         hits.normal[rays] = beyond.normal
@@ -135,18 +161,23 @@ def measure(
         (M,) indices of the rays that return, (M,) ranges in metres and (M,) reflectances in [0, 1).
     """
     hit = np.flatnonzero(hits.surface != MISS)
-    surface, distance = hits.surface[hit], hits.distance[hit]
+    surface = hits.surface[hit]
+    distance = hits.distance[hit]
     material = surfaces.material[surface]
     facing = np.abs(np.einsum("ij,ij->i", hits.normal[hit], directions[hit]))
     power = surfaces.reflectance[surface] * (1 - _GLOSS[material] * (1 - facing * facing))
     probability = (1 - _DROPOUT[material]) * _return_probability(power, facing, distance, noise)
     kept = np.flatnonzero(rng.random(len(hit), np.float32) < probability)
-    hit, distance, material, power, facing = hit[kept], distance[kept], material[kept], power[kept], facing[kept]
+    hit = hit[kept]
+    distance = distance[kept]
+    material = material[kept]
+    power = power[kept]
+    facing = facing[kept]
     gaussian = rng.standard_normal((3, len(hit)), np.float32)
     slope = facing + _GRAZING[material]
-    shift = _displacement(material, origins[hit], directions[hit], distance, gaussian[1:]) / np.clip(
-        slope, _FLATTEST, 1
-    )
+    shift = _displacement(
+        material, origins[hit], directions[hit], distance, gaussian[1:]
+    ) / np.clip(slope, _FLATTEST, 1)
     measured = distance + np.clip(shift, -_DEEPEST * distance, _DEEPEST * distance)
     measured += np.float32(noise.range_std) * gaussian[1]
     value = _response(power * gains[laser[hit]], slope, distance)
@@ -164,18 +195,29 @@ def _return_probability(power: Floats, facing: Floats, distance: Floats, noise: 
 
 
 def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
-    """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without noise."""
-    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(np.int32)
+    """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without
+    noise."""
+    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(
+        np.int32
+    )
     value = power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
     value = value + np.float32(_RISE - 1) * np.maximum(value - np.float32(_SHOULDER), 0)
-    return np.asarray(np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0))
+    return np.asarray(
+        np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+    )
 
 
 def _displacement(
-    material: NDArray[np.uint8], origins: Floats, directions: Floats, distance: Floats, gaussian: Floats
+    material: NDArray[np.uint8],
+    origins: Floats,
+    directions: Floats,
+    distance: Floats,
+    gaussian: Floats,
 ) -> Floats:
     """(N,) metres by which the surface at each hit lies behind its triangle."""
     displaced = _ROUGHNESS[material] * gaussian[0] * np.exp(_TAIL * gaussian[1])
     soft = np.flatnonzero(_RELIEF[material])
-    displaced[soft] += _RELIEF[material[soft]] * relief(origins[soft] + distance[soft, None] * directions[soft])
+    displaced[soft] += _RELIEF[material[soft]] * relief(
+        origins[soft] + distance[soft, None] * directions[soft]
+    )
     return np.asarray(displaced)

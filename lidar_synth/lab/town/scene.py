@@ -1,7 +1,7 @@
 """A scene under construction: static objects, and objects with an instance number.
 
-Objects are placed in street coordinates. The scene rotates them along the street, puts them on the ground, and
-collects their triangles with a surface number for each.
+Objects are placed in street coordinates. The scene rotates them along the street, puts them on the
+ground, and collects their triangles with a surface number for each.
 """
 
 from dataclasses import dataclass, field
@@ -64,7 +64,13 @@ class Scene:
         self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
 
     def put(
-        self, item: StaticObject, s: float, t: float, yaw: float = 0.0, lift: float = 0.0, solid: float = 0.0
+        self,
+        item: StaticObject,
+        s: float,
+        t: float,
+        yaw: float = 0.0,
+        lift: float = 0.0,
+        solid: float = 0.0,
     ) -> None:
         """Put a static object on the ground.
 
@@ -73,7 +79,8 @@ class Scene:
             s, t: street coordinates of its origin, metres.
             yaw: radians relative to the street's heading.
             lift: metres above the ground.
-            solid: half the side of the square around its origin that pedestrians and cyclists avoid, metres.
+            solid: half the side of the square around its origin that pedestrians and cyclists
+                avoid, metres.
         """
         self.pending.append((item, s, t, yaw, lift))
         if solid:
@@ -85,7 +92,9 @@ class Scene:
         points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (0, 0, 1)
         yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
         for (item, *_), point, yaw in zip(self.pending, points, yaws, strict=True):
-            rows = [self.surfaces.add(f, raw) for f, raw in zip(item.finishes, item.raw, strict=True)]
+            rows = [
+                self.surfaces.add(f, raw) for f, raw in zip(item.finishes, item.raw, strict=True)
+            ]
             self.add_mesh(item.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
         self.pending.clear()
         return merge(self.meshes)
@@ -102,7 +111,8 @@ class Scene:
             *(np.asarray(v, float) for v in (s, t, yaw, np.asarray(length, float) / 3))
         )
         heading = self.ground.course.heading(s) + yaw
-        c, d = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        d = np.sin(yaw)
         # One kind of ground under all probes: a wheel on the kerb does not tilt the whole car.
         probes = [(s + a * half, t + b * half) for a, b in ((c, d), (-c, -d), (-d, c), (d, -c))]
         front, back, left, right = (self.ground.height(*p, 0) for p in probes)
@@ -117,13 +127,20 @@ class Scene:
         pose[..., 3, 3] = 1
         return pose
 
-    def add_instance(self, prototype: Prototype, colour: RGB, moving: bool) -> tuple[int, NDArray[np.int32]]:
+    def add_instance(
+        self, prototype: Prototype, colour: RGB, moving: bool
+    ) -> tuple[int, NDArray[np.int32]]:
         """Register a new instance; return its number and the surface number of each slot."""
         self.instances += 1
-        rows = [self.surfaces.add(f, prototype.raw[int(moving)], self.instances) for f in prototype.painted(colour)]
+        rows = [
+            self.surfaces.add(f, prototype.raw[int(moving)], self.instances)
+            for f in prototype.painted(colour)
+        ]
         return self.instances, np.array(rows, np.int32)
 
-    def park(self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0) -> None:
+    def park(
+        self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0
+    ) -> None:
         """Put a static object with an instance number on the ground."""
         instance, surfaces = self.add_instance(prototype, colour, moving=False)
         low, high = prototype.mesh.bounds
@@ -131,13 +148,23 @@ class Scene:
         placed = PlacedObject(prototype, pose, instance, surfaces, scale)
         self.placed.append(placed)
         self.add_mesh(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
-        half = np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])) @ (high[:2] - low[:2]) / 2
+        half = (
+            np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]))
+            @ (high[:2] - low[:2])
+            / 2
+        )
         self.footprints.append((s - half[0], s + half[0], t - half[1], t + half[1]))
 
     def is_free(self, s: float, t: float, half: tuple[float, float]) -> bool:
-        """Whether no obstacle lies within the half extents ``half`` (along s, along t) around a position, metres."""
+        """Whether no obstacle lies within the half extents ``half`` (along s, along t) around a
+        position, metres."""
         if not self.footprints:
             return True
         f = np.array(self.footprints)
-        hit = (f[:, 0] < s + half[0]) & (f[:, 1] > s - half[0]) & (f[:, 2] < t + half[1]) & (f[:, 3] > t - half[1])
+        hit = (
+            (f[:, 0] < s + half[0])
+            & (f[:, 1] > s - half[0])
+            & (f[:, 2] < t + half[1])
+            & (f[:, 3] > t - half[1])
+        )
         return not hit.any()

@@ -1,7 +1,9 @@
-"""Rendering of the camera image by ray casting: sun, shadows, sky, glass, textures, exposure, noise.
+"""Rendering of the camera image by ray casting: sun, shadows, sky, glass, textures, exposure,
+noise.
 
-The camera sees the same triangles as the LiDAR at the same time. Textures are noise in world coordinates, so that
-they stay fixed to surfaces from image to image; the same noise cuts leaf shapes out of the triangles of the foliage.
+The camera sees the same triangles as the LiDAR at the same time. Textures are noise in world
+coordinates, so that they stay fixed to surfaces from image to image; the same noise cuts leaf
+shapes out of the triangles of the foliage.
 """
 
 from dataclasses import dataclass
@@ -16,7 +18,8 @@ from lidar_synth.lab.town.returns import cell_noise
 from lidar_synth.lab.town.scene import Pose
 
 Floats = NDArray[np.float32]
-_GRAIN, _GLOSS = column("grain"), column("gloss")
+_GRAIN = column("grain")
+_GLOSS = column("gloss")
 _GLASS = np.array([INDEX["glass"], INDEX["carglass"]])
 _OPEN_SHARE = {INDEX["leaf"]: 0.42, INDEX["wire"]: 0.78}
 """Share of each of these materials that is open to camera rays."""
@@ -41,14 +44,19 @@ class Light:
 
 def sample_light(rng: np.random.Generator) -> Light:
     """A random time of day and weather."""
-    height, azimuth = np.radians(rng.uniform(25, 62)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)], np.float32)
+    height = np.radians(rng.uniform(25, 62))
+    azimuth = rng.uniform(0, 2 * np.pi)
+    sun = np.array(
+        [np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)],
+        np.float32,
+    )
     cloud = float(np.clip(rng.normal(0.3, 0.4), 0, 1))
     return Light(sun, 3.0 * (1 - cloud) ** 0.7, 0.55 + 0.45 * cloud, cloud)
 
 
 def sky(directions: Floats, light: Light) -> Floats:
-    """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun, as in photos."""
+    """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun,
+    as in photos."""
     up = np.clip(directions[:, 2:], 0, 1)
     blue = np.array([0.22, 0.44, 0.86], np.float32) * (1 - light.cloud) + 0.85 * light.cloud
     colour = blue * up**0.45 + np.array([1.0, 1.02, 1.04], np.float32) * (1 - up**0.45)
@@ -61,7 +69,8 @@ def sky(directions: Floats, light: Light) -> Floats:
 
 
 def _value_noise(places: Floats, layer: float) -> Floats:
-    """(N,) value noise in 0..1 at points of the plane (N, 2); each ``layer`` is an independent pattern."""
+    """(N,) value noise in 0..1 at points of the plane (N, 2); each ``layer`` is an independent
+    pattern."""
     base = np.floor(places)
     f = places - base
     f = f * f * (3 - 2 * f)
@@ -73,21 +82,27 @@ def _value_noise(places: Floats, layer: float) -> Floats:
     return value
 
 
-def camera_hits(snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable) -> Hits:
-    """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of foliage and wire mesh."""
+def camera_hits(
+    snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable
+) -> Hits:
+    """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of
+    foliage and wire mesh."""
     origins = np.broadcast_to(eye, directions.shape)
     hits = snapshot.cast(origins, directions, eye)
     rays = np.flatnonzero(hits.surface != MISS)
     for _ in range(4):
         material = surfaces.material[hits.surface[rays]]
         share = np.select([material == m for m in _OPEN_SHARE], list(_OPEN_SHARE.values()), 0.0)
-        rays, share = rays[share > 0], share[share > 0]
+        rays = rays[share > 0]
+        share = share[share > 0]
         place = eye + hits.distance[rays, None] * directions[rays]
         rays = rays[cell_noise(place, 0.035) < share]
         if not len(rays):
             break
         start = hits.distance[rays] + np.float32(0.01)
-        beyond = snapshot.cast(origins[rays] + start[:, None] * directions[rays], directions[rays], eye)
+        beyond = snapshot.cast(
+            origins[rays] + start[:, None] * directions[rays], directions[rays], eye
+        )
         hits.distance[rays], hits.surface[rays], hits.normal[rays] = (
             start + beyond.distance,
             beyond.surface,
@@ -98,14 +113,18 @@ def camera_hits(snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: S
 
 
 def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.uint8]) -> Floats:
-    """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel, and the joints
-    between bricks, tiles, stones and slabs."""
+    """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel,
+    and the joints between bricks, tiles, stones and slabs."""
     size = np.float32(0.02) * 2 ** np.ceil(np.log2(np.maximum(far / 12, 1)))
     fine = cell_noise(place / size[:, None], 1.0) - 0.5
     coarse = cell_noise(place, 0.55) - 0.5
     value = 1 + _GRAIN[material] * (1.1 * fine + 0.5 * coarse)
     along = place[:, 0] * -normal[:, 1] + place[:, 1] * normal[:, 0]
-    for name, height, width, near in (("brick", 0.075, 0.25, 14), ("tile", 0.33, 0.26, 45), ("stone", 0.24, 0.45, 30)):
+    for name, height, width, near in (
+        ("brick", 0.075, 0.25, 14),
+        ("tile", 0.33, 0.26, 45),
+        ("stone", 0.24, 0.45, 30),
+    ):
         rays = np.flatnonzero((material == INDEX[name]) & (far < near))
         row = np.floor(place[rays, 2] / height)
         edge = (place[rays, 2] / height % 1 < 0.16) | ((along[rays] / width + 0.5 * row) % 1 < 0.07)
@@ -124,9 +143,12 @@ def shade(
     image = np.empty_like(directions)
     image[missed] = sky(directions[missed], light)
     rays = np.flatnonzero(~missed)
-    ray, far, surface = directions[rays], hits.distance[rays], hits.surface[rays]
+    ray = directions[rays]
+    far = hits.distance[rays]
+    surface = hits.surface[rays]
     normal = hits.normal[rays] * -np.sign(np.einsum("ij,ij->i", hits.normal[rays], ray))[:, None]
-    place, material = eye + far[:, None] * ray, surfaces.material[surface]
+    place = eye + far[:, None] * ray
+    material = surfaces.material[surface]
     colour = surfaces.colour[surface] ** 2.2 * _texture(place, normal, far, material)[:, None]
     # Light passes through foliage: both sides of its triangles are lit.
     leaf = (material == INDEX["leaf"]) | (material == INDEX["grass"])
@@ -136,10 +158,17 @@ def shade(
     if light.direct > 0.1:
         test = np.flatnonzero(facing > 0)
         start = place[test] + 0.02 * normal[test]
-        lit[test] = snapshot.cast(start, np.ascontiguousarray(np.broadcast_to(light.sun, start.shape))).surface == MISS
+        lit[test] = (
+            snapshot.cast(
+                start, np.ascontiguousarray(np.broadcast_to(light.sun, start.shape))
+            ).surface
+            == MISS
+        )
     under = 0.55 + 0.45 * normal[:, 2]
     glow = light.ambient * under[:, None] * np.array([0.92, 0.98, 1.08], np.float32)
-    shaded = colour * (glow + light.direct * (lit * facing)[:, None] * np.array([1.06, 1.0, 0.90], np.float32))
+    shaded = colour * (
+        glow + light.direct * (lit * facing)[:, None] * np.array([1.06, 1.0, 0.90], np.float32)
+    )
     _reflect(shaded, ray, normal, material, lit, light)
     haze = 1 - np.exp(-far / 700)[:, None]
     image[rays] = shaded * (1 - haze) + haze * np.array([0.85, 0.9, 0.97], np.float32)
@@ -147,9 +176,15 @@ def shade(
 
 
 def _reflect(
-    shaded: Floats, ray: Floats, normal: Floats, material: NDArray[np.uint8], lit: Floats, light: Light
+    shaded: Floats,
+    ray: Floats,
+    normal: Floats,
+    material: NDArray[np.uint8],
+    lit: Floats,
+    light: Light,
 ) -> None:
-    """Add, in place, reflections of sky and sun on glass and glossy paint; near the horizon they show dark houses."""
+    """Add, in place, reflections of sky and sun on glass and glossy paint; near the horizon they
+    show dark houses."""
     rays = np.flatnonzero(_GLOSS[material] > 0.25)
     across = np.einsum("ij,ij->i", ray[rays], normal[rays])
     mirrored = ray[rays] - 2 * across[:, None] * normal[rays]
@@ -186,7 +221,9 @@ def render(
     image[edge] /= 4
     value = image.reshape(height, width, 3)
     value *= _exposure(value)
-    value += rng.standard_normal(value.shape, np.float32) * (0.004 + 0.012 * np.sqrt(np.clip(value, 0, 1)))
+    value += rng.standard_normal(value.shape, np.float32) * (
+        0.004 + 0.012 * np.sqrt(np.clip(value, 0, 1))
+    )
     return tone_map(value)
 
 

@@ -6,14 +6,17 @@ from lidar_synth.lab.town.furniture import GALVANISED, OTHER, POLE, SIGN, Static
 from lidar_synth.lab.town.materials import RGB, Finish
 from lidar_synth.lab.town.meshes import Mesh, boxes, disc, fan, merge, tube
 
-RED, BLUE, WHITE, YELLOW, BLACK = (
-    (0.72, 0.10, 0.09), (0.10, 0.25, 0.62), (0.92, 0.92, 0.92), (0.93, 0.80, 0.15), (0.1, 0.1, 0.1),
-)  # fmt: skip
+RED = (0.72, 0.10, 0.09)
+BLUE = (0.10, 0.25, 0.62)
+WHITE = (0.92, 0.92, 0.92)
+YELLOW = (0.93, 0.80, 0.15)
+BLACK = (0.1, 0.1, 0.1)
 Outline = list[tuple[float, float]]
 
 
 def _rectangle(width: float, height: float, up: float = 0.0) -> Outline:
-    y, z = width / 2, height / 2
+    y = width / 2
+    z = height / 2
     return [(-y, up - z), (y, up - z), (y, up + z), (-y, up + z)]
 
 
@@ -31,11 +34,13 @@ BOARDS: dict[str, tuple[Outline, RGB, Outline, RGB]] = {
     "town": (_rectangle(1.20, 0.80), YELLOW, _rectangle(0.80, 0.08, 0.06), BLACK),
     "street": (_rectangle(0.90, 0.14), (0.12, 0.20, 0.50), _rectangle(0.70, 0.04), WHITE),
 }
-"""The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in metres (left, up)."""
+"""The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in
+metres (left, up)."""
 
 
 def road_sign(kind: str, height: float) -> StaticObject:
-    """A traffic sign facing +x; ``kind`` is a key of ``BOARDS``, ``height`` is the centre of the board in metres."""
+    """A traffic sign facing +x; ``kind`` is a key of ``BOARDS``, ``height`` is the centre of the
+    board in metres."""
     board, ground, mark, colour = BOARDS[kind]
 
     def flat(outline: Outline, x: float, slot: int) -> Mesh:
@@ -44,12 +49,15 @@ def road_sign(kind: str, height: float) -> StaticObject:
     pole = tube([(0, 0, -0.2), (0, 0, height + 0.3)], 0.038, 6)
     mesh = merge([pole, flat(board, 0.05, 1), flat(mark, 0.054, 2), flat(board, 0.042, 3)])
     return StaticObject(
-        mesh, (GALVANISED, Finish("sign", ground), Finish("sign", colour), GALVANISED), (POLE, SIGN, SIGN, SIGN)
+        mesh,
+        (GALVANISED, Finish("sign", ground), Finish("sign", colour), GALVANISED),
+        (POLE, SIGN, SIGN, SIGN),
     )
 
 
 def traffic_light(height: float, reach: float) -> StaticObject:
-    """Traffic lights on a pole, facing +x, and with ``reach`` > 0 (metres) also on an arm over the road towards +y."""
+    """Traffic lights on a pole, facing +x, and with ``reach`` > 0 (metres) also on an arm over the
+    road towards +y."""
     parts = [tube([(0, 0, -0.2), (0, 0, height)], 0.06, 7)]
     spots = [(0.0, 2.3)]
     if reach:
@@ -61,5 +69,7 @@ def traffic_light(height: float, reach: float) -> StaticObject:
     colours: tuple[RGB, ...] = ((0.1, 0.5, 0.25), (0.35, 0.25, 0.05), (0.3, 0.05, 0.05))
     dark = Finish("plastic", (0.07, 0.09, 0.08))
     return StaticObject(
-        merge(parts), (GALVANISED, dark, *(Finish("lamp", c) for c in colours)), (POLE, OTHER, OTHER, OTHER, OTHER)
+        merge(parts),
+        (GALVANISED, dark, *(Finish("lamp", c) for c in colours)),
+        (POLE, OTHER, OTHER, OTHER, OTHER),
     )

@@ -19,7 +19,8 @@ def _embree() -> tuple[Any, Any]:
         raise LibraryError(
             f"the town needs embreex, which cannot be imported ({error})",
             "embreex 2.17 or later; PyPI has no wheel for Linux on aarch64",
-            "Type 'pip install embreex', or read a town that was exported on another machine: only the town needs it.",
+            "Type 'pip install embreex', or read a town that was exported on another machine: "
+            "only the town needs it.",
         ) from error
     return EmbreeScene, TriangleMesh
 
@@ -39,9 +40,14 @@ class Solid:
         self._scene = scene()
         self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
 
-    def first(self, origins: Floats, directions: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-        """Distance (inf = no hit), triangle (-1 = no hit) and normal (not unit) of the first hit of each ray."""
-        out = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
+    def first(
+        self, origins: Floats, directions: Floats
+    ) -> tuple[Floats, NDArray[np.int32], Floats]:
+        """Distance (inf = no hit), triangle (-1 = no hit) and normal (not unit) of the first hit of
+        each ray."""
+        out = self._scene.run(
+            np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1
+        )
         face: NDArray[np.int32] = out["primID"]
         distance: Floats = out["tfar"]
         distance[face < 0] = np.inf

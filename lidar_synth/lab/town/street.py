@@ -1,6 +1,8 @@
-"""The plan of a stretch of road: widths of carriageway, pavements and parking bays, and the streets that cross it.
+"""The plan of a stretch of road: widths of carriageway, pavements and parking bays, and the streets
+that cross it.
 
-There are five kinds: ``residential``, ``main`` (main road), ``junction``, ``square``, ``edge`` (edge of town).
+There are five kinds: ``residential``, ``main`` (main road), ``junction``, ``square``, ``edge``
+    (edge of town).
 Traffic drives on the right: lanes at t < 0 run towards +s.
 """
 
@@ -13,8 +15,10 @@ KINDS = ("residential", "main", "junction", "square", "edge")
 SHARES = (0.40, 0.15, 0.12, 0.08, 0.25)
 """Probability of each kind."""
 REACH = 88.0
-"""Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the sensor's range."""
-RIGHT, LEFT = 0, 1
+"""Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the
+sensor's range."""
+RIGHT = 0
+LEFT = 1
 
 
 class Band(NamedTuple):
@@ -58,15 +62,16 @@ class Street:
         bands: strips beyond the kerb, from the inside to the outside, (right, left).
         lanes: the lanes; the ego vehicle drives in the first.
         crossings: the side streets.
-        parking: how cars park, (right, left): ``none``, ``street`` (inside the kerb), ``bay``, ``kerb`` (half on the
-            pavement).
+        parking: how cars park, (right, left): ``none``, ``street`` (inside the kerb), ``bay``,
+            ``kerb`` (half on the pavement).
         speed: speed of the ego vehicle, m/s.
-        median: half of the width of the strip between the two directions of traffic, metres; 0 = none.
+        median: half of the width of the strip between the two directions of traffic, metres; 0 =
+            none.
         marked: whether lane markings are painted.
         plaza: the side with an open square (RIGHT or LEFT), or None.
         turn: (side street into which the ego vehicle turns, side to which it turns), or None.
-        ends: lowest and highest s of the street, where it meets a cross street with houses behind it; infinite where
-            the street continues.
+        ends: lowest and highest s of the street, where it meets a cross street with houses behind
+            it; infinite where the street continues.
     """
 
     kind: str
@@ -97,8 +102,10 @@ class Street:
         return None
 
     def gaps(self, side: int, margin: float) -> list[tuple[float, float]]:
-        """Intervals of s between the side streets of a side, within ``REACH`` and the ends of the street, metres."""
-        low, high = max(-REACH, self.ends[0]), min(self.length + REACH, self.ends[1])
+        """Intervals of s between the side streets of a side, within ``REACH`` and the ends of the
+        street, metres."""
+        low = max(-REACH, self.ends[0])
+        high = min(self.length + REACH, self.ends[1])
         gaps = []
         for c in sorted(self.crossings):
             if side in c.sides:
@@ -115,26 +122,43 @@ def _ends(kind: str, length: float, rng: np.random.Generator) -> tuple[float, fl
     return back, length + rng.uniform(30, 85) if rng.random() < share else np.inf
 
 
-def _crossings(kind: str, length: float, ends: tuple[float, float], rng: np.random.Generator) -> tuple[SideStreet, ...]:
+def _crossings(
+    kind: str, length: float, ends: tuple[float, float], rng: np.random.Generator
+) -> tuple[SideStreet, ...]:
     """Sampled side streets: at closed ends, at a junction, and at random elsewhere."""
-    places = [SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT)) for e in ends if np.isfinite(e)]
+    places = [
+        SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT)) for e in ends if np.isfinite(e)
+    ]
     if kind == "junction":
         middle = length * rng.uniform(0.45, 0.75) + 5
         places = [p for p in places if abs(p.s - middle) > 30]
-        return (*places, SideStreet(middle, rng.uniform(3.3, 6.8), rng.uniform(2, 3.2), (RIGHT, LEFT)))
+        return (
+            *places,
+            SideStreet(middle, rng.uniform(3.3, 6.8), rng.uniform(2, 3.2), (RIGHT, LEFT)),
+        )
     for s in np.arange(-70, length + 70, 14.0) + rng.uniform(0, 14):
         apart = all(abs(s - p.s) > 45 for p in places)
         if apart and rng.random() < (0.10 if kind == "edge" else 0.22):
             sides = ((RIGHT, LEFT), (RIGHT,), (LEFT,))[rng.integers(3)]
             places.append(
-                SideStreet(float(s), rng.uniform(2.5, 3.4), 0.0 if kind == "edge" else rng.uniform(1.5, 2.2), sides)
+                SideStreet(
+                    float(s),
+                    rng.uniform(2.5, 3.4),
+                    0.0 if kind == "edge" else rng.uniform(1.5, 2.2),
+                    sides,
+                )
             )
     return tuple(places)
 
 
-def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+def _residential(
+    rng: np.random.Generator,
+) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
     """Sampled bands, kerbs, parking and lanes of a residential street."""
-    parking = [str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18])) for _ in range(2)]
+    parking = [
+        str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18]))
+        for _ in range(2)
+    ]
     lane = rng.uniform(2.7, 3.5)
     edge = [lane + (2.0 if p == "street" else 0.0) for p in parking]
     bands = []
@@ -146,7 +170,9 @@ def _residential(rng: np.random.Generator) -> tuple[list[list[Band]], list[float
     return bands, edge, parking, [Lane(-lane / 2, 1), Lane(lane / 2, -1)]
 
 
-def _main(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
+def _main(
+    rng: np.random.Generator,
+) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
     """Sampled bands, kerbs, parking, lanes and median of a main road."""
     each = int(rng.choice([1, 2], p=[0.6, 0.4]))
     width = rng.uniform(3.2, 3.9)
@@ -192,11 +218,14 @@ _SPEEDS = {
 
 
 def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
-    """The sampled plan of a street of a kind, long enough for the ego vehicle to drive ``seconds``."""
+    """The sampled plan of a street of a kind, long enough for the ego vehicle to drive
+    ``seconds``."""
     turns = rng.random() < _TURNS[kind]
     speed = rng.uniform(4.5, 7.0) if turns else rng.uniform(*_SPEEDS[kind])
     length = speed * seconds
-    median, marked, plaza = 0.0, True, None
+    median = 0.0
+    marked = True
+    plaza = None
     wide = kind == "main" or (kind in ("junction", "square") and rng.random() < 0.55)
     if wide:
         bands, edge, parking, lanes, median = _main(rng)
@@ -211,11 +240,24 @@ def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street
     crossings = _crossings(kind, length, ends, rng)
     exits = [(c, side) for c in crossings for side in c.sides if 12 < c.s < length - 10]
     if turns and not exits:
-        added = SideStreet(0.4 * length + 4, rng.uniform(2.7, 3.4), rng.uniform(1.5, 2.2), (RIGHT, LEFT))
+        added = SideStreet(
+            0.4 * length + 4, rng.uniform(2.7, 3.4), rng.uniform(1.5, 2.2), (RIGHT, LEFT)
+        )
         crossings = (*(c for c in crossings if abs(c.s - added.s) > 30), added)
         exits = [(added, RIGHT), (added, LEFT)]
     turn = exits[rng.integers(len(exits))] if turns and exits else None
     return Street(
-        kind, length, (edge[0], edge[1]), (tuple(bands[0]), tuple(bands[1])), tuple(lanes),
-        crossings, (parking[0], parking[1]), speed, median, marked, plaza, turn, ends,
-    )  # fmt: skip
+        kind,
+        length,
+        (edge[0], edge[1]),
+        (tuple(bands[0]), tuple(bands[1])),
+        tuple(lanes),
+        crossings,
+        (parking[0], parking[1]),
+        speed,
+        median,
+        marked,
+        plaza,
+        turn,
+        ends,
+    )

@@ -1,7 +1,8 @@
-"""The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any order of access.
-Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it, with ``interval`` seconds from scan
-to scan, among static and moving objects. Stretches lie a kilometre apart in the world frame of the poses, so that
-accumulating scans by pose never mixes two of them.
+"""The town as a source of scans: ``Town(seed)[i]`` is the same scan in every process and in any
+order of access. Twenty neighbouring scans share a stretch of road. The ego vehicle drives along it,
+with ``interval`` seconds from scan to scan, among static and moving objects. Stretches lie a
+kilometre apart in the world frame of the poses, so that accumulating scans by pose never mixes two
+of them.
 """
 
 import hashlib
@@ -29,7 +30,15 @@ from lidar_synth.lab.town.returns import Noise, laser_gains, measure, see_throug
 from lidar_synth.lab.town.scene import Pose
 from lidar_synth.lab.town.shading import render, sample_light
 from lidar_synth.lab.town.skin.skin import Skin, load_skin
-from lidar_synth.lab.town.world import IMAGE, LIGHT, SCAN, STRETCH_FRAMES, World, build_world, rng_for
+from lidar_synth.lab.town.world import (
+    IMAGE,
+    LIGHT,
+    SCAN,
+    STRETCH_FRAMES,
+    World,
+    build_world,
+    rng_for,
+)
 
 REVOLUTION = 0.1
 """Seconds of one turn of the sensor."""
@@ -46,14 +55,16 @@ class Town:
         scans: number of scans.
         interval: seconds between neighbouring scans of a stretch, 0 < interval < 60.
         noise: the measurement noise of the sensor; by default ``Noise()``.
-        motion: whether the vehicle moves while the sensor turns. The points are motion compensated, as SemanticKITTI's:
-            in the frame of the scan's pose, each cast from where the sensor was. Other objects stand still.
-        skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the physical model's alone.
-            Labels, rings and boxes are the same with it; a few returns are missing.
+        motion: whether the vehicle moves while the sensor turns. The points are motion compensated,
+            as SemanticKITTI's: in the frame of the scan's pose, each cast from where the sensor
+            was. Other objects stand still.
+        skin: the look of a real sensor's returns, as ``load_skin`` takes it; by default the
+            physical model's alone. Labels, rings and boxes are the same with it; a few returns are
+            missing.
 
     Raises:
-        ConfigError: on a negative seed or number of scans, an interval out of range, an unknown sensor or skin, or a
-            skin of another sensor.
+        ConfigError: on a negative seed or number of scans, an interval out of range, an unknown
+            sensor or skin, or a skin of another sensor.
         FileError: on a skin that cannot be read.
         DataError: on a damaged skin.
         LibraryError: if embreex is missing.
@@ -83,16 +94,20 @@ class Town:
                 f"a town with seed {seed}, {scans} scans and an interval of {interval} s",
                 "seed >= 0, scans >= 0 and 0 < interval < 60 s",
             )
-        self.seed, self.sensor, self.interval = seed, load_sensor(sensor), interval
+        self.seed = seed
+        self.sensor = load_sensor(sensor)
+        self.interval = interval
         self.skin = None if skin is None else load_skin(skin)
         if self.skin is not None:
             self.skin.check(self.sensor)
         # A skin has the offsets of the real lasers.
         self._noise = noise or (Noise(gain_std=0) if self.skin else Noise())
-        self._scans, self._motion = scans, motion
+        self._scans = scans
+        self._motion = motion
         self._worlds: OrderedDict[int, World] = OrderedDict()
         elevation, height = self.sensor.optics()
-        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise from straight ahead.
+        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise
+        # from straight ahead.
         azimuths = self.sensor.firing_azimuths()
         order = np.argsort(-azimuths % (2 * np.pi), axis=1)
         self._laser, place = np.nonzero(np.take_along_axis(free_rays(self.sensor), order, 1))
@@ -107,19 +122,37 @@ class Town:
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
-        return Town, (self.seed, self.sensor, self._scans, self.interval, self._noise, self._motion, self.skin)
+        return Town, (
+            self.seed,
+            self.sensor,
+            self._scans,
+            self.interval,
+            self._noise,
+            self._motion,
+            self.skin,
+        )
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Where the scans come from: the town's seed and interval, and its skin with the licence of that."""
-        skin = {} if self.skin is None else {"skin": self.skin.digest, "skin_licence": self.skin.provenance["licence"]}
+        """Where the scans come from: the town's seed and interval, and its skin with the licence of
+        that."""
+        skin = (
+            {}
+            if self.skin is None
+            else {"skin": self.skin.digest, "skin_licence": self.skin.provenance["licence"]}
+        )
         return {"made_by": "town", "seed": self.seed, "interval": self.interval, **skin}
 
     @property
     def settings(self) -> dict[str, Any]:
         """Plain values that determine the scans, apart from their number."""
         plain = {"seed": self.seed, "interval": self.interval, "sensor": self.sensor.to_dict()}
-        return {**plain, "noise": asdict(self._noise), "motion": self._motion, "skin": self.skin and self.skin.digest}
+        return {
+            **plain,
+            "noise": asdict(self._noise),
+            "motion": self._motion,
+            "skin": self.skin and self.skin.digest,
+        }
 
     @property
     def identity(self) -> str:
@@ -149,17 +182,20 @@ class Town:
         return self._worlds[stretch]
 
     def moment(self, index: int) -> tuple[Snapshot, Pose, np.random.Generator]:
-        """The scene of a scan, the sensor's pose in its stretch, and the random generator of the scan."""
+        """The scene of a scan, the sensor's pose in its stretch, and the random generator of the
+        scan."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
         rng = rng_for(SCAN, self.seed, stretch, frame)
-        world, time = self.world(index), frame * self.interval
+        world = self.world(index)
+        time = frame * self.interval
         pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
         about = ego_place(world.street, time)[:2]
         movers = place_movers(world.movers, world.scene, time, about, self.sensor.range_max + 20)
         return Snapshot(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
-        """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan ``index``.
+        """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan
+        ``index``.
 
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
@@ -167,7 +203,13 @@ class Town:
         snapshot, pose, _ = self.moment(self._checked(index))
         stretch, frame = divmod(index, STRETCH_FRAMES)
         light = sample_light(rng_for(LIGHT, self.seed, stretch))
-        return render(snapshot, pose, self.world(index).surfaces, light, rng_for(IMAGE, self.seed, stretch, frame))
+        return render(
+            snapshot,
+            pose,
+            self.world(index).surfaces,
+            light,
+            rng_for(IMAGE, self.seed, stretch, frame),
+        )
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
@@ -182,10 +224,17 @@ class Town:
         """
         snapshot, pose, rng = self.moment(self._checked(index))
         world = self.world(index)
-        laser, surface, points, reflectance = self._turn(snapshot, pose, self._travelled(index), world.surfaces, rng)
-        raw, instance = world.surfaces.raw[surface], world.surfaces.instance[surface]
+        laser, surface, points, reflectance = self._turn(
+            snapshot, pose, self._travelled(index), world.surfaces, rng
+        )
+        raw = world.surfaces.raw[surface]
+        instance = world.surfaces.instance[surface]
         returned = np.bincount(instance, minlength=world.scene.instances + 1)
-        objects = [o for o in (*world.scene.placed, *snapshot.movers) if o.prototype.name and returned[o.instance]]
+        objects = [
+            o
+            for o in (*world.scene.placed, *snapshot.movers)
+            if o.prototype.name and returned[o.instance]
+        ]
         placed = pose.copy()
         placed[0, 3] += APART * (index // STRETCH_FRAMES)
         return Scan(
@@ -204,12 +253,17 @@ class Town:
         )
 
     def _travelled(self, index: int) -> NDArray[np.float32]:
-        """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world frame."""
+        """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world
+        frame."""
         if not self._motion:
             return np.zeros(3, np.float32)
-        world, time = self.world(index), index % STRETCH_FRAMES * self.interval
+        world = self.world(index)
+        time = index % STRETCH_FRAMES * self.interval
         still = np.zeros(2)
-        ends = [ego_pose(world.street, world.scene, time + t, HEIGHT, still) for t in (-REVOLUTION / 2, REVOLUTION / 2)]
+        ends = [
+            ego_pose(world.street, world.scene, time + t, HEIGHT, still)
+            for t in (-REVOLUTION / 2, REVOLUTION / 2)
+        ]
         return (ends[1] - ends[0])[:3, 3].astype(np.float32)
 
     def _turn(
@@ -220,9 +274,11 @@ class Town:
         surfaces: SurfaceTable,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-        """Laser, surface number, point in the sensor frame and reflectance of each return of one revolution.
+        """Laser, surface number, point in the sensor frame and reflectance of each return of one
+        revolution.
 
-        The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion compensated scans.
+        The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion
+        compensated scans.
         """
         turn = pose[:3, :3].astype(np.float32)
         directions = self._rays @ turn.T
@@ -241,7 +297,11 @@ class Town:
             boxed = surfaces.instance[hits.surface[back]] > 0
             dressed = self.skin.apply(points, reflectance, self._laser[back], boxed, rng)
             points += dressed.shift[:, None] * self._rays[back]
-            back, points, reflectance = back[dressed.kept], points[dressed.kept], dressed.reflectance[dressed.kept]
+            back = back[dressed.kept]
+            points = points[dressed.kept]
+            reflectance = dressed.reflectance[dressed.kept]
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
-        kept = np.flatnonzero((distance >= self.sensor.range_min) & (distance <= self.sensor.range_max))
+        kept = np.flatnonzero(
+            (distance >= self.sensor.range_min) & (distance <= self.sensor.range_max)
+        )
         return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]

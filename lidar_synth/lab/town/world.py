@@ -1,7 +1,7 @@
 """A complete stretch of road: its plan, its static world as triangles, and its movers.
 
-Everything is sampled from a counter-based generator keyed by (seed, stretch), so that a stretch is the same in every
-process and in any order of access.
+Everything is sampled from a counter-based generator keyed by (seed, stretch), so that a stretch is
+the same in every process and in any order of access.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,9 @@ WORLD, LIGHT, SCAN, IMAGE = range(4)
 
 def rng_for(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
     """The random generator for one purpose in a stretch or in one of its frames."""
-    return np.random.Generator(np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame)))
+    return np.random.Generator(
+        np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame))
+    )
 
 
 @dataclass(frozen=True)

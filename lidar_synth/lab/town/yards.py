@@ -44,7 +44,9 @@ def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
     _plant_garden(scene, lot, street, house, rng)
 
 
-def _put_facing_street(scene: Scene, item: StaticObject, lot: Lot, s: float, front: float, width: float) -> None:
+def _put_facing_street(
+    scene: Scene, item: StaticObject, lot: Lot, s: float, front: float, width: float
+) -> None:
     """Put a building whose front faces the street; ``s`` is the lower end of its front."""
     if lot.side == LEFT:
         scene.put(item, s, front)
@@ -61,11 +63,26 @@ def _furnish_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
         _put_facing_street(scene, shed, lot, middle - 1.45, house + rng.uniform(0.5, 3), 2.9)
     if rng.random() < 0.4 and lot.setback > 2.5:
         kinds = vehicles()
-        kind = str(rng.choice(["hatchback", "compact", "sedan", "estate", "suv", "mpv", "small", "caravan"]))
+        kind = str(
+            rng.choice(
+                ["hatchback", "compact", "sedan", "estate", "suv", "mpv", "small", "caravan"]
+            )
+        )
         yaw = np.pi / 2 * (1 if rng.random() < 0.5 else -1)
-        scene.park(kinds[kind], PAINTS[rng.integers(len(PAINTS))], middle, lot.sign * (lot.front + 2.6), yaw)
+        scene.park(
+            kinds[kind],
+            PAINTS[rng.integers(len(PAINTS))],
+            middle,
+            lot.sign * (lot.front + 2.6),
+            yaw,
+        )
     if rng.random() < 0.35:
-        scene.put(furniture.bin_(rng), lot.driveway[0] - 0.5, lot.sign * (lot.front + 0.9), -lot.sign * np.pi / 2)
+        scene.put(
+            furniture.bin_(rng),
+            lot.driveway[0] - 0.5,
+            lot.sign * (lot.front + 0.9),
+            -lot.sign * np.pi / 2,
+        )
 
 
 def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng) -> None:
@@ -74,11 +91,15 @@ def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng
     width = lot.end - lot.start
     # Plants behind a house are hardly visible, so most are put near the street.
     for _ in range(rng.poisson((0.4 + lot.garden) * width * min(depth, 10) / 11)):
-        s, t = rng.uniform(lot.start + 0.8, lot.end - 0.8), lot.front + rng.uniform(0.9, max(1.0, depth - 0.6))
+        s = rng.uniform(lot.start + 0.8, lot.end - 0.8)
+        t = lot.front + rng.uniform(0.9, max(1.0, depth - 0.6))
         if lot.driveway and lot.driveway[0] - 1 < s < lot.driveway[1] + 1:
             continue
         species = str(
-            rng.choice(["bush", "thuja", "fruit", "round", "birch", "spruce"], p=[0.56, 0.13, 0.16, 0.06, 0.04, 0.05])
+            rng.choice(
+                ["bush", "thuja", "fruit", "round", "birch", "spruce"],
+                p=[0.56, 0.13, 0.16, 0.06, 0.04, 0.05],
+            )
         )
         near = t < 15 and -35 < s < street.length + 40
         scene.put(furniture.random_plant(species, rng, near=near), s, lot.sign * t, solid=0.5)
@@ -93,7 +114,9 @@ def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng
     if lot.plan and rng.random() < 0.5:
         gap = lot.start + lot.house_offset / 2 if lot.house_offset > 2 else lot.start + 0.3
         item = fences.clipped_hedge(8.0, rng) if rng.random() < 0.5 else fences.wire_fence(8.0, 1.2)
-        scene.put(item, lot.start + 0.2 if lot.driveway else gap, lot.sign * house, lot.sign * np.pi / 2)
+        scene.put(
+            item, lot.start + 0.2 if lot.driveway else gap, lot.sign * house, lot.sign * np.pi / 2
+        )
     if lot.plan:
         _close_gap(scene, lot, behind, rng)
 
@@ -114,7 +137,16 @@ def _close_gap(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
         elif draw < 0.6:
             scene.put(fences.bar_fence(high - low, 1.6, 0.11, (0.45, 0.35, 0.25), True), low, t)
         elif draw < 0.8 and high - low > 3.4:
-            _put_facing_street(scene, StaticObject(garage(3.2, 4.0), finishes(rng), HOUSE), lot, low + 0.1, abs(t), 3.2)
+            _put_facing_street(
+                scene,
+                StaticObject(garage(3.2, 4.0), finishes(rng), HOUSE),
+                lot,
+                low + 0.1,
+                abs(t),
+                3.2,
+            )
         else:
             for s in np.arange(low + 0.7, high, 1.6):
-                scene.put(furniture.random_plant("bush", rng, rng.uniform(1.0, 1.5), near=False), s, t)
+                scene.put(
+                    furniture.random_plant("bush", rng, rng.uniform(1.0, 1.5), near=False), s, t
+                )

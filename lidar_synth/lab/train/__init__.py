@@ -1,8 +1,8 @@
 """Training of teachers, autoencoders and students.
 
-``run(config)`` trains as ``lidar-synth train RECIPE`` and ``lidar-synth distill`` do, ``train_model(plan)`` as
-``lidar-synth train MODEL``; the parts below it (data, tasks, state,
-the loop as a generator) serve trainings of your own. Running needs Accelerate (extra ``train``).
+``run(config)`` trains as ``lidar-synth train RECIPE`` and ``lidar-synth distill`` do,
+``train_model(plan)`` as ``lidar-synth train MODEL``; the parts below it (data, tasks, state, the
+loop as a generator) serve trainings of your own. Running needs Accelerate (extra ``train``).
 """
 
 from lidar_synth.lab.train.autoencoder import (

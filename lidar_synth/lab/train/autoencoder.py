@@ -2,19 +2,23 @@
 
 An autoencoder trains in the same loop as a flow: one network, one optimiser, one loss::
 
-    reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by cross-entropy
-    codebook         squared distance of latents to their codes: ``commitment`` moves the encoder, ``codebook`` a
-                     "gradient" codebook; an "ema" codebook follows by moving averages
+    reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by
+    cross-entropy
+    codebook         squared distance of latents to their codes: ``commitment`` moves the encoder,
+                     ``codebook`` a "gradient" codebook; an "ema" codebook follows by moving
+                     averages
     mask             distance of the decoder's mask, where it has one, to 1 = return and -1 = none
-    geometric        squared distance of points, each the mean of four neighbours in a row, in units of the
-                     maximum range: preserves the curves that the beams trace
-    adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming Transformers for
-                     High-Resolution Image Synthesis", CVPR 2021). Both networks are trained in every step:
-                     the autoencoder's term uses the discriminator with frozen weights, the discriminator's term
-                     uses detached reconstructions
+    geometric        squared distance of points, each the mean of four neighbours in a row, in units
+                     of the maximum range: preserves the curves that the beams trace
+    adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming
+                     Transformers for High-Resolution Image Synthesis", CVPR 2021). Both networks
+                     are trained in every step: the autoencoder's term uses the discriminator with
+                     frozen weights, the discriminator's term uses detached reconstructions
 
-The architectures "autoencoder" and "surfaces" predict distributions. Their loss is the negative log-likelihood of the
-scan: of the return, of the class, and, given a return, of the range and the other values. "surfaces" takes them
+The architectures "autoencoder" and "surfaces" predict distributions. Their loss is the negative
+log-likelihood of the
+scan: of the return, of the class, and, given a return, of the range and the other values.
+    "surfaces" takes them
 together, with ``weights`` as exponents of the likelihoods of range and reflectance.
 """
 
@@ -62,13 +66,16 @@ class Losses:
         geometric: of the distance between points.
         mask: of the decoder's mask.
         adversarial: of the discriminator's output.
-        adaptive: multiply ``adversarial`` by the ratio of two gradient norms at the decoder's last layer: of all
-            reconstruction terms, and of the adversarial term (Esser et al., Eq. 7).
+        adaptive: multiply ``adversarial`` by the ratio of two gradient norms at the decoder's last
+            layer: of all reconstruction terms, and of the adversarial term (Esser et al., Eq. 7).
         discriminator_width: channels of the discriminator.
-        noise: standard deviation of the noise added to the latents of an "autoencoder", which lie in (-1, 1).
-        rare: exponent of the class weights of an "autoencoder": the weight of a cell is the share of its class in the
-            batch to the power of -rare. Poles cover one per cent of a scan, but matter more than that.
-        unlabelled: share of the images whose labels an "autoencoder" or "surfaces" decodes without having seen them.
+        noise: standard deviation of the noise added to the latents of an "autoencoder", which lie
+            in (-1, 1).
+        rare: exponent of the class weights of an "autoencoder": the weight of a cell is the share
+            of its class in the batch to the power of -rare. Poles cover one per cent of a scan, but
+            matter more than that.
+        unlabelled: share of the images whose labels an "autoencoder" or "surfaces" decodes without
+            having seen them.
 
     Raises:
         ConfigError: on a negative weight.
@@ -116,14 +123,22 @@ class Autoencoding(nn.Module):
         weights: Mapping[str, float],
     ) -> None:
         super().__init__()
-        self.network, self.tensors, self.losses = network, tensors, losses
-        self.metric, self.weights = metric, weights
-        self.discriminator = Discriminator(tensors.size, losses.discriminator_width) if losses.adversarial else None
-        directions = torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0) / sensor.range_max
+        self.network = network
+        self.tensors = tensors
+        self.losses = losses
+        self.metric = metric
+        self.weights = weights
+        self.discriminator = (
+            Discriminator(tensors.size, losses.discriminator_width) if losses.adversarial else None
+        )
+        directions = (
+            torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0) / sensor.range_max
+        )
         self.register_buffer("rays", directions, persistent=False)
 
     def forward(self, x: Tensor, noise: Tensor | None = None) -> Tensor:
-        """The loss of a batch of tensors (B, C, H, W), a scalar; ``noise`` is standard normal, of the same shape."""
+        """The loss of a batch of tensors (B, C, H, W), a scalar; ``noise`` is standard normal, of
+        the same shape."""
         if isinstance(self.network, Autoencoder | SurfaceAutoencoder):
             shape = self.network.latent_shape
             noise = torch.zeros_like(x) if noise is None else noise
@@ -135,9 +150,15 @@ class Autoencoding(nn.Module):
         if mask.shape[1]:
             loss = loss + self.losses.mask * self.metric(mask, self._returned(x)).mean()
         if self.losses.geometric:
-            loss = loss + self.losses.geometric * (self._points(output) - self._points(x)).square().sum(1).mean()
+            loss = (
+                loss
+                + self.losses.geometric
+                * (self._points(output) - self._points(x)).square().sum(1).mean()
+            )
         if self.discriminator is not None:
-            loss = loss + self._adversarial(self.discriminator, expected(output, self.tensors), x, loss)
+            loss = loss + self._adversarial(
+                self.discriminator, expected(output, self.tensors), x, loss
+            )
         loss = loss + self.losses.commitment * encoding.gap.mean()
         return loss + self.losses.codebook * encoding.code_gap.mean()
 
@@ -162,14 +183,21 @@ class Autoencoding(nn.Module):
         """The weighted sum over channels, a scalar."""
         sizes = [CHANNELS[name] for name in self.tensors.channels]
         loss = output.new_zeros(())
-        for name, a, b in zip(self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True):  # type: ignore[no-untyped-call]
+        for name, a, b in zip(
+            self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True
+        ):  # type: ignore[no-untyped-call]
             label = name == "label"
-            part = F.binary_cross_entropy_with_logits(a, (b + 1) / 2) if label else self.metric(a, b).mean()
+            part = (
+                F.binary_cross_entropy_with_logits(a, (b + 1) / 2)
+                if label
+                else self.metric(a, b).mean()
+            )
             loss = loss + self.weights.get(name, 1.0) * part
         return loss
 
     def nll(self, predicted: CellDistributions | Surfaces, x: Tensor) -> Tensor:
-        """The negative log-likelihood of images (B, C, H, W) under the predicted distributions, a scalar."""
+        """The negative log-likelihood of images (B, C, H, W) under the predicted distributions, a
+        scalar."""
         if isinstance(predicted, Surfaces):
             return self._nll_of_surfaces(predicted, x)
         return self._nll_of_cells(predicted, x)
@@ -186,7 +214,8 @@ class Autoencoding(nn.Module):
 
     def _nll_of_cells(self, heads: CellDistributions, x: Tensor) -> Tensor:
         count = 1 + heads.readings.middles.shape[1]
-        distance, values = x[:, :1], x[:, 1:count]
+        distance = x[:, :1]
+        values = x[:, 1:count]
         returned = (distance > -1).float()
         nll = [heads.surfaces.nll(distance), heads.readings.nll(values)]
         loss = F.binary_cross_entropy_with_logits(heads.returned.float(), returned)
@@ -195,7 +224,10 @@ class Autoencoding(nn.Module):
             code = _code(x[:, count:])
             weight = self._rarity(code, codes)[:, None]
             unlikely = F.cross_entropy(heads.classes.float(), code, reduction="none")
-            loss = loss + self.weights.get("label", 1.0) * (weight[:, 0] * unlikely).sum() / weight.sum()
+            loss = (
+                loss
+                + self.weights.get("label", 1.0) * (weight[:, 0] * unlikely).sum() / weight.sum()
+            )
         weight = weight * returned
         means = (torch.cat(nll, 1) * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
         for name, mean in zip(self.tensors.channels, means, strict=False):  # the label has no mean
@@ -217,15 +249,24 @@ class Autoencoding(nn.Module):
 
     def _metres(self, x: Tensor) -> Tensor:
         """(B, 1, H, W) ranges."""
-        first = sum(CHANNELS[name] for name in self.tensors.channels[: self.tensors.channels.index("range")])
+        first = sum(
+            CHANNELS[name] for name in self.tensors.channels[: self.tensors.channels.index("range")]
+        )
         return self.tensors.normalisation.decode(x[:, first : first + 1])
 
-    def _adversarial(self, judge: nn.Module, output: Tensor, x: Tensor, reconstruction: Tensor | None = None) -> Tensor:
-        """The terms of autoencoder and discriminator; an adaptive weight needs the loss of the ``reconstruction``."""
+    def _adversarial(
+        self, judge: nn.Module, output: Tensor, x: Tensor, reconstruction: Tensor | None = None
+    ) -> Tensor:
+        """The terms of autoencoder and discriminator; an adaptive weight needs the loss of the
+        ``reconstruction``."""
         frozen = {name: p.detach() for name, p in judge.named_parameters()}
         fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
         verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
-        balance = self._balance(reconstruction, fooled) if self.losses.adaptive and reconstruction is not None else 1.0
+        balance = (
+            self._balance(reconstruction, fooled)
+            if self.losses.adaptive and reconstruction is not None
+            else 1.0
+        )
         return self.losses.adversarial * balance * fooled + verdict / 2
 
     def _balance(self, reconstruction: Tensor, fooled: Tensor) -> Tensor:
@@ -234,7 +275,10 @@ class Autoencoding(nn.Module):
         last = self.network.decoder.head.weight
         if not (torch.is_grad_enabled() and last.requires_grad):
             return fooled.new_zeros(())
-        one, other = (torch.autograd.grad(x, last, retain_graph=True)[0].norm() for x in (reconstruction, fooled))
+        one, other = (
+            torch.autograd.grad(x, last, retain_graph=True)[0].norm()
+            for x in (reconstruction, fooled)
+        )
         balance: Tensor = (one / (other + 1e-4)).clamp(max=1e4)
         return balance
 
@@ -260,7 +304,8 @@ class Discriminator(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         for i in range(depth):
-            inputs, outputs = (channels if i == 0 else width << (i - 1)), width << i
+            inputs = channels if i == 0 else width << (i - 1)
+            outputs = width << i
             layers += [WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2))]
             layers += [Norm(outputs, 1e-6), nn.LeakyReLU(0.2)] if i else [nn.LeakyReLU(0.2)]
         self.layers = nn.Sequential(*layers, WrapConv(width << (depth - 1), 1))
@@ -291,15 +336,19 @@ def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str
     """Reconstruction errors of tensors (B, C, H, W).
 
     Returns:
-        ``mae``, metres, over cells with a return in both; ``within_5cm``, share of all real returns; ``drop_accuracy``,
-        share of cells that are a return in both or in neither; ``chamfer``, metres, mean of both directions' mean
-        distances to the nearest point, from up to 2048 points evenly spaced; with labels ``label_accuracy``, share of
-        cells with a return in both whose label is the same.
+        ``mae``, metres, over cells with a return in both; ``within_5cm``, share of all real
+        returns; ``drop_accuracy``, share of cells that are a return in both or in neither;
+        ``chamfer``, metres, mean of both directions' mean distances to the nearest point, from up
+        to 2048 points evenly spaced; with labels ``label_accuracy``, share of cells with a return
+        in both whose label is the same.
     """
     rays = torch.from_numpy(sensor.ray_directions().copy())
     sums: dict[str, list[float]] = {}
-    for real, made in zip(codec.tensors.to_images(x, sensor), reconstruct(codec, x, sensor), strict=True):
-        a, b = torch.from_numpy(real.range), torch.from_numpy(made.range)
+    for real, made in zip(
+        codec.tensors.to_images(x, sensor), reconstruct(codec, x, sensor), strict=True
+    ):
+        a = torch.from_numpy(real.range)
+        b = torch.from_numpy(made.range)
         both = (a > 0) & (b > 0)
         error = (a - b).abs()
         figures = {

@@ -27,14 +27,17 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 
-DTYPES: dict[str, type[np.generic]] = {name: TYPES[name] for name in ("range", "reflectance", "label")}
+DTYPES: dict[str, type[np.generic]] = {
+    name: TYPES[name] for name in ("range", "reflectance", "label")
+}
 """Data type of each channel in a cache, the same as in a bank."""
 
 Layout = dict[str, tuple[tuple[int, ...], type[np.generic]]]
 """{field of a cache: its shape and type}."""
 
 BLOCK = 64
-"""Scans of a cache that share a checksum: they are noted when they are complete, and made again if they are damaged."""
+"""Scans of a cache that share a checksum: they are noted when they are complete, and made again if
+they are damaged."""
 
 NOTE = "cache.json"
 """The file beside a cache that says what it holds, with the checksums of its blocks."""
@@ -45,8 +48,8 @@ class ImageCache:
     """Range images, 3 to 4 bytes a cell.
 
     Args:
-        fields: {channel: (N, H, W)} of the types in ``DTYPES``, in memory or memory-mapped; others, such as camera
-            images (N, 3, h, w), are uint8 and stay as they are.
+        fields: {channel: (N, H, W)} of the types in ``DTYPES``, in memory or memory-mapped; others,
+            such as camera images (N, 3, h, w), are uint8 and stay as they are.
         sensor: defines the grid.
     """
 
@@ -62,21 +65,28 @@ class ImageCache:
         return len(self.fields["range"])
 
     def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """(B, H, W) of each channel: range float32 metres, reflectance float32 in [0, 1], label uint8; (B, ...) uint8
-        of all else."""
-        values = {name: torch.from_numpy(v[np.asarray(indices, np.int64)]) for name, v in self.fields.items()}
+        """(B, H, W) of each channel: range float32 metres, reflectance float32 in [0, 1], label
+        uint8; (B, ...) uint8 of all else."""
+        values = {
+            name: torch.from_numpy(v[np.asarray(indices, np.int64)])
+            for name, v in self.fields.items()
+        }
         values["range"] = values["range"].float() * self.encoding.scale
         if "reflectance" in values:
             values["reflectance"] = values["reflectance"].float() / LEVELS["reflectance"]
         return values
 
-    def write(self, index: int, image: RangeImage, others: Mapping[str, NDArray[np.uint8]] | None = None) -> None:
+    def write(
+        self, index: int, image: RangeImage, others: Mapping[str, NDArray[np.uint8]] | None = None
+    ) -> None:
         """Put a range image, and what else is kept of its scan, into its place.
 
         Raises:
             DataError: on a value that has no code, see ``Encoding.encode``.
         """
-        self.encoding.encode(image, {name: self.fields[name][index] for name in self.encoding.names})
+        self.encoding.encode(
+            image, {name: self.fields[name][index] for name in self.encoding.names}
+        )
         for name, values in (others or {}).items():
             self.fields[name][index] = values
 
@@ -108,8 +118,8 @@ def cache_scans(
         source: of scans.
         sensor: defines the grid.
         channels: names of ``DTYPES``.
-        folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes on; by
-            default the cache is in memory.
+        folder: keep the cache there, memory-mapped: a second call finds it, an interrupted one goes
+            on; by default the cache is in memory.
         description: what tells this source from another one, plain values; stands beside the cache.
         progress: show a bar.
         others: {name: what else to keep}.
@@ -130,7 +140,12 @@ def cache_scans(
         cache = ImageCache({n: np.empty(*kind) for n, kind in layout.items()}, sensor)
         sums: list[int | None] = [None] * -(-len(source) // BLOCK)
     else:
-        facts = {"sensor": sensor.to_dict(), "shape": shape, "channels": names, "source": dict(description or {})}
+        facts = {
+            "sensor": sensor.to_dict(),
+            "shape": shape,
+            "channels": names,
+            "source": dict(description or {}),
+        }
         if others:
             facts["others"] = {name: other.shape for name, other in others.items()}
         cache, sums = _open_folder(folder, facts, layout, sensor)
@@ -157,15 +172,16 @@ def cache_latents(
     codec_hash: str = "",
     progress: bool = True,
 ) -> NDArray[np.float16]:
-    """The latents of all scans of a cache, as they are and mirrored: an autoencoder that stands still need not look
-    at the same scan in every epoch.
+    """The latents of all scans of a cache, as they are and mirrored: an autoencoder that stands
+    still need not look at the same scan in every epoch.
 
     Args:
         cache: of N scans.
         tensors: layout of the codec's tensors.
         codec: of the latents.
         device: where it is.
-        folder: keep them there; a second call with the same ``codec_hash`` finds them. By default in memory.
+        folder: keep them there; a second call with the same ``codec_hash`` finds them. By default
+            in memory.
         codec_hash: of the codec's weights.
         progress: show a bar.
 
@@ -180,7 +196,9 @@ def cache_latents(
     if path is not None and path.exists():
         try:
             found: NDArray[np.float16] = _open_array(path, "r", shape, np.float16)
-            if read_sealed(path.with_suffix(".json"), "the sum of latents")["sum"] == zlib.crc32(found.data):
+            if read_sealed(path.with_suffix(".json"), "the sum of latents")["sum"] == zlib.crc32(
+                found.data
+            ):
                 return found
             raise DataError(f"{path} is damaged")
         except (DataError, FileError, KeyError) as error:
@@ -206,7 +224,10 @@ def _open_folder(
         except DataError as error:
             warnings.warn(f"{error}; the cache is made again", stacklevel=2)
     try:
-        maps = {n: _open_array(folder / f"{n}.npy", "r+" if None in sums else "r", *layout[n]) for n in layout}
+        maps = {
+            n: _open_array(folder / f"{n}.npy", "r+" if None in sums else "r", *layout[n])
+            for n in layout
+        }
         return ImageCache(maps, sensor), sums
     except (DataError, FileError):
         pass  # a new cache, or a damaged one
@@ -214,9 +235,14 @@ def _open_folder(
         folder.mkdir(parents=True, exist_ok=True)
         for name in layout:  # another run may read the old files, which must not shrink under it
             (folder / f"{name}.npy").unlink(missing_ok=True)
-        new = {n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", d, s) for n, (s, d) in layout.items()}
+        new = {
+            n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", d, s)
+            for n, (s, d) in layout.items()
+        }
     except OSError as error:
-        raise FileError(f"the cache {folder} cannot be opened ({error})", "a folder that can be written") from error
+        raise FileError(
+            f"the cache {folder} cannot be opened ({error})", "a folder that can be written"
+        ) from error
     sums = [None] * len(sums)
     _note(folder, facts, sums)  # another run that opens the folder now does not empty the files
     return ImageCache(new, sensor), sums
@@ -229,7 +255,8 @@ def _check(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int | No
         ConfigError: if it is the cache of other data.
         DataError: if its files are damaged as a whole.
     """
-    found, wanted = read_sealed(folder / NOTE, "the notes of a cache"), json.loads(json.dumps(facts))
+    found = read_sealed(folder / NOTE, "the notes of a cache")
+    wanted = json.loads(json.dumps(facts))
     sums = found.pop("sums", None)
     if found != wanted:
         differs = [key for key in found | wanted if found.get(key) != wanted.get(key)]
@@ -240,15 +267,24 @@ def _check(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int | No
         )
     maps = {n: _open_array(folder / f"{n}.npy", "r", *layout[n]) for n in layout}
     intact = [s if s is None or s == _sum(maps, block) else None for block, s in enumerate(sums)]
-    if damaged := [block for block, s in enumerate(sums) if s is not None and intact[block] is None]:
-        named = ", ".join(f"{_span(block).start} to {_span(block).stop - 1}" for block in damaged[:5])
+    if damaged := [
+        block for block, s in enumerate(sums) if s is not None and intact[block] is None
+    ]:
+        named = ", ".join(
+            f"{_span(block).start} to {_span(block).stop - 1}" for block in damaged[:5]
+        )
         more = f" and {len(damaged) - 5} more blocks" if len(damaged) > 5 else ""
-        warnings.warn(f"{folder}: scans {named}{more} are damaged, and are made again", stacklevel=2)
+        warnings.warn(
+            f"{folder}: scans {named}{more} are damaged, and are made again", stacklevel=2
+        )
     return intact
 
 
-def _open_array(path: Path, mode: Literal["r", "r+"], shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
-    """Map an ``.npy`` file of this shape and type into memory; its header has to be the one that numpy writes.
+def _open_array(
+    path: Path, mode: Literal["r", "r+"], shape: tuple[int, ...], dtype: type[np.generic]
+) -> NDArray[Any]:
+    """Map an ``.npy`` file of this shape and type into memory; its header has to be the one that
+    numpy writes.
 
     Raises:
         DataError: on another file.
@@ -256,7 +292,12 @@ def _open_array(path: Path, mode: Literal["r", "r+"], shape: tuple[int, ...], dt
     """
     header = BytesIO()
     np.lib.format.write_array_header_1_0(
-        header, {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
+        header,
+        {
+            "descr": np.lib.format.dtype_to_descr(np.dtype(dtype)),
+            "fortran_order": False,
+            "shape": shape,
+        },
     )
     start = header.getvalue()
     try:
@@ -264,7 +305,9 @@ def _open_array(path: Path, mode: Literal["r", "r+"], shape: tuple[int, ...], dt
         with path.open("rb") as file:
             same = file.read(len(start)) == start
         if not same or size != len(start) + prod(shape) * np.dtype(dtype).itemsize:
-            raise DataError(f"{path} is truncated or damaged", f"{np.dtype(dtype)} of shape {shape}")
+            raise DataError(
+                f"{path} is truncated or damaged", f"{np.dtype(dtype)} of shape {shape}"
+            )
         return np.memmap(path, dtype, mode, len(start), shape)
     except OSError as error:
         raise unreadable(path, error, "a file of a cache") from error

@@ -1,7 +1,8 @@
 """Training batches as a function of their position alone.
 
-A run requests samples by their position in one endless sequence. A sample (scan, rotation, mirroring, noise, time) is a
-function of (seed, position) only, so that a resumed run, or one with another number of processes, sees the same data.
+A run requests samples by their position in one endless sequence. A sample (scan, rotation,
+mirroring, noise, time) is a function of (seed, position) only, so that a resumed run, or one with
+another number of processes, sees the same data.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,8 @@ from lidar_synth.lab.train.cache import ImageCache
 from lidar_synth.noise import gaussian, uniform
 
 _TRAINING = 1 << 62
-"""Offset of a run's seed: training noise differs from the noise of scans that are sampled with the same seed."""
+"""Offset of a run's seed: training noise differs from the noise of scans that are sampled with the
+same seed."""
 
 
 class Batch(NamedTuple):
@@ -48,7 +50,8 @@ class Conditioning:
     Args:
         name: of ``CONDITIONS``.
         dropout: share of samples with a blank condition, so that the model can be guided.
-        reduction: share of conditions that tell less: one view of a camera image, a layout without outlines.
+        reduction: share of conditions that tell less: one view of a camera image, a layout without
+            outlines.
         views: number of views of a camera image.
     """
 
@@ -67,11 +70,13 @@ class Batches:
         tensors: layout of the network's tensors.
         seed: 0 <= seed < 2^62.
         flip: mirror every other sample, left to right.
-        roll: turn every sample about the vertical by a random whole number of columns; of columns of the ``latents``
-            if there are any, by which an autoencoder whose columns wrap around turns them exactly.
+        roll: turn every sample about the vertical by a random whole number of columns; of columns
+            of the ``latents`` if there are any, by which an autoencoder whose columns wrap around
+            turns them exactly.
         device: on which noise is generated and batches are assembled.
         codec: encodes tensors to states; None = the tensors are the states.
-        latents: (2, N, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place of ``codec``.
+        latents: (2, N, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place
+            of ``codec``.
         conditioning: the field of the cache that is the condition; None = unconditional.
 
     Raises:
@@ -90,7 +95,10 @@ class Batches:
 
     def __post_init__(self) -> None:
         if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
-            raise ConfigError(f"roll with the condition {self.conditioning.name!r}", "roll=false: it does not turn")
+            raise ConfigError(
+                f"roll with the condition {self.conditioning.name!r}",
+                "roll=false: it does not turn",
+            )
 
     def scans_at(self, positions: Sequence[int]) -> list[int]:
         """Index of the scan at each position; every epoch is a permutation of all scans."""
@@ -112,7 +120,9 @@ class Batches:
             return _rolled(x, (unit * turns).tolist()) if self.roll else x
 
         if self.latents is not None:
-            y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(self.device, torch.float32)
+            y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(
+                self.device, torch.float32
+            )
             y0 = _rolled(y0, turns.tolist()) if self.roll else y0
         else:
             y0 = augmented(self.tensors.encode(self.cache.read(scans)).to(self.device))
@@ -120,17 +130,24 @@ class Batches:
         cond = None if self.conditioning is None else augmented(self._stored(scans))
         if cond is not None:
             cond = self._dropped(cond, draws)
-        return Batch(y0, gaussian(seed, positions, y0.shape[1:], self.device), draws[:, 0].to(self.device), cond)
+        return Batch(
+            y0,
+            gaussian(seed, positions, y0.shape[1:], self.device),
+            draws[:, 0].to(self.device),
+            cond,
+        )
 
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
-        """The conditions (B, ...) of the scans at these positions, without dropout and augmentation; None if
-        unconditional."""
+        """The conditions (B, ...) of the scans at these positions, without dropout and
+        augmentation; None if unconditional."""
         return None if self.conditioning is None else self._stored(self.scans_at(positions))
 
     def _stored(self, scans: Sequence[int]) -> Tensor:
         """The cached conditions (B, ...) of these scans."""
         assert self.conditioning is not None
-        values = self.cache.fields[CONDITIONS[self.conditioning.name].field][np.asarray(scans, np.int64)]
+        values = self.cache.fields[CONDITIONS[self.conditioning.name].field][
+            np.asarray(scans, np.int64)
+        ]
         return torch.from_numpy(values).to(self.device)
 
     def _dropped(self, cond: Tensor, draws: Tensor) -> Tensor:
@@ -140,7 +157,11 @@ class Batches:
         if about.reduction:
             less = CONDITIONS[about.name].reduced(cond, draws[:, 4] / about.reduction, about.views)
             cond = _where(draws[:, 4] < about.reduction, less, cond)
-        return _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond) if about.dropout else cond
+        return (
+            _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond)
+            if about.dropout
+            else cond
+        )
 
 
 @dataclass(frozen=True)
@@ -156,7 +177,9 @@ class InTurns:
 
     def __post_init__(self) -> None:
         if self.first.conditioning is not None:
-            raise ConfigError(f"rehearsal for a model with the condition {self.first.conditioning.name!r}", "none")
+            raise ConfigError(
+                f"rehearsal for a model with the condition {self.first.conditioning.name!r}", "none"
+            )
 
     @property
     def tensors(self) -> TensorFormat:
@@ -184,11 +207,15 @@ def _rolled(x: Tensor, columns: Sequence[int]) -> Tensor:
 def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
     """(count,) a permutation, a function of the seed and the epoch."""
     # One number per scan and epoch, at indices that positions (< 2^62) do not use.
-    keys = uniform(seed + _TRAINING, range((1 << 62) + epoch * count, (1 << 62) + (epoch + 1) * count))
+    keys = uniform(
+        seed + _TRAINING, range((1 << 62) + epoch * count, (1 << 62) + (epoch + 1) * count)
+    )
     return np.argsort(keys.numpy(), kind="stable")
 
 
-def micro_batches(step: int, batch: int, accumulate: int, process: int = 0, processes: int = 1) -> Iterator[range]:
+def micro_batches(
+    step: int, batch: int, accumulate: int, process: int = 0, processes: int = 1
+) -> Iterator[range]:
     """The positions that one process trains on in one optimiser step, one range per micro-batch.
 
     Args:
@@ -201,7 +228,9 @@ def micro_batches(step: int, batch: int, accumulate: int, process: int = 0, proc
         ConfigError: if the batch cannot be divided.
     """
     if batch % (accumulate * processes):
-        raise ConfigError(f"batch {batch} over {accumulate} micro-batches and {processes} processes", "a multiple")
+        raise ConfigError(
+            f"batch {batch} over {accumulate} micro-batches and {processes} processes", "a multiple"
+        )
     size = batch // (accumulate * processes)
     for i in range(accumulate):
         start = step * batch + (i * processes + process) * size

@@ -1,10 +1,11 @@
 """Fine-tuning of a decoder on the latents that a flow generates.
 
-An autoencoder is trained on its own latents with a little noise. A student of few steps makes larger errors of another
-kind, such as walls whose pieces do not meet. Therefore the decoder alone is trained further, with encoder and flow
-frozen. Every other latent is noised to the student's last timestep and denoised by the student's last step; the decoder
-learns to reconstruct the original scan from it. The other latents get noise of random strength up to that of
-``Losses``, so that the decoder still trusts exact latents.
+An autoencoder is trained on its own latents with a little noise. A student of few steps makes
+larger errors of another kind, such as walls whose pieces do not meet. Therefore the decoder alone
+is trained further, with encoder and flow frozen. Every other latent is noised to the student's last
+timestep and denoised by the student's last step; the decoder learns to reconstruct the original
+scan from it. The other latents get noise of random strength up to that of ``Losses``, so that the
+decoder still trusts exact latents.
 """
 
 import math
@@ -21,7 +22,8 @@ from lidar_synth.lab.train.loop import Task
 
 
 class Decoding(Autoencoding):
-    """The trained module: a decoder; the encoder is frozen. Takes the arguments of ``Autoencoding``."""
+    """The trained module: a decoder; the encoder is frozen. Takes the arguments of
+    ``Autoencoding``."""
 
     network: Autoencoder | SurfaceAutoencoder
 
@@ -36,7 +38,9 @@ def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tenso
     return loss
 
 
-def decoding_task(autoencoder: Autoencoder | SurfaceAutoencoder, velocity: Velocity, time: float, noise: float) -> Task:
+def decoding_task(
+    autoencoder: Autoencoder | SurfaceAutoencoder, velocity: Velocity, time: float, noise: float
+) -> Task:
     """Latents as a flow leaves them; the answer is the image.
 
     Args:

@@ -1,4 +1,5 @@
-"""Early stopping: the loss on scans that are not trained on, always of the same samples with the same noise."""
+"""Early stopping: the loss on scans that are not trained on, always of the same samples with the
+same noise."""
 
 import json
 from dataclasses import dataclass, field
@@ -52,7 +53,9 @@ def read_history(folder: Path) -> list[Measured]:
     try:
         return [Measured(int(step), float(loss), float(seconds)) for step, loss, seconds in values]
     except (TypeError, ValueError) as error:
-        raise DataError(f"{path} is damaged ({error})", "steps, losses and seconds", "Remove it.") from error
+        raise DataError(
+            f"{path} is damaged ({error})", "steps, losses and seconds", "Remove it."
+        ) from error
 
 
 @dataclass
@@ -80,16 +83,25 @@ class Watch:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the loss has not fallen for as many measurements as the run has patience. Those before the learning
-        rate begins to fall do not count where a plateau ended, or the rate would never fall."""
+        """Whether the loss has not fallen for as many measurements as the run has patience. Those
+        before the learning rate begins to fall do not count where a plateau ended, or the rate
+        would never fall."""
         assert self.config.held_out is not None
         recipe = self.config.recipe
-        begin = PLATEAU * recipe.iterations if recipe.schedule == "trapezoid" and recipe.iterations < ENDLESS else 0
+        begin = (
+            PLATEAU * recipe.iterations
+            if recipe.schedule == "trapezoid" and recipe.iterations < ENDLESS
+            else 0
+        )
         losses = [m.loss for m in self.measured if m.step >= begin]
-        return bool(losses) and len(losses) - 1 - losses.index(min(losses)) >= self.config.held_out.patience
+        return (
+            bool(losses)
+            and len(losses) - 1 - losses.index(min(losses)) >= self.config.held_out.patience
+        )
 
     def measure(self, training: Training) -> bool:
-        """Measure the averaged weights, write the history, and return whether they are the best up to now."""
+        """Measure the averaged weights, write the history, and return whether they are the best up
+        to now."""
         if self.measured and self.measured[-1].step == training.step:
             return self.measured[-1].loss == self.least
         loss = self._loss(training)
@@ -103,7 +115,8 @@ class Watch:
         assert self.config.held_out is not None
         recipe = training.recipe
         metric = weighted(METRICS[recipe.metric], recipe.weights, self.data.tensors)
-        total, count = 0.0, self.config.held_out.samples
+        total = 0.0
+        count = self.config.held_out.samples
         for start in range(0, count, recipe.batch):
             positions = range(start, min(start + recipe.batch, count))
             with self.accelerator.autocast():
@@ -113,7 +126,9 @@ class Watch:
         return total / count
 
 
-def open_watch(config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator") -> Watch:
+def open_watch(
+    config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator"
+) -> Watch:
     """The watch of a run, which continues the history in its folder.
 
     Raises:

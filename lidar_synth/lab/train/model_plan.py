@@ -69,11 +69,15 @@ class ModelPlan:
     @property
     def runs(self) -> StagedRuns:
         """The runs of the stages; those with iterations of their own have no share of the time."""
-        return StagedRuns(self.folder, {name: s.minutes for name, s in self.stages.items() if s.minutes is not None})
+        return StagedRuns(
+            self.folder,
+            {name: s.minutes for name, s in self.stages.items() if s.minutes is not None},
+        )
 
     def __str__(self) -> str:
         """The plan in words."""
-        runs, budgets = self.runs, self.runs.budgets(self.minutes)
+        runs = self.runs
+        budgets = self.runs.budgets(self.minutes)
         lines = [f"{self.name} -> {self.out}"]
         for name, stage in self.stages.items():
             limit = f"{stage.config.recipe.iterations} iterations"
@@ -82,35 +86,51 @@ class ModelPlan:
             if runs.is_done(name):
                 limit = "done"
             elif spent := runs.spent(name):
-                limit += f", {spent:.1f} of them done" if name in budgets else f", {spent:.1f} minutes done"
-            given = [f"{key}={path}" + (" (missing)" if is_missing(path) else "") for key, path in stage.starts.items()
-                     if path not in map(runs.checkpoint, self.stages)]  # fmt: skip
-            lines.append(f"  {name:<10} {stage.recipe:<24} {limit}" + "".join(f"; {one}" for one in given))
-        lines.append("The minutes are those of training; casting scans and selecting timesteps take more.")
+                limit += (
+                    f", {spent:.1f} of them done"
+                    if name in budgets
+                    else f", {spent:.1f} minutes done"
+                )
+            given = [
+                f"{key}={path}" + (" (missing)" if is_missing(path) else "")
+                for key, path in stage.starts.items()
+                if path not in map(runs.checkpoint, self.stages)
+            ]
+            lines.append(
+                f"  {name:<10} {stage.recipe:<24} {limit}" + "".join(f"; {one}" for one in given)
+            )
+        lines.append(
+            "The minutes are those of training; casting scans and selecting timesteps take more."
+        )
         return "\n".join([*lines, "The same command resumes."])
 
 
 def plan_model(
-    model: str | Path, overrides: Sequence[str] = (), minutes: float | None = None, until: str | None = None
+    model: str | Path,
+    overrides: Sequence[str] = (),
+    minutes: float | None = None,
+    until: str | None = None,
 ) -> ModelPlan:
     """The plan of a model.
 
     Args:
-        model: the name of a published model of stages, such as ``town-dense``, or a YAML file like those in
-            ``configs/models``.
-        overrides: ``STAGE.KEY=VALUE`` for the recipe of one stage, ``KEY=VALUE`` for those of all stages, and
-            ``output=FOLDER`` for the folder of the model, ``runs/NAME`` by default. A stage with ``recipe.iterations``
-            runs to them, whatever time it takes. An earlier stage whose checkpoint is replaced by another one is left
-            out, unless a further stage needs it.
-        minutes: limit of the time of all stages, which is shared in proportion to the minutes of the model's file; by
-            default their sum.
+        model: the name of a published model of stages, such as ``town-dense``, or a YAML file like
+            those in ``configs/models``.
+        overrides: ``STAGE.KEY=VALUE`` for the recipe of one stage, ``KEY=VALUE`` for those of all
+            stages, and ``output=FOLDER`` for the folder of the model, ``runs/NAME`` by default. A
+            stage with ``recipe.iterations`` runs to them, whatever time it takes. An earlier stage
+            whose checkpoint is replaced by another one is left out, unless a further stage needs
+            it.
+        minutes: limit of the time of all stages, which is shared in proportion to the minutes of
+            the model's file; by default their sum.
         until: the last stage to run.
 
     Returns:
         The plan, for ``train_model``.
 
     Raises:
-        ConfigError: on an unknown model or stage, an override that fits none of its stages, or too few minutes.
+        ConfigError: on an unknown model or stage, an override that fits none of its stages, or too
+            few minutes.
         FileError: where a file cannot be read.
 
     Example:
@@ -125,14 +145,18 @@ def plan_model(
     path = find_model_file(model)
     if path is None:
         names = ", ".join(one.name for one in published_models())
-        raise ConfigError(f"model {str(model)!r}", f"a YAML file with the key 'stages', or one of {names}")
-    name, settings = path.stem, load_model(path)
+        raise ConfigError(
+            f"model {str(model)!r}", f"a YAML file with the key 'stages', or one of {names}"
+        )
+    name = path.stem
+    settings = load_model(path)
     if until is not None and until not in settings.stages:
         raise ConfigError(f"--until {until!r}", f"a stage of {name}: {', '.join(settings.stages)}")
     last = until or list(settings.stages)[-1]
     given = _split(name, overrides, settings)
     folder = Path(given.pop(OUTPUT, [f"runs/{name}"])[-1])
-    runs, stages = StagedRuns(folder, {}), {}
+    runs = StagedRuns(folder, {})
+    stages = {}
     for stage_name, stage in settings.stages.items():
         stages[stage_name] = _planned(stage_name, stage, path, runs, given[stage_name])
     stages = _needed(stages, last, runs)
@@ -144,12 +168,14 @@ def plan_model(
 
 
 def is_missing(path: Path) -> bool:
-    """Whether there is no checkpoint to start from: neither a file nor a shipped model of that name."""
+    """Whether there is no checkpoint to start from: neither a file nor a shipped model of that
+    name."""
     return str(path) not in shipped_models() and not path.is_file()
 
 
 def _split(model: str, overrides: Sequence[str], settings: ModelConfig) -> dict[str, list[str]]:
-    """{name of a stage: overrides of its recipe, those for all stages first}; the model's folder under ``OUTPUT``."""
+    """{name of a stage: overrides of its recipe, those for all stages first}; the model's folder
+    under ``OUTPUT``."""
     every, own = [], {name: [] for name in settings.stages}  # type: ignore[var-annotated]
     folder = []
     common = [key for key in Run.model_fields if key != OUTPUT]
@@ -165,7 +191,8 @@ def _split(model: str, overrides: Sequence[str], settings: ModelConfig) -> dict[
         else:
             raise ConfigError(
                 f"override {override!r}",
-                f"STAGE.KEY=VALUE for a stage of {model} ({', '.join(own)}), output=FOLDER, or a key of all its "
+                f"STAGE.KEY=VALUE for a stage of {model} ({', '.join(own)}), output=FOLDER, or a "
+                "key of all its "
                 f"recipes ({', '.join(common)})",
                 f"Such as {next(iter(own))}.recipe.batch=4.",
             )
@@ -173,7 +200,9 @@ def _split(model: str, overrides: Sequence[str], settings: ModelConfig) -> dict[
     return split | {OUTPUT: folder} if folder else split
 
 
-def _planned(name: str, stage: Stage, path: Path, runs: StagedRuns, overrides: Sequence[str]) -> PlannedStage:
+def _planned(
+    name: str, stage: Stage, path: Path, runs: StagedRuns, overrides: Sequence[str]
+) -> PlannedStage:
     """The run of a stage, with all that it needs."""
     beside = path.parent / stage.recipe
     recipe = beside if beside.is_file() else stage.recipe
@@ -191,13 +220,20 @@ def _planned(name: str, stage: Stage, path: Path, runs: StagedRuns, overrides: S
     if timed and config.recipe.schedule != "trapezoid":
         given = f"{name}.recipe.schedule={config.recipe.schedule} with a limit of time"
         raise ConfigError(given, "trapezoid", f"Or give {name}.recipe.iterations=N.")
-    starts = {key: Path(start) for key in PARENTS if (start := getattr(config, key, None)) is not None}
-    of_others = {key: other for key, other in stage.needs.items()
-                 if "/" in other and str(starts.get(key)) == values[key]}  # fmt: skip
+    starts = {
+        key: Path(start) for key in PARENTS if (start := getattr(config, key, None)) is not None
+    }
+    of_others = {
+        key: other
+        for key, other in stage.needs.items()
+        if "/" in other and str(starts.get(key)) == values[key]
+    }
     return PlannedStage(str(recipe), config, stage.minutes if timed else None, starts, of_others)
 
 
-def _needed(stages: Mapping[str, PlannedStage], last: str, runs: StagedRuns) -> dict[str, PlannedStage]:
+def _needed(
+    stages: Mapping[str, PlannedStage], last: str, runs: StagedRuns
+) -> dict[str, PlannedStage]:
     """The stages that the last one starts from, directly or not, and itself."""
     needed = {last}
     for name in reversed(list(stages)):

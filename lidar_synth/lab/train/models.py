@@ -1,4 +1,5 @@
-"""A model from its stages: each is a run in a folder of its own, and starts from the checkpoints of earlier ones.
+"""A model from its stages: each is a run in a folder of its own, and starts from the checkpoints of
+earlier ones.
 
 The folder of the model, ``runs/NAME``, holds::
 
@@ -26,17 +27,19 @@ LARGE = 14.4e6
 
 
 def train_model(plan: ModelPlan) -> Path:
-    """Run the stages of a model one after the other; a second call resumes, and keeps the stages that are done.
+    """Run the stages of a model one after the other; a second call resumes, and keeps the stages
+    that are done.
 
     Args:
         plan: of the model, from ``plan_model``.
 
     Returns:
-        The checkpoint of the last stage, which ``load_generator`` reads unless it is an autoencoder.
+        The checkpoint of the last stage, which ``load_generator`` reads unless it is an
+        autoencoder.
 
     Raises:
-        ConfigError: if a checkpoint to start from is missing, a stage that is done had other settings or started from
-            another checkpoint, or the time is too short for its warm-up.
+        ConfigError: if a checkpoint to start from is missing, a stage that is done had other
+            settings or started from another checkpoint, or the time is too short for its warm-up.
         LibraryError: if Accelerate (extra ``train``) is not installed.
 
     Example:
@@ -65,22 +68,28 @@ def train_model(plan: ModelPlan) -> Path:
 
 def _check_starts(plan: ModelPlan, name: str) -> None:
     """Refuse a stage before anything runs if a checkpoint is missing that no stage makes."""
-    stage, made = plan.stages[name], {plan.runs.checkpoint(other) for other in plan.stages}
+    stage = plan.stages[name]
+    made = {plan.runs.checkpoint(other) for other in plan.stages}
     for key, path in stage.starts.items():
         if path in made or not is_missing(path):
             continue
-        expected, hint = "a checkpoint", f"Give {name}.{key}=FILE.safetensors."
+        expected = "a checkpoint"
+        hint = f"Give {name}.{key}=FILE.safetensors."
         if key in stage.of_others:
             model, _, other = stage.of_others[key].partition("/")
             expected = f"the checkpoint of the stage {other} of {model}"
             own = "" if path.parents[1] == Path("runs", model) else f" output={path.parents[1]}"
-            hint = f"Type `lidar-synth train {model} --until {other}{own}` first, or give {hint[5:]}"
+            hint = (
+                f"Type `lidar-synth train {model} --until {other}{own}` first, or give {hint[5:]}"
+            )
         raise ConfigError(f"{name}.{key}={path}, which does not exist", expected, hint)
 
 
 def _still_done(plan: ModelPlan, name: str) -> bool:
-    """Whether a stage that is done needs no more iterations; other settings and other starts are refused."""
-    stage, folder = plan.stages[name], plan.runs.folder_of(name)
+    """Whether a stage that is done needs no more iterations; other settings and other starts are
+    refused."""
+    stage = plan.stages[name]
+    folder = plan.runs.folder_of(name)
     done = iterations_of(stage.config)
     config = stage.config if stage.minutes is None else with_iterations(stage.config, done)
     check_resumed(config)
@@ -104,6 +113,10 @@ def _export(plan: ModelPlan, last: str) -> Path:
         stages[name] = {"recipe": stage.recipe, "iterations": facts["iterations"]}
     header = checkpoint.header
     header = replace(header, provenance=header.provenance | {"model": plan.name, "stages": stages})
-    size = 4 * sum(p.numel() for network in checkpoint.networks.values() for p in network.parameters())
-    save_checkpoint(plan.out, header, checkpoint.networks, torch.float16 if size >= LARGE else torch.float32)
+    size = 4 * sum(
+        p.numel() for network in checkpoint.networks.values() for p in network.parameters()
+    )
+    save_checkpoint(
+        plan.out, header, checkpoint.networks, torch.float16 if size >= LARGE else torch.float32
+    )
     return plan.out

@@ -1,6 +1,7 @@
 """How weights are moved by their gradients.
 
-To add one: write a function of (network, rate, betas, weight decay) that returns one or more of torch's optimisers,
+To add one: write a function of (network, rate, betas, weight decay) that returns one or more of
+    torch's optimisers,
 which share the weights among them and all run at the schedule's rate; enter it in ``OPTIMIZERS``.
 """
 
@@ -21,27 +22,40 @@ BLOCKS = (SelfAttention, ContextAttention, GatedFeedForward)
 """Modules whose linear layers Muon moves."""
 
 
-def adamw(network: nn.Module, rate: float, betas: tuple[float, float], decay: float) -> list[Optimizer]:
+def adamw(
+    network: nn.Module, rate: float, betas: tuple[float, float], decay: float
+) -> list[Optimizer]:
     """AdamW for all weights (Loshchilov and Hutter 2019)."""
     return [torch.optim.AdamW(network.parameters(), rate, betas, weight_decay=decay)]
 
 
-def muon(network: nn.Module, rate: float, betas: tuple[float, float], decay: float) -> list[Optimizer]:
-    """Muon (Jordan et al. 2024) for the matrices of attention and feed-forward layers, scaled to AdamW's step (Liu et
-    al. 2025, "Muon is scalable for LLM training"), so that both take one rate; AdamW for all else.
+def muon(
+    network: nn.Module, rate: float, betas: tuple[float, float], decay: float
+) -> list[Optimizer]:
+    """Muon (Jordan et al. 2024) for the matrices of attention and feed-forward layers, scaled to
+    AdamW's step (Liu et al. 2025, "Muon is scalable for LLM training"), so that both take one rate;
+    AdamW for all else.
 
     Raises:
         ConfigError: for a network without such layers.
         LibraryError: with a torch before 2.9, which has no Muon.
     """
     if not hasattr(torch.optim, "Muon"):
-        raise LibraryError(f"torch {torch.__version__}, which has no Muon", "torch >= 2.9", "Or optimizer: adamw.")
+        raise LibraryError(
+            f"torch {torch.__version__}, which has no Muon", "torch >= 2.9", "Or optimizer: adamw."
+        )
     matrices = _matrices(network)
     if not matrices:
-        raise ConfigError(f"optimizer 'muon' for {type(network).__name__}", "a transformer such as hdit, or adamw")
+        raise ConfigError(
+            f"optimizer 'muon' for {type(network).__name__}", "a transformer such as hdit, or adamw"
+        )
     chosen = {id(p) for p in matrices}
     rest = [p for p in network.parameters() if id(p) not in chosen]
-    kind = torch.optim.Muon if matrices[0].device.type != "cpu" or faster_in_bfloat16() else _in_float32()
+    kind = (
+        torch.optim.Muon
+        if matrices[0].device.type != "cpu" or faster_in_bfloat16()
+        else _in_float32()
+    )
     return [
         kind(matrices, rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw"),
         torch.optim.AdamW(rest, rate, betas, weight_decay=decay),
@@ -68,7 +82,12 @@ class _Float32(TorchFunctionMode):
 
 def _matrices(network: nn.Module) -> list[Tensor]:
     """The weights of linear layers that belong to ``BLOCKS``."""
-    layers = (layer for block in network.modules() if isinstance(block, BLOCKS) for layer in block.children())
+    layers = (
+        layer
+        for block in network.modules()
+        if isinstance(block, BLOCKS)
+        for layer in block.children()
+    )
     return [layer.weight for layer in layers if isinstance(layer, nn.Linear)]
 
 

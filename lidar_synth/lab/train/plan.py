@@ -1,4 +1,5 @@
-"""From a training configuration to what a run needs: networks, task, data and the header of the checkpoint."""
+"""From a training configuration to what a run needs: networks, task, data and the header of the
+checkpoint."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -40,7 +41,12 @@ from lidar_synth.lab.train.data import Batches, Conditioning
 from lidar_synth.lab.train.decoding import Decoding, decoding_loss, decoding_task
 from lidar_synth.lab.train.loop import Loss, Task, several_steps_task, student_task, teacher_task
 from lidar_synth.lab.train.selection import load_selection, save_selection, selection_settings
-from lidar_synth.lab.train.start import fresh_networks, provenance_of, start_networks, with_recordings
+from lidar_synth.lab.train.start import (
+    fresh_networks,
+    provenance_of,
+    start_networks,
+    with_recordings,
+)
 from lidar_synth.lab.train.teaching import target_flow
 
 if TYPE_CHECKING:
@@ -56,7 +62,8 @@ class TrainingPlan:
         task: makes training examples of batches.
         header: of the checkpoint.
         loss: the minimised loss.
-        frozen: parts of the checkpoint that are not trained, such as the autoencoder of a latent model.
+        frozen: parts of the checkpoint that are not trained, such as the autoencoder of a latent
+            model.
     """
 
     network: nn.Module
@@ -113,7 +120,12 @@ def plan_autoencoder(config: TrainConfig) -> TrainingPlan:
     recipe = config.recipe
     network: Any = networks[CODEC]
     trained = Autoencoding(
-        network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights
+        network,
+        header.tensors,
+        header.sensor,
+        config.losses,
+        METRICS[recipe.metric],
+        recipe.weights,
     )
     return TrainingPlan(trained, reconstruction_task, header, autoencoder_loss)
 
@@ -123,14 +135,25 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
     networks, header = start_networks(config)
     network = networks[CODEC]
     if not isinstance(network, Autoencoder | SurfaceAutoencoder):
-        raise ConfigError(f"decoder with init {config.init}", "a model whose autoencoder predicts distributions")
+        raise ConfigError(
+            f"decoder with init {config.init}", "a model whose autoencoder predicts distributions"
+        )
     frozen = {
-        name: part.requires_grad_(False).to(accelerator.device) for name, part in networks.items() if name != CODEC
+        name: part.requires_grad_(False).to(accelerator.device)
+        for name, part in networks.items()
+        if name != CODEC
     }
     for weight in network.encoder():
         weight.requires_grad_(False)
     recipe = config.recipe
-    trained = Decoding(network, header.tensors, header.sensor, config.losses, METRICS[recipe.metric], recipe.weights)
+    trained = Decoding(
+        network,
+        header.tensors,
+        header.sensor,
+        config.losses,
+        METRICS[recipe.metric],
+        recipe.weights,
+    )
     velocity = towards(join(frozen), header.time_grid)
     task = decoding_task(network, velocity, header.time_grid[-2], config.losses.noise)
     return TrainingPlan(trained, task, header, decoding_loss, frozen)
@@ -147,13 +170,22 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
     if VELOCITY not in teacher.networks:
         raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
     if teacher.header.networks[VELOCITY].arguments.get("ends"):
-        raise ConfigError(f"teacher {config.teacher}, a student of several numbers of steps", "its teacher")
+        raise ConfigError(
+            f"teacher {config.teacher}, a student of several numbers of steps", "its teacher"
+        )
     _check_scans(config, teacher.header)
     if CODEC in teacher.networks and config.recipe.weights:
-        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+        raise ConfigError(
+            f"recipe.weights {dict(config.recipe.weights)} of a latent model",
+            "none: latents are mixed",
+        )
     flow, made = target_flow(config, teacher, accelerator.device)
     provenance = provenance_of(config) | made
-    header = replace(teacher.header, time_grid=config.grid or uniform_grid(config.intervals), provenance=provenance)
+    header = replace(
+        teacher.header,
+        time_grid=config.grid or uniform_grid(config.intervals),
+        provenance=provenance,
+    )
     student = join(load_checkpoint(config.teacher).networks)
     plan = TrainingPlan(student, teacher_task(), header, frozen=_codec_of(teacher.networks))
     if config.grid is None and config.strategy == "adaptive_piecewise":
@@ -164,7 +196,11 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         header = replace(header, time_grid=found.grid, other_grids=others, provenance=provenance)
     if config.also:
         return _student_of_several_steps(config, plan, flow, header)
-    return replace(plan, task=student_task(config.strategy, flow, header.time_grid, config.steps), header=header)
+    return replace(
+        plan,
+        task=student_task(config.strategy, flow, header.time_grid, config.steps),
+        header=header,
+    )
 
 
 def _check_scans(config: DistillConfig, teacher: Header) -> None:
@@ -177,26 +213,32 @@ def _check_scans(config: DistillConfig, teacher: Header) -> None:
     if config.data.town is None or not isinstance(learnt_from, dict) or not learnt_from.get("path"):
         return
     raise ConfigError(
-        f"data.town={config.data.town} for teacher {config.teacher}, which learnt from {learnt_from['path']}",
+        f"data.town={config.data.town} for teacher {config.teacher}, which learnt from "
+        f"{learnt_from['path']}",
         "the teacher's scans",
         f"data.town=null data.path={learnt_from['path']} data.licence=LICENCE",
     )
 
 
-def _student_of_several_steps(config: DistillConfig, plan: TrainingPlan, flow: Any, header: Header) -> TrainingPlan:
+def _student_of_several_steps(
+    config: DistillConfig, plan: TrainingPlan, flow: Any, header: Header
+) -> TrainingPlan:
     """The student is told where a step ends; before training, it is the teacher nevertheless."""
     networks = split(plan.network)
     held = header.networks[VELOCITY]
     if held.architecture != "hdit" or config.strategy != "adaptive_piecewise":
         raise ConfigError(
-            f"also={list(config.also)} for a {held.architecture} by {config.strategy}", "an hdit, adaptive_piecewise"
+            f"also={list(config.also)} for a {held.architecture} by {config.strategy}",
+            "an hdit, adaptive_piecewise",
         )
     part = held._replace(arguments=held.arguments | {"ends": True})
     networks[VELOCITY] = build_network(*part)
     networks[VELOCITY].load_state_dict(split(plan.network)[VELOCITY].state_dict(), strict=False)
     header = replace(header, networks=header.networks | {VELOCITY: part})
     task = several_steps_task(flow, (header.time_grid, *header.other_grids), config.steps)
-    return replace(plan, network=join(networks), task=task, header=header, loss=balanced_velocity_loss)
+    return replace(
+        plan, network=join(networks), task=task, header=header, loss=balanced_velocity_loss
+    )
 
 
 def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
@@ -204,19 +246,29 @@ def _codec_of(networks: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
 
 
 def open_data(
-    config: Run, plan: TrainingPlan, device: torch.device, data: Data | None = None, folder: str = "cache"
+    config: Run,
+    plan: TrainingPlan,
+    device: torch.device,
+    data: Data | None = None,
+    folder: str = "cache",
 ) -> Batches:
-    """The batches of the run, or of other ``data``; the scans are projected once and cached, in a ``folder`` of the run
-    where the data names none."""
+    """The batches of the run, or of other ``data``; the scans are projected once and cached, in a
+    ``folder`` of the run where the data names none."""
     given = config.data if data is None else data
-    sensor, tensors = plan.header.sensor, plan.header.tensors
+    sensor = plan.header.sensor
+    tensors = plan.header.tensors
     source = given.open(sensor)
-    conditioning, channels, others = None, set(tensors.channels), {}
+    conditioning = None
+    channels = set(tensors.channels)
+    others = {}
     for name, options in plan.header.conditioning.items():
-        condition, encoder = CONDITIONS[name], plan.parts(plan.network)[ENCODER]
+        condition = CONDITIONS[name]
+        encoder = plan.parts(plan.network)[ENCODER]
         shape = condition.shape(encoder)
         less = options.get("view_dropout", 0.0) or options.get("outline_dropout", 0.0)
-        conditioning = Conditioning(name, options.get("dropout", 0.0), less, getattr(encoder, "views", 1))
+        conditioning = Conditioning(
+            name, options.get("dropout", 0.0), less, getattr(encoder, "views", 1)
+        )
         if condition.field == "label":  # a channel of the range image
             channels.add("label")
         else:
@@ -224,7 +276,9 @@ def open_data(
     kept = given.cache or config.output / folder
     cache = cache_scans(source, sensor, channels, kept, given.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
-    batches = Batches(cache, tensors, config.seed, given.flip, given.roll, device, codec, conditioning)
+    batches = Batches(
+        cache, tensors, config.seed, given.flip, given.roll, device, codec, conditioning
+    )
     if codec is None or not given.latents:
         return batches
     made_by = network_hash(plan.parts(plan.network)[CODEC])
@@ -238,24 +292,39 @@ def _reader(
     if name == "camera" and isinstance(source, Town):
         from PIL import Image
 
-        return lambda i, scan: resized(Image.fromarray(source.image(i)), shape, options, "the town's image")
+        return lambda i, scan: resized(
+            Image.fromarray(source.image(i)), shape, options, "the town's image"
+        )
     return lambda i, scan: CONDITIONS[name].read(scan, sensor, shape, options)
 
 
-def _selection(config: DistillConfig, velocity: Any, plan: TrainingPlan, accelerator: "Accelerator") -> Selection:
+def _selection(
+    config: DistillConfig, velocity: Any, plan: TrainingPlan, accelerator: "Accelerator"
+) -> Selection:
     """The timesteps of the student; those of an earlier call with the same settings are reused."""
-    path, settings = config.output / "selection.npz", selection_settings(config, plan.header)
+    path = config.output / "selection.npz"
+    settings = selection_settings(config, plan.header)
     if path.exists():
         try:
             return load_selection(path, settings)
         except DataError as error:
             warnings.warn(f"{error}; the timesteps are selected again", stacklevel=2)
-    conditions = open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
+    conditions = (
+        open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
+    )
     with accelerator.autocast():
         selection = select_timesteps(
-            velocity, plan.codec().shape, config.intervals, metric=config.recipe.metric, device=accelerator.device,
-            condition=conditions, **config.selection.model_dump(),
-        )  # fmt: skip
+            velocity,
+            plan.codec().shape,
+            config.intervals,
+            metric=config.recipe.metric,
+            device=accelerator.device,
+            condition=conditions,
+            **config.selection.model_dump(),
+        )
     save_selection(path, selection, settings)
-    tqdm.write(f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform {selection.uniform_cost:.4g}")
+    tqdm.write(
+        f"timesteps {selection.grid}: cost {selection.cost:.4g}, uniform "
+        f"{selection.uniform_cost:.4g}"
+    )
     return selection

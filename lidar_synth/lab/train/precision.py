@@ -5,11 +5,13 @@ from functools import cache
 
 import torch
 
-_SIDE, _ROUNDS = 512, 3
+_SIDE = 512
+_ROUNDS = 3
 
 
 def computed(asked: str) -> str:
-    """The precision for a configuration's: "bf16" only on a GPU, or a processor that is faster with it.
+    """The precision for a configuration's: "bf16" only on a GPU, or a processor that is faster with
+    it.
 
     Args:
         asked: "no" = float32, or "bf16".
@@ -22,8 +24,8 @@ def computed(asked: str) -> str:
 def faster_in_bfloat16() -> bool:
     """Whether this machine's processor multiplies matrices faster in bfloat16 than in float32.
 
-    Those without instructions for it are ten times slower, those with AMX several times faster. Measured once in a
-    process, in some hundredths of a second.
+    Those without instructions for it are ten times slower, those with AMX several times faster.
+    Measured once in a process, in some hundredths of a second.
     """
     return _seconds(torch.bfloat16) < _seconds(torch.float32)
 

@@ -7,8 +7,8 @@ The folder holds::
     selection.npz            a student's timesteps and how they were selected
     state.safetensors        the state from which an interrupted run resumes
     held_out.json            losses on held-out scans, if there are any
-    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are held-out scans
-    samples/, logs/          pictures; scalars for TensorBoard
+    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are
+    held-out scans samples/, logs/          pictures; scalars for TensorBoard
 """
 
 import math
@@ -48,19 +48,25 @@ if TYPE_CHECKING:
 _LOG_EVERY = 10  # steps between two numbers in the logs
 
 
-def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: float | None = None) -> Path:
-    """Train a teacher, an autoencoder or a student, with a progress bar, logs, pictures and saved states.
+def run(
+    config: TrainConfig | DistillConfig, resume: bool = False, minutes: float | None = None
+) -> Path:
+    """Train a teacher, an autoencoder or a student, with a progress bar, logs, pictures and saved
+    states.
 
     Args:
-        config: ``TrainConfig`` for a teacher or an autoencoder, ``DistillConfig`` for a student (``load_config``).
-        resume: continue from the state in the output folder, if there is one; the settings must be the same.
+        config: ``TrainConfig`` for a teacher or an autoencoder, ``DistillConfig`` for a student
+            (``load_config``).
+        resume: continue from the state in the output folder, if there is one; the settings must be
+            the same.
         minutes: save and stop after this time.
 
     Returns:
         Path of the checkpoint, which ``load_generator`` reads.
 
     Raises:
-        ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other settings.
+        ConfigError: if the folder holds a run and ``resume`` is not set, or holds a run with other
+            settings.
         LibraryError: if Accelerate (extra ``train``) is not installed.
         DataError: if the loss becomes NaN or infinite; the last saved state is kept.
 
@@ -73,7 +79,9 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
     state = config.output / STATE
     if state.exists():
         if not resume:
-            raise ConfigError(f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER")
+            raise ConfigError(
+                f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER"
+            )
         set_damaged_aside(config.output)
     if state.exists():
         check_resumed(config)
@@ -84,7 +92,10 @@ def run(config: TrainConfig | DistillConfig, resume: bool = False, minutes: floa
             check_parents(config, plan.header)
             training.load(state)
         if accelerator.is_main_process:  # after all checks
-            write_file(config.output / "config.yaml", yaml.safe_dump(config.model_dump(mode="json")).encode())
+            write_file(
+                config.output / "config.yaml",
+                yaml.safe_dump(config.model_dump(mode="json")).encode(),
+            )
         if config.compile:
             plan.network.compile()
         for module in plan.network.modules():
@@ -110,18 +121,23 @@ def require_accelerate() -> None:
 def _accelerator(config: Run) -> Iterator["Accelerator"]:
     """Accelerate's handle for one run.
 
-    Accelerate keeps the first precision of a process. It is cleared after the run, so that the next one can have
-    another, unless the caller had set up Accelerate before.
+    Accelerate keeps the first precision of a process. It is cleared after the run, so that the next
+    one can have another, unless the caller had set up Accelerate before.
     """
     require_accelerate()
     from accelerate import Accelerator
     from accelerate.state import AcceleratorState, is_initialized
 
-    by_caller, precision = is_initialized(), computed(config.precision)
+    by_caller = is_initialized()
+    precision = computed(config.precision)
     if by_caller and AcceleratorState().mixed_precision not in (config.precision, precision):
         given = f"precision={config.precision}, where this process has set up Accelerate with"
-        raise ConfigError(f"{given} {AcceleratorState().mixed_precision!r}", "the same precision, or a new process")
-    # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as separate runs.
+        raise ConfigError(
+            f"{given} {AcceleratorState().mixed_precision!r}",
+            "the same precision, or a new process",
+        )
+    # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as
+    # separate runs.
     gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
     try:
         yield Accelerator(mixed_precision=precision, cpu="LOCAL_RANK" in os.environ and not gpu)
@@ -143,7 +159,10 @@ def _lock(config: Run, main: bool) -> Iterator[None]:
     config.output.mkdir(parents=True, exist_ok=True)
     with one_writer(config.output / ".lock") as free:
         if not free:
-            raise ConfigError(f"another run is training in {config.output}", "one at a time, or another output=FOLDER")
+            raise ConfigError(
+                f"another run is training in {config.output}",
+                "one at a time, or another output=FOLDER",
+            )
         for part in config.output.glob(".*.part"):
             part.unlink(missing_ok=True)
         yield
@@ -155,7 +174,11 @@ def checkpoint_path(config: Run) -> Path:
 
 
 def _train(
-    config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator", minutes: float | None
+    config: Run,
+    plan: TrainingPlan,
+    training: Training,
+    accelerator: "Accelerator",
+    minutes: float | None,
 ) -> Path:
     """The loop with logs and saved states."""
     with accelerator.main_process_first():
@@ -166,7 +189,11 @@ def _train(
             batches = InTurns(data, replace(others, seed=config.seed + 1))
     training.began = time.monotonic()  # preparing the data is no training
     log = _Log(config, training.step, minutes is not None) if accelerator.is_main_process else None
-    watch = open_watch(config, plan, training, accelerator) if config.held_out and log is not None else None
+    watch = (
+        open_watch(config, plan, training, accelerator)
+        if config.held_out and log is not None
+        else None
+    )
     if watch is not None and not watch.measured:
         _save(config, plan, training, data, watch)
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
@@ -190,12 +217,17 @@ def _train(
     return checkpoint_path(config)
 
 
-def _save(config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None) -> None:
-    """Write the checkpoint, if it is the best, and then the state: what is lost in between is trained again."""
+def _save(
+    config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None
+) -> None:
+    """Write the checkpoint, if it is the best, and then the state: what is lost in between is
+    trained again."""
     if watch is None or watch.measure(training):
         if isinstance(training.average, Autoencoding):
             training.average.finish(data)
-        facts = {"iterations": training.step} | ({} if watch is None else {"held_out_loss": watch.least})
+        facts = {"iterations": training.step} | (
+            {} if watch is None else {"held_out_loss": watch.least}
+        )
         header = replace(plan.header, provenance=plan.header.provenance | facts)
         save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
     training.save(config.output / STATE)
@@ -232,8 +264,10 @@ class _Log:
         self.board.close()
 
     def picture(self, plan: TrainingPlan, training: Training, data: Batches) -> None:
-        """Samples of a flow, from the first scans' conditions; of an autoencoder what went in and what came out."""
-        name, some = self.config.output.name, range(self.config.samples.count)
+        """Samples of a flow, from the first scans' conditions; of an autoencoder what went in and
+        what came out."""
+        name = self.config.output.name
+        some = range(self.config.samples.count)
         given: list[Scan] | list[RangeImage]
         if isinstance(training.average, Autoencoding):
             given = self._reconstructions(plan, training.average, data)
@@ -246,7 +280,9 @@ class _Log:
             title=f"{name}, {training.step} iterations",
         )
 
-    def _reconstructions(self, plan: TrainingPlan, trained: Autoencoding, data: Batches) -> list[RangeImage]:
+    def _reconstructions(
+        self, plan: TrainingPlan, trained: Autoencoding, data: Batches
+    ) -> list[RangeImage]:
         """Real range images, each followed by its reconstruction; figures go to the logs."""
         codec = Latent(trained.network, plan.header.tensors)
         images = data(range(self.config.samples.count)).y0

@@ -20,8 +20,8 @@ def cosine(step: int, warmup: int, iterations: int) -> float:
 
 
 def trapezoid(step: int, warmup: int, iterations: int, decay: float = 1 - PLATEAU) -> float:
-    """Linear from 0 over ``warmup`` steps, constant, then linear to 0 over the last quarter: up to there a run does
-    not depend on ``iterations``, which may still be changed."""
+    """Linear from 0 over ``warmup`` steps, constant, then linear to 0 over the last quarter: up to
+    there a run does not depend on ``iterations``, which may still be changed."""
     return min(1.0, (step + 1) / max(1, warmup), (iterations - step) / (decay * iterations))
 
 

@@ -1,7 +1,9 @@
 """The reference trainer: a small range-view segmenter on real scans with synthetic ones among them.
 
-All that a training with mixed data takes, in one file: ``endless_batches`` is the data loading, ``train_segmenter`` the
-loop. ``tools/train_segmenter.py`` calls it from the command line, on the town or on your own dataset.
+All that a training with mixed data takes, in one file: ``endless_batches`` is the data loading,
+    ``train_segmenter`` the
+loop. ``tools/train_segmenter.py`` calls it from the command line, on the town or on your own
+dataset.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -66,9 +68,10 @@ def train_segmenter(
         steps: optimiser steps.
         rate: the highest learning rate.
         progress: show a bar.
-        half: compute the forward pass in bfloat16, in the channels-last memory format: three times as fast on a CPU
-            with AMX, slower on one without bfloat16.
-        watch: called with the number of steps done after each of them; it may use the network in evaluation mode.
+        half: compute the forward pass in bfloat16, in the channels-last memory format: three times
+            as fast on a CPU with AMX, slower on one without bfloat16.
+        watch: called with the number of steps done after each of them; it may use the network in
+            evaluation mode.
 
     Returns:
         The loss of every step.
@@ -86,7 +89,9 @@ def train_segmenter(
     for _, batch in zip(range(steps), batches, strict=False):
         target = batch["label"].long()
         if not bool((target != IGNORE).any()):
-            raise DataError("a batch without one valid label", "at least one label that is not 255 = ignore")
+            raise DataError(
+                "a batch without one valid label", "at least one label that is not 255 = ignore"
+            )
         inputs = segmenter_input(batch["range"], batch["reflectance"], height)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=half):
             logits = network(inputs)

@@ -1,4 +1,5 @@
-"""The timesteps of a student on disk, with the settings that decided them: others must not pass for these."""
+"""The timesteps of a student on disk, with the settings that decided them: others must not pass for
+these."""
 
 import json
 import warnings
@@ -46,7 +47,9 @@ def save_selection(path: Path, selection: Selection, settings: dict[str, Any]) -
     Raises:
         FileError: where it cannot be written.
     """
-    write_arrays(path, asdict(selection) | {"settings": np.array(json.dumps(settings, sort_keys=True))})
+    write_arrays(
+        path, asdict(selection) | {"settings": np.array(json.dumps(settings, sort_keys=True))}
+    )
 
 
 def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
@@ -61,11 +64,13 @@ def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
         made = _shown_by(found)
         settings = {key: settings[key] for key in made}
         warnings.warn(
-            f"{path} is of a version that kept no settings: only {', '.join(made)} are compared", stacklevel=2
+            f"{path} is of a version that kept no settings: only {', '.join(made)} are compared",
+            stacklevel=2,
         )
     if other := sorted(key for key in made | settings if made.get(key) != settings.get(key)):
         raise ConfigError(
-            f"{path}, which was made with " + ", ".join(f"{key}={made.get(key)!r}" for key in other),
+            f"{path}, which was made with "
+            + ", ".join(f"{key}={made.get(key)!r}" for key in other),
             ", ".join(f"{key}={settings.get(key)!r}" for key in other),
             "Remove it to select again, or give another output=FOLDER.",
         )
@@ -77,10 +82,16 @@ def _read(path: Path) -> tuple[Selection, dict[str, Any] | None]:
     values = read_arrays(path)
     try:
         found = Selection(
-            tuple(values["grid"].tolist()), float(values["cost"]), float(values["uniform_cost"]),
-            tuple(values["candidates"].tolist()), values["costs"], values["per_trajectory"],
-        )  # fmt: skip
-        return found, dict(parse_json(str(values["settings"]), str(path))) if "settings" in values else None
+            tuple(values["grid"].tolist()),
+            float(values["cost"]),
+            float(values["uniform_cost"]),
+            tuple(values["candidates"].tolist()),
+            values["costs"],
+            values["per_trajectory"],
+        )
+        return found, dict(
+            parse_json(str(values["settings"]), str(path))
+        ) if "settings" in values else None
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise DataError(f"{path} is damaged ({error})", "a selection of timesteps") from error
 

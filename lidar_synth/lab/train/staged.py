@@ -1,7 +1,8 @@
-"""Training runs one after the other, in folders below one folder, with a limit of time for all of them.
+"""Training runs one after the other, in folders below one folder, with a limit of time for all of
+them.
 
-A run of ``train_for`` keeps its learning rate for three quarters of its time; then the rate falls to zero over a third
-of the steps done so far (the schedule "trapezoid").
+A run of ``train_for`` keeps its learning rate for three quarters of its time; then the rate falls
+to zero over a third of the steps done so far (the schedule "trapezoid").
 """
 
 import math
@@ -55,14 +56,16 @@ class StagedRuns:
         return read_progress(self.folder_of(name)).seconds / 60
 
     def budgets(self, limit: float) -> dict[str, float]:
-        """Minutes of each stage that is not done, which share what the others have left of a ``limit`` for all."""
+        """Minutes of each stage that is not done, which share what the others have left of a
+        ``limit`` for all."""
         open_ = {name: share for name, share in self.shares.items() if not self.is_done(name)}
         left = limit - sum(self.spent(name) for name in self.shares.keys() - open_.keys())
         return {name: left * share / sum(open_.values()) for name, share in open_.items()}
 
 
 def iterations_of(config: Run) -> int:
-    """The iterations of the run in a folder; ``ENDLESS`` before its rate falls, or if there is none."""
+    """The iterations of the run in a folder; ``ENDLESS`` before its rate falls, or if there is
+    none."""
     return began_with(config).recipe.iterations if (config.output / STATE).is_file() else ENDLESS
 
 
@@ -76,7 +79,8 @@ def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
 
     Args:
         config: of the run, with the schedule "trapezoid".
-        minutes: of training in all, those of earlier calls included. The fall of the rate takes a quarter of them.
+        minutes: of training in all, those of earlier calls included. The fall of the rate takes a
+            quarter of them.
 
     Returns:
         The checkpoint.
@@ -89,10 +93,12 @@ def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
         left = PLATEAU * minutes - read_progress(config.output).seconds / 60
         if left > 0:
             run(with_iterations(config, ENDLESS), resume=True, minutes=left)
-        steps, warmup = read_progress(config.output).step, config.recipe.warmup
+        steps = read_progress(config.output).step
+        warmup = config.recipe.warmup
         if steps < warmup:
             raise ConfigError(
-                f"{minutes:.3g} minutes for {config.output}, {steps} steps before the learning rate falls",
+                f"{minutes:.3g} minutes for {config.output}, {steps} steps before the learning "
+                "rate falls",
                 f"enough for its {warmup} steps of warm-up",
                 "Type more --minutes, or fewer steps (recipe.warmup=N) with another output=FOLDER.",
             )

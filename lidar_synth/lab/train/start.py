@@ -1,4 +1,5 @@
-"""What a training run starts with: fresh networks, or those of a checkpoint, and the header of what will come of it."""
+"""What a training run starts with: fresh networks, or those of a checkpoint, and the header of what
+will come of it."""
 
 import json
 import os
@@ -14,7 +15,14 @@ from torch import nn
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import BankScans, ScanFiles, layout_of
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec, load_checkpoint
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Header,
+    NetworkSpec,
+    load_checkpoint,
+)
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
@@ -32,11 +40,15 @@ def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
         if CODEC not in codec.networks:
             raise ConfigError(f"codec {config.codec}", "the checkpoint of an autoencoder")
         _check_held(config, codec.header, ("sensor", "channels", "normalisation"), config.codec)
-        sensor, tensors, fixed = codec.header.sensor, codec.header.tensors, {CODEC: codec.header.networks[CODEC]}
+        sensor = codec.header.sensor
+        tensors = codec.header.tensors
+        fixed = {CODEC: codec.header.networks[CODEC]}
         state = make_codec(codec.networks[CODEC], tensors, sensor.shape).shape
         provenance |= {"codec": codec.hash, "codec_provenance": codec.header.provenance}
     else:
-        sensor, tensors, fixed = load_sensor(config.sensor), config.tensors(), {}
+        sensor = load_sensor(config.sensor)
+        tensors = config.tensors()
+        fixed = {}
         state = (tensors.size, *sensor.shape)
     parts = config.parts(state, sensor.shape)
     networks = _build(config, parts, sensor, state)
@@ -47,7 +59,9 @@ def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
         channels=tensors.channels,
         time_grid=uniform_grid(1 if config.autoencodes else config.steps),
         provenance=provenance,
-        conditioning={config.condition.kind: config.condition.options()} if config.condition else {},
+        conditioning={config.condition.kind: config.condition.options()}
+        if config.condition
+        else {},
     )
     return networks, header
 
@@ -58,14 +72,32 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     start = load_checkpoint(find_model(config.init))
     wanted = {CODEC, VELOCITY} if config.decoder else {CODEC if config.autoencodes else VELOCITY}
     if not wanted <= set(start.networks) or config.codec is not None:
-        raise ConfigError(f"init {config.init} with parts {sorted(start.networks)}", "a checkpoint of the same kind")
-    _check_held(config, start.header, ("sensor", "channels", "normalisation", "network"), config.init)
-    provenance = provenance_of(config) | {"init": start.hash, "init_provenance": start.header.provenance}
-    grid = start.header.time_grid if config.autoencodes or config.decoder else uniform_grid(config.steps)
+        raise ConfigError(
+            f"init {config.init} with parts {sorted(start.networks)}",
+            "a checkpoint of the same kind",
+        )
+    _check_held(
+        config, start.header, ("sensor", "channels", "normalisation", "network"), config.init
+    )
+    provenance = provenance_of(config) | {
+        "init": start.hash,
+        "init_provenance": start.header.provenance,
+    }
+    grid = (
+        start.header.time_grid
+        if config.autoencodes or config.decoder
+        else uniform_grid(config.steps)
+    )
     networks = {CODEC: start.networks[CODEC]} if config.autoencodes else start.networks
     kept = {name: start.header.networks[name] for name in networks}
     conditioning = {} if config.autoencodes else start.header.conditioning
-    header = replace(start.header, networks=kept, time_grid=grid, provenance=provenance, conditioning=conditioning)
+    header = replace(
+        start.header,
+        networks=kept,
+        time_grid=grid,
+        provenance=provenance,
+        conditioning=conditioning,
+    )
     if not (config.autoencodes or config.decoder):
         networks, header = _without_ends(networks, header)
     if config.condition is None or config.autoencodes:
@@ -76,7 +108,8 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
 
 
 def _same_condition(config: TrainConfig, condition: Condition, header: Header) -> Header:
-    """The header of a conditional model that is trained further, with the shares of ``condition`` that are given.
+    """The header of a conditional model that is trained further, with the shares of ``condition``
+    that are given.
 
     Raises:
         ConfigError: if the model has another condition.
@@ -84,40 +117,59 @@ def _same_condition(config: TrainConfig, condition: Condition, header: Header) -
     [(kind, held)] = header.conditioning.items()
     encoder = header.networks[ENCODER]
     known = {"kind": kind, "encoder": encoder.architecture, "arguments": encoder.arguments} | held
-    given = {name: value for name, value in condition if name in condition.model_fields_set and value is not None}
+    given = {
+        name: value
+        for name, value in condition
+        if name in condition.model_fields_set and value is not None
+    }
     shares = {name: value for name, value in given.items() if name.endswith("dropout")}
-    if isinstance(given.get("arguments"), dict):  # those that a configuration names: sizes follow from the data
+    if isinstance(
+        given.get("arguments"), dict
+    ):  # those that a configuration names: sizes follow from the data
         known["arguments"] = {name: known["arguments"].get(name) for name in given["arguments"]}
     for name in sorted(given.keys() - shares.keys()):
         value = list(given[name]) if isinstance(given[name], tuple) else given[name]
         if value != known.get(name):
             raise ConfigError(
-                f"condition.{name} {value!r} for init {config.init}", f"that of the model, {known.get(name)!r}"
+                f"condition.{name} {value!r} for init {config.init}",
+                f"that of the model, {known.get(name)!r}",
             )
     changed = {name: value for name, value in (held | shares).items() if value}
     return replace(header, conditioning={kind: changed})
 
 
-def _without_ends(networks: dict[str, nn.Module], header: Header) -> tuple[dict[str, nn.Module], Header]:
-    """A student of several numbers of steps as the start of a flow, which is not told where a step ends."""
+def _without_ends(
+    networks: dict[str, nn.Module], header: Header
+) -> tuple[dict[str, nn.Module], Header]:
+    """A student of several numbers of steps as the start of a flow, which is not told where a step
+    ends."""
     held = header.networks[VELOCITY]
     if not held.arguments.get("ends"):
         return networks, header
-    part = held._replace(arguments={name: value for name, value in held.arguments.items() if name != "ends"})
+    part = held._replace(
+        arguments={name: value for name, value in held.arguments.items() if name != "ends"}
+    )
     velocity = build_network(*part)
-    velocity.load_state_dict({k: v for k, v in networks[VELOCITY].state_dict().items() if not k.startswith("step.")})
-    return networks | {VELOCITY: velocity}, replace(header, networks=header.networks | {VELOCITY: part}, other_grids=())
+    velocity.load_state_dict(
+        {k: v for k, v in networks[VELOCITY].state_dict().items() if not k.startswith("step.")}
+    )
+    return networks | {VELOCITY: velocity}, replace(
+        header, networks=header.networks | {VELOCITY: part}, other_grids=()
+    )
 
 
 def _add_condition(
     config: TrainConfig, networks: dict[str, nn.Module], header: Header
 ) -> tuple[dict[str, nn.Module], Header]:
-    """An unconditional model as the start of a conditional one: it generates what it did, and learns to look."""
+    """An unconditional model as the start of a conditional one: it generates what it did, and
+    learns to look."""
     assert config.condition is not None
     held = header.networks[VELOCITY]
     derived = network_class(held.architecture).derived_arguments
     own = {name: value for name, value in held.arguments.items() if name not in derived}
-    asked = config.model_copy(update={"network": Network(architecture=held.architecture, arguments=own)})
+    asked = config.model_copy(
+        update={"network": Network(architecture=held.architecture, arguments=own)}
+    )
     state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
     parts = asked.parts(state, header.sensor.shape)
     made = _build(config, parts, header.sensor, state)
@@ -128,9 +180,13 @@ def _add_condition(
             f"a condition for init {config.init}, a {held.architecture}",
             "init: a model of this condition, or an unconditional hdit",
         ) from error
-    assert not new.unexpected_keys and all("condition" in k or "context" in k for k in new.missing_keys), new
+    assert not new.unexpected_keys and all(
+        "condition" in k or "context" in k for k in new.missing_keys
+    ), new
     conditioning: dict[str, Any] = {config.condition.kind: config.condition.options()}
-    return networks | made, replace(header, networks=header.networks | parts, conditioning=conditioning)
+    return networks | made, replace(
+        header, networks=header.networks | parts, conditioning=conditioning
+    )
 
 
 def _build(
@@ -139,7 +195,9 @@ def _build(
     """Networks with fresh weights, some of which look where the cells of the state look."""
     torch.manual_seed(config.seed)
     angles = torch.from_numpy(sensor.ray_angles(config.rays))
-    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[0]
+    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[
+        0
+    ]
     networks: dict[str, nn.Module] = {}
     for name, part in parts.items():
         needed = {"angles": pooled} if network_class(part.architecture).needs_ray_angles else {}
@@ -165,11 +223,14 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
     }
     for key in set(keys) & config.model_fields_set:
         if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
-            raise ConfigError(f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}.")
+            raise ConfigError(
+                f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}."
+            )
 
 
 def with_recordings(config: Run, header: Header) -> Header:
-    """The header with all recordings that the weights will know: of this run and of what it begins with.
+    """The header with all recordings that the weights will know: of this run and of what it begins
+    with.
 
     Raises:
         FileError, DataError: where the scans cannot be opened.
@@ -191,12 +252,25 @@ def _recordings(data: Data, sensor: Sensor) -> Recordings:
     assert isinstance(source, ScanFiles)
     if isinstance(source, BankScans):  # maybe at a URL, which has no layout to look for
         return recordings_of(source, "bank", data.path)
-    return recordings_of(source, data.layout or layout_of(Path(os.path.expandvars(data.path))), data.path)
+    return recordings_of(
+        source, data.layout or layout_of(Path(os.path.expandvars(data.path))), data.path
+    )
 
 
 def provenance_of(config: Run) -> dict[str, Any]:
-    """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by their hash."""
-    beside = {"output", "data", "licence", "samples", "save_every", "sensor", "held_out", "rehearsal", *PARENTS}
+    """What a checkpoint says of its making; the checkpoints that it was made from stand beside, by
+    their hash."""
+    beside = {
+        "output",
+        "data",
+        "licence",
+        "samples",
+        "save_every",
+        "sensor",
+        "held_out",
+        "rehearsal",
+        *PARENTS,
+    }
     more = {} if config.rehearsal is None else {"rehearsal": config.rehearsal.describe()}
     return more | {
         "data": config.data.describe(),

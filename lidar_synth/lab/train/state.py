@@ -1,8 +1,9 @@
 """The state of a training run, and how it is saved for resumption.
 
-The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the network, the averaged
-weights, the optimiser's moments, the step, the seconds of training and a checksum. Everything else is a function of the
-configuration and the step.
+The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the
+    network, the averaged
+weights, the optimiser's moments, the step, the seconds of training and a checksum. Everything else
+is a function of the configuration and the step.
 """
 
 import copy
@@ -41,8 +42,8 @@ class Recipe:
         batch: samples of a step, over all processes and micro-batches.
         accumulate: micro-batches of a step.
         metric: a name of ``METRICS``.
-        weights: {channel: weight} of squared errors, 1 by default. Labels are five channels of seven, but should not
-            dominate the loss.
+        weights: {channel: weight} of squared errors, 1 by default. Labels are five channels of
+            seven, but should not dominate the loss.
         optimizer: a name of ``OPTIMIZERS``.
         rate: the learning rate at the top of the schedule.
         betas, weight_decay: of AdamW; the weight decay also applies to Muon.
@@ -77,14 +78,26 @@ class Recipe:
         for key, table in (("metric", METRICS), ("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
             if getattr(self, key) not in table:
                 raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
-        if set(self.weights) - set(CHANNELS) or not all(weight > 0 for weight in self.weights.values()):
-            raise ConfigError(f"weights {dict(self.weights)}", f"numbers above 0 for some of {', '.join(CHANNELS)}")
-        if min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1 or not self.rate > 0:
-            raise ConfigError(f"{self}", "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0")
+        if set(self.weights) - set(CHANNELS) or not all(
+            weight > 0 for weight in self.weights.values()
+        ):
+            raise ConfigError(
+                f"weights {dict(self.weights)}",
+                f"numbers above 0 for some of {', '.join(CHANNELS)}",
+            )
+        if (
+            min(self.iterations, self.batch, self.accumulate, self.ema_every) < 1
+            or not self.rate > 0
+        ):
+            raise ConfigError(
+                f"{self}",
+                "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0",
+            )
 
 
 class Training:
-    """The state of a run between two steps: the network, its averaged copy, the optimisers, the step.
+    """The state of a run between two steps: the network, its averaged copy, the optimisers, the
+    step.
 
     Args:
         network: the velocity network, on its device.
@@ -107,12 +120,15 @@ class Training:
         return self.earlier + time.monotonic() - self.began
 
     def update_average(self) -> None:
-        """Move the averaged weights towards the network's, and copy its buffers (statistics of norms, codebooks)."""
+        """Move the averaged weights towards the network's, and copy its buffers (statistics of
+        norms, codebooks)."""
         updates = self.step // self.recipe.ema_every
         # Early averages have a short memory, so that they forget the initial weights.
         keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+            torch._foreach_lerp_(
+                list(self.average.parameters()), list(self.network.parameters()), 1 - keep
+            )
             for mine, new in zip(self.average.buffers(), self.network.buffers(), strict=True):
                 mine.copy_(new)
 
@@ -151,9 +167,13 @@ class Training:
                 which, number, key = name.split(".")
                 moments[int(which)].setdefault(int(number), {})[key] = tensor
             for optimizer, state in zip(self.optimizers, moments, strict=True):
-                optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+                optimizer.load_state_dict(
+                    {"state": state, "param_groups": optimizer.state_dict()["param_groups"]}
+                )
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
-            raise DataError(f"{path} is the state of another network ({error})", "the same configuration") from error
+            raise DataError(
+                f"{path} is the state of another network ({error})", "the same configuration"
+            ) from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
 
@@ -199,7 +219,8 @@ def set_damaged_aside(folder: Path) -> None:
 
 
 def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
-    """The progress and the tensors of a state, if they have the checksum that was written with them."""
+    """The progress and the tensors of a state, if they have the checksum that was written with
+    them."""
     with _opened(path) as file:
         facts = dict(file.metadata())
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
@@ -215,7 +236,9 @@ def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
 
 def _progress(file: Any) -> Progress:
     held = file.metadata()
-    return Progress(int(held["step"]), float(held.get("seconds", 0.0)))  # older states have no seconds
+    return Progress(
+        int(held["step"]), float(held.get("seconds", 0.0))
+    )  # older states have no seconds
 
 
 @contextmanager
@@ -224,6 +247,10 @@ def _opened(path: Path) -> Iterator[Any]:
         with safe_open(path, "pt") as file:
             yield file
     except OSError as error:
-        raise FileError(f"{path} cannot be read ({error})", "a saved state", "Start without --resume.") from error
+        raise FileError(
+            f"{path} cannot be read ({error})", "a saved state", "Start without --resume."
+        ) from error
     except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{path} is not a saved state ({error})", "state.safetensors of a run") from error
+        raise DataError(
+            f"{path} is not a saved state ({error})", "state.safetensors of a run"
+        ) from error

@@ -6,13 +6,22 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import CODEC, VELOCITY, Checkpoint, join, load_checkpoint, network_hash
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    VELOCITY,
+    Checkpoint,
+    join,
+    load_checkpoint,
+    network_hash,
+)
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.generate.flow.path import Velocity, autoguided, guided
 from lidar_synth.lab.train.config import DistillConfig
 
 
-def target_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device) -> tuple[Velocity, dict[str, Any]]:
+def target_flow(
+    config: DistillConfig, teacher: Checkpoint, device: torch.device
+) -> tuple[Velocity, dict[str, Any]]:
     """The velocity that a student is distilled from, and its part of the student's provenance.
 
     Args:
@@ -21,8 +30,8 @@ def target_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device
         device: of the training.
 
     Raises:
-        ConfigError: on classifier-free guidance of a teacher without dropout of its condition, or a weaker model of
-            other data.
+        ConfigError: on classifier-free guidance of a teacher without dropout of its condition, or a
+            weaker model of other data.
     """
     made = {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
     velocity = _frozen_flow(teacher, config.compile)
@@ -30,7 +39,9 @@ def target_flow(config: DistillConfig, teacher: Checkpoint, device: torch.device
         weaker = load_checkpoint(config.weaker, device)
         _check_weaker(config, teacher, weaker)
         made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
-        return autoguided(velocity, _frozen_flow(weaker, config.compile), config.guidance, config.within), made
+        return autoguided(
+            velocity, _frozen_flow(weaker, config.compile), config.guidance, config.within
+        ), made
     return velocity if config.guidance == 1 else _from_blank(config, teacher, velocity), made
 
 
@@ -45,11 +56,15 @@ def _frozen_flow(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
 def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module) -> Velocity:
     """The teacher with classifier-free guidance."""
     if not isinstance(velocity, Conditioned):
-        raise ConfigError(f"guidance {config.guidance} of an unconditional teacher", "1, or weaker=CHECKPOINT")
+        raise ConfigError(
+            f"guidance {config.guidance} of an unconditional teacher", "1, or weaker=CHECKPOINT"
+        )
     [(name, options)] = teacher.header.conditioning.items()
     if not options.get("dropout"):
         raise ConfigError(
-            f"guidance {config.guidance} of a teacher that was trained without dropout of its condition", "1"
+            f"guidance {config.guidance} of a teacher that was trained without dropout of its "
+            "condition",
+            "1",
         )
     empty = torch.zeros(CONDITIONS[name].shape(velocity.encoder), dtype=torch.uint8)
     return guided(velocity, config.guidance, blank(name, empty))
@@ -58,17 +73,24 @@ def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module)
 def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint) -> None:
     """Both models need the same states and conditions."""
     if config.guidance == 1:
-        raise ConfigError(f"weaker {config.weaker} with guidance 1", "a guidance scale other than 1, such as 2")
+        raise ConfigError(
+            f"weaker {config.weaker} with guidance 1", "a guidance scale other than 1, such as 2"
+        )
     if not 0 <= config.within[0] < config.within[1] <= 1:
         raise ConfigError(f"within {config.within}", "two increasing times within [0, 1]")
     if VELOCITY not in weaker.networks:
         raise ConfigError(f"weaker {config.weaker}, an autoencoder", "a model that generates")
-    differs = [k for k in ("sensor", "channels", "normalisation", "conditioning")
-               if getattr(weaker.header, k) != getattr(teacher.header, k)]  # fmt: skip
+    differs = [
+        k
+        for k in ("sensor", "channels", "normalisation", "conditioning")
+        if getattr(weaker.header, k) != getattr(teacher.header, k)
+    ]
     if _hash_of_latents(weaker) != _hash_of_latents(teacher):
         differs.append("autoencoder")
     if differs:
-        raise ConfigError(f"weaker {config.weaker} of another {', '.join(differs)}", f"those of {config.teacher}")
+        raise ConfigError(
+            f"weaker {config.weaker} of another {', '.join(differs)}", f"those of {config.teacher}"
+        )
 
 
 def _hash_of_latents(checkpoint: Checkpoint) -> str:

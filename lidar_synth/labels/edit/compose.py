@@ -11,7 +11,9 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 
 
-def composed(scan: Scan, removed: NDArray[np.bool_], rays: ScanRays, which: NDArray[np.intp], new: Scan) -> Scan:
+def composed(
+    scan: Scan, removed: NDArray[np.bool_], rays: ScanRays, which: NDArray[np.intp], new: Scan
+) -> Scan:
     """Replace returns of a scan.
 
     Args:
@@ -22,10 +24,11 @@ def composed(scan: Scan, removed: NDArray[np.bool_], rays: ScanRays, which: NDAr
         new: n returns with the fields of the scan; ring and time are set here.
 
     Returns:
-        The scan with its remaining points unchanged and in order, and new ones in place of the return of their ray, or
-        after the return before it in the ring. Its domain is ``SYNTHETIC``.
+        The scan with its remaining points unchanged and in order, and new ones in place of the
+        return of their ray, or after the return before it in the ring. Its domain is ``SYNTHETIC``.
     """
-    kept, place = scan[~removed], _place(rays, which)
+    kept = scan[~removed]
+    place = _place(rays, which)
     if scan.ring is not None:
         new = replace(new, ring=rays.ring[which].astype(np.int16))
     if scan.time is not None:
@@ -53,14 +56,18 @@ def _place(rays: ScanRays, which: NDArray[np.intp]) -> NDArray[np.int64]:
 
 
 def _raw(kept: Scan, new: Scan, order: NDArray[np.intp]) -> NDArray[np.uint32] | None:
-    """The labels as in the file, new points with SemanticKITTI's static classes; None for ids of another dataset."""
-    raw, label = kept.raw_label, new.label
+    """The labels as in the file, new points with SemanticKITTI's static classes; None for ids of
+    another dataset."""
+    raw = kept.raw_label
+    label = new.label
     if raw is None or label is None:
         return None
     try:
         same = (SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16)) == kept.label).all()
     except ValueError:
         return None
-    instance = np.zeros(len(new), np.uint32) if new.instance is None else new.instance.astype(np.uint32)
+    instance = (
+        np.zeros(len(new), np.uint32) if new.instance is None else new.instance.astype(np.uint32)
+    )
     added = SEMANTIC_KITTI.encode(label).astype(np.uint32) | instance << np.uint32(16)
     return np.concatenate([raw, added])[order] if same else None

@@ -1,10 +1,11 @@
 """What lies behind a removed object, estimated from the same rings beside it.
 
-A ring is continued over the hole from both sides. If both are one surface, its horizontal distance rho is interpolated:
-on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a cos(azimuth) + b sin(azimuth). Otherwise
-each side is continued to the middle. Deviations from it, lost returns, reflectance and labels are copied from the rays
-beside the hole, mirrored at its edge. Nothing but ground can be where the object stood; an estimate there is moved to
-where the ray leaves that place.
+A ring is continued over the hole from both sides. If both are one surface, its horizontal distance
+rho is interpolated: on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a
+cos(azimuth) + b sin(azimuth). Otherwise each side is continued to the middle. Deviations from it,
+lost returns, reflectance and labels are copied from the rays beside the hole, mirrored at its edge.
+Nothing but ground can be where the object stood; an estimate there is moved to where the ray leaves
+that place.
 """
 
 import numba
@@ -20,7 +21,8 @@ REACH = 400
 """Number of rays beside a hole that are searched for the surface behind the object."""
 
 FRONT = 0.5
-"""Metres by which a return has to be nearer than the object to be in front of it, and not beside or behind it."""
+"""Metres by which a return has to be nearer than the object to be in front of it, and not beside or
+behind it."""
 
 SAME = 0.2
 """Relative difference of distance below which both sides of a hole are one surface."""
@@ -46,20 +48,30 @@ def continued(
         rays: E rays.
         hole: (E,) True for rays of the hole.
         near: (E,) horizontal distance of the removed object at rays of the hole, metres.
-        far: (E,) horizontal distance at which the ray leaves the place of the object, 0 = it does not pass through it.
+        far: (E,) horizontal distance at which the ray leaves the place of the object, 0 = it does
+            not pass through it.
         ground: (E,) True for returns of the ground, which may lie in front of the object.
         thing: (E,) True for returns of other objects, which do not continue behind it.
 
     Returns:
-        (E,) the ray from which a ray of the hole is copied, -1 = none or not of the hole, and (E,) its horizontal
-        distance in metres, inf = no return.
+        (E,) the ray from which a ray of the hole is copied, -1 = none or not of the hole, and (E,)
+        its horizontal distance in metres, inf = no return.
     """
-    donor, rho = np.full(len(hole), -1, np.int64), np.full(len(hole), np.inf)
+    donor = np.full(len(hole), -1, np.int64)
+    rho = np.full(len(hole), np.inf)
     known = (rays.point >= 0) & ~hole
     for first, stop in zip(rays.start[:-1].tolist(), rays.start[1:].tolist(), strict=True):
         part = slice(first, stop)
         if hole[part].any() and not hole[part].all():
-            given = hole[part], known[part], rays.rho[part], near[part], far[part], ground[part], thing[part]
+            given = (
+                hole[part],
+                known[part],
+                rays.rho[part],
+                near[part],
+                far[part],
+                ground[part],
+                thing[part],
+            )
             _ring(rays.step, *given, donor[part], rho[part])
             donor[part] += first * (donor[part] >= 0)
     return donor, rho
@@ -69,20 +81,26 @@ def continued(
 def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type: ignore[no-untyped-def]
     """Fill the holes of one ring, whose last ray is followed by its first."""
     count = len(hole)
-    left, right = np.empty(SIDE, np.int64), np.empty(SIDE, np.int64)
+    left = np.empty(SIDE, np.int64)
+    right = np.empty(SIDE, np.int64)
     for i in range(count):
         if not hole[i] or hole[i - 1]:
             continue
-        length, limit = 0, np.inf
+        length = 0
+        limit = np.inf
         while hole[(i + length) % count]:
             limit = min(limit, near[(i + length) % count])
             length += 1
         n = _side(hole, known, rho, ground, thing, i - 1, -1, limit, left)
         m = _side(hole, known, rho, ground, thing, (i + length) % count, 1, limit, right)
-        a, b = _edge(known, rho, left, n), _edge(known, rho, right, m)
-        turn = (length + 1 + 2 * _SMOOTH) * step  # from the middle to the middle of the averaged rays
+        a = _edge(known, rho, left, n)
+        b = _edge(known, rho, right, m)
+        turn = (
+            length + 1 + 2 * _SMOOTH
+        ) * step  # from the middle to the middle of the averaged rays
         levels = _level(known, ground, left, n), _level(known, ground, right, m)
-        flat, mixed = levels[0] and levels[1], levels[0] != levels[1]
+        flat = levels[0] and levels[1]
+        mixed = levels[0] != levels[1]
         same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b) and (turn < WIDE or not mixed)
         if min(a, b) > 0 and not same and turn < WIDE:
             same = abs(_ahead(known, rho, left, n, step, turn) - b) < SAME * b
@@ -93,20 +111,25 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             side, size, nth, edge = (left, n, k, a) if use_left else (right, m, length - 1 - k, b)
             if size == 0:
                 continue
-            source, j = side[nth % size], (i + k) % count
+            source = side[nth % size]
+            j = (i + k) % count
             donor[j] = source
             if not known[source]:
                 continue
             base = edge
             if same:
-                of_a, of_b = 1 - share, share
+                of_a = 1 - share
+                of_b = share
                 if not flat and turn < 3:
-                    of_a, of_b = np.sin((1 - share) * turn) / np.sin(turn), np.sin(share * turn) / np.sin(turn)
+                    of_a = np.sin((1 - share) * turn) / np.sin(turn)
+                    of_b = np.sin(share * turn) / np.sin(turn)
                 base = 1 / (of_a / a + of_b / b)
             at = nth % size
             around = min(at, size - 1 - at, _SMOOTH)
             smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
-            jump = abs(smooth - edge) > SAME * edge  # the source is of another surface than the edge
+            jump = (
+                abs(smooth - edge) > SAME * edge
+            )  # the source is of another surface than the edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
             if mixed or not ground[source]:  # ground continued towards a wall rises
                 out[j] = max(out[j], far[j])
@@ -117,7 +140,8 @@ def _ahead(known, rho, side, size, step, turn):  # type: ignore[no-untyped-def]
     """Distance at the other edge of a plane wall through the returns of a side; inf = none."""
     if size < _BASE + 2 * _SMOOTH + 1:
         return np.inf
-    near, far = _edge(known, rho, side, size), _edge(known, rho, side[_BASE : _BASE + 2 * _SMOOTH + 1], -1)
+    near = _edge(known, rho, side, size)
+    far = _edge(known, rho, side[_BASE : _BASE + 2 * _SMOOTH + 1], -1)
     if far == 0:
         return np.inf
     rise = (np.cos(_BASE * step) / near - 1 / far) / np.sin(_BASE * step)
@@ -127,8 +151,10 @@ def _ahead(known, rho, side, size, step, turn):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _side(hole, known, rho, ground, thing, start, step, limit, out):  # type: ignore[no-untyped-def]
-    """Collect the rays beside a hole, from its edge outwards, but not those that end on or in front of an object."""
-    found, count = 0, len(hole)
+    """Collect the rays beside a hole, from its edge outwards, but not those that end on or in front
+    of an object."""
+    found = 0
+    count = len(hole)
     for k in range(min(REACH, count)):
         i = (start + k * step) % count
         front = known[i] and not ground[i] and rho[i] < limit - FRONT
@@ -143,7 +169,8 @@ def _side(hole, known, rho, ground, thing, start, step, limit, out):  # type: ig
 @numba.njit(cache=True)
 def _edge(known, rho, side, size):  # type: ignore[no-untyped-def]
     """Median distance of the first returns on a side, or with size -1 of all of them; 0 = none."""
-    values, found = np.empty(len(side)), 0
+    values = np.empty(len(side))
+    found = 0
     for i in side if size < 0 else side[:size]:
         if known[i]:
             values[found] = rho[i]

@@ -1,8 +1,8 @@
 """An object set into a scan at a new place, as the sensor would have seen it there.
 
-The object's recorded surface is placed anew, and every ray of the scan is cast at it. A ray that hits it before its own
-return gets the object's; one whose return is nearer keeps it. So the object hides what is behind it and is hidden by
-what is in front of it, on the rays of this very scan.
+The object's recorded surface is placed anew, and every ray of the scan is cast at it. A ray that
+hits it before its own return gets the object's; one whose return is nearer keeps it. So the object
+hides what is behind it and is hidden by what is in front of it, on the rays of this very scan.
 """
 
 from collections.abc import Sequence
@@ -31,19 +31,23 @@ if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
 
 TURN = 30.0
-"""Largest angle, degrees, by which an object may be seen from another side than it was recorded from."""
+"""Largest angle, degrees, by which an object may be seen from another side than it was recorded
+from."""
 
 NEARER = 0.5
-"""Smallest new distance of an object as a share of the recorded one; nearer, it would need returns that it lacks."""
+"""Smallest new distance of an object as a share of the recorded one; nearer, it would need returns
+that it lacks."""
 
 BESIDE = 0.05
-"""Metres outside its box at which an object may still be hit: patches at its rim reach beyond the returns."""
+"""Metres outside its box at which an object may still be hit: patches at its rim reach beyond the
+returns."""
 
 GRAZE = 0.05
 """Metres by which the object has to be in front of a return to replace it."""
 
 Pose = Sequence[float]
-"""x and y in metres and, optionally, yaw in radians, counter-clockwise about +z from +x, in the sensor frame."""
+"""x and y in metres and, optionally, yaw in radians, counter-clockwise about +z from +x, in the
+sensor frame."""
 
 
 class Placed(NamedTuple):
@@ -62,12 +66,17 @@ class Placed(NamedTuple):
     def points(self, points: NDArray[np.float32]) -> NDArray[np.float64]:
         """(N, 3) recorded points at the new place, metres."""
         offset = points - self.old[:3]
-        c, s = np.cos(self.old[6]), np.sin(self.old[6])
-        along, across = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
+        c = np.cos(self.old[6])
+        s = np.sin(self.old[6])
+        along = offset[:, 0] * c + offset[:, 1] * s
+        across = offset[:, 1] * c - offset[:, 0] * s
         across = -across if self.mirrored else across
         x, y, z, *_, yaw = self.box.astype(np.float64)
-        c, s = np.cos(yaw), np.sin(yaw)
-        return np.stack([along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z], 1)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
+        return np.stack(
+            [along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z], 1
+        )
 
 
 def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5) -> Scan:
@@ -75,20 +84,21 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
 
     Args:
         scan: N points; the ground is found by its labels, or by the lowest returns if it has none.
-        item: an object of ``objects_of`` or of an ``ObjectBank``. A mirror image of it is used if that shows the side
-            that is seen.
-        pose: x and y of its box's centre, and its yaw; by default the recorded place. Without a yaw, the sensor sees
-            the object from the side from which it was recorded. Its height follows from the ground.
-        least: minimum number of visible returns of an object, also of the scan's own: one that is hidden further
-            loses its box and its returns.
+        item: an object of ``objects_of`` or of an ``ObjectBank``. A mirror image of it is used if
+            that shows the side that is seen.
+        pose: x and y of its box's centre, and its yaw; by default the recorded place. Without a
+            yaw, the sensor sees the object from the side from which it was recorded. Its height
+            follows from the ground.
+        least: minimum number of visible returns of an object, also of the scan's own: one that is
+            hidden further loses its box and its returns.
 
     Returns:
-        A new scan with the object's box (a scan without boxes then has this one alone) and, if it has instances, a new
-        instance. Its labels are those of the object, if the scan has labels.
+        A new scan with the object's box (a scan without boxes then has this one alone) and, if it
+        has instances, a new instance. Its labels are those of the object, if the scan has labels.
 
     Raises:
-        DataError: if the place is outside the sensor's range, taken, or without ground; if the object would be seen
-            from a side that was not recorded, from too near, or not at all.
+        DataError: if the place is outside the sensor's range, taken, or without ground; if the
+            object would be seen from a side that was not recorded, from too near, or not at all.
 
     Example:
         >>> from lidar_synth import Town
@@ -103,16 +113,22 @@ def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
     return _set(scan, item, _place(scan, item, pose), least, np.zeros(len(scan), bool))
 
 
-def _set(scan: Scan, item: Object, placed: Placed, least: int, estimated: NDArray[np.bool_]) -> Scan:
-    """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their distance."""
+def _set(
+    scan: Scan, item: Object, placed: Placed, least: int, estimated: NDArray[np.bool_]
+) -> Scan:
+    """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their
+    distance."""
     rays = rays_of_scan(scan)
-    window = np.flatnonzero(rays.through(placed.box + np.array([0, 0, 0, 0.6, 0.6, 0.6, 0], np.float32)))
+    window = np.flatnonzero(
+        rays.through(placed.box + np.array([0, 0, 0, 0.6, 0.6, 0.6, 0], np.float32))
+    )
     rho, hits, at = _hits(item, placed, rays, window)
     guess = (rays.point[window] >= 0) & estimated[rays.point[window]]
     seen = np.isfinite(rho) & (guess | (rho < rays.rho[window] - GRAZE))
     if seen.sum() < least:
         raise DataError(
-            f"an object at {_place_text(placed.box)} with {seen.sum()} visible returns of {np.isfinite(rho).sum()}",
+            f"an object at {_place_text(placed.box)} with {seen.sum()} visible returns of "
+            f"{np.isfinite(rho).sum()}",
             f"at least {least}",
             "Choose a nearer place, or one that nothing hides.",
         )
@@ -123,25 +139,36 @@ def _set(scan: Scan, item: Object, placed: Placed, least: int, estimated: NDArra
     remaining, boxes = still_visible(scan, ~replaced, least)
     which = window[seen]
     fields = _fields(scan, item, hits, at[seen])
-    new = replace(scan[np.zeros(len(which), np.intp)], points=rays.points(which, rho[seen]), **fields)
+    new = replace(
+        scan[np.zeros(len(which), np.intp)], points=rays.points(which, rho[seen]), **fields
+    )
     assert item.scan.boxes is not None
     instance = np.array([next_instance(scan) if scan.instance is not None else -1], np.int32)
     values = grown(placed.box, new.points)[None]
-    own = Boxes(values, item.scan.boxes.names, occlusion=item.scan.boxes.occlusion.copy(), instance=instance)
+    own = Boxes(
+        values, item.scan.boxes.names, occlusion=item.scan.boxes.occlusion.copy(), instance=instance
+    )
     own = occluded(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
     result = composed(scan, ~remaining, rays, which, new)
     return replace(result, boxes=joined([boxes, own]))
 
 
 def move(
-    scan: Scan, box: int, pose: Pose, *, model: "Generator | str | Path | None" = None, seed: int = 0, least: int = 5
+    scan: Scan,
+    box: int,
+    pose: Pose,
+    *,
+    model: "Generator | str | Path | None" = None,
+    seed: int = 0,
+    least: int = 5,
 ) -> Scan:
     """Move an object of a scan: ``remove`` it and ``insert`` it at another place.
 
     Args:
         scan: N points with boxes.
         box: the number of the object's box.
-        pose, least: see ``insert``. What is only estimated behind the object does not stand in its way.
+        pose, least: see ``insert``. What is only estimated behind the object does not stand in its
+            way.
         model, seed: see ``remove``.
 
     Returns:
@@ -175,7 +202,9 @@ def cut_out(scan: Scan, box: int) -> Object:
     selected(scan, box)
     if scan.ring is None:
         ring, on_grid = rings_of(scan)
-        sensor = replace(scan.sensor, firings=None) if on_grid else scan.sensor  # as many as columns
+        sensor = (
+            replace(scan.sensor, firings=None) if on_grid else scan.sensor
+        )  # as many as columns
         scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
     found = objects_of(scan, least=1)
     if box not in found:
@@ -187,34 +216,50 @@ def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
     """The object at its pose on the ground."""
     old = item.box.astype(np.float64)
     x, y, yaw = _complete(old, pose)
-    distance, recorded = float(np.hypot(x, y)), float(np.hypot(old[0], old[1]))
+    distance = float(np.hypot(x, y))
+    recorded = float(np.hypot(old[0], old[1]))
     box = np.array([x, y, 0, *old[3:6], yaw], np.float32)
     limits = max(scan.sensor.range_min, 1.0), scan.sensor.range_max
     if not limits[0] < distance < limits[1]:
-        raise DataError(f"an object at {_place_text(box)}, {distance:.1f} m away",
-                        f"a place {limits[0]:g} to {limits[1]:g} m from the sensor {scan.sensor.name!r}")  # fmt: skip
+        raise DataError(
+            f"an object at {_place_text(box)}, {distance:.1f} m away",
+            f"a place {limits[0]:g} to {limits[1]:g} m from the sensor {scan.sensor.name!r}",
+        )
     if distance < NEARER * recorded:
-        raise DataError(f"an object recorded at {recorded:.1f} m, to be seen at {distance:.1f} m",
-                        f"at least {NEARER * recorded:.1f} m, because it has too few returns for less")  # fmt: skip
+        raise DataError(
+            f"an object recorded at {recorded:.1f} m, to be seen at {distance:.1f} m",
+            f"at least {NEARER * recorded:.1f} m, because it has too few returns for less",
+        )
     if scan.boxes is not None and (taken := overlapping(box, scan.boxes.values)).any():
         number = int(np.flatnonzero(taken)[0])
-        raise DataError(f"an object at {_place_text(box)}, which overlaps box {number} ({scan.boxes.names[number]})",
-                        "a free place", "Remove that object first, or choose another place.")  # fmt: skip
+        raise DataError(
+            f"an object at {_place_text(box)}, which overlaps box {number} "
+            f"({scan.boxes.names[number]})",
+            "a free place",
+            "Remove that object first, or choose another place.",
+        )
     if _recorded_here(scan, item, box):
         box[2] = old[2]
         return Placed(old, box, False)
     ground = ground_under(scan, box)
     if ground is None or not ground.encloses:
-        raise DataError(f"an object at {_place_text(box)}, where the scan has no level ground", "ground around the box")
+        raise DataError(
+            f"an object at {_place_text(box)}, where the scan has no level ground",
+            "ground around the box",
+        )
     if not ground.free:
-        raise DataError(f"an object at {_place_text(box)}, where the scan has other returns", "a free place")
+        raise DataError(
+            f"an object at {_place_text(box)}, where the scan has other returns", "a free place"
+        )
     box[2] = ground.height + old[2] - item.ground
     return Placed(old, box, _mirrored(old, x, y, yaw))
 
 
 def _recorded_here(scan: Scan, item: Object, box: NDArray[np.float32]) -> bool:
     """Whether an object returns to its own place in its own scan, where its returns are no more."""
-    same = item.scan.id == scan.id and bool(np.allclose(box[[0, 1, 6]], item.box[[0, 1, 6]], atol=1e-3))
+    same = item.scan.id == scan.id and bool(
+        np.allclose(box[[0, 1, 6]], item.box[[0, 1, 6]], atol=1e-3)
+    )
     return same and not _shared(item.scan, scan).any()
 
 
@@ -245,7 +290,8 @@ def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
     off = [abs((seen - side + np.pi) % (2 * np.pi) - np.pi) for side in (recorded, -recorded)]
     if min(off) > np.radians(TURN):
         raise DataError(
-            f"an object seen from {np.degrees(off[0]):.0f} degrees beside the side that was recorded",
+            f"an object seen from {np.degrees(off[0]):.0f} degrees beside the side that was "
+            "recorded",
             f"at most {TURN:g} degrees, for it or its mirror image",
             "Leave out the yaw: the recorded side then faces the sensor.",
         )
@@ -255,17 +301,23 @@ def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
 def _hits(
     item: Object, placed: Placed, rays: ScanRays, window: NDArray[np.intp]
 ) -> tuple[NDArray[np.float64], Hits, NDArray[np.intp]]:
-    """(n,) the horizontal distance at which each ray of the window hits the object, inf = never; all hits, and the
-    index (n, 2) of each ray's."""
-    rho, at = np.full(len(window), np.inf), np.zeros((len(window), 2), np.intp)
+    """(n,) the horizontal distance at which each ray of the window hits the object, inf = never;
+    all hits, and the index (n, 2) of each ray's."""
+    rho = np.full(len(window), np.inf)
+    at = np.zeros((len(window), 2), np.intp)
     surfaces = _surfaces(item.scan)
     rings, first, which = np.unique(rays.ring[window], return_index=True, return_inverse=True)
     slope = np.array([np.median(rays.slope[window[which == k]]) for k in range(len(rings))])
     count = round(2 * np.pi / rays.step)
     raster = rays_from(slope, rays.height[window[first]], rays.azimuth[window[first]], count)
-    hits = first_hits(surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0]))
+    hits = first_hits(
+        surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0])
+    )
     if len(window):
-        firing = np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp) % count
+        firing = (
+            np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp)
+            % count
+        )
         at = np.stack([which, firing], 1)
         rho = hits.nearest.rho[which, firing]
         points = rays.points(window, np.where(np.isfinite(rho), rho, 0.0))
@@ -278,18 +330,30 @@ def _surfaces(part: Scan) -> Surfaces:
     ring, on_grid = rings_of(part)
     sensor = replace(part.sensor, firings=None) if on_grid else part.sensor
     return estimate(
-        Scan(part.points, part.reflectance, sensor, label=part.label, ring=ring.astype(np.int16), id=part.id)
+        Scan(
+            part.points,
+            part.reflectance,
+            sensor,
+            label=part.label,
+            ring=ring.astype(np.int16),
+            id=part.id,
+        )
     )
 
 
-def _behind(rays: ScanRays, window: NDArray[np.intp], rho: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(n,) rays of the window between two that hit the object in their ring, whose return lies behind it."""
+def _behind(
+    rays: ScanRays, window: NDArray[np.intp], rho: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(n,) rays of the window between two that hit the object in their ring, whose return lies
+    behind it."""
     behind = np.zeros(len(window), bool)
     for ring in np.unique(rays.ring[window]):
         mine = np.flatnonzero(rays.ring[window] == ring)
         hit = np.flatnonzero(np.isfinite(rho[mine]))
         if len(hit):
-            start = hit[np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)]  # after the widest gap
+            start = hit[
+                np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)
+            ]  # after the widest gap
             length = len(mine) - np.diff(hit, append=hit[0] + len(mine)).max() + 1
             inner = mine[(start + np.arange(length)) % len(mine)]
             behind[inner] = rays.rho[window[inner]] > np.min(rho[mine][hit])

@@ -1,4 +1,5 @@
-"""The rays of one scan, ring by ring: those of its returns, and those that came back without a return."""
+"""The rays of one scan, ring by ring: those of its returns, and those that came back without a
+return."""
 
 from typing import NamedTuple
 
@@ -11,7 +12,8 @@ from lidar_synth.geometry.transfer.surfaces import rings_of
 
 
 class ScanRays(NamedTuple):
-    """E rays, ordered by ring and clockwise within a ring; the last of a ring is followed by its first.
+    """E rays, ordered by ring and clockwise within a ring; the last of a ring is followed by its
+    first.
 
     Args:
         point: (E,) index of the return; -1 = none.
@@ -35,7 +37,8 @@ class ScanRays(NamedTuple):
 
     def points(self, which: NDArray[np.intp], rho: NDArray[np.float64]) -> NDArray[np.float32]:
         """(n, 3) points on some rays at horizontal distances (n,), metres."""
-        azimuth, z = self.azimuth[which], self.height[which] + self.slope[which] * rho
+        azimuth = self.azimuth[which]
+        z = self.height[which] + self.slope[which] * rho
         return np.stack([rho * np.cos(azimuth), -rho * np.sin(azimuth), z], 1).astype(np.float32)
 
     def through(self, box: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -43,40 +46,54 @@ class ScanRays(NamedTuple):
         return np.asarray(self.leaving(box) > 0)
 
     def leaving(self, box: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not pass through."""
-        c, s = np.cos(float(box[6])), np.sin(float(box[6]))
-        dx, dy = np.cos(self.azimuth), -np.sin(self.azimuth)
+        """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not
+        pass through."""
+        c = np.cos(float(box[6]))
+        s = np.sin(float(box[6]))
+        dx = np.cos(self.azimuth)
+        dy = -np.sin(self.azimuth)
         origin = (-box[0] * c - box[1] * s, box[0] * s - box[1] * c, self.height - box[2])
         along = (dx * c + dy * s, dy * c - dx * s, self.slope)
-        enter, leave = np.zeros(len(dx)), np.full(len(dx), np.inf)
+        enter = np.zeros(len(dx))
+        leave = np.full(len(dx), np.inf)
         for o, d, size in zip(origin, along, box[3:6], strict=True):
             d = np.where(np.abs(d) < 1e-9, 1e-9, d)
-            a, b = (-size / 2 - o) / d, (size / 2 - o) / d
-            enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+            a = (-size / 2 - o) / d
+            b = (size / 2 - o) / d
+            enter = np.maximum(enter, np.minimum(a, b))
+            leave = np.minimum(leave, np.maximum(a, b))
         return np.where(enter <= leave, leave, 0.0)
 
 
 def rays_of_scan(scan: Scan) -> ScanRays:
-    """The rays of a scan of N returns; gaps between the returns of a ring are rays without a return.
+    """The rays of a scan of N returns; gaps between the returns of a ring are rays without a
+    return.
 
-    The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the sensor's grid. In the
-    last case rays start at the origin, unless those of the grid start above it (``Sensor.starts``).
+    The rings are ``scan.ring``, or follow from the order of the points, or are the rows of the
+    sensor's grid. In the last case rays start at the origin, unless those of the grid start above
+    it (``Sensor.starts``).
     """
     ring, on_grid = rings_of(scan)
     starts = scan.sensor.starts.astype(np.float64) if len(scan.sensor.starts) else np.zeros(1)
     optics = starts if on_grid else scan.sensor.optics()[1]
     x, y, z = scan.points.astype(np.float64).T
-    azimuth, rho = -np.arctan2(y, x), np.maximum(np.hypot(x, y), 1e-3)
+    azimuth = -np.arctan2(y, x)
+    rho = np.maximum(np.hypot(x, y), 1e-3)
     height = optics[np.minimum(ring, len(optics) - 1)]
     order = np.lexsort((azimuth, ring))
-    ring, azimuth, rho, height = ring[order], azimuth[order], rho[order], height[order]
+    ring = ring[order]
+    azimuth = azimuth[order]
+    rho = rho[order]
+    height = height[order]
     slope = (z[order] - height) / rho
     last = np.append(ring[1:] != ring[:-1], True)
     first = np.flatnonzero(np.append(True, last[:-1]))
     following = np.arange(1, len(ring) + 1)
     following[last] = first
     gap = azimuth[following] - azimuth + 2 * np.pi * last
-    step = 2 * np.pi / (scan.sensor.columns if on_grid else scan.sensor.firings or scan.sensor.columns)
+    step = (
+        2 * np.pi / (scan.sensor.columns if on_grid else scan.sensor.firings or scan.sensor.columns)
+    )
     added = np.where(gap > WIDEST * step, np.rint(gap / step).astype(np.int64) - 1, 0)
     source = np.repeat(np.arange(len(ring)), added + 1)
     ends = np.cumsum(added + 1)

@@ -72,12 +72,16 @@ def redrawn(
     check_model(model, kept.sensor)
     there = np.linalg.norm(filled.points, axis=1) > 0
     asked = np.where(there[:, None], filled.points, rays.points(which, np.full(len(which), FAR)))
-    everything = locate(np.concatenate([kept.points, filled.points]).astype(np.float32), kept.sensor)
+    everything = locate(
+        np.concatenate([kept.points, filled.points]).astype(np.float32), kept.sensor
+    )
     cell = locate(asked.astype(np.float32), kept.sensor).cell
     known = everything.point >= 0
     distance = np.where(known, everything.range[everything.point], 0).astype(np.float32)
     both = _joined(kept, filled)
-    image = RangeImage(distance, kept.sensor, carry(both, everything.point, _CARRIED & both.fields().keys()))
+    image = RangeImage(
+        distance, kept.sensor, carry(both, everything.point, _CARRIED & both.fields().keys())
+    )
     hole = np.zeros(distance.shape, bool)
     hole.reshape(-1)[cell[cell >= 0]] = True
     hole &= ~known | (everything.point >= len(kept))
@@ -91,20 +95,28 @@ _CARRIED = {"reflectance", "label"}
 
 def _joined(kept: Scan, filled: Scan) -> Scan:
     names = _CARRIED & kept.fields().keys()
-    fields: dict[str, Any] = {n: np.concatenate([getattr(kept, n), getattr(filled, n)]) for n in names}
+    fields: dict[str, Any] = {
+        n: np.concatenate([getattr(kept, n), getattr(filled, n)]) for n in names
+    }
     points = np.concatenate([kept.points, filled.points])
     return Scan(points, sensor=kept.sensor, **fields)
 
 
 def _on_rays(
-    filled: Scan, rays: ScanRays, which: NDArray[np.intp], drawn: RangeImage, cell: NDArray[np.int32],
+    filled: Scan,
+    rays: ScanRays,
+    which: NDArray[np.intp],
+    drawn: RangeImage,
+    cell: NDArray[np.int32],
     inside: NDArray[np.bool_],
-) -> Scan:  # fmt: skip
-    """The points of the hole at the distances of their cells; on the ground, where their ray meets its height."""
+) -> Scan:
+    """The points of the hole at the distances of their cells; on the ground, where their ray meets
+    its height."""
     row = np.maximum(cell, 0) // drawn.sensor.columns
     elevation = drawn.sensor.row_elevations()[row].astype(np.float64)
     distance = drawn.range.reshape(-1)[cell].astype(np.float64)
-    rho, z = distance * np.cos(elevation), distance * np.sin(elevation)
+    rho = distance * np.cos(elevation)
+    z = distance * np.sin(elevation)
     if len(starts := drawn.sensor.starts):
         z += starts[row]  # ranges of such rows are measured from where their rays start
     label = drawn.channels.get("label")
@@ -115,8 +127,12 @@ def _on_rays(
         level = GROUND[label.reshape(-1)[cell]] & (np.abs(meets - rho) < BEND * rho)
         rho = np.where(level, meets, rho)
     points = np.where(distance[:, None] > 0, rays.points(which, rho), np.float32(0))
-    fields: dict[str, Any] = {"points": np.where(inside[:, None], points, filled.points).astype(np.float32)}
-    for name in {"reflectance", "label", "confidence"} & filled.fields().keys() & drawn.channels.keys():
+    fields: dict[str, Any] = {
+        "points": np.where(inside[:, None], points, filled.points).astype(np.float32)
+    }
+    for name in (
+        {"reflectance", "label", "confidence"} & filled.fields().keys() & drawn.channels.keys()
+    ):
         values = drawn.channels[name].reshape(-1)[cell]
         fields[name] = np.where(inside, values, getattr(filled, name)).astype(values.dtype)
     return replace(filled, **fields)

@@ -1,7 +1,7 @@
 """Objects taken out of a scan, and the surfaces behind them in their place.
 
-The hole consists of the rays that the object returned or absorbed. They are continued from the same rings beside it
-(``fill``), and drawn again by a generator if there is one (``redraw``).
+The hole consists of the rays that the object returned or absorbed. They are continued from the same
+rings beside it (``fill``), and drawn again by a generator if there is one (``redraw``).
 """
 
 from collections.abc import Sequence
@@ -27,29 +27,35 @@ if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
 
 Which = int | Sequence[int] | Boxes | NDArray[np.float32]
-"""Boxes: by their numbers in the scan, or by their values; seven whole numbers, each once, are seven boxes."""
+"""Boxes: by their numbers in the scan, or by their values; seven whole numbers, each once, are
+seven boxes."""
 
 MARGIN = 0.05
-"""Metres around an object within which a ray without a return is taken for one that the object absorbed."""
+"""Metres around an object within which a ray without a return is taken for one that the object
+absorbed."""
 
 
-def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = None, seed: int = 0) -> Scan:
+def remove(
+    scan: Scan, box: Which, *, model: "Generator | str | Path | None" = None, seed: int = 0
+) -> Scan:
     """Remove objects from a scan, with their boxes, and fill the holes with what is behind them.
 
     Args:
         scan: N points.
-        box: number of a box of the scan, several numbers, or a box (7,) or ``Boxes`` in the sensor frame.
-        model: an unconditional generator on the scan's grid, its name or file, that draws the holes; None, the
-            default, fills them by geometry alone.
+        box: number of a box of the scan, several numbers, or a box (7,) or ``Boxes`` in the sensor
+            frame.
+        model: an unconditional generator on the scan's grid, its name or file, that draws the
+            holes; None, the default, fills them by geometry alone.
         seed: of the model's noise.
 
     Returns:
-        A new scan. All other points, labels, boxes and instances are unchanged; without boxes to remove, it is the
-        scan as it was given.
+        A new scan. All other points, labels, boxes and instances are unchanged; without boxes to
+        remove, it is the scan as it was given.
 
     Raises:
-        DataError: on a box that the scan does not have, that is out of the sensor's range or that holds no return; on
-            seven whole numbers with repeats, which may be a box or boxes; with a model, on a scan of another sensor.
+        DataError: on a box that the scan does not have, that is out of the sensor's range or that
+            holds no return; on seven whole numbers with repeats, which may be a box or boxes; with
+            a model, on a scan of another sensor.
         ConfigError: on an unknown or a conditional model.
 
     Example:
@@ -66,7 +72,10 @@ def remove(scan: Scan, box: Which, *, model: "Generator | str | Path | None" = N
         return scan
     parts = [(returns_of(scan, boxes[[i]]), boxes.values[i]) for i in range(len(boxes))]
     if numbers is None and not any(mine.any() for mine, _ in parts):
-        raise DataError(f"box {_text(boxes.values[0])} of scan {scan.id!r} without a return", "a box with an object")
+        raise DataError(
+            f"box {_text(boxes.values[0])} of scan {scan.id!r} without a return",
+            "a box with an object",
+        )
     result = without(scan, parts, open_model(model), seed)
     if scan.boxes is None:
         return result
@@ -78,28 +87,42 @@ def selected(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
     """The boxes that an argument names, and their numbers in the scan, None for boxes of its own.
 
     Raises:
-        DataError: on a number or a place that the scan does not have, or seven whole numbers with repeats.
+        DataError: on a number or a place that the scan does not have, or seven whole numbers with
+            repeats.
     """
     given = np.asarray(box.values if isinstance(box, Boxes) else box)
     if not given.size:
         return Boxes(np.zeros((0, 7), np.float32), ()), None
     if given.dtype.kind in "iu" and given.shape == (7,) and len(np.unique(given)) < 7:
-        raise DataError(f"seven whole numbers {given.tolist()}", "each number once, or a box (7,) as floats")
+        raise DataError(
+            f"seven whole numbers {given.tolist()}", "each number once, or a box (7,) as floats"
+        )
     if given.dtype.kind in "iu" and given.ndim < 2:
         numbers = np.atleast_1d(given).tolist()
         count = 0 if scan.boxes is None else len(scan.boxes)
         if scan.boxes is None or min(numbers) < 0 or max(numbers) >= count:
             given_text = f"box {given.tolist()} of scan {scan.id!r} with {count} boxes"
-            raise DataError(given_text, "numbers of its boxes, from 0",
-                            "A scan without boxes takes a box (7,): x, y, z, length, width, height, yaw.")  # fmt: skip
+            raise DataError(
+                given_text,
+                "numbers of its boxes, from 0",
+                "A scan without boxes takes a box (7,): x, y, z, length, width, height, yaw.",
+            )
         return scan.boxes[numbers], numbers
     if given.ndim == 0 or given.shape[-1] != 7 or given.dtype.kind not in "iuf":
-        raise DataError(f"a box of shape {given.shape}", "(7,): x, y, z, length, width, height, yaw")
-    boxes = box if isinstance(box, Boxes) else Boxes(given.astype(np.float32), ("Misc",) * (given.size // 7))
+        raise DataError(
+            f"a box of shape {given.shape}", "(7,): x, y, z, length, width, height, yaw"
+        )
+    boxes = (
+        box
+        if isinstance(box, Boxes)
+        else Boxes(given.astype(np.float32), ("Misc",) * (given.size // 7))
+    )
     for values in boxes.values:
         if (distance := float(np.linalg.norm(values[:3]))) > scan.sensor.range_max:
-            raise DataError(f"a box {_text(values)}, {distance:.1f} m away",
-                            f"at most {scan.sensor.range_max:g} m, the range of {scan.sensor.name!r}")  # fmt: skip
+            raise DataError(
+                f"a box {_text(values)}, {distance:.1f} m away",
+                f"at most {scan.sensor.range_max:g} m, the range of {scan.sensor.name!r}",
+            )
     return boxes, None
 
 
@@ -108,7 +131,8 @@ def _text(values: NDArray[np.float32]) -> str:
 
 
 def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
-    """(N,) the returns of the object in one box, with those of its mirrors and aerials just outside."""
+    """(N,) the returns of the object in one box, with those of its mirrors and aerials just
+    outside."""
     mine = belonging(scan, box)
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
     around = Boxes(wide, box.names).contain(scan.points)[0] & ~mine
@@ -117,7 +141,9 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
         around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
     else:
         around &= scan.points[:, 2] > box.values[0, 2] - box.values[0, 5] / 2 + FLOOR
-    if scan.label is not None:  # in the box, also returns at the object's edge whose label is another one
+    if (
+        scan.label is not None
+    ):  # in the box, also returns at the object's edge whose label is another one
         same = np.isin(scan.label, np.unique(scan.label[mine])) & (scan.label < THINGS)
         around &= same | (box.contain(scan.points)[0] & ~GROUND[scan.label])
     if scan.instance is not None and mine.any():
@@ -145,19 +171,24 @@ def without(
         start: see ``inpaint``; None = its default.
 
     Returns:
-        The scan with its remaining points unchanged and in order. Points of the hole take the place of removed ones;
-        those on rays that had no return come after their neighbour in the ring. Boxes stay as they are.
+        The scan with its remaining points unchanged and in order. Points of the hole take the place
+        of removed ones; those on rays that had no return come after their neighbour in the ring.
+        Boxes stay as they are.
     """
     removed = np.any([mine for mine, _ in parts], 0)
     if not removed.any():
         return scan
     rays = rays_of_scan(scan)
     there = rays.point >= 0
-    hole, near, far = there & removed[rays.point], np.full(len(there), np.inf), np.zeros(len(there))
+    hole = there & removed[rays.point]
+    near = np.full(len(there), np.inf)
+    far = np.zeros(len(there))
     near[hole] = rays.rho[hole]
     for mine, box in parts:
         if mine.any():
-            absorbed = ~there & rays.through(box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32))
+            absorbed = ~there & rays.through(
+                box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32)
+            )
             near[absorbed] = np.minimum(near[absorbed], np.hypot(*scan.points[mine, :2].T).min())
             hole |= absorbed
             place = widened(grown(box, scan.points[mine]), CLEARANCE + MARGIN)
@@ -172,7 +203,8 @@ def without(
 
 
 def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
-    """(E,) True for returns of the ground: by their labels, or without labels where a ring is level and low."""
+    """(E,) True for returns of the ground: by their labels, or without labels where a ring is level
+    and low."""
     ground = np.zeros(len(rays.point), bool)
     there = rays.point >= 0
     if scan.label is not None and (scan.label != IGNORE).any():
@@ -194,9 +226,14 @@ def _things(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:
 
 
 def _copies(
-    scan: Scan, rays: ScanRays, which: NDArray[np.intp], donor: NDArray[np.int64], rho: NDArray[np.float64]
+    scan: Scan,
+    rays: ScanRays,
+    which: NDArray[np.intp],
+    donor: NDArray[np.int64],
+    rho: NDArray[np.float64],
 ) -> Scan:
-    """One point for each ray of the hole, with the fields of its source; points at the origin have no return."""
+    """One point for each ray of the hole, with the fields of its source; points at the origin have
+    no return."""
     found = np.isfinite(rho)
     points = np.where(found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0))
     limits = scan.sensor.range_min, scan.sensor.range_max

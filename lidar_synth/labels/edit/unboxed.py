@@ -1,7 +1,7 @@
 """Objects of a synthetic scan that have no box: a detector would learn that they are background.
 
-Points of classes that detectors find are joined to clusters. Clusters outside all boxes are counted, and removed with
-their holes filled.
+Points of classes that detectors find are joined to clusters. Clusters outside all boxes are
+counted, and removed with their holes filled.
 """
 
 from collections.abc import Callable, Iterable
@@ -52,14 +52,18 @@ class Unboxed(NamedTuple):
 
     def __str__(self) -> str:
         rate = self.objects / max(self.scans, 1)
-        return f"{rate:.1f} objects without a box a scan ({self.share:.0%} of the points of their classes)"
+        return (
+            f"{rate:.1f} objects without a box a scan ({self.share:.0%} of the points of their "
+            "classes)"
+        )
 
 
 def clusters(scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST) -> NDArray[np.int64]:
     """(N,) number of the unboxed object of each point, from 1 on; 0 = none.
 
     Args:
-        scan: N points; without labels there is nothing to find, without boxes every object is unboxed.
+        scan: N points; without labels there is nothing to find, without boxes every object is
+            unboxed.
         classes: train ids of the classes that have boxes.
         least: minimum number of points of an object.
     """
@@ -67,7 +71,9 @@ def clusters(scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST) -> 
     outside = np.flatnonzero(_outside(scan, classes))
     if len(outside):
         cube = np.floor(scan.points[outside] / _REACH).astype(np.int64) + (1 << 18)
-        keys, of = np.unique((cube[:, 0] << 40) | (cube[:, 1] << 20) | cube[:, 2], return_inverse=True)
+        keys, of = np.unique(
+            (cube[:, 0] << 40) | (cube[:, 1] << 20) | cube[:, 2], return_inverse=True
+        )
         root = np.arange(len(keys))
         _join(keys, _NEIGHBOURS, root)
         size = np.bincount(root[of], minlength=len(keys))
@@ -89,12 +95,23 @@ def measure(scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = 
     total = Unboxed(0, 0, 0, 0)
     for scan in scans:
         points = 0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
-        found = (1, int(clusters(scan, classes, least).max(initial=0)), points, int(_outside(scan, classes).sum()))
+        found = (
+            1,
+            int(clusters(scan, classes, least).max(initial=0)),
+            points,
+            int(_outside(scan, classes).sum()),
+        )
         total = Unboxed(*(a + b for a, b in zip(total, found, strict=True)))
     return total
 
 
-def closed(scan: Scan, model: Model = None, seed: int = 0, classes: Iterable[int] = BOXED, least: int = LEAST) -> Scan:
+def closed(
+    scan: Scan,
+    model: Model = None,
+    seed: int = 0,
+    classes: Iterable[int] = BOXED,
+    least: int = LEAST,
+) -> Scan:
     """Remove the unboxed objects of a scan, and fill the holes with what is behind them.
 
     Args:
@@ -131,8 +148,8 @@ HANDLING: dict[str, Callable[[Scan], Scan]] = {"close": closed, "keep": _kept, "
 
 
 def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
-    """The handling of unboxed objects by its name: ``"close"`` removes them, ``"keep"`` does nothing, ``"error"``
-    refuses the scan.
+    """The handling of unboxed objects by its name: ``"close"`` removes them, ``"keep"`` does
+    nothing, ``"error"`` refuses the scan.
 
     Args:
         name: a key of ``HANDLING``.
@@ -160,9 +177,14 @@ def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:
 
 
 def _with_rim(scan: Scan, mine: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """The returns of a cluster with those at its rim that have another label, and the box (7,) around it."""
-    low, high = scan.points[mine].min(0), scan.points[mine].max(0)
-    box = grown(np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32), scan.points[mine])
+    """The returns of a cluster with those at its rim that have another label, and the box (7,)
+    around it."""
+    low = scan.points[mine].min(0)
+    high = scan.points[mine].max(0)
+    box = grown(
+        np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
+        scan.points[mine],
+    )
     around = Boxes(box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
     if scan.label is not None:
         around &= ~GROUND[scan.label]
@@ -172,7 +194,13 @@ def _with_rim(scan: Scan, mine: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], N
 
 
 _NEIGHBOURS = np.array(
-    [(x << 40) + (y << 20) + z for x in (0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)],
+    [
+        (x << 40) + (y << 20) + z
+        for x in (0, 1)
+        for y in (-1, 0, 1)
+        for z in (-1, 0, 1)
+        if (x, y, z) > (0, 0, 0)
+    ],
     np.int64,
 )
 """Differences of the keys of a cube and of the half of its neighbours that come after it."""
@@ -180,12 +208,14 @@ _NEIGHBOURS = np.array(
 
 @numba.njit(cache=True)
 def _join(keys, neighbours, root):  # type: ignore[no-untyped-def]
-    """Fill ``root`` (K,) with the first of all cubes that each is connected with; keys (K,) are sorted."""
+    """Fill ``root`` (K,) with the first of all cubes that each is connected with; keys (K,) are
+    sorted."""
     for i in range(len(keys)):
         for step in neighbours:
             j = np.searchsorted(keys, keys[i] + step)
             if j < len(keys) and keys[j] == keys[i] + step:
-                a, b = i, j
+                a = i
+                b = j
                 while root[a] != a:
                     a = root[a]
                 while root[b] != b:

@@ -1,8 +1,9 @@
-"""Batch mixing: real samples from DataLoader workers, synthetic scans made in the main process on the training device.
+"""Batch mixing: real samples from DataLoader workers, synthetic scans made in the main process on
+the training device.
 
-A thread makes the scans of the next batch while the trainer works on the current one; on a GPU it uses a CUDA stream
-of its own. Label policy, augmentation and ``to_sample`` are those of the dataset, so that the samples are the same as
-with any other way of loading.
+A thread makes the scans of the next batch while the trainer works on the current one; on a GPU it
+uses a CUDA stream of its own. Label policy, augmentation and ``to_sample`` are those of the
+dataset, so that the samples are the same as with any other way of loading.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -25,7 +26,8 @@ class Place(NamedTuple):
 
     Args:
         epoch, position: its place in the plan.
-        missing: (number of the synthetic source, index) of the scan that is still to be made, or None.
+        missing: (number of the synthetic source, index) of the scan that is still to be made, or
+            None.
         sample: the finished sample if no scan is missing.
     """
 
@@ -39,10 +41,12 @@ class BatchMixer:
     """A replacement of ``DataLoader`` for a ``MixedScans`` whose generator is on the GPU.
 
     Args:
-        dataset: the dataset. The main process makes the scans of generators; workers load all other samples.
+        dataset: the dataset. The main process makes the scans of generators; workers load all other
+            samples.
         batch_size: number of samples in a batch, in the order of the plan.
         batch_sampler: instead of ``batch_size``, such as ``dataset.batches(...)`` of one rank.
-        options: other options of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is ``dataset.collate``.
+        options: other options of ``DataLoader``, such as ``num_workers``; ``collate_fn`` is
+            ``dataset.collate``.
 
     Raises:
         ConfigError: if both or neither of ``batch_size`` and ``batch_sampler`` are given.
@@ -65,12 +69,18 @@ class BatchMixer:
         **options: Any,
     ) -> None:
         if (batch_size is None) == (batch_sampler is None):
-            raise ConfigError(f"batch_size={batch_size} and batch_sampler={batch_sampler}", "one of them")
+            raise ConfigError(
+                f"batch_size={batch_size} and batch_sampler={batch_sampler}", "one of them"
+            )
         self.dataset = dataset
         self.batch_sampler = batch_sampler or dataset.batches(batch_size or 0)
-        self._sources = {n: source for n, source in enumerate(dataset.synthetic) if isinstance(source, Generated)}
+        self._sources = {
+            n: source for n, source in enumerate(dataset.synthetic) if isinstance(source, Generated)
+        }
         others = _Others(dataset, self._sources)
-        self._loader = DataLoader(others, batch_sampler=self.batch_sampler, collate_fn=list, **options)
+        self._loader = DataLoader(
+            others, batch_sampler=self.batch_sampler, collate_fn=list, **options
+        )
         self._streams: dict[torch.device, torch.cuda.Stream] = {}
 
     def __len__(self) -> int:
@@ -90,17 +100,25 @@ class BatchMixer:
     def _batch(self, places: Sequence[Place]) -> Any:
         scans: dict[tuple[int, int], Scan] = {}
         for number, source in self._sources.items():
-            indices = list(dict.fromkeys(p.missing[1] for p in places if p.missing and p.missing[0] == number))
+            indices = list(
+                dict.fromkeys(p.missing[1] for p in places if p.missing and p.missing[0] == number)
+            )
             if indices:
                 with self._stream(source.generator.device):
                     made = source.scans(indices)
                 scans |= {(number, index): scan for index, scan in zip(indices, made, strict=True)}
         return self.dataset.collate(
-            [self.dataset.finish(scans[p.missing], p.epoch, p.position) if p.missing else p.sample for p in places]
+            [
+                self.dataset.finish(scans[p.missing], p.epoch, p.position)
+                if p.missing
+                else p.sample
+                for p in places
+            ]
         )
 
     def _stream(self, device: torch.device) -> AbstractContextManager[Any]:
-        """The CUDA stream on which scans are made, so that they do not queue behind the trainer's work."""
+        """The CUDA stream on which scans are made, so that they do not queue behind the trainer's
+        work."""
         if device.type != "cuda":
             return nullcontext()
         if device not in self._streams:
@@ -114,7 +132,9 @@ class _Others(Dataset[Place]):
 
     def __init__(self, dataset: MixedScans, missing: Collection[int]) -> None:
         # Workers get no network: one on a GPU could not be sent to them.
-        sources: list[Any] = [None if n in missing else source for n, source in enumerate(dataset.synthetic)]
+        sources: list[Any] = [
+            None if n in missing else source for n, source in enumerate(dataset.synthetic)
+        ]
         self._dataset = copy(dataset)
         self._dataset.synthetic = tuple(sources)
 

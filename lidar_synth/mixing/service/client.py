@@ -1,6 +1,8 @@
-"""The client of the generator process: it starts the process, sends requests, waits for answers and ends it.
+"""The client of the generator process: it starts the process, sends requests, waits for answers and
+ends it.
 
-Every wait ends: with an answer, with a closed connection because the process died, or with the timeout.
+Every wait ends: with an answer, with a closed connection because the process died, or with the
+    timeout.
 """
 
 import os
@@ -35,13 +37,19 @@ class Client:
 
     def __init__(self, plan: GeneratorJob, slots: Slots, timeout: float) -> None:
         if current_process().daemon:
-            raise ConfigError("a rolling bank made inside a worker process", "one that is made before the workers are")
+            raise ConfigError(
+                "a rolling bank made inside a worker process",
+                "one that is made before the workers are",
+            )
         self.timeout = timeout
-        self._slots, self._secret = slots, plan.secret
+        self._slots = slots
+        self._secret = plan.secret
         self._connections: dict[tuple[int, int], Connection] = {}  # by process and thread
         context = get_context("spawn")
         started, end = context.Pipe(duplex=False)
-        self._process = context.Process(target=run, args=(plan, slots, end), name="lidar-synth", daemon=True)
+        self._process = context.Process(
+            target=run, args=(plan, slots, end), name="lidar-synth", daemon=True
+        )
         self._process.start()
         end.close()
         self._owner, self.pid = os.getpid(), self._process.pid or 0
@@ -68,7 +76,9 @@ class Client:
             self.tell(*request)
             line = self._line()
             if not line.poll(self.timeout):
-                raise self._late(f"answered (scan {request[1]})" if request[0] == GET else "answered")
+                raise self._late(
+                    f"answered (scan {request[1]})" if request[0] == GET else "answered"
+                )
             answer = receive(line)
             answered = True
             return answer
@@ -90,10 +100,13 @@ class Client:
 
     def __getstate__(self) -> dict[str, Any]:
         assert_spawning(self)  # in any other pickle the slots would be a copy that no process fills
-        return {k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")} | {"_connections": {}}
+        return {k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")} | {
+            "_connections": {}
+        }
 
     def _line(self) -> Connection:
-        """This thread's own connection; a forked process must not use the ones inherited from its parent."""
+        """This thread's own connection; a forked process must not use the ones inherited from its
+        parent."""
         if _here() not in self._connections:
             if os.getpid() == self._owner and not self._end.alive:
                 raise ConfigError("a rolling bank that is closed", "an open one")
@@ -108,7 +121,10 @@ class Client:
         if os.getpid() == self._owner:
             self._process.join(1)
             code = f", exit code {self._process.exitcode}"
-        words = self._slots.last_words or "no message: killed, out of memory, or closed by the main process"
+        words = (
+            self._slots.last_words
+            or "no message: killed, out of memory, or closed by the main process"
+        )
         return ProcessError(
             f"the generator process of the rolling bank died (process {self.pid}{code}; {words})",
             "a process that lives as long as training",
@@ -118,10 +134,12 @@ class Client:
     def _late(self, what: str) -> ProcessError:
         made = self._slots.counters[0]
         return ProcessError(
-            f"the generator process of the rolling bank (process {self.pid}, {made} scans made so far) has not {what} "
+            f"the generator process of the rolling bank (process {self.pid}, {made} scans made so "
+            f"far) has not {what} "
             f"within {self.timeout:g} s",
             "a model that is fast enough",
-            "Increase timeout=, use a faster device or fewer steps, or reuse scans in memory: starved='reuse'.",
+            "Increase timeout=, use a faster device or fewer steps, or reuse scans in memory: "
+            "starved='reuse'.",
         )
 
 

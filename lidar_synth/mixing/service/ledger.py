@@ -1,7 +1,8 @@
-"""The bookkeeping of a rolling bank: which scan is in which slot, how many readers copy it, and which is made next.
+"""The bookkeeping of a rolling bank: which scan is in which slot, how many readers copy it, and
+which is made next.
 
-The generator process keeps the ledger; this module does not depend on processes or models. Scans for which a reader
-waits are made first, then those that the outlook predicts.
+The generator process keeps the ledger; this module does not depend on processes or models. Scans
+for which a reader waits are made first, then those that the outlook predicts.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,13 +13,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.mixing.service.outlook import NEVER, KnownOrder, Outlook, RotatingPool, SequentialPrefetch
+from lidar_synth.mixing.service.outlook import (
+    NEVER,
+    KnownOrder,
+    Outlook,
+    RotatingPool,
+    SequentialPrefetch,
+)
 
 Starved = Literal["wait", "reuse"]
-"""What happens to a request whose scan is not ready: it waits, or gets the scan in memory that was served least."""
+"""What happens to a request whose scan is not ready: it waits, or gets the scan in memory that was
+served least."""
 
 COUNTERS = ("made", "served", "waited", "reused")
-"""Number of scans made, of requests answered, of requests that waited, and of requests that got another scan."""
+"""Number of scans made, of requests answered, of requests that waited, and of requests that got
+another scan."""
 _MADE, _SERVED, _WAITED, _REUSED = range(4)
 
 
@@ -50,16 +59,23 @@ class Ledger:
         slots: number of slots.
         counters: (4,) int64, the values of ``COUNTERS``, updated in place.
         starved: see ``Starved``.
-        replaced: number of scans that an epoch replaces in a pool made of the other slots; 0 = no pool.
+        replaced: number of scans that an epoch replaces in a pool made of the other slots; 0 = no
+            pool.
     """
 
-    def __init__(self, slots: int, counters: NDArray[np.int64], starved: Starved = "wait", replaced: int = 0) -> None:
+    def __init__(
+        self, slots: int, counters: NDArray[np.int64], starved: Starved = "wait", replaced: int = 0
+    ) -> None:
         empty = [Slot(place, -1 - place) for place in range(slots)]
-        self._slots = {slot.number: slot for slot in empty}  # by scan number, in the order in which they were claimed
+        self._slots = {
+            slot.number: slot for slot in empty
+        }  # by scan number, in the order in which they were claimed
         self._counters = counters
         self._starved = starved
         self._awaited: list[int] = []  # numbers of scans for which readers wait
-        self._outlook: Outlook = RotatingPool(slots - replaced, replaced) if replaced else SequentialPrefetch(slots)
+        self._outlook: Outlook = (
+            RotatingPool(slots - replaced, replaced) if replaced else SequentialPrefetch(slots)
+        )
         lock = Lock()
         self._work = Condition(lock)  # a scan may have to be made
         self._made = Condition(lock)  # a scan has become readable
@@ -108,7 +124,8 @@ class Ledger:
     def publish(self, slot: Slot, checksum: int) -> None:
         """Mark a slot as written."""
         with self._work:
-            slot.checksum, slot.ready = checksum, True
+            slot.checksum = checksum
+            slot.ready = True
             self._counters[_MADE] += 1
             self._made.notify_all()
 
@@ -144,7 +161,9 @@ class Ledger:
             if wanted is None or slot is None:
                 return
             del self._slots[slot.number]
-            slot.number, slot.served, slot.ready = wanted[1], 0, False
+            slot.number = wanted[1]
+            slot.served = 0
+            slot.ready = False
             self._slots[slot.number] = slot
             yield slot
 
@@ -152,7 +171,14 @@ class Ledger:
         return self._outlook.next_use(slot.number, slot.served) if slot.number >= 0 else NEVER
 
     def _room(self, use: float) -> Slot | None:
-        """The slot to overwrite for a scan with this use: the oldest that is not needed, or the one needed last."""
-        idle = [s for s in self._slots.values() if s.ready and not s.lent and s.number not in self._awaited]
-        last = next((s for s in idle if self._use(s) == NEVER), None) or max(idle, key=self._use, default=None)
+        """The slot to overwrite for a scan with this use: the oldest that is not needed, or the one
+        needed last."""
+        idle = [
+            s
+            for s in self._slots.values()
+            if s.ready and not s.lent and s.number not in self._awaited
+        ]
+        last = next((s for s in idle if self._use(s) == NEVER), None) or max(
+            idle, key=self._use, default=None
+        )
         return last if last and self._use(last) > use else None

@@ -1,6 +1,8 @@
-"""Outlooks predict which scans will be requested next, and which slots of a rolling bank may be overwritten.
+"""Outlooks predict which scans will be requested next, and which slots of a rolling bank may be
+overwritten.
 
-An outlook assigns every scan a *use*: the position of its next request, or ``NEVER``. The scan with the nearest use is
+An outlook assigns every scan a *use*: the position of its next request, or ``NEVER``. The scan with
+    the nearest use is
 made first, and the scan with the farthest use is overwritten (Belady's rule, which is optimal).
 """
 
@@ -20,7 +22,8 @@ class Outlook(Protocol):
         ...
 
     def upcoming(self, held: Container[int]) -> tuple[float, int] | None:
-        """The use and number of the next scan that is not held in memory; None if no further request is known."""
+        """The use and number of the next scan that is not held in memory; None if no further
+        request is known."""
         ...
 
     def next_use(self, number: int, served: int) -> float:
@@ -29,10 +32,12 @@ class Outlook(Protocol):
 
 
 class SequentialPrefetch:
-    """Predicts 0, 1, 2, ..., or consecutive numbers from the latest request on, when no order was announced.
+    """Predicts 0, 1, 2, ..., or consecutive numbers from the latest request on, when no order was
+    announced.
 
     Args:
-        window: maximum distance of requests that come out of order; older scans are not expected to be requested.
+        window: maximum distance of requests that come out of order; older scans are not expected to
+            be requested.
     """
 
     def __init__(self, window: int) -> None:
@@ -63,7 +68,8 @@ class KnownOrder:
     """
 
     def __init__(self, numbers: Sequence[int], window: int) -> None:
-        self._numbers, self._window = numbers, window
+        self._numbers = numbers
+        self._window = window
         self._uses: dict[int, deque[int]] = defaultdict(deque)
         for place, number in enumerate(numbers):
             self._uses[number].append(place)
@@ -93,7 +99,8 @@ class KnownOrder:
 
 
 class RotatingPool:
-    """A pool of scans that serves all requests of an epoch; each new epoch replaces the oldest scans.
+    """A pool of scans that serves all requests of an epoch; each new epoch replaces the oldest
+    scans.
 
     Args:
         size: number of scans in the pool.
@@ -101,7 +108,8 @@ class RotatingPool:
     """
 
     def __init__(self, size: int, replaced: int) -> None:
-        self._size, self._replaced = size, replaced
+        self._size = size
+        self._replaced = replaced
         self.set_epoch(0)
 
     def set_epoch(self, epoch: int) -> None:

@@ -1,8 +1,8 @@
 """The generator process: it owns the model, fills the slots and answers the readers.
 
-One thread makes scans, one thread answers each reader, and one ends the process when its parent has ended in any way.
-A message is a few int64 numbers, so that nothing is ever unpickled, and a reader that dies in the middle of a message
-leaves only a closed connection behind.
+One thread makes scans, one thread answers each reader, and one ends the process when its parent has
+ended in any way. A message is a few int64 numbers, so that nothing is ever unpickled, and a reader
+that dies in the middle of a message leaves only a closed connection behind.
 """
 
 import hmac
@@ -30,10 +30,11 @@ from lidar_synth.mixing.service.ledger import Ledger, Slot, Starved
 from lidar_synth.mixing.service.slots import Slots
 
 GET, GIVE_BACK, SET_EPOCH, EXPECT = range(4)
-"""The first number of a request. The others are the scan's number (``GET``), none (``GIVE_BACK``), the epoch
-(``SET_EPOCH``), or whether this is the last part, followed by the numbers (``EXPECT``).
+"""The first number of a request. The others are the scan's number (``GET``), none (``GIVE_BACK``),
+the epoch (``SET_EPOCH``), or whether this is the last part, followed by the numbers (``EXPECT``).
 
-The answer to ``GET`` is (slot, number, checksum); ``GIVE_BACK`` has no answer; the others are answered by 0.
+The answer to ``GET`` is (slot, number, checksum); ``GIVE_BACK`` has no answer; the others are
+answered by 0.
 """
 
 WATCH = 0.5
@@ -83,7 +84,9 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
         slots: the shared memory to fill.
         started: the pipe to which the address is sent once the model is loaded.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; the parent ends us
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C goes to all processes of a terminal; the parent ends us
     Thread(target=_watch_parent, daemon=True).start()
     try:
         if plan.threads:
@@ -104,14 +107,17 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
         os._exit(1)  # at once, so that no reader waits for an answer
 
 
-def _make(generator: Generator, plan: GeneratorJob, claimed: Sequence[Slot], slots: Slots, ledger: Ledger) -> None:
+def _make(
+    generator: Generator, plan: GeneratorJob, claimed: Sequence[Slot], slots: Slots, ledger: Ledger
+) -> None:
     images = generator.range_images(plan.seed, [slot.number for slot in claimed], **plan.sampling)
     for slot, image in zip(claimed, images, strict=True):
         ledger.publish(slot, slots.write(slot.place, slot.number, image))
 
 
 def _watch_parent() -> None:
-    """End this process with its parent. Its pipe does not show this, because forked workers hold the other end too."""
+    """End this process with its parent. Its pipe does not show this, because forked workers hold
+    the other end too."""
     parent = parent_process()
     assert parent is not None, "a generator process without a parent"
     number = parent.pid if os.name == "posix" else os.getppid()

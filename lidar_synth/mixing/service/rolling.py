@@ -1,8 +1,9 @@
-"""A rolling bank: a process of its own makes scans ahead of demand, and every reader copies them from shared memory.
+"""A rolling bank: a process of its own makes scans ahead of demand, and every reader copies them
+from shared memory.
 
-DataLoader workers cannot use a GPU, and a model in each of them would take too much memory. Here one spawned process
-owns the model and keeps the scans that are needed next in shared memory. Under distributed training every rank makes
-its own bank, on its own device::
+DataLoader workers cannot use a GPU, and a model in each of them would take too much memory. Here
+one spawned process owns the model and keeps the scans that are needed next in shared memory. Under
+distributed training every rank makes its own bank, on its own device::
 
     synth = RollingBank("town", device=f"cuda:{local_rank}", seed=0)
     train = MixedScans(real, synth, ratio=0.25)
@@ -28,30 +29,36 @@ from lidar_synth.mixing.service.ledger import COUNTERS, Starved
 from lidar_synth.mixing.service.process import EXPECT, GET, GIVE_BACK, SET_EPOCH, GeneratorJob
 from lidar_synth.mixing.service.slots import Slots
 
-_PART = 8192  # numbers in one message: fewer than fit into a socket's buffer, so that sending never blocks
+# numbers in one message: fewer than fit into a socket's buffer, so that sending never blocks
+_PART = 8192
 
 
 class RollingBank:
     """Scans by number from a generator process.
 
-    Scan ``number`` is ``generator.scans(seed, [number])`` after a bank's encoding, for any process and any order of
-    access. Two settings trade this for speed: ``starved="reuse"``, and ``refresh``, with which the scan is a function
+    Scan ``number`` is ``generator.scans(seed, [number])`` after a bank's encoding, for any process
+    and any order of
+    access. Two settings trade this for speed: ``starved="reuse"``, and ``refresh``, with which the
+        scan is a function
     of number and epoch.
 
-    Workers inherit the bank when they start, forked or spawned. The generator process ends with ``close()``, at the
-    end of a ``with`` block, or with the process that made the bank; in each case its shared memory is freed.
+    Workers inherit the bank when they start, forked or spawned. The generator process ends with
+    ``close()``, at the end of a ``with`` block, or with the process that made the bank; in each
+    case its shared memory is freed.
 
     Args:
-        model: the name of a shipped model or the path of a checkpoint; the model must be unconditional.
+        model: the name of a shipped model or the path of a checkpoint; the model must be
+            unconditional.
         seed: of the scans, 0 <= seed < 2^64.
-        slots: number of scans in shared memory, 3 to 5 bytes per cell each. It should exceed what all workers request
-            in advance: workers x ``prefetch_factor`` x batch size x ratio. A scan that comes again in the next epoch
-            (the plan's ``reuse``) is kept until then if there is room for an epoch's scans, and made again otherwise.
-        starved: what happens on a request for a scan that is not ready: ``"wait"`` for it, or ``"reuse"`` the scan in
-            memory that was served least often.
-        refresh: share in (0, 1]; None = off. The bank keeps a pool of scans and replaces this share of it with each
-            epoch; request n gets the scan of the pool whose number is n modulo its size. The next epoch's scans have
-            slots of their own.
+        slots: number of scans in shared memory, 3 to 5 bytes per cell each. It should exceed what
+            all workers request in advance: workers x ``prefetch_factor`` x batch size x ratio. A
+            scan that comes again in the next epoch (the plan's ``reuse``) is kept until then if
+            there is room for an epoch's scans, and made again otherwise.
+        starved: what happens on a request for a scan that is not ready: ``"wait"`` for it, or
+            ``"reuse"`` the scan in memory that was served least often.
+        refresh: share in (0, 1]; None = off. The bank keeps a pool of scans and replaces this share
+            of it with each epoch; request n gets the scan of the pool whose number is n modulo its
+            size. The next epoch's scans have slots of their own.
         timeout: maximum seconds of any wait, be it for the model to load or for one scan.
         threads: of torch in the generator process; None = torch's default.
         steps, solver: as for ``Generator.range_images``.
@@ -96,17 +103,23 @@ class RollingBank:
         path = find_model(model)
         header, checksum = read_header(path)
         if header.conditioning:
-            raise ConfigError(f"a rolling bank of {path}, a conditional model", "an unconditional model")
+            raise ConfigError(
+                f"a rolling bank of {path}, a conditional model", "an unconditional model"
+            )
         channels = set(header.channels) | ({"confidence"} if "label" in header.channels else set())
         replaced = max(1, round(refresh * slots)) if refresh else 0
         self.sensor = header.sensor
         self.fields = frozenset(channels - {"range"} | {"reflectance"})
         dtype = str(options.get("dtype", "torch.float32"))
         precision = "" if dtype.endswith("float32") else f":{dtype}"
-        self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
+        self.identity = (
+            f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
+        )
         self._name = f"{path.stem}/{seed}"
         self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
-        plan = GeneratorJob(path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver})
+        plan = GeneratorJob(
+            path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver}
+        )
         self._client = Client(plan, self._slots, timeout)
 
     @property
@@ -123,14 +136,19 @@ class RollingBank:
             DataError: if the scan's bytes in shared memory are not those that were written.
         """
         served, arrays = self.read(number)
-        return replace(unproject(self._slots.encoding.decode(arrays)), id=f"{self._name}/{served}", domain=SYNTHETIC)
+        return replace(
+            unproject(self._slots.encoding.decode(arrays)),
+            id=f"{self._name}/{served}",
+            domain=SYNTHETIC,
+        )
 
     def image(self, number: int) -> RangeImage:
         """The range image of the scan at ``number``; raises as ``bank[number]``."""
         return self._slots.encoding.decode(self.read(number)[1])
 
     def read(self, number: int) -> tuple[int, dict[str, NDArray[Any]]]:
-        """The number of the scan that serves a request, and its encoded arrays; raises as ``bank[number]``."""
+        """The number of the scan that serves a request, and its encoded arrays; raises as
+        ``bank[number]``."""
         if not 0 <= number < 2**63:
             raise ConfigError(f"scan {number}", "0 <= number < 2^63")
         slot, served, checksum = self._client.ask(GET, int(number))
@@ -141,10 +159,12 @@ class RollingBank:
                 self._client.tell(GIVE_BACK)
 
     def expect(self, numbers: Sequence[int]) -> None:
-        """Announce the scans that this process and its workers will request next, in order, if not 0, 1, 2, ...
+        """Announce the scans that this process and its workers will request next, in order, if not
+        0, 1, 2, ...
 
-        ``MixedScans`` calls this. Under distributed training a rank requests only its share, and its bank makes only
-        these scans. Without a call, the bank counts up from the highest number that was requested.
+        ``MixedScans`` calls this. Under distributed training a rank requests only its share, and
+        its bank makes only these scans. Without a call, the bank counts up from the highest number
+        that was requested.
         """
         for start in range(0, max(len(numbers), 1), _PART):
             part = map(int, numbers[start : start + _PART])
@@ -155,7 +175,8 @@ class RollingBank:
         self._client.ask(SET_EPOCH, epoch)
 
     def counts(self) -> dict[str, int]:
-        """The numbers of scans made and served so far, and of requests that waited or were served another scan."""
+        """The numbers of scans made and served so far, and of requests that waited or were served
+        another scan."""
         return dict(zip(COUNTERS, self._slots.counters.tolist(), strict=True))
 
     def close(self) -> None:
@@ -171,7 +192,9 @@ class RollingBank:
 
 def _check(slots: int, seed: int, starved: str, refresh: float | None, timeout: float) -> None:
     if slots < 1 or timeout <= 0:
-        raise ConfigError(f"slots={slots}, timeout={timeout}", "at least 1 slot, and more than 0 seconds")
+        raise ConfigError(
+            f"slots={slots}, timeout={timeout}", "at least 1 slot, and more than 0 seconds"
+        )
     if not 0 <= seed < 2**64:
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
     if starved not in get_args(Starved):

@@ -1,8 +1,8 @@
 """Shared memory with encoded scans, which the generator process writes and the readers copy.
 
-It is one block without a file. On Linux and Windows it has no name either, so that the kernel frees it when the last
-process that maps it ends in any way; elsewhere torch's own manager frees it. Besides the scans it holds the counters
-and the last words of the process that fills it.
+It is one block without a file. On Linux and Windows it has no name either, so that the kernel frees
+it when the last process that maps it ends in any way; elsewhere torch's own manager frees it.
+Besides the scans it holds the counters and the last words of the process that fills it.
 """
 
 import math
@@ -36,16 +36,20 @@ class Slots:
         self.encoding = encoding
         self.count = count
         self._layout = encoding.arrays()
-        self._size = sum(math.prod(shape) * dtype.itemsize for shape, dtype in self._layout.values())
+        self._size = sum(
+            math.prod(shape) * dtype.itemsize for shape, dtype in self._layout.values()
+        )
         head = 8 * len(COUNTERS) + _WORDS
         try:
             memory = torch.zeros(head + count * self._size, dtype=torch.uint8)
             self._memory = memory.share_memory_()  # type: ignore[no-untyped-call]
         except RuntimeError as error:
             raise ConfigError(
-                f"a rolling bank of {count} slots, {count * self._size / 1e6:.0f} MB of shared memory ({error})",
+                f"a rolling bank of {count} slots, {count * self._size / 1e6:.0f} MB of shared "
+                f"memory ({error})",
                 "no more than is free",
-                "Use fewer slots, or a container with more shared memory: docker run --shm-size=1g.",
+                "Use fewer slots, or a container with more shared memory: docker run "
+                "--shm-size=1g.",
             ) from error
 
     @property
@@ -77,7 +81,10 @@ class Slots:
         """
         copy = self._slot(slot).copy()
         if _checksum(copy, number) != checksum:
-            raise DataError(f"scan {number} in slot {slot} of the rolling bank is damaged", f"checksum {checksum:08x}")
+            raise DataError(
+                f"scan {number} in slot {slot} of the rolling bank is damaged",
+                f"checksum {checksum:08x}",
+            )
         return self._arrays(copy)
 
     def _part(self, start: int, size: int) -> NDArray[np.uint8]:
@@ -92,7 +99,8 @@ class Slots:
 
     def _arrays(self, place: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """The scan's arrays in the bytes of one slot."""
-        arrays, start = {}, 0
+        arrays = {}
+        start = 0
         for name, (shape, dtype) in self._layout.items():
             size = math.prod(shape) * dtype.itemsize
             arrays[name] = place[start : start + size].view(dtype).reshape(shape)
@@ -101,5 +109,6 @@ class Slots:
 
 
 def _checksum(content: NDArray[np.uint8], number: int) -> int:
-    """CRC-32 of a slot's bytes and of the scan's number, so that a scan in a wrong slot is noticed as well."""
+    """CRC-32 of a slot's bytes and of the scan's number, so that a scan in a wrong slot is noticed
+    as well."""
     return zlib.crc32(content.data, zlib.crc32(number.to_bytes(8, "little")))

@@ -1,10 +1,12 @@
-"""torchvision from the package index beside a torch without CUDA, with which its compiled operators cannot load."""
+"""torchvision from the package index beside a torch without CUDA, with which its compiled operators
+cannot load."""
 
 import torch
 
 
 def import_torchvision() -> None:
-    """Import torchvision; declare the operators that its import needs, if they could not be loaded."""
+    """Import torchvision; declare the operators that its import needs, if they could not be
+    loaded."""
     try:
         import torchvision
     except RuntimeError:

@@ -1,11 +1,13 @@
-"""Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short configurations.
+"""Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short
+configurations.
 
     python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --nuscenes NUSCENES
         [--frame NUSCENES_FRAME]
 
-Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in OUT. KITTI is mixed
-with generated scans of its own layouts, which have boxes, the other datasets with scans of the town. ``--frame`` names
-a folder of one real nuScenes key frame with the trainer's ``info.json``.
+Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in
+OUT. KITTI is mixed with generated scans of its own layouts, which have boxes, the other datasets
+with scans of the town. ``--frame`` names a folder of one real nuScenes key frame with the trainer's
+``info.json``.
 """
 
 import argparse
@@ -45,30 +47,42 @@ def kitti(out: Path, scans: int) -> None:
     settings = MIX | {"synthetic": layouts(out / "layouts", scans, root), "labels": "boxes"}
     write_infos(out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", settings, **where)
     objects = ObjectBank.from_scans(open_scans(town(out / "synthetic", scans, "town")))
-    write_gt_database(objects, root, origin="bottom", folder="kitti_gt_database", infos="kitti_dbinfos_train.pkl")
+    write_gt_database(
+        objects, root, origin="bottom", folder="kitti_gt_database", infos="kitti_dbinfos_train.pkl"
+    )
 
 
 def nuscenes(out: Path, scans: int, frame: Path | None) -> None:
-    """The lists of ``data/nuscenes`` with one more real key frame, the mixed one, and the database of objects."""
+    """The lists of ``data/nuscenes`` with one more real key frame, the mixed one, and the database
+    of objects."""
     root = out / "data" / "nuscenes"
     for split in ("train", "val"):
         nuscenes_list(root, root / f"nuscenes_infos_{split}.pkl", split, "v1.0-mini")
     listed = root / "nuscenes_infos_train.pkl"
     if frame is not None:
-        listed = with_frame(nuscenes_list(root, root / "town.json", "train", "v1.0-mini"), frame, root)
+        listed = with_frame(
+            nuscenes_list(root, root / "town.json", "train", "v1.0-mini"), frame, root
+        )
     made = town(out / "synthetic32", scans, "hdl32e_nuscenes")
     where = {"data_root": root, "points": "samples/LIDAR_TOP", "sweeps": "sweeps/LIDAR_TOP"}
-    write_infos(out / "data" / "nuscenes_mixed", listed, MIX | {"synthetic": made}, balance=True, **where)
+    write_infos(
+        out / "data" / "nuscenes_mixed", listed, MIX | {"synthetic": made}, balance=True, **where
+    )
     objects = ObjectBank.from_scans(open_scans(made))
     write_gt_database(
-        objects, root, origin="bottom", folder="nuscenes_gt_database", infos="nuscenes_dbinfos_train.pkl",
+        objects,
+        root,
+        origin="bottom",
+        folder="nuscenes_gt_database",
+        infos="nuscenes_dbinfos_train.pkl",
         layout="nuscenes",
-    )  # fmt: skip
+    )
 
 
 def with_frame(listed: Path, frame: Path, root: Path) -> Path:
     """Add a real key frame to a list, and its scan to the dataset."""
-    content, real = json.loads(listed.read_text()), json.loads((frame / "info.json").read_text())
+    content = json.loads(listed.read_text())
+    real = json.loads((frame / "info.json").read_text())
     content["data_list"] += real["data_list"]
     listed.write_text(json.dumps(content))
     for path in (frame / "samples" / "LIDAR_TOP").iterdir():
@@ -86,18 +100,34 @@ def town(out: Path, scans: int, sensor: str) -> Path:
 def layouts(out: Path, scans: int, kitti: Path) -> Path:
     """A bank of generated scans with boxes, those of KITTI's scans."""
     if not out.is_dir():
-        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--model", "town-layout", "--count", str(scans)]
-        subprocess.run([*bake, "--condition", kitti, "--condition-layout", "kitti_object"], check=True)
+        bake = [
+            sys.executable,
+            "-m",
+            "lidar_synth",
+            "bake",
+            out,
+            "--model",
+            "town-layout",
+            "--count",
+            str(scans),
+        ]
+        subprocess.run(
+            [*bake, "--condition", kitti, "--condition-layout", "kitti_object"], check=True
+        )
     return out
 
 
-def shorten(name: str, out: Path, iterations: int = 4, batch_size: int = 1, extra: Iterable[str] = ()) -> Path:
-    """Write a configuration of ours with few iterations, small batches and one worker; the network is the stock one.
+def shorten(
+    name: str, out: Path, iterations: int = 4, batch_size: int = 1, extra: Iterable[str] = ()
+) -> Path:
+    """Write a configuration of ours with few iterations, small batches and one worker; the network
+    is the stock one.
 
     Args:
         name: the file in ``configs/mmdet3d``.
         out: output folder.
-        iterations: of training; a checkpoint is written in the middle and at the end, where validation follows.
+        iterations: of training; a checkpoint is written in the middle and at the end, where
+            validation follows.
         batch_size: of training.
         extra: further modules to import.
     """
@@ -108,12 +138,20 @@ def shorten(name: str, out: Path, iterations: int = 4, batch_size: int = 1, extr
     for step in dataset.pipeline:
         if step.type == "ObjectSample":
             few_objects(step.db_sampler)
-    config.train_cfg = {"type": "IterBasedTrainLoop", "max_iters": iterations, "val_interval": iterations}
+    config.train_cfg = {
+        "type": "IterBasedTrainLoop",
+        "max_iters": iterations,
+        "val_interval": iterations,
+    }
     config.param_scheduler = []
     if config.optim_wrapper.type == "AmpOptimWrapper":  # mixed precision is a GPU's
         config.optim_wrapper = {"type": "OptimWrapper", "optimizer": config.optim_wrapper.optimizer}
     config.default_hooks.logger = {"type": "LoggerHook", "interval": 1}
-    config.default_hooks.checkpoint = {"type": "CheckpointHook", "interval": iterations // 2, "by_epoch": False}
+    config.default_hooks.checkpoint = {
+        "type": "CheckpointHook",
+        "interval": iterations // 2,
+        "by_epoch": False,
+    }
     config.log_processor = {"type": "LogProcessor", "window_size": 1, "by_epoch": False}
     if "mmdet3d_report" in extra:
         config.custom_hooks = [*config.custom_hooks, {"type": "Report"}]
@@ -125,19 +163,25 @@ def shorten(name: str, out: Path, iterations: int = 4, batch_size: int = 1, extr
 
 
 def few_objects(sampler: Any) -> None:
-    """Restrict a database sampler to cars, which every street has; the stock one stops at a class without objects."""
+    """Restrict a database sampler to cars, which every street has; the stock one stops at a class
+    without objects."""
     kept = [name for name in sampler.classes if name in ("Car", "car")]
-    sampler.classes, sampler.sample_groups = kept, dict.fromkeys(kept, 2)
+    sampler.classes = kept
+    sampler.sample_groups = dict.fromkeys(kept, 2)
     sampler.prepare = {"filter_by_difficulty": [], "filter_by_min_points": dict.fromkeys(kept, 5)}
 
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--kitti", type=Path)
     parser.add_argument("--nuscenes", type=Path)
-    parser.add_argument("--frame", type=Path, help="a real nuScenes key frame: info.json and samples/LIDAR_TOP")
+    parser.add_argument(
+        "--frame", type=Path, help="a real nuScenes key frame: info.json and samples/LIDAR_TOP"
+    )
     parser.add_argument("--scans", type=int, default=4, help="number of synthetic scans")
     parser.add_argument("--configs", nargs="*", default=[], help="configurations to shorten")
     options = parser.parse_args()

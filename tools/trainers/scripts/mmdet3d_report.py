@@ -1,6 +1,8 @@
-"""Prints the scans of each training step: ``samples 3: town-2-000001 000000.bin``, by their ids or their files.
+"""Prints the scans of each training step: ``samples 3: town-2-000001 000000.bin``, by their ids or
+their files.
 
-Imported by a configuration: ``custom_imports = dict(imports=["mmdet3d_report", ...])``, with the hook ``Report``.
+Imported by a configuration: ``custom_imports = dict(imports=["mmdet3d_report", ...])``, with the
+    hook ``Report``.
 """
 
 from pathlib import Path
@@ -31,6 +33,12 @@ Fetch.__call__ = read_named  # type: ignore[method-assign]
 class Report(Hook):  # type: ignore[misc]
     """Prints each step's scans."""
 
-    def after_train_iter(self, runner: Any, batch_idx: int, data_batch: Any = None, outputs: Any = None) -> None:
+    def after_train_iter(
+        self, runner: Any, batch_idx: int, data_batch: Any = None, outputs: Any = None
+    ) -> None:
         """Print them."""
-        print(f"samples {runner.iter + 1}:", *(sample.scan for sample in data_batch["data_samples"]), flush=True)
+        print(
+            f"samples {runner.iter + 1}:",
+            *(sample.scan for sample in data_batch["data_samples"]),
+            flush=True,
+        )

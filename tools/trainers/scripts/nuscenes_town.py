@@ -1,8 +1,10 @@
-"""Write streets of the town as a nuScenes dataset: key frames, the sweeps between them, and the tables.
+"""Write streets of the town as a nuScenes dataset: key frames, the sweeps between them, and the
+tables.
 
     python tools/trainers/scripts/nuscenes_town.py OUT [--seed 0]
 
-Version v1.0-mini with two scenes, one for training and one for validation. A scene is a second with two key frames,
+Version v1.0-mini with two scenes, one for training and one for validation. A scene is a second with
+two key frames,
 as the LiDAR alone sees it: no cameras, and an empty map.
 """
 
@@ -75,10 +77,14 @@ def write_dataset(out: Path, seed: int) -> None:
     for category, attribute in CATEGORIES.values():
         tables.add("category", category, name=category, description="")
         tables.add("attribute", attribute, name=attribute, description="")
-    town = Town(seed=seed, sensor="hdl32e_nuscenes", scans=STRETCH_FRAMES * len(SCENES), interval=INTERVAL)
+    town = Town(
+        seed=seed, sensor="hdl32e_nuscenes", scans=STRETCH_FRAMES * len(SCENES), interval=INTERVAL
+    )
     # The devkit asks for a map of each log.
     tables.add("log", "log", logfile="", vehicle="", date_captured="", location="")
-    tables.add("map", "map", category="semantic_prior", filename="maps/empty.png", log_tokens=["log"])
+    tables.add(
+        "map", "map", category="semantic_prior", filename="maps/empty.png", log_tokens=["log"]
+    )
     (out / "maps").mkdir(parents=True, exist_ok=True)
     Image.new("L", (8, 8)).save(out / "maps" / "empty.png")
     for number, name in enumerate(SCENES):
@@ -88,9 +94,12 @@ def write_dataset(out: Path, seed: int) -> None:
 
 def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -> None:
     """Write the sweeps of a scene, and its rows."""
-    frames, samples, tracks = [], [], dict[int, list[dict[str, Any]]]()
+    frames = []
+    samples = []
+    tracks = dict[int, list[dict[str, Any]]]()
     for frame in range(STRETCH_FRAMES):
-        scan, stamp = town[number * STRETCH_FRAMES + frame], int(1e6 * (START + 100 * number + INTERVAL * frame))
+        scan = town[number * STRETCH_FRAMES + frame]
+        stamp = int(1e6 * (START + 100 * number + INTERVAL * frame))
         key = frame in KEYS
         sample = f"{name}-{KEYS[0] if frame <= KEYS[0] else KEYS[1]}"
         if key:
@@ -98,32 +107,60 @@ def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -
             annotate(tables, scan, sample, tracks, name)
         token = f"{name}-{frame:02d}"
         file = f"{'samples' if key else 'sweeps'}/LIDAR_TOP/{name}__LIDAR_TOP__{stamp}.pcd.bin"
-        frames.append(tables.add(
-            "sample_data", token, sample_token=sample, ego_pose_token=token, calibrated_sensor_token="mount",
-            timestamp=stamp, fileformat="pcd", is_key_frame=key, height=0, width=0, filename=file,
-        ))  # fmt: skip
+        frames.append(
+            tables.add(
+                "sample_data",
+                token,
+                sample_token=sample,
+                ego_pose_token=token,
+                calibrated_sensor_token="mount",
+                timestamp=stamp,
+                fileformat="pcd",
+                is_key_frame=key,
+                height=0,
+                width=0,
+                filename=file,
+            )
+        )
         vehicle = in_world(scan)
         vehicle[:3, 3] -= HEIGHT * vehicle[:3, 2]
         rotation = Quaternion(matrix=vehicle[:3, :3]).elements.tolist()
-        tables.add("ego_pose", token, timestamp=stamp, rotation=rotation, translation=vehicle[:3, 3].tolist())
+        tables.add(
+            "ego_pose",
+            token,
+            timestamp=stamp,
+            rotation=rotation,
+            translation=vehicle[:3, 3].tolist(),
+        )
         (out / file).parent.mkdir(parents=True, exist_ok=True)
         (out / file).write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
     for rows in (frames, samples, *tracks.values()):
         tables.link(rows)
     for instance, rows in tracks.items():
-        ends = {"first_annotation_token": rows[0]["token"], "last_annotation_token": rows[-1]["token"]}
+        ends = {
+            "first_annotation_token": rows[0]["token"],
+            "last_annotation_token": rows[-1]["token"],
+        }
         tables.add(
-            "instance", f"{name}-{instance}", category_token=CATEGORIES[rows[0].pop("class")][0],
-            nbr_annotations=len(rows), **ends,
-        )  # fmt: skip
+            "instance",
+            f"{name}-{instance}",
+            category_token=CATEGORIES[rows[0].pop("class")][0],
+            nbr_annotations=len(rows),
+            **ends,
+        )
     ends = {"first_sample_token": samples[0]["token"], "last_sample_token": samples[-1]["token"]}
-    tables.add("scene", name, name=name, description="", log_token="log", nbr_samples=len(samples), **ends)
+    tables.add(
+        "scene", name, name=name, description="", log_token="log", nbr_samples=len(samples), **ends
+    )
 
 
-def annotate(tables: Tables, scan: Scan, sample: str, tracks: dict[int, list[dict[str, Any]]], scene: str) -> None:
+def annotate(
+    tables: Tables, scan: Scan, sample: str, tracks: dict[int, list[dict[str, Any]]], scene: str
+) -> None:
     """Add the boxes of a key frame to the tables, and to the tracks of their instances."""
     assert scan.boxes is not None
-    pose, counts = in_world(scan), scan.boxes.contain(scan.points).sum(1)
+    pose = in_world(scan)
+    counts = scan.boxes.contain(scan.points).sum(1)
     for i, kind in enumerate(scan.boxes.names):
         if NAMES[kind] not in CATEGORIES or not counts[i]:
             continue
@@ -131,11 +168,18 @@ def annotate(tables: Tables, scan: Scan, sample: str, tracks: dict[int, list[dic
         instance = int(scan.boxes.instance[i])
         turn = Quaternion(matrix=pose[:3, :3]) * Quaternion(axis=(0, 0, 1), radians=yaw)
         row = tables.add(
-            "sample_annotation", f"{sample}-{instance}", sample_token=sample, instance_token=f"{scene}-{instance}",
-            visibility_token="4", attribute_tokens=[CATEGORIES[NAMES[kind]][1]], num_radar_pts=0,
-            translation=(pose[:3, :3] @ (x, y, z) + pose[:3, 3]).tolist(), size=[width, length, height],
-            rotation=turn.elements.tolist(), num_lidar_pts=int(counts[i]),
-        )  # fmt: skip
+            "sample_annotation",
+            f"{sample}-{instance}",
+            sample_token=sample,
+            instance_token=f"{scene}-{instance}",
+            visibility_token="4",
+            attribute_tokens=[CATEGORIES[NAMES[kind]][1]],
+            num_radar_pts=0,
+            translation=(pose[:3, :3] @ (x, y, z) + pose[:3, 3]).tolist(),
+            size=[width, length, height],
+            rotation=turn.elements.tolist(),
+            num_lidar_pts=int(counts[i]),
+        )
         tracks.setdefault(instance, []).append(row)
         if len(tracks[instance]) == 1:
             row["class"] = NAMES[kind]
@@ -148,7 +192,9 @@ def in_world(scan: Scan) -> Any:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

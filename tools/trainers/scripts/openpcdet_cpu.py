@@ -3,9 +3,11 @@
     cd OpenPCDet/tools
     python /path/to/openpcdet_cpu.py train.py --cfg_file ...
 
-spconv is the one from the package index. OpenPCDet's functions for a CPU are compiled from its sources
-(``openpcdet_cpu.cpp``), and numba's simulator runs the kernels of KITTI's evaluation. Two functions that OpenPCDet has
-for GPUs only are written here from its overlaps of boxes for a CPU: non-maximum suppression, and the overlaps of its
+spconv is the one from the package index. OpenPCDet's functions for a CPU are compiled from its
+sources (``openpcdet_cpu.cpp``), and numba's simulator runs the kernels of KITTI's evaluation. Two
+functions that OpenPCDet has
+for GPUs only are written here from its overlaps of boxes for a CPU: non-maximum suppression, and
+    the overlaps of its
 recall. Everything else that it compiles with nvcc can be imported and not called.
 
 Prints the scans of each batch.
@@ -26,9 +28,12 @@ from cpu_torchvision import import_torchvision
 from torch.utils.cpp_extension import load
 
 NEEDS_GPU = (
-    "roipoint_pool3d.roipoint_pool3d_cuda", "bev_pool.bev_pool_ext", "ingroup_inds.ingroup_inds_cuda",
-    "pointnet2.pointnet2_stack.pointnet2_stack_cuda", "pointnet2.pointnet2_batch.pointnet2_batch_cuda",
-)  # fmt: skip
+    "roipoint_pool3d.roipoint_pool3d_cuda",
+    "bev_pool.bev_pool_ext",
+    "ingroup_inds.ingroup_inds_cuda",
+    "pointnet2.pointnet2_stack.pointnet2_stack_cuda",
+    "pointnet2.pointnet2_batch.pointnet2_batch_cuda",
+)
 """Operators that stock PointPillars, SECOND and CenterPoint import and do not call."""
 
 
@@ -45,7 +50,9 @@ def prepare(tree: Path) -> None:
         _module("pcdet.version", __version__="0.6.0")
     for name in NEEDS_GPU:
         _module(f"pcdet.ops.{name}")
-    _module("pcdet.datasets.argo2.argo2_dataset", Argo2Dataset=None)  # imports av2 and kornia for its own data
+    _module(
+        "pcdet.datasets.argo2.argo2_dataset", Argo2Dataset=None
+    )  # imports av2 and kornia for its own data
     functions = {name: value for name, value in vars(compiled).items() if not name.startswith("__")}
     _module("pcdet.ops.roiaware_pool3d.roiaware_pool3d_cuda", **functions)
     overlaps = Overlaps(compiled.boxes_iou_bev_cpu)
@@ -59,8 +66,11 @@ def _module(name: str, **content: Any) -> None:
 
 
 def compile_functions(tree: Path) -> Any:
-    """Compile OpenPCDet's functions for a CPU, once for each version of torch; takes half a minute."""
-    cache = Path(os.environ.get("TORCH_EXTENSIONS_DIR", Path.home() / ".cache" / "torch_extensions"))
+    """Compile OpenPCDet's functions for a CPU, once for each version of torch; takes half a
+    minute."""
+    cache = Path(
+        os.environ.get("TORCH_EXTENSIONS_DIR", Path.home() / ".cache" / "torch_extensions")
+    )
     folder = cache / f"openpcdet_cpu_{torch.__version__}"
     headers = folder / "include"  # its sources for a CPU include CUDA's headers without use
     headers.mkdir(parents=True, exist_ok=True)
@@ -68,16 +78,21 @@ def compile_functions(tree: Path) -> Any:
         if not (headers / name).exists():
             (headers / name).touch()
     operators = tree / "pcdet" / "ops"
-    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # ninja is there
+    os.environ["PATH"] = (
+        f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # ninja is there
+    )
     return load(
-        "openpcdet_cpu", [str(Path(__file__).with_suffix(".cpp"))], extra_cflags=["-O1", "-w"],
+        "openpcdet_cpu",
+        [str(Path(__file__).with_suffix(".cpp"))],
+        extra_cflags=["-O1", "-w"],
         extra_include_paths=[str(headers), str(operators), str(operators / "iou3d_nms" / "src")],
         build_directory=str(folder),
-    )  # fmt: skip
+    )
 
 
 class Overlaps:
-    """What OpenPCDet computes on a GPU from the overlaps of boxes (N, 7), by its function for a CPU."""
+    """What OpenPCDet computes on a GPU from the overlaps of boxes (N, 7), by its function for a
+    CPU."""
 
     def __init__(self, boxes_iou_bev_cpu: Any) -> None:
         self._compute = boxes_iou_bev_cpu
@@ -89,9 +104,11 @@ class Overlaps:
         return out
 
     def suppress(self, boxes: Any, keep: Any, threshold: float) -> int:
-        """Greedy non-maximum suppression of boxes that are sorted by score; fills ``keep`` and counts them."""
+        """Greedy non-maximum suppression of boxes that are sorted by score; fills ``keep`` and
+        counts them."""
         near = self.ratios(boxes, boxes) > threshold
-        left, count = torch.ones(len(boxes), dtype=torch.bool), 0
+        left = torch.ones(len(boxes), dtype=torch.bool)
+        count = 0
         for i in range(len(boxes)):
             if left[i]:
                 keep[count], count = i, count + 1

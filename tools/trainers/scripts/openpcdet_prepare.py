@@ -1,10 +1,11 @@
-"""What OpenPCDet makes once from a dataset, on a machine without a GPU: info lists and the database of GT sampling.
+"""What OpenPCDet makes once from a dataset, on a machine without a GPU: info lists and the database
+of GT sampling.
 
     python openpcdet_prepare.py TREE kitti|nuscenes FOLDER OBJECTS.npz
 
-FOLDER is KITTI's object set with ``ImageSets``, or the folder that holds ``v1.0-mini``. KITTI's planes are fitted where
-they are missing. OpenPCDet's sampler needs objects of every class, which so few scans lack: the database of GT sampling
-is that of a bank of objects.
+FOLDER is KITTI's object set with ``ImageSets``, or the folder that holds ``v1.0-mini``. KITTI's
+planes are fitted where they are missing. OpenPCDet's sampler needs objects of every class, which so
+few scans lack: the database of GT sampling is that of a bank of objects.
 """
 
 import argparse
@@ -23,7 +24,9 @@ TABLES = ("sensor", "calibrated_sensor", "sample_data")
 
 def main() -> None:
     """Write the files beside the dataset."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tree", type=Path)
     parser.add_argument("kind", choices=["kitti", "nuscenes"])
     parser.add_argument("folder", type=Path)
@@ -53,7 +56,9 @@ def prepare_kitti(config: Any, folder: Path, objects: Any) -> None:
     kitti_dataset.Path = Path  # it imports that only when it is run as a script
     write_planes(folder)
     for split in ("val", "train"):
-        dataset = kitti_dataset.KittiDataset(config, ["Car", "Pedestrian", "Cyclist"], training=False, root_path=folder)
+        dataset = kitti_dataset.KittiDataset(
+            config, ["Car", "Pedestrian", "Cyclist"], training=False, root_path=folder
+        )
         dataset.set_split(split)
         file = folder / f"kitti_infos_{split}.pkl"
         file.write_bytes(pickle.dumps(dataset.get_infos(num_workers=1)))
@@ -71,22 +76,40 @@ def prepare_nuscenes(config: Any, folder: Path, objects: Any) -> None:
     config.VERSION = VERSION
     dataset = NuScenesDataset(config, None, training=True, root_path=folder, logger=create_logger())
     dataset.create_groundtruth_database(max_sweeps=config.MAX_SWEEPS)
-    names = [group.partition(":")[0] for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS]
+    names = [
+        group.partition(":")[0] for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS
+    ]
     complete(folder / VERSION / f"nuscenes_dbinfos_{config.MAX_SWEEPS}sweeps_withvelo.pkl", names)
 
 
 def add_camera(folder: Path) -> None:
-    """Add a front camera to nuScenes' tables that have none, because OpenPCDet reads its pose; there is no picture."""
+    """Add a front camera to nuScenes' tables that have none, because OpenPCDet reads its pose;
+    there is no picture."""
     tables = {name: json.loads((folder / f"{name}.json").read_text()) for name in TABLES}
     if any(row["channel"] == "CAM_FRONT" for row in tables["sensor"]):
         return
     tables["sensor"].append({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"})
-    pose = {"translation": [1.7, 0, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5]}  # z ahead, x right, y down
+    pose = {
+        "translation": [1.7, 0, 1.5],
+        "rotation": [0.5, -0.5, 0.5, -0.5],
+    }  # z ahead, x right, y down
     lens = {"camera_intrinsic": [[1266, 0, 800], [0, 1266, 450], [0, 0, 1]]}
-    tables["calibrated_sensor"].append({"token": "camera", "sensor_token": "camera", **pose, **lens})
+    tables["calibrated_sensor"].append(
+        {"token": "camera", "sensor_token": "camera", **pose, **lens}
+    )
     for row in [row for row in tables["sample_data"] if row["is_key_frame"]]:
-        new = {"token": f"{row['token']}-camera", "calibrated_sensor_token": "camera", "fileformat": "jpg"}
-        new |= {"height": 900, "width": 1600, "filename": "samples/CAM_FRONT/none.jpg", "prev": "", "next": ""}
+        new = {
+            "token": f"{row['token']}-camera",
+            "calibrated_sensor_token": "camera",
+            "fileformat": "jpg",
+        }
+        new |= {
+            "height": 900,
+            "width": 1600,
+            "filename": "samples/CAM_FRONT/none.jpg",
+            "prev": "",
+            "next": "",
+        }
         tables["sample_data"].append(row | new)
     for name, rows in tables.items():
         (folder / f"{name}.json").write_text(json.dumps(rows))

@@ -3,9 +3,9 @@
     cd Pointcept
     python /path/to/pointcept_cpu.py tools/train.py --config-file ... --options ...
 
-spconv is the one from the package index. What Pointcept compiles for CUDA only, pointops and pointgroup_ops, comes from
-``tools/stand_ins``; so do torch_scatter and torch_cluster, unless they are installed. What is sent to a GPU stays on
-the CPU.
+spconv is the one from the package index. What Pointcept compiles for CUDA only, pointops and
+pointgroup_ops, comes from ``tools/stand_ins``; so do torch_scatter and torch_cluster, unless they
+are installed. What is sent to a GPU stays on the CPU.
 
 Prints the name of each training sample and the epoch of its mixture.
 """
@@ -47,7 +47,9 @@ def main() -> None:
 
     def shown(self: Any, idx: int) -> Any:
         data = read(self, idx)
-        print(f"epoch {self.mixed.epoch} sample {data['name']}\n", end="", flush=True)  # workers print at once
+        print(
+            f"epoch {self.mixed.epoch} sample {data['name']}\n", end="", flush=True
+        )  # workers print at once
         return data
 
     MixedSemanticKITTI.get_data = shown

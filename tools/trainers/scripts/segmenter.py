@@ -1,6 +1,7 @@
 """A user's Lightning module: a small segmenter.
 
-Prints a line for each training sample, so that a resumed run can be compared with an uninterrupted one.
+Prints a line for each training sample, so that a resumed run can be compared with an uninterrupted
+one.
 """
 
 from typing import Any
@@ -26,7 +27,11 @@ class Segmenter(lightning.LightningModule):
         return loss
 
     def validation_step(self, batch: Any, index: int) -> None:
-        self.log("validation loss", self.loss(self.net(batch["points"]), batch["label"]), batch_size=len(batch["id"]))
+        self.log(
+            "validation loss",
+            self.loss(self.net(batch["points"]), batch["label"]),
+            batch_size=len(batch["id"]),
+        )
 
     def on_validation_epoch_end(self) -> None:
         print(f"validation loss {self.trainer.callback_metrics['validation loss']:.4f}", flush=True)

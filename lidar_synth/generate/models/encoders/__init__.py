@@ -1,1 +1,2 @@
-"""Encoders of conditions: each produces maps on the grid of the state, or tokens to which the state attends."""
+"""Encoders of conditions: each produces maps on the grid of the state, or tokens to which the state
+attends."""

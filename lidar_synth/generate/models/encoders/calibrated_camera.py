@@ -1,4 +1,5 @@
-"""Encoder of one calibrated camera's images: every cell of the state gets the image features along its ray."""
+"""Encoder of one calibrated camera's images: every cell of the state gets the image features along
+its ray."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -14,27 +15,29 @@ from lidar_synth.generate.models.positions import RayAngles
 
 
 class SightEncoder(Encoder):
-    """Encodes a camera image as feature maps on the grid of the state, using the camera's calibration.
+    """Encodes a camera image as feature maps on the grid of the state, using the camera's
+    calibration.
 
-    Convolutions compute features of the image. Each cell samples them at the pixel onto which the point ``distance``
-    metres along the cell's ray projects. Nearer and farther points project to slightly different pixels, because the
-    camera and the sensor are apart; the receptive field of the features covers this parallax. The last map is 1 where
-    the cell lies within the image.
+    Convolutions compute features of the image. Each cell samples them at the pixel onto which the
+    point ``distance`` metres along the cell's ray projects. Nearer and farther points project to
+    slightly different pixels, because the camera and the sensor are apart; the receptive field of
+    the features covers this parallax. The last map is 1 where the cell lies within the image.
 
-    Unlike attention to tokens, the correspondence between cells and pixels is not learnt, so that minutes of training
-    on hundreds of images suffice. The encoder is specific to one camera and its mounting.
+    Unlike attention to tokens, the correspondence between cells and pixels is not learnt, so that
+    minutes of training on hundreds of images suffice. The encoder is specific to one camera and its
+    mounting.
 
     Args:
         target: rows and columns of the state.
         image: rows and columns of the camera's images.
-        image_from_sensor: (3, 4) projection from homogeneous points in the sensor frame to pixels of such an image
-            (``Calibration.image_from_sensor``).
+        image_from_sensor: (3, 4) projection from homogeneous points in the sensor frame to pixels
+            of such an image (``Calibration.image_from_sensor``).
         resolution: h, w to which images are resized.
         channels: channels of the maps.
         widths: channels of the convolutions, each of which halves rows and columns.
         distance: distance of the projected points in metres.
-        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell, radians; None if a
-            checkpoint will be loaded.
+        angles: (2, rows, columns) elevation and azimuth (clockwise from ahead) of every cell,
+            radians; None if a checkpoint will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -57,7 +60,10 @@ class SightEncoder(Encoder):
         angles: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.resolution, self.image, self.channels, self.distance = pair(resolution), pair(image), channels, distance
+        self.resolution = pair(resolution)
+        self.image = pair(image)
+        self.channels = channels
+        self.distance = distance
         self.matrix = [[float(v) for v in row] for row in image_from_sensor]
         if [len(row) for row in self.matrix] != [4, 4, 4]:
             raise ConfigError(f"image_from_sensor {image_from_sensor}", "3 rows of 4 numbers")
@@ -69,8 +75,8 @@ class SightEncoder(Encoder):
         self.body.append(nn.Conv2d(widths[-1], channels - 1, 3, 1, 1))
 
     def pixel_coordinates(self) -> Tensor:
-        """The (rows, columns, 2) image position of every cell: column and row, from -1 to 1 within the image, and 9 for
-        points behind the camera."""
+        """The (rows, columns, 2) image position of every cell: column and row, from -1 to 1 within
+        the image, and 9 for points behind the camera."""
         elevation, azimuth = self.angles.cells
         flat = elevation.cos()
         ray = torch.stack([flat * azimuth.cos(), -flat * azimuth.sin(), elevation.sin()], -1)
@@ -92,5 +98,7 @@ class SightEncoder(Encoder):
         features = self.body(x.contiguous(memory_format=torch.channels_last)).float()
         positions = self.pixel_coordinates()
         visible = (positions.abs() <= 1).all(-1).float().expand(len(x), 1, *positions.shape[:2])
-        maps = F.grid_sample(features, positions.expand(len(x), *positions.shape), align_corners=False)
+        maps = F.grid_sample(
+            features, positions.expand(len(x), *positions.shape), align_corners=False
+        )
         return torch.cat([maps * visible, visible], 1).to(x.dtype)

@@ -1,4 +1,5 @@
-"""Encoder of camera images that are cut into views side by side: convolutions turn each view into tokens."""
+"""Encoder of camera images that are cut into views side by side: convolutions turn each view into
+tokens."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -11,10 +12,12 @@ from lidar_synth.generate.models.network import Encoder
 
 
 class ViewEncoder(Encoder):
-    """Encodes a camera image, cut into views side by side, as tokens; a small network for training from scratch.
+    """Encodes a camera image, cut into views side by side, as tokens; a small network for training
+    from scratch.
 
     Args:
-        resolution: h, w of the image; with four convolutions, h is a multiple of 16 and w of 16 times ``views``.
+        resolution: h, w of the image; with four convolutions, h is a multiple of 16 and w of 16
+            times ``views``.
         views: number of views.
         channels: channels of a token.
         widths: channels of the convolutions, each of which halves rows and columns.
@@ -31,8 +34,12 @@ class ViewEncoder(Encoder):
         widths: Sequence[int] = (32, 64, 96, 128),
     ) -> None:
         super().__init__()
-        self.resolution, self.channels, self.views = pair(resolution), channels, views
-        grid = reduced(self.resolution, [(1, views)] + [(2, 2)] * len(widths), f"an image of {views} views")
+        self.resolution = pair(resolution)
+        self.channels = channels
+        self.views = views
+        grid = reduced(
+            self.resolution, [(1, views)] + [(2, 2)] * len(widths), f"an image of {views} views"
+        )
         inputs = [3, *widths[:-1]]
         self.body = nn.Sequential()
         for a, b in zip(inputs, widths, strict=True):

@@ -15,13 +15,15 @@ from lidar_synth.generate.models.network import Encoder
 
 CLIP_VARIABLE = "LIDAR_SYNTH_CLIP"
 """Environment variable with the path of CLIP ViT-L/14's weights."""
-CLIP_WIDTH, CLIP_SIDE = 768, 224
-_CLIP_MEAN, _CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+CLIP_WIDTH = 768
+CLIP_SIDE = 224
+_CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+_CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 class ClipViewEncoder(Encoder):
-    """Encodes a camera image as one token per view with the frozen vision tower of CLIP ViT-L/14, as in LiDM. Unlike
-    in LiDM, the view embedding and the projection are trained.
+    """Encodes a camera image as one token per view with the frozen vision tower of CLIP ViT-L/14,
+    as in LiDM. Unlike in LiDM, the view embedding and the projection are trained.
 
     Args:
         views: number of views side by side, each of 224 x 224 pixels.
@@ -33,7 +35,9 @@ class ClipViewEncoder(Encoder):
 
     def __init__(self, views: int = 4, channels: int = 512) -> None:
         super().__init__()
-        self.resolution, self.channels, self.views = (CLIP_SIDE, CLIP_SIDE * views), channels, views
+        self.resolution = (CLIP_SIDE, CLIP_SIDE * views)
+        self.channels = channels
+        self.views = views
         self.view_embedding = nn.Parameter(torch.empty(views, CLIP_WIDTH))
         nn.init.normal_(self.view_embedding, std=CLIP_WIDTH**-0.5)
         self.project = nn.Linear(CLIP_WIDTH, channels)
@@ -60,10 +64,15 @@ class _Tower(nn.Module):
 
     def __init__(self, model: Any, transformers: bool) -> None:
         super().__init__()
-        self.model, self.transformers = model, transformers
+        self.model = model
+        self.transformers = transformers
 
     def forward(self, x: Tensor) -> Tensor:
-        out = self.model(pixel_values=x).image_embeds if self.transformers else self.model.encode_image(x)
+        out = (
+            self.model(pixel_values=x).image_embeds
+            if self.transformers
+            else self.model.encode_image(x)
+        )
         return cast(Tensor, out)
 
 
@@ -81,8 +90,10 @@ def frozen_clip(location: str, device: str) -> nn.Module:
     """
     path = Path(location)
     hint = (
-        f"Save CLIP ViT-L/14 as a folder (transformers: openai/clip-vit-large-patch14) or as open_clip's .safetensors "
-        f"file, and set {CLIP_VARIABLE} to it; or train with the encoder 'views', which needs neither."
+        "Save CLIP ViT-L/14 as a folder (transformers: openai/clip-vit-large-patch14) or as "
+        "open_clip's .safetensors "
+        f"file, and set {CLIP_VARIABLE} to it; or train with the encoder 'views', which needs "
+        "neither."
     )
     if not location or not path.exists():
         given = f"{CLIP_VARIABLE}={location}" if location else f"{CLIP_VARIABLE} is not set"
@@ -91,7 +102,9 @@ def frozen_clip(location: str, device: str) -> nn.Module:
         if path.is_dir():
             from transformers import CLIPVisionModelWithProjection
 
-            model = CLIPVisionModelWithProjection.from_pretrained(location, local_files_only=True, use_safetensors=True)
+            model = CLIPVisionModelWithProjection.from_pretrained(
+                location, local_files_only=True, use_safetensors=True
+            )
         elif path.suffix == ".safetensors":
             import open_clip
 
@@ -100,7 +113,11 @@ def frozen_clip(location: str, device: str) -> nn.Module:
             raise FileError(f"CLIP's weights in {path}", "a folder, or a .safetensors file", hint)
     except ImportError as error:
         library = "transformers" if path.is_dir() else "open_clip_torch"
-        raise LibraryError(f"{library} is not installed", library, f"pip install {library}") from error
+        raise LibraryError(
+            f"{library} is not installed", library, f"pip install {library}"
+        ) from error
     except OSError as error:
-        raise FileError(f"CLIP's weights in {path} cannot be read ({error})", "a complete copy", hint) from error
+        raise FileError(
+            f"CLIP's weights in {path} cannot be read ({error})", "a complete copy", hint
+        ) from error
     return _Tower(model, path.is_dir()).to(device).eval().requires_grad_(False)

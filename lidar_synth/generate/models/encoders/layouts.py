@@ -21,8 +21,9 @@ _NEAREST = 1.0
 class LayoutEncoder(Encoder):
     """Encodes the image of a layout as feature maps on the grid of the state.
 
-    Every cell becomes its class (one-hot), its distance (inverse and logarithm), the ray's way through the box and the
-    place along the box. Strided convolutions reduce the cells of the image to those of the state.
+    Every cell becomes its class (one-hot), its distance (inverse and logarithm), the ray's way
+    through the box and the place along the box. Strided convolutions reduce the cells of the image
+    to those of the state.
 
     Args:
         resolution: H, W of the image.
@@ -48,12 +49,17 @@ class LayoutEncoder(Encoder):
         depth: int = 2,
     ) -> None:
         super().__init__()
-        self.resolution, self.channels = pair(resolution), channels
+        self.resolution = pair(resolution)
+        self.channels = channels
         target = pair(target)
         strides = _strides(self.resolution, target)
         if reduced(self.resolution, strides, "a layout image") != target or not widths:
-            raise ConfigError(f"a layout image of {self.resolution} for a state of {target}", "a power of two times it")
-        self.body, inputs = nn.Sequential(), _FEATURES
+            raise ConfigError(
+                f"a layout image of {self.resolution} for a state of {target}",
+                "a power of two times it",
+            )
+        self.body = nn.Sequential()
+        inputs = _FEATURES
         for i, stride in enumerate(strides or [(1, 1)]):
             outputs = widths[min(i, len(widths) - 1)]
             self.body.extend([nn.Conv2d(inputs, outputs, stride, stride), nn.SiLU()])
@@ -75,8 +81,11 @@ class LayoutEncoder(Encoder):
         """(B, F, H, W), channels last in memory."""
         dtype = next(self.body.parameters()).dtype
         codes = F.one_hot(image[:, 0].long(), len(CODES)).to(dtype)
-        depth, chord, along = depths_of(image), image[:, 3].float(), image[:, 4].float()
-        known, near = depth > 0, depth.clamp(min=_NEAREST)
+        depth = depths_of(image)
+        chord = image[:, 3].float()
+        along = image[:, 4].float()
+        known = depth > 0
+        near = depth.clamp(min=_NEAREST)
         through = (chord > 0) & known
         values = [
             torch.where(known, 4 / near, 0),
@@ -89,7 +98,9 @@ class LayoutEncoder(Encoder):
 
 def _strides(resolution: tuple[int, int], target: tuple[int, int]) -> list[tuple[int, int]]:
     """Strides of up to (2, 4), the largest number of columns first."""
-    rows, columns = (max(1, a // b).bit_length() - 1 for a, b in zip(resolution, target, strict=True))
+    rows, columns = (
+        max(1, a // b).bit_length() - 1 for a, b in zip(resolution, target, strict=True)
+    )
     first = [(1, 4)] * max(0, (columns - rows + 1) // 2)
     columns -= 2 * len(first)
     while columns < 0:

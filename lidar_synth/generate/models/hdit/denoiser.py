@@ -1,9 +1,11 @@
-"""HDiT that predicts the data instead of the velocity, for networks that are small relative to their images.
+"""HDiT that predicts the data instead of the velocity, for networks that are small relative to
+their images.
 
-The velocity contains the noise, which has as many degrees of freedom as the image has values; tokens with fewer
-channels than their patch has values cannot represent it. The data have far fewer. The network F therefore predicts the
-data, and only details that are finer than its prediction are taken from the state (the preconditioning of Karras et
-al., "Elucidating the Design Space of Diffusion-Based Generative Models", NeurIPS 2022, on the rectified path)::
+The velocity contains the noise, which has as many degrees of freedom as the image has values;
+tokens with fewer channels than their patch has values cannot represent it. The data have far fewer.
+The network F therefore predicts the data, and only details that are finer than its prediction are
+taken from the state (the preconditioning of Karras et al., "Elucidating the Design Space of
+Diffusion-Based Generative Models", NeurIPS 2022, on the rectified path)::
 
     y0' = (1 - t) s^2 / d(t) y - t / sqrt(d(t)) F(y, t, c),      d(t) = (1 - t)^2 s^2 + t^2
     v   = (y - y0') / t = (t - (1 - t) s^2) / d(t) y + F(y, t, c) / sqrt(d(t))
@@ -24,7 +26,8 @@ class Denoiser(HDiT):
     """Velocity network v(y, t, c) like ``HDiT``, computed from an estimate of the data.
 
     Args:
-        detail: s, standard deviation of the details that are taken from the state, in normalised units.
+        detail: s, standard deviation of the details that are taken from the state, in normalised
+            units.
         arguments: arguments of ``HDiT``.
 
     Raises:
@@ -38,7 +41,11 @@ class Denoiser(HDiT):
         self.detail = detail
 
     def forward(
-        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None, end: Tensor | float | None = None
+        self,
+        y: Tensor,
+        t: Tensor | float,
+        cond: Tensor | None = None,
+        end: Tensor | float | None = None,
     ) -> Tensor:
         """The velocity dy/dt at y and t; arguments and result are those of ``HDiT``."""
         output = super().forward(y, t, cond, end)

@@ -1,8 +1,8 @@
 """HDiT: an hourglass transformer that predicts the velocity of a range image.
 
-The architecture is that of R2Flow (Nakashima et al., "Fast LiDAR Data Generation with Rectified Flows", ICRA
-2025) after Crowson et al., "Scalable High-Resolution Pixel-Space Image Synthesis with Hourglass Diffusion
-Transformers", ICML 2024::
+The architecture is that of R2Flow (Nakashima et al., "Fast LiDAR Data Generation with Rectified
+Flows", ICRA 2025) after Crowson et al., "Scalable High-Resolution Pixel-Space Image Synthesis with
+Hourglass Diffusion Transformers", ICML 2024::
 
     image (B, C, H, W) -> tokens of 1 x 4 cells
       -> levels with neighbourhood attention; 2 x 2 tokens merge into one of twice the width
@@ -10,9 +10,10 @@ Transformers", ICML 2024::
       -> back up through the levels, with skip connections
     -> velocity (B, C, H, W)
 
-A condition is given in one of two forms: maps on the grid of the state, which are added to the tokens
-(``condition_channels``), or tokens, to which those of the coarsest level attend (``context_channels``). The layers of
-both are initialised to zero.
+A condition is given in one of two forms: maps on the grid of the state, which are added to the
+    tokens
+(``condition_channels``), or tokens, to which those of the coarsest level attend
+(``context_channels``). The layers of both are initialised to zero.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,14 @@ from torch.utils.checkpoint import checkpoint
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention
 from lidar_synth.generate.models.convolution import check_condition
-from lidar_synth.generate.models.hdit.transformer import Block, Expand, Level, Merge, from_patches, to_patches
+from lidar_synth.generate.models.hdit.transformer import (
+    Block,
+    Expand,
+    Level,
+    Merge,
+    from_patches,
+    to_patches,
+)
 from lidar_synth.generate.models.layers import RMSNorm
 from lidar_synth.generate.models.network import Network
 from lidar_synth.generate.models.positions import (
@@ -43,8 +51,8 @@ from lidar_synth.generate.models.positions import (
 class HDiT(Network):
     """Velocity network v(y, t, c) in the paper's convention: t = 1 noise, t = 0 data, v = y1 - y0.
 
-    All arguments but ``angles`` are plain values, which a checkpoint stores. The network computes in the dtype of its
-    weights (or of autocast) and returns the dtype of y.
+    All arguments but ``angles`` are plain values, which a checkpoint stores. The network computes
+    in the dtype of its weights (or of autocast) and returns the dtype of y.
 
     Args:
         resolution: H, W of the image; each a multiple of the patch times 2^(levels - 1).
@@ -53,7 +61,8 @@ class HDiT(Network):
         context_channels: channels of a condition's tokens; 0 = no tokens.
         width: channels of a token at the finest level; each further level has twice as many.
         time_width: channels of the time embedding, even.
-        depths: blocks per level, finest first; all levels but the last have as many again on the way up.
+        depths: blocks per level, finest first; all levels but the last have as many again on the
+            way up.
         heads: attention heads per level.
         patch: rows and columns of cells in a token.
         window: rows and columns of tokens in a neighbourhood, odd.
@@ -61,8 +70,8 @@ class HDiT(Network):
         mapping_depth: layers of the mapping networks of time and position.
         position: one of ``POSITIONS``, the encoding that is added to the tokens.
         ends: whether it can be told the end of a step, and then predicts the mean velocity over it.
-        angles: (2, H, W) elevation and azimuth of every cell, radians (``Sensor.ray_angles``); None if a
-            checkpoint will be loaded.
+        angles: (2, H, W) elevation and azimuth of every cell, radians (``Sensor.ray_angles``); None
+            if a checkpoint will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -89,8 +98,12 @@ class HDiT(Network):
         angles: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.resolution, self.patch, self.window = _pair(resolution), _pair(patch), _pair(window)
-        self.channels, self.condition_channels, self.context_channels = channels, condition_channels, context_channels
+        self.resolution = _pair(resolution)
+        self.patch = _pair(patch)
+        self.window = _pair(window)
+        self.channels = channels
+        self.condition_channels = condition_channels
+        self.context_channels = context_channels
         self.grids = _grids(self.resolution, self.patch, len(depths))
         self.ends = ends
         """Whether it takes the end of a step."""
@@ -98,7 +111,9 @@ class HDiT(Network):
         """Recompute the activations of the blocks in the backward pass instead of storing them."""
         _check(self.grids, width, heads, position)
         if angles is not None and angles.shape != (2, *self.resolution):
-            raise ConfigError(f"ray angles of shape {tuple(angles.shape)}", f"{(2, *self.resolution)}")
+            raise ConfigError(
+                f"ray angles of shape {tuple(angles.shape)}", f"{(2, *self.resolution)}"
+            )
 
         widths = [width << i for i in range(len(depths))]
         cells = self.patch[0] * self.patch[1]
@@ -111,15 +126,21 @@ class HDiT(Network):
         self.time = TimeEmbedding(time_width, ratio, mapping_depth)
         if ends:
             self.step = StepEmbedding(time_width)
-        self.rotary = nn.ModuleList(Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True))
-        self.near = nn.ModuleList(NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1])
+        self.rotary = nn.ModuleList(
+            Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True)
+        )
+        self.near = nn.ModuleList(
+            NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1]
+        )
         self.tokenize = nn.Linear(cells * channels, width, bias=False)
         if condition_channels:
             self.tokenize_condition = nn.Linear(cells * condition_channels, width, bias=False)
             nn.init.zeros_(self.tokenize_condition.weight)
 
         def blocks(i: int, context: int = 0) -> nn.ModuleList:
-            return nn.ModuleList(Block(widths[i], time_width, heads[i], ratio, context) for _ in range(depths[i]))
+            return nn.ModuleList(
+                Block(widths[i], time_width, heads[i], ratio, context) for _ in range(depths[i])
+            )
 
         upper = range(len(depths) - 1)
         self.down = nn.ModuleList(blocks(i) for i in upper)
@@ -132,31 +153,42 @@ class HDiT(Network):
         nn.init.zeros_(self.detokenize.weight)
 
     def forward(
-        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None, end: Tensor | float | None = None
+        self,
+        y: Tensor,
+        t: Tensor | float,
+        cond: Tensor | None = None,
+        end: Tensor | float | None = None,
     ) -> Tensor:
         """The velocity dy/dt at y and t, or its mean from t to ``end``.
 
         Args:
             y: (B, C, H, W) state.
             t: (B,) times, or one for all states, in [0, 1]; 1 = noise.
-            cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, as the network takes.
+            cond: (B, condition_channels, H, W) maps or (B, M, context_channels) tokens, as the
+                network takes.
             end: (B,) times below t, or one for all; None = the velocity at t itself.
 
         Returns:
             (B, C, H, W).
 
         Raises:
-            DataError: on a state, times or a condition of another shape, or on ends for a network without them.
+            DataError: on a state, times or a condition of another shape, or on ends for a network
+                without them.
         """
         self._check(y, cond)
         t = _times(t, y)
         time = self.time(t)
         if end is not None:
             if not self.ends:
-                raise DataError("the end of a step, for a network that was built without ends", "a network with ends")
+                raise DataError(
+                    "the end of a step, for a network that was built without ends",
+                    "a network with ends",
+                )
             time = time + self.step(t - _times(end, y))
         angles = self.angles(self.patch, len(self.grids))
-        levels = [self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)]
+        levels = [
+            self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)
+        ]
         place = self.position(angles[0]).flatten(0, 1)
         x = self.tokenize(self._patches(y)) + place
         if cond is not None and self.condition_channels:
@@ -175,7 +207,8 @@ class HDiT(Network):
         return from_patches(x, self.patch, self.resolution).movedim(-1, 1).to(y.dtype)
 
     def _level(self, i: int, angles: Tensor, dtype: torch.dtype) -> Level:
-        """The inputs that the blocks of level i share, given the ray angles (2, rows, columns) of its tokens."""
+        """The inputs that the blocks of level i share, given the ray angles (2, rows, columns) of
+        its tokens."""
         cosine, sine = self.rotary[i](angles)
         near = self.near[i] if i < len(self.near) else None
         return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]  # the elements of a ModuleList have no type
@@ -195,15 +228,22 @@ class HDiT(Network):
     def _check(self, y: Tensor, cond: Tensor | None) -> None:
         shape = (self.channels, *self.resolution)
         if y.shape[1:] != shape:
-            raise DataError(f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})")
-        check_condition(cond, len(y), (self.condition_channels, *self.resolution), self.context_channels)
+            raise DataError(
+                f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})"
+            )
+        check_condition(
+            cond, len(y), (self.condition_channels, *self.resolution), self.context_channels
+        )
 
 
 def _times(t: Tensor | float, y: Tensor) -> Tensor:
     """(B,) float32 times of the states y (B, ...)."""
     t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
     if t.shape not in ((), (1,), (len(y),)):
-        raise DataError(f"times of shape {tuple(t.shape)} for {len(y)} states", "one time per state, or one for all")
+        raise DataError(
+            f"times of shape {tuple(t.shape)} for {len(y)} states",
+            "one time per state, or one for all",
+        )
     return t.expand(len(y))
 
 
@@ -221,7 +261,8 @@ def _grids(resolution: Grid, patch: Grid, levels: int) -> list[Grid]:
             f"resolution {resolution}",
             f"multiples of {unit}: patches of {patch} that merge 2 x 2 {levels - 1} times",
         )
-    rows, columns = resolution[0] // patch[0], resolution[1] // patch[1]
+    rows = resolution[0] // patch[0]
+    columns = resolution[1] // patch[1]
     return [(rows >> i, columns >> i) for i in range(levels)]
 
 

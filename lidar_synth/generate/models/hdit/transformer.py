@@ -8,7 +8,14 @@ from torch import Tensor, nn
 
 from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention, attention
 from lidar_synth.generate.models.convolution import attend
-from lidar_synth.generate.models.layers import EPS, AdaRMSNorm, GatedFeedForward, RMSNorm, piece_length, rms_norm
+from lidar_synth.generate.models.layers import (
+    EPS,
+    AdaRMSNorm,
+    GatedFeedForward,
+    RMSNorm,
+    piece_length,
+    rms_norm,
+)
 from lidar_synth.generate.models.positions import rotate
 
 
@@ -48,8 +55,13 @@ class SelfAttention(nn.Module):
     def forward(self, x: Tensor, time: Tensor, level: Level) -> Tensor:
         """Tokens (B, N, C) and time (B, E) to (B, N, C)."""
         length = piece_length(x, x.shape[1], len(x) * self.qkv.out_features)
-        tables = zip(torch.split(level.cosine, length), torch.split(level.sine, length), strict=True)
-        pieces = [self._project(p, time, *t) for p, t in zip(torch.split(x, length, 1), tables, strict=True)]
+        tables = zip(
+            torch.split(level.cosine, length), torch.split(level.sine, length), strict=True
+        )
+        pieces = [
+            self._project(p, time, *t)
+            for p, t in zip(torch.split(x, length, 1), tables, strict=True)
+        ]
         q, k, v = (torch.cat(z, 1) for z in zip(*pieces, strict=True))
         if level.near is not None:
             h = level.near(q, k, v)
@@ -59,18 +71,21 @@ class SelfAttention(nn.Module):
         out: Tensor = x + self.out(h.flatten(2))
         return out
 
-    def _project(self, x: Tensor, time: Tensor, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _project(
+        self, x: Tensor, time: Tensor, cosine: Tensor, sine: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (B, N, heads, D); q k^T includes the temperature."""
         q, k, v = self.qkv(self.norm(x, time)).reshape(*x.shape[:2], 3, self.heads, -1).unbind(2)
         # A vector of root mean square 1 has the length sqrt(D).
         scale = self.temperature.clamp(max=math.log(100.0)).exp() / q.shape[-1]
-        q, k = rms_norm(q, EPS**2), rms_norm(k, EPS**2)
+        q = rms_norm(q, EPS**2)
+        k = rms_norm(k, EPS**2)
         return rotate(q * scale, cosine, sine).to(v.dtype), rotate(k, cosine, sine).to(v.dtype), v
 
 
 class ContextAttention(nn.Module):
-    """Residual attention to the tokens of a condition; begins at 0, so that the weights of an unconditional model are a
-    start for a conditional one.
+    """Residual attention to the tokens of a condition; begins at 0, so that the weights of an
+    unconditional model are a start for a conditional one.
 
     Args:
         dim: C, channels of a token.
@@ -82,7 +97,8 @@ class ContextAttention(nn.Module):
     def __init__(self, dim: int, embedding: int, heads: int, context: int) -> None:
         super().__init__()
         self.heads = heads
-        self.norm, self.context_norm = AdaRMSNorm(dim, embedding), RMSNorm(context)
+        self.norm = AdaRMSNorm(dim, embedding)
+        self.context_norm = RMSNorm(context)
         self.query = nn.Linear(dim, dim, bias=False)
         self.key_value = nn.Linear(context, 2 * dim, bias=False)
         self.out = nn.Linear(dim, dim, bias=False)
@@ -121,10 +137,14 @@ class Block(nn.Module):
     The arguments are those of the three layers.
     """
 
-    def __init__(self, dim: int, embedding: int, heads: int, ratio: float, context: int = 0) -> None:
+    def __init__(
+        self, dim: int, embedding: int, heads: int, ratio: float, context: int = 0
+    ) -> None:
         super().__init__()
         self.attention = SelfAttention(dim, embedding, heads)
-        self.context_attention = ContextAttention(dim, embedding, heads, context) if context else None
+        self.context_attention = (
+            ContextAttention(dim, embedding, heads, context) if context else None
+        )
         self.feed_forward = FeedForward(dim, embedding, ratio)
 
     def forward(self, x: Tensor, time: Tensor, level: Level) -> Tensor:
@@ -154,7 +174,8 @@ class Merge(nn.Module):
 
 
 class Expand(nn.Module):
-    """One token of 2 C channels to 2 x 2 of C, interpolated with the skip connection by a learned weight.
+    """One token of 2 C channels to 2 x 2 of C, interpolated with the skip connection by a learned
+    weight.
 
     Args:
         dim: C.
@@ -180,6 +201,7 @@ def to_patches(x: Tensor, patch: Grid) -> Tensor:
 
 def from_patches(x: Tensor, patch: Grid, resolution: Grid) -> Tensor:
     """(B, N, p q C) to (B, H, W, C), the inverse of ``to_patches``."""
-    rows, columns = resolution[0] // patch[0], resolution[1] // patch[1]
+    rows = resolution[0] // patch[0]
+    columns = resolution[1] // patch[1]
     x = x.reshape(len(x), rows, columns, *patch, -1).transpose(2, 3)
     return x.reshape(len(x), *resolution, -1)

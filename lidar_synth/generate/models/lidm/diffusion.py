@@ -1,15 +1,18 @@
-"""A denoising diffusion U-Net as the velocity network of a rectified flow, without further training.
+"""A denoising diffusion U-Net as the velocity network of a rectified flow, without further
+training.
 
-LiDM's network predicts the noise e in x = a y0 + s e at an integer diffusion step, with a^2 + s^2 = 1 (Ho et al.,
-"Denoising Diffusion Probabilistic Models", NeurIPS 2020). A state y = (1 - t) y0 + t e of the rectified path has the
-same signal-to-noise ratio where s / a = t / (1 - t), and is the same state up to scale::
+LiDM's network predicts the noise e in x = a y0 + s e at an integer diffusion step, with a^2 + s^2 =
+1 (Ho et al., "Denoising Diffusion Probabilistic Models", NeurIPS 2020). A state y = (1 - t) y0 + t
+e of the rectified path has the same signal-to-noise ratio where s / a = t / (1 - t), and is the
+same state up to scale::
 
     x = y / sqrt((1 - t)^2 + t^2)        a = (1 - t) / sqrt(...),  s = t / sqrt(...)
     v = e - y0 = (e - y) / (1 - t) = (y - y0') / t,     y0' = (x - s e) / a
 
-This is exact at the times of the 1000 steps. Between two of them, the step is interpolated in log(s / a), in which the
-network's time embedding is smooth. Before the first and after the last step (t below 0.037 and above 0.988 for LiDM),
-the network is evaluated at that step on the normalised state, as samplers of diffusion models do at their start.
+This is exact at the times of the 1000 steps. Between two of them, the step is interpolated in log(s
+/ a), in which the network's time embedding is smooth. Before the first and after the last step (t
+below 0.037 and above 0.988 for LiDM), the network is evaluated at that step on the normalised
+state, as samplers of diffusion models do at their start.
 """
 
 from typing import Any
@@ -22,11 +25,12 @@ from lidar_synth.generate.models.lidm.unet import UNet
 
 
 class DiffusionUNet(UNet):
-    """Velocity network v(y, t, c) like ``UNet``, computed from the noise that its weights were trained to predict.
+    """Velocity network v(y, t, c) like ``UNet``, computed from the noise that its weights were
+    trained to predict.
 
     Args:
-        beta_start, beta_end: first and last variance of the schedule. The square roots of its variances are evenly
-            spaced (latent diffusion calls this schedule "linear").
+        beta_start, beta_end: first and last variance of the schedule. The square roots of its
+            variances are evenly spaced (latent diffusion calls this schedule "linear").
         steps: number of diffusion steps.
         arguments: arguments of ``UNet``.
 
@@ -35,12 +39,17 @@ class DiffusionUNet(UNet):
     """
 
     def __init__(
-        self, beta_start: float = 0.0015, beta_end: float = 0.0195, steps: int = 1000, **arguments: Any
+        self,
+        beta_start: float = 0.0015,
+        beta_end: float = 0.0195,
+        steps: int = 1000,
+        **arguments: Any,
     ) -> None:
         super().__init__(**arguments)
         if not 0 < beta_start <= beta_end < 1 or steps < 2:
             raise ConfigError(
-                f"{steps} steps, betas {beta_start} to {beta_end}", "0 < start <= end < 1, at least 2 steps"
+                f"{steps} steps, betas {beta_start} to {beta_end}",
+                "0 < start <= end < 1, at least 2 steps",
             )
         self.schedule = beta_start, beta_end, steps
 
@@ -57,14 +66,18 @@ class DiffusionUNet(UNet):
 
 
 def schedule_times(beta_start: float, beta_end: float, steps: int) -> Tensor:
-    """(steps,) float64 times of the rectified path that have the signal-to-noise ratios of the diffusion steps."""
-    betas = torch.linspace(beta_start**0.5, beta_end**0.5, steps, dtype=torch.float64, device="cpu").square()
+    """(steps,) float64 times of the rectified path that have the signal-to-noise ratios of the
+    diffusion steps."""
+    betas = torch.linspace(
+        beta_start**0.5, beta_end**0.5, steps, dtype=torch.float64, device="cpu"
+    ).square()
     signal = (1 - betas).cumprod(0)
     return (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
 
 
 def step_of(t: Tensor, times: Tensor) -> Tensor:
-    """The diffusion step at each time, float32, interpolated in the logarithm of the signal-to-noise ratio.
+    """The diffusion step at each time, float32, interpolated in the logarithm of the
+    signal-to-noise ratio.
 
     Args:
         t: times of any shape, within [0, 1]; they are clamped to the range of ``times``.
@@ -73,5 +86,6 @@ def step_of(t: Tensor, times: Tensor) -> Tensor:
     ratio = torch.logit(t.double().clamp(times[0], times[-1]))
     ratios = torch.logit(times)
     above = torch.searchsorted(ratios, ratio.contiguous()).clamp(1, len(times) - 1)
-    low, high = ratios[above - 1], ratios[above]
+    low = ratios[above - 1]
+    high = ratios[above]
     return (above - 1 + (ratio - low) / (high - low)).float()

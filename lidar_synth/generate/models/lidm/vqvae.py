@@ -1,10 +1,12 @@
 """An autoencoder of range images with a codebook (VQ-VAE), after LiDM's.
 
-Columns wrap around. The decoder is curve-wise: the beams of a sensor trace curves, and its finest levels convolve along
-rows only (1 x 4). ``encode`` returns the latent before quantisation, and ``decode`` first quantises it (Ran et al.,
-"Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024), which removes small errors of a flow.
+Columns wrap around. The decoder is curve-wise: the beams of a sensor trace curves, and its finest
+levels convolve along rows only (1 x 4). ``encode`` returns the latent before quantisation, and
+``decode`` first quantises it (Ran et al., "Towards Realistic Scene Generation with LiDAR Diffusion
+Models", CVPR 2024), which removes small errors of a flow.
 
-Input and output have the channels of the image; labels are encoded as bits. With ``mask``, the decoder has one more
+Input and output have the channels of the image; labels are encoded as bits. With ``mask``, the
+decoder has one more
 channel that predicts returns: a cell is empty where it is below 0.
 """
 
@@ -39,7 +41,8 @@ CURVE = (1, 4)
 
 
 class _Step(NamedTuple):
-    """Change of resolution: kernel and padding (left, right, above, below) of the encoder, kernel of the decoder."""
+    """Change of resolution: kernel and padding (left, right, above, below) of the encoder, kernel
+    of the decoder."""
 
     down: Grid
     pad: tuple[int, int, int, int]
@@ -58,8 +61,8 @@ class Encoding(NamedTuple):
     """Result of a forward pass, for the training loss.
 
     Args:
-        output: (B, C, H, W) decoded image; gradients pass the codebook straight through to the encoder. (B, C + 1, H,
-            W) for a network with a mask, which is the last channel.
+        output: (B, C, H, W) decoded image; gradients pass the codebook straight through to the
+            encoder. (B, C + 1, H, W) for a network with a mask, which is the last channel.
         gap: (B,) mean squared distance of the latent to its codes, with gradients to the encoder.
         code_gap: (B,) the same distance with gradients to the codes.
     """
@@ -70,7 +73,8 @@ class Encoding(NamedTuple):
 
 
 class VQVAE(Network):
-    """Autoencoder of range images. The defaults are LiDM's, which encode 64 x 1024 cells to 8 x 16 x 128.
+    """Autoencoder of range images. The defaults are LiDM's, which encode 64 x 1024 cells to 8 x 16
+    x 128.
 
     Args:
         resolution: H, W of the image.
@@ -85,8 +89,8 @@ class VQVAE(Network):
         attention: whether the coarsest level has attention.
         attention_levels: levels (0 = the finest) with attention after each block.
         mask: whether to predict returns in a separate channel.
-        patch: rows and columns of cells that form one position of the finest level: LiDM uses (1, 1), larger patches
-            are faster.
+        patch: rows and columns of cells that form one position of the finest level: LiDM uses (1,
+            1), larger patches are faster.
         groups: groups of the norms; see ``convolution.GROUPS``.
 
     Raises:
@@ -116,21 +120,35 @@ class VQVAE(Network):
         mask: bool = False,
     ) -> None:
         super().__init__()
-        self.resolution, self.patch, self.channels, self.mask = pair(resolution), pair(patch), channels, mask
+        self.resolution = pair(resolution)
+        self.patch = pair(patch)
+        self.channels = channels
+        self.mask = mask
         steps = [pair(s) for s in strides]
-        if codebook not in CODEBOOKS or len(multipliers) != len(steps) + 1 or any(s not in _STEPS for s in steps):
+        if (
+            codebook not in CODEBOOKS
+            or len(multipliers) != len(steps) + 1
+            or any(s not in _STEPS for s in steps)
+        ):
             raise ConfigError(
                 f"codebook {codebook!r}, multipliers {tuple(multipliers)} and strides {steps}",
-                f"one of {', '.join(CODEBOOKS)}, one multiplier more than strides, strides of {tuple(_STEPS)}",
+                f"one of {', '.join(CODEBOOKS)}, one multiplier more than strides, strides of "
+                f"{tuple(_STEPS)}",
             )
         if not set(attention_levels) <= set(range(len(multipliers))):
-            raise ConfigError(f"attention_levels {list(attention_levels)}", f"levels 0 to {len(multipliers) - 1}")
+            raise ConfigError(
+                f"attention_levels {list(attention_levels)}", f"levels 0 to {len(multipliers) - 1}"
+            )
         self.draws = 0
-        self.latent_shape = (latent_channels, *reduced(self.resolution, [self.patch, *steps], "an image"))
+        self.latent_shape = (
+            latent_channels,
+            *reduced(self.resolution, [self.patch, *steps], "an image"),
+        )
         """Channels, rows and columns of a latent."""
         self.gradient_checkpointing = False
         """Recompute the activations of the levels in the backward pass instead of storing them."""
-        widths, cells = [width * m for m in multipliers], self.patch[0] * self.patch[1]
+        widths = [width * m for m in multipliers]
+        cells = self.patch[0] * self.patch[1]
         attends = [level in attention_levels for level in range(len(widths))]
         levels = (widths, steps, blocks, attends, attention, groups)
         self.encoder = Encoder(cells * channels, latent_channels, width, *levels)
@@ -138,28 +156,36 @@ class VQVAE(Network):
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
         self.codebook = Codebook(codes, latent_channels, codebook)
-        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise needs.
+        # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
+        # needs.
         self.register_buffer("shift", torch.zeros(latent_channels))
         self.register_buffer("scale", torch.ones(latent_channels))
 
     def encode(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) to latents before the codebook, (B, *latent_shape), mean 0 and variance 1 per channel."""
+        """Images (B, C, H, W) to latents before the codebook, (B, *latent_shape), mean 0 and
+        variance 1 per channel."""
         return (self._encode(x) - _channel(self.shift)) / _channel(self.scale)
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """Latents (B, *latent_shape), quantised, to images (B, C, H, W), with -1 where the mask predicts no return.
+        """Latents (B, *latent_shape), quantised, to images (B, C, H, W), with -1 where the mask
+        predicts no return.
 
         ``uniform_noise`` is ignored, since decoding is deterministic.
         """
         check_shape(z, self.latent_shape, "a latent")
         z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
         output = self._decode(self.codebook(z)[0])
-        return torch.where(output[:, self.channels :] < 0, -1.0, output[:, : self.channels]) if self.mask else output
+        return (
+            torch.where(output[:, self.channels :] < 0, -1.0, output[:, : self.channels])
+            if self.mask
+            else output
+        )
 
     def forward(self, x: Tensor) -> Encoding:
         """Encode and decode images (B, C, H, W).
 
-        In training mode, this updates the running statistics of the latents and the codes of an "ema" codebook.
+        In training mode, this updates the running statistics of the latents and the codes of an
+        "ema" codebook.
         """
         z = self._encode(x)
         if self.training:
@@ -169,11 +195,15 @@ class VQVAE(Network):
             self.codebook.follow(z.detach(), index)
         through = z + (quantised - z).detach() if len(self.codebook) else z
         gap = (z - quantised.detach()).float().square().flatten(1).mean(1)
-        return Encoding(self._decode(through), gap, (quantised - z.detach()).float().square().flatten(1).mean(1))
+        return Encoding(
+            self._decode(through), gap, (quantised - z.detach()).float().square().flatten(1).mean(1)
+        )
 
     def _encode(self, x: Tensor) -> Tensor:
         check_shape(x, (self.channels, *self.resolution), "an image")
-        x = fold(x.to(self.to_latent.weight.dtype), self.patch).contiguous(memory_format=torch.channels_last)
+        x = fold(x.to(self.to_latent.weight.dtype), self.patch).contiguous(
+            memory_format=torch.channels_last
+        )
         z: Tensor = self.to_latent(self.encoder(x, self.gradient_checkpointing))
         return z if len(self.codebook) else z.tanh()
 
@@ -182,8 +212,8 @@ class VQVAE(Network):
 
 
 class Encoder(nn.Module):
-    """Images (B, C, H, W) to (B, K, h, w). Arguments are those of ``VQVAE``; ``widths`` and ``attends`` are per level,
-    finest first."""
+    """Images (B, C, H, W) to (B, K, h, w). Arguments are those of ``VQVAE``; ``widths`` and
+    ``attends`` are per level, finest first."""
 
     def __init__(
         self,
@@ -205,10 +235,12 @@ class Encoder(nn.Module):
             for a, b, has_attention in zip(inputs, widths, attends, strict=True)
         )
         self.down = nn.ModuleList(
-            WrapConv(w, w, _STEPS[s].down, s, _STEPS[s].pad) for w, s in zip(widths[:-1], strides, strict=True)
+            WrapConv(w, w, _STEPS[s].down, s, _STEPS[s].pad)
+            for w, s in zip(widths[:-1], strides, strict=True)
         )
         self.middle = _middle(widths[-1], attention, groups)
-        self.norm, self.head = Norm(widths[-1], 1e-6, groups), WrapConv(widths[-1], latent)
+        self.norm = Norm(widths[-1], 1e-6, groups)
+        self.head = WrapConv(widths[-1], latent)
 
     def forward(self, x: Tensor, checkpointing: bool) -> Tensor:
         x = run(self.levels[0], checkpointing, self.stem(x))
@@ -218,8 +250,8 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, K, h, w) to images (B, C, H, W). Arguments are those of ``VQVAE``; ``widths`` and ``attends`` are per level,
-    finest first."""
+    """(B, K, h, w) to images (B, C, H, W). Arguments are those of ``VQVAE``; ``widths`` and
+    ``attends`` are per level, finest first."""
 
     def __init__(
         self,
@@ -243,8 +275,11 @@ class Decoder(nn.Module):
             for a, b, has_attention, k in zip(inputs, widths, attends, kernels, strict=True)
         ]
         self.levels = nn.ModuleList(reversed(levels))
-        self.up = nn.ModuleList(_Upsample(w, s) for w, s in reversed(list(zip(widths[1:], strides, strict=True))))
-        self.norm, self.head = Norm(widths[0], 1e-6, groups), WrapConv(widths[0], channels, CURVE)
+        self.up = nn.ModuleList(
+            _Upsample(w, s) for w, s in reversed(list(zip(widths[1:], strides, strict=True)))
+        )
+        self.norm = Norm(widths[0], 1e-6, groups)
+        self.head = WrapConv(widths[0], channels, CURVE)
 
     def forward(self, z: Tensor, checkpointing: bool) -> Tensor:
         x = run(self.levels[0], checkpointing, run(self.middle, checkpointing, self.stem(z)))
@@ -262,10 +297,14 @@ class _Upsample(nn.Module):
         self.conv = WrapConv(channels, channels, _STEPS[stride].up)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.conv(F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True))  # type: ignore[no-any-return]
+        return self.conv(
+            F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True)
+        )  # type: ignore[no-any-return]
 
 
-def _level(inputs: int, outputs: int, blocks: int, groups: int, attends: bool, kernel: Grid = (3, 3)) -> nn.Sequential:
+def _level(
+    inputs: int, outputs: int, blocks: int, groups: int, attends: bool, kernel: Grid = (3, 3)
+) -> nn.Sequential:
     parts: list[nn.Module] = []
     for i in range(blocks):
         parts.append(Residual(inputs if i == 0 else outputs, outputs, kernel, groups=groups))

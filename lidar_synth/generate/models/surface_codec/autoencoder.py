@@ -1,8 +1,8 @@
 """Autoencoder of dense range images that two CPU cores can train and decode.
 
-An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 16) in (-1, 1). The decoder works on patches of 2 x 8
-cells and predicts what the cells of a patch can show (``surfaces``); only the last linear layer knows single cells,
-which makes it cheap.
+An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 16) in (-1, 1). The decoder works on
+patches of 2 x 8 cells and predicts what the cells of a patch can show (``surfaces``); only the last
+linear layer knows single cells, which makes it cheap.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,24 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, row_bias
 from lidar_synth.generate.models.convolution import check_shape, pair, reduced
-from lidar_synth.generate.models.surface_codec.blocks import PATCH, Block, cell_norm, from_patches, split, to_patches
+from lidar_synth.generate.models.surface_codec.blocks import (
+    PATCH,
+    Block,
+    cell_norm,
+    from_patches,
+    split,
+    to_patches,
+)
 from lidar_synth.generate.models.surface_codec.bounds import bounds_of, codes_of
 from lidar_synth.generate.models.surface_codec.relief import SPANS, relief_fields
-from lidar_synth.generate.models.surface_codec.surfaces import DRAWS, NUMBERS, PER_CELL, Noise, Surfaces, surfaces_of
+from lidar_synth.generate.models.surface_codec.surfaces import (
+    DRAWS,
+    NUMBERS,
+    PER_CELL,
+    Noise,
+    Surfaces,
+    surfaces_of,
+)
 from lidar_synth.geometry.normalize import NORMALISATIONS
 
 DOWN = (4, 16)
@@ -35,7 +49,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         latent_channels: Z.
         encoder_widths: channels of the encoder on patches and on latent cells.
         widths: channels of the decoder on patches and on latent cells.
-        reaches: dilations of the decoder's blocks on latent cells, since a wall is straight over many of them.
+        reaches: dilations of the decoder's blocks on latent cells, since a wall is straight over
+            many of them.
         depth: blocks of the decoder on patches.
         surfaces: K of a patch, at most 4.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
@@ -68,15 +83,26 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         super().__init__()
         if channels != 2 + bits or not 2**bits >= codes > 1 or normalisation not in NORMALISATIONS:
             raise ConfigError(
-                f"{channels} channels, {codes} codes in {bits} bits, normalisation {normalisation!r}",
-                f"range, reflectance and enough bits for the codes; one of {', '.join(NORMALISATIONS)}",
+                f"{channels} channels, {codes} codes in {bits} bits, normalisation "
+                f"{normalisation!r}",
+                "range, reflectance and enough bits for the codes; one of "
+                f"{', '.join(NORMALISATIONS)}",
             )
-        if not 1 <= surfaces <= PATCH[1] // 2:  # a patch of half the columns has a shared number for each in a row
+        if (
+            not 1 <= surfaces <= PATCH[1] // 2
+        ):  # a patch of half the columns has a shared number for each in a row
             raise ConfigError(f"{surfaces} surfaces", f"1 to {PATCH[1] // 2}")
         if any(not 1 <= reach <= pair(resolution)[1] // DOWN[1] for reach in reaches):
-            raise ConfigError(f"reaches {list(reaches)}", f"columns of a latent, from 1 to {resolution[1] // DOWN[1]}")
-        self.resolution, self.channels, self.bits, self.codes = pair(resolution), channels, bits, codes
-        self.surfaces, self.normalisation = surfaces, NORMALISATIONS[normalisation]
+            raise ConfigError(
+                f"reaches {list(reaches)}",
+                f"columns of a latent, from 1 to {resolution[1] // DOWN[1]}",
+            )
+        self.resolution = pair(resolution)
+        self.channels = channels
+        self.bits = bits
+        self.codes = codes
+        self.surfaces = surfaces
+        self.normalisation = NORMALISATIONS[normalisation]
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
         """Channels, rows and columns of a latent."""
         self.draws = DRAWS
@@ -84,10 +110,12 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         self.widths = tuple(self.resolution[1] // merged for merged in (1, 2))
         """Columns that images can be decoded to."""
         cells, rows, (outer, inner) = PATCH[0] * PATCH[1], self.resolution[0], widths
-        # Not a convolution: oneDNN's with this kernel and stride gives wrong values in bfloat16 (torch 2.13).
+        # Not a convolution: oneDNN's with this kernel and stride gives wrong values in bfloat16
+        # (torch 2.13).
         stem = nn.Linear((channels + 1) * cells, encoder_widths[0])
         self.add_encoder(stem, encoder_widths, rows // PATCH[0], 2, latent_channels)
-        self.place_latent, self.place_outer = row_bias(inner, rows // DOWN[0]), row_bias(outer, rows // PATCH[0])
+        self.place_latent = row_bias(inner, rows // DOWN[0])
+        self.place_outer = row_bias(outer, rows // PATCH[0])
         self.from_latent = nn.Conv2d(latent_channels, inner, 1)
         self.decode_inner = nn.Sequential(*(Block(inner, reach) for reach in reaches))
         self.split = nn.Conv2d(inner, 4 * outer, 1)
@@ -110,7 +138,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
 
     def embed(self, x: Tensor) -> Tensor:
         """Images with a channel of their returns, (B, C + 1, H, W), to patches of 2 x 8 cells."""
-        rows, columns = self.resolution[0] // PATCH[0], self.resolution[1] // PATCH[1]
+        rows = self.resolution[0] // PATCH[0]
+        columns = self.resolution[1] // PATCH[1]
         patches: Tensor = self.stem(to_patches(x, PATCH).flatten(1))
         return patches.view(len(x), rows, columns, -1).movedim(-1, 1)
 
@@ -119,8 +148,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         return self.describe(z)
 
     def describe(self, z: Tensor, merged: int = 1) -> Surfaces:
-        """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by row; ``merged``
-        columns become one."""
+        """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by
+        row; ``merged`` columns become one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(split(self.split(h), (2, 2)) + self.place_outer)
@@ -128,38 +157,50 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         return surfaces_of(numbers, self.surfaces, self.codes, PATCH, merged)
 
     def decode(
-        self, z: Tensor, uniform_noise: Tensor | None = None, given: Mapping[str, Tensor] | None = None
+        self,
+        z: Tensor,
+        uniform_noise: Tensor | None = None,
+        given: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Latents to images.
 
         Args:
             z: (B, *latent_shape).
-            uniform_noise: (B, draws, H, W') numbers in (0, 1) to sample an image with; None = the most likely image. W'
-                is one of ``widths``, and becomes the width of the image.
-            given: "layout": (B, 5, H, W) uint8, images of layouts: objects are in their boxes only. "semantic":
-                (B, H, W) uint8, label maps: returns have the labels of the map, where it has any.
+            uniform_noise: (B, draws, H, W') numbers in (0, 1) to sample an image with; None = the
+                most likely image. W' is one of ``widths``, and becomes the width of the image.
+            given: "layout": (B, 5, H, W) uint8, images of layouts: objects are in their boxes only.
+                "semantic": (B, H, W) uint8, label maps: returns have the labels of the map, where
+                it has any.
 
         Returns:
-            (B, C, H, W'): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
-            grows with its probability.
+            (B, C, H, W'): range -1 where there is no return; bits as logits of the most likely
+            code, whose magnitude grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
         rows, columns = self.resolution if uniform_noise is None else uniform_noise.shape[-2:]
         if uniform_noise is None:
             uniform_noise = torch.full((len(z), DRAWS, rows, columns), 0.5, device=z.device)
         if columns not in self.widths:
-            raise DataError(f"noise for {columns} columns", f"one of {', '.join(map(str, self.widths))}")
+            raise DataError(
+                f"noise for {columns} columns", f"one of {', '.join(map(str, self.widths))}"
+            )
         merged = self.resolution[1] // columns
         patch = PATCH[0], PATCH[1] // merged
         surfaces = self.describe(self.bounded(z), merged)
         relief = relief_fields(uniform_noise[:, -1], merged)
         drawn = to_patches(uniform_noise, patch), to_patches(relief, patch)
-        given, bounds, codes = given or {}, None, None
+        given = given or {}
+        bounds = None
+        codes = None
         if "layout" in given:
             bounds = bounds_of(given["layout"], columns, patch, self.codes, self.normalisation)
         if "semantic" in given:
             codes = codes_of(given["semantic"], columns, patch)
         cells = surfaces.sample(*drawn, self.noise, self.normalisation, bounds, codes)
-        distance, value, code, likely = torch.split(from_patches(cells, patch, (rows, columns)), 1, 1)
-        bits = torch.cat([(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1)
+        distance, value, code, likely = torch.split(
+            from_patches(cells, patch, (rows, columns)), 1, 1
+        )
+        bits = torch.cat(
+            [(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1
+        )
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)

@@ -1,4 +1,5 @@
-"""Convolutional blocks over maps (B, C, H, W) with the memory format channels last, whose columns wrap around."""
+"""Convolutional blocks over maps (B, C, H, W) with the memory format channels last, whose columns
+wrap around."""
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -52,6 +53,7 @@ def to_patches(x: Tensor, patch: tuple[int, int]) -> Tensor:
 
 def from_patches(x: Tensor, patch: tuple[int, int], resolution: tuple[int, int]) -> Tensor:
     """The inverse of ``to_patches``."""
-    rows, columns = resolution[0] // patch[0], resolution[1] // patch[1]
+    rows = resolution[0] // patch[0]
+    columns = resolution[1] // patch[1]
     x = x.reshape(-1, rows, columns, x.shape[1], *patch)
     return x.permute(0, 3, 1, 4, 2, 5).reshape(len(x), -1, *resolution)

@@ -1,4 +1,5 @@
-"""What a condition says of single cells: where objects may be and of which class, and classes that are given."""
+"""What a condition says of single cells: where objects may be and of which class, and classes that
+are given."""
 
 from typing import NamedTuple
 
@@ -18,8 +19,8 @@ class Bounds(NamedTuple):
     """The part of each ray that is in a box.
 
     Args:
-        near, far: (N, P) normalised ranges where the ray of a cell enters and leaves a box; near > far if it meets
-            none.
+        near, far: (N, P) normalised ranges where the ray of a cell enters and leaves a box; near >
+            far if it meets none.
         label: (N, P) int64 class of the object in the box, -1 = unknown.
         codes: (C,) bool, the classes that are drawn in boxes only: all that move.
     """
@@ -30,11 +31,14 @@ class Bounds(NamedTuple):
     codes: Tensor
 
 
-def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, normalisation: Normalisation) -> Bounds:
+def bounds_of(
+    layout: Tensor, columns: int, patch: tuple[int, int], codes: int, normalisation: Normalisation
+) -> Bounds:
     """The bounds of the cells of N patches.
 
-    Rays that meet no box have near = 1 and far = -1, and all rays of a blank image -1 and 1, since nothing is known of
-    them. A column that stands for several has what is in any of them, and the class of the nearest box.
+    Rays that meet no box have near = 1 and far = -1, and all rays of a blank image -1 and 1, since
+    nothing is known of them. A column that stands for several has what is in any of them, and the
+    class of the nearest box.
 
     Args:
         layout: (B, 5, H, W) uint8, images of layouts.
@@ -43,8 +47,11 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
         codes: number of classes.
         normalisation: of the ranges.
     """
-    code, depth, chord = layout[:, 0], depths_of(layout), layout[:, 3] * CHORD_STEP
-    boxed, blank = code >= CODES["Car"], (code == 0).all(2).all(1)[:, None, None]
+    code = layout[:, 0]
+    depth = depths_of(layout)
+    chord = layout[:, 3] * CHORD_STEP
+    boxed = code >= CODES["Car"]
+    blank = (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
     far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(blank, 1.0)
     labels = torch.tensor(_LABELS, device=layout.device)[code.long()]
@@ -52,7 +59,8 @@ def bounds_of(layout: Tensor, columns: int, patch: tuple[int, int], codes: int, 
     near, nearest = near.reshape(shape).min(3)
     labels = labels.reshape(shape).gather(3, nearest[..., None])[..., 0]
     parts = torch.stack([near, far.reshape(shape).amax(3), labels.float()], 1)
-    # Parked bicycles and motorcycles too: a layout does not say where one stands, and drawn anywhere it is a streak.
+    # Parked bicycles and motorcycles too: a layout does not say where one stands, and drawn
+    # anywhere it is a streak.
     kinds = torch.arange(codes, device=layout.device) <= TRAIN_ID["motorcyclist"]
     near, far, labels = to_patches(parts, patch).unbind(1)
     return Bounds(near, far, labels.long(), kinds)
@@ -68,7 +76,11 @@ def codes_of(labels: Tensor, columns: int, patch: tuple[int, int]) -> Tensor:
         columns: of the cells; a divisor of W.
         patch: rows and columns of a patch.
     """
-    parts = torch.where(labels == IGNORE, -1, labels.long()).view(*labels.shape[:2], columns, -1).unbind(3)
+    parts = (
+        torch.where(labels == IGNORE, -1, labels.long())
+        .view(*labels.shape[:2], columns, -1)
+        .unbind(3)
+    )
     codes = parts[0]
     for part in parts[1:]:
         codes = torch.where(codes < 0, part, codes)

@@ -1,9 +1,13 @@
-"""How the noise of a codec's cells is divided: what differs from cell to cell, and what the cells of a patch share.
+"""How the noise of a codec's cells is divided: what differs from cell to cell, and what the cells
+of a patch share.
 
-The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the same error of the
-range and similar reflectances, leaves do not. Both follow from pairs of neighbouring cells of real images that show one
-surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what differs; the correlation
-of reflectances is that of their normal scores. The relief of plants follows from the correlation of errors at two
+The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the
+same error of the range and similar reflectances, leaves do not. Both follow from pairs of
+neighbouring cells of real images that show one
+surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what
+    differs; the correlation
+of reflectances is that of their normal scores. The relief of plants follows from the correlation of
+errors at two
 distances along a row: at the longer one, only the wider field is correlated.
 """
 
@@ -29,7 +33,9 @@ _SURE = 1e-4
 
 
 @torch.no_grad()
-def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Tensor]], noise: float = 0.03) -> None:
+def measure_noise(
+    network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Tensor]], noise: float = 0.03
+) -> None:
     """Set the noise of a codec from images.
 
     Args:
@@ -38,7 +44,9 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
         noise: standard deviation of the noise on latents, as in training.
     """
     codes = len(network.roughness)
-    sums = torch.zeros(codes, 4, dtype=torch.float64)  # pairs, |e1 - e2|, products and squares of scores
+    sums = torch.zeros(
+        codes, 4, dtype=torch.float64
+    )  # pairs, |e1 - e2|, products and squares of scores
     relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     for x, code in images:
@@ -52,14 +60,24 @@ def measure_noise(network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Te
             for some in (slice(0, -1), slice(1, None))
         )
         same = (left[2] == right[2]) & (left[3] == right[3]) & (left[4] > -1) & (right[4] > -1)
-        terms = [torch.ones_like(left[0]), (left[0] - right[0]).abs(), left[1] * right[1], left[1] ** 2]
+        terms = [
+            torch.ones_like(left[0]),
+            (left[0] - right[0]).abs(),
+            left[1] * right[1],
+            left[1] ** 2,
+        ]
         for column, term in enumerate(terms):
             sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
-        whole = from_patches(torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution)
+        whole = from_patches(
+            torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution
+        )
         relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
-    total, known = sums.sum(0), sums[:, 0] >= LEAST
+    total = sums.sum(0)
+    known = sums[:, 0] >= LEAST
     network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
-    network.alike.copy_(torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95))
+    network.alike.copy_(
+        torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95)
+    )
     network.relief.copy_(_relief(relief))
 
 
@@ -71,7 +89,8 @@ def _scores(
     network: SurfaceAutoencoder,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each cell shows."""
+    """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each
+    cell shows."""
     far = normalised(surfaces.inverse, network.normalisation)
     fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
     fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
@@ -89,14 +108,19 @@ def _scores(
 
 
 def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Tensor:
-    """(C, 1 + lags, 2) sums of products of the errors (B, H, W) of two cells of a row that show one class, and their
-    number; the first lag is 0."""
+    """(C, 1 + lags, 2) sums of products of the errors (B, H, W) of two cells of a row that show one
+    class, and their number; the first lag is 0."""
     sums = []
     inside = (error.abs() < _LARGEST) & (distance > -1)
     for lag in (0, *LAGS):
         same = inside & inside.roll(-lag, -1) & (kinds == kinds.roll(-lag, -1))
-        products, of = (error * error.roll(-lag, -1))[same].double(), kinds[same].long()
-        sums.append(torch.stack([torch.bincount(of, products, codes), torch.bincount(of, minlength=codes)], 1))
+        products = (error * error.roll(-lag, -1))[same].double()
+        of = kinds[same].long()
+        sums.append(
+            torch.stack(
+                [torch.bincount(of, products, codes), torch.bincount(of, minlength=codes)], 1
+            )
+        )
     return torch.stack(sums, 1)
 
 

@@ -1,9 +1,11 @@
-"""Relief of plants: bumps that are wider than a patch, which no latent can hold and which are therefore drawn.
+"""Relief of plants: bumps that are wider than a patch, which no latent can hold and which are
+therefore drawn.
 
-The error of a predicted range has two causes. On a wall it is doubt: the plane lies elsewhere, and drawing that would
-bend the wall. On grass and leaves it is relief, correlated over several columns, and a surface without it is smoother
-than any real one. The relief of a cell is a sum of fields of standard normal values, each with its own correlation
-along the columns. Rows of one patch share their values.
+The error of a predicted range has two causes. On a wall it is doubt: the plane lies elsewhere, and
+    drawing that would
+bend the wall. On grass and leaves it is relief, correlated over several columns, and a surface
+without it is smoother than any real one. The relief of a cell is a sum of fields of standard normal
+values, each with its own correlation along the columns. Rows of one patch share their values.
 """
 
 import math
@@ -21,7 +23,8 @@ def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
     """The fields of relief.
 
     Args:
-        uniform_noise: (B, H, W') numbers in (0, 1), of which those in the second rows of patches are used.
+        uniform_noise: (B, H, W') numbers in (0, 1), of which those in the second rows of patches
+            are used.
         merged: columns of the full image that are one here, a divisor of all ``SPANS``.
 
     Returns:
@@ -38,12 +41,14 @@ def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
 
 
 def to_normal(uniform_noise: Tensor) -> Tensor:
-    """Uniform numbers in (0, 1) to standard normal ones; eight times as fast as ``torch.special.ndtri`` on a CPU."""
+    """Uniform numbers in (0, 1) to standard normal ones; eight times as fast as
+    ``torch.special.ndtri`` on a CPU."""
     return math.sqrt(2) * torch.erfinv(2 * uniform_noise - 1)
 
 
 def correlation(span: int, lag: int) -> float:
-    """The correlation of the values of a field whose columns are ``lag`` apart, averaged over all places."""
+    """The correlation of the values of a field whose columns are ``lag`` apart, averaged over all
+    places."""
     turn = [column * math.pi / 2 / span for column in range(span)]
     total = 0.0
     for column in range(span):

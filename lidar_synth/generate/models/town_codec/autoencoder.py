@@ -1,10 +1,12 @@
 """Autoencoder of range images that two CPU cores can train.
 
-An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran et al., "Towards
-Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024).
+An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the size of LiDM's (Ran
+et al., "Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024).
 
-No latent can hold what is random about a sensor: whether a ray returns, the speckle of a reflectance. The decoder
-therefore predicts distributions, and an image is sampled from them: the mean would be smoother than any real scan, and
+No latent can hold what is random about a sensor: whether a ray returns, the speckle of a
+    reflectance. The decoder
+therefore predicts distributions, and an image is sampled from them: the mean would be smoother than
+    any real scan, and
 a network trained on such means would take the noise of real scans for something new.
 """
 
@@ -20,7 +22,12 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, Residual, row_bias
 from lidar_synth.generate.models.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.generate.models.town_codec.distributions import CellDistributions
-from lidar_synth.generate.models.town_codec.multiscale import LATTICES, LatticeRefinement, at_lattice, step_ratio
+from lidar_synth.generate.models.town_codec.multiscale import (
+    LATTICES,
+    LatticeRefinement,
+    at_lattice,
+    step_ratio,
+)
 from lidar_synth.generate.models.town_codec.plane_fit import PlaneFit
 from lidar_synth.generate.models.town_codec.planes import Planes, RangeMixture, laplace_noise
 from lidar_synth.generate.models.town_codec.reflectance import ZeroInflatedLogistic
@@ -39,7 +46,8 @@ ROUGHNESS = 5e-4
 
 Grid = tuple[int, int]
 Observe = Callable[[CellDistributions, Grid], Tensor]
-"""(predicted distributions, lattice) to the values of its cells: sampled, or those of a given image."""
+"""(predicted distributions, lattice) to the values of its cells: sampled, or those of a given
+image."""
 
 
 class Autoencoder(BoundedAutoencoder):
@@ -47,17 +55,22 @@ class Autoencoder(BoundedAutoencoder):
 
     Args:
         resolution: H, W of the image, multiples of 4 and 8.
-        channels: C of the image: the range first, then other numbers such as reflectance, then ``bits``.
+        channels: C of the image: the range first, then other numbers such as reflectance, then
+            ``bits``.
         bits: channels of the image that are an analog code (``normalize.encode_labels``).
         codes: K, how many codes there are.
         latent_channels: Z.
         widths: channels on patches of 2 x 4 cells and of 4 x 8.
-        depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it in the encoder.
-        wide: dilations of further blocks of the decoder on the coarser grid, since a wall is straight over many cells.
-        window: rows and columns of patches of 2 x 4 cells over which planes are fitted; empty = no plane fit.
+        depth: residual blocks of the decoder on the coarser grid; one less after it, one less on it
+            in the encoder.
+        wide: dilations of further blocks of the decoder on the coarser grid, since a wall is
+            straight over many cells.
+        window: rows and columns of patches of 2 x 4 cells over which planes are fitted; empty = no
+            plane fit.
         fine: channels of the decoder's last map, on single cells.
         normalisation: a name of ``NORMALISATIONS``, that of the range.
-        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; None if a checkpoint will be loaded.
+        angles: (2, H, W) elevation and azimuth of the cells' rays, radians; None if a checkpoint
+            will be loaded.
 
     Raises:
         ConfigError: on values that do not fit together.
@@ -84,18 +97,28 @@ class Autoencoder(BoundedAutoencoder):
         super().__init__()
         self.resolution = pair(resolution)
         rows = self.resolution[0]
-        if (bits and not 2**bits >= codes > 1) or (not bits and codes) or channels <= bits or depth < 2:
+        if (
+            (bits and not 2**bits >= codes > 1)
+            or (not bits and codes)
+            or channels <= bits
+            or depth < 2
+        ):
             raise ConfigError(
                 f"{channels} channels, {codes} codes in {bits} bits, depth {depth}",
                 "a range beside the bits, as many bits as the codes need (0 for 0), and depth >= 2",
             )
         if normalisation not in NORMALISATIONS:
-            raise ConfigError(f"normalisation {normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+            raise ConfigError(
+                f"normalisation {normalisation!r}", f"one of {', '.join(NORMALISATIONS)}"
+            )
         columns = self.resolution[1] // DOWN[1]
         if any(not 1 <= reach <= columns for reach in wide):
             raise ConfigError(f"wide {list(wide)}", f"columns of a latent, from 1 to {columns}")
         outer, inner = widths
-        self.channels, self.values, self.bits, self.fine = channels, channels - bits - 1, bits, fine
+        self.channels = channels
+        self.values = channels - bits - 1
+        self.bits = bits
+        self.fine = fine
         self.draws = 2 + self.values
         """Random numbers per cell that sampling an image takes."""
         self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
@@ -118,7 +141,8 @@ class Autoencoder(BoundedAutoencoder):
         self.sizes = [PLANES, self.values, self.values, self.values, 1, codes]
         self.heads = nn.Conv2d(fine, sum(self.sizes), 1)
         self.neighbours = nn.ModuleList(
-            LatticeRefinement(fine, 1 + 2 * self.values, 2 * fine, step_ratio(a, b)) for a, b in pairwise(LATTICES)
+            LatticeRefinement(fine, 1 + 2 * self.values, 2 * fine, step_ratio(a, b))
+            for a, b in pairwise(LATTICES)
         )
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
@@ -126,18 +150,22 @@ class Autoencoder(BoundedAutoencoder):
 
         Args:
             z: (B, *latent_shape).
-            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample an image with; None = the mode.
+            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample an image with; None = the
+                mode.
 
         Returns:
-            (B, C, H, W): range -1 where there is no return; bits as logits of the most likely code, whose magnitude
-            grows with its probability.
+            (B, C, H, W): range -1 where there is no return; bits as logits of the most likely code,
+            whose magnitude grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
         predicted = self._decode_lattices(
             self.bounded(z),
-            lambda cells, lattice: cells.sample(None if uniform_noise is None else at_lattice(lattice, uniform_noise)),
+            lambda cells, lattice: cells.sample(
+                None if uniform_noise is None else at_lattice(lattice, uniform_noise)
+            ),
         )
-        distance, seen = predicted.surfaces.mode(), predicted.sample(uniform_noise)
+        distance = predicted.surfaces.mode()
+        seen = predicted.sample(uniform_noise)
         if uniform_noise is not None:
             distance = distance + ROUGHNESS * laplace_noise(uniform_noise[:, :1])
         parts = [torch.where(seen[:, :1] > 0, distance, -1.0), seen[:, 1:]]
@@ -152,13 +180,14 @@ class Autoencoder(BoundedAutoencoder):
         return patches
 
     def expand(self, z: Tensor, image: Tensor) -> CellDistributions:
-        """Bounded latents to the distributions of every cell, given its neighbours on coarser ``LATTICES`` of an image
-        (B, C, H, W)."""
+        """Bounded latents to the distributions of every cell, given its neighbours on coarser
+        ``LATTICES`` of an image (B, C, H, W)."""
         seen = torch.cat([(image[:, :1] > -1).to(image.dtype), image[:, 1 : 1 + self.values]], 1)
         return self._decode_lattices(z, lambda _, lattice: at_lattice(lattice, seen))
 
     def _decode_lattices(self, z: Tensor, observe: Observe) -> CellDistributions:
-        """The distributions of every cell, lattice by lattice; ``observe`` gives the values of the cells of one."""
+        """The distributions of every cell, lattice by lattice; ``observe`` gives the values of the
+        cells of one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(F.pixel_shuffle(self.split(h), 2) + self.place_outer)
@@ -174,10 +203,14 @@ class Autoencoder(BoundedAutoencoder):
             predicted = closer
         return self._distributions(planes, predicted, LATTICES[-1])
 
-    def _distributions(self, planes: tuple[Tensor, Tensor], predicted: Tensor, lattice: Grid) -> CellDistributions:
+    def _distributions(
+        self, planes: tuple[Tensor, Tensor], predicted: Tensor, lattice: Grid
+    ) -> CellDistributions:
         chosen, middles, spreads, blank, *rest = torch.split(predicted, self.sizes, 1)
         ranges, doubts = (at_lattice(lattice, part) for part in planes)
-        readings = ZeroInflatedLogistic(middles.float(), spreads.float().clamp(*SPREADS), blank.float())
+        readings = ZeroInflatedLogistic(
+            middles.float(), spreads.float().clamp(*SPREADS), blank.float()
+        )
         return CellDistributions(RangeMixture(ranges, doubts, chosen.float()), readings, *rest)
 
     def _corners(self, code: Tensor) -> Tensor:

@@ -28,8 +28,8 @@ class CellDistributions(NamedTuple):
         """Returns (1 or 0) and readings, (B, 1 + V, H, W).
 
         Args:
-            uniform_noise: (B, 2 + V, H, W) numbers in (0, 1); the first channel is for the range, the last for the
-                return. None = the mode.
+            uniform_noise: (B, 2 + V, H, W) numbers in (0, 1); the first channel is for the range,
+                the last for the return. None = the mode.
         """
         if uniform_noise is None:
             return torch.cat([(self.returned > 0).float(), self.readings.mode()], 1)
@@ -42,6 +42,7 @@ class CellDistributions(NamedTuple):
         Args:
             seen: (B, 1 + V, H, W) returns and readings as ``sample`` gives them.
         """
-        returned, values = seen[:, :1], seen[:, 1:]
+        returned = seen[:, :1]
+        values = seen[:, 1:]
         off = torch.where(returned > 0, self.readings.residual(values), 0.0)
         return torch.cat([returned - torch.sigmoid(self.returned.float()), off], 1)

@@ -1,9 +1,12 @@
-"""Multi-scale autoregressive sampling: coarse cells first, then the cells between them given their neighbours.
+"""Multi-scale autoregressive sampling: coarse cells first, then the cells between them given their
+neighbours.
 
-Neighbouring cells are correlated: a dark car is dark all over, and a window pane loses its returns as a whole. Sampled
-independently, the cells of a wall would be as noisy as leaves. Therefore the cells of a coarse lattice are sampled
-first, then those of a finer one, conditioned on the residuals (sampled minus predicted) of their neighbours. In
-training all cells are known, so that one pass gives the exact likelihood of the image.
+Neighbouring cells are correlated: a dark car is dark all over, and a window pane loses its returns
+    as a whole. Sampled
+independently, the cells of a wall would be as noisy as leaves. Therefore the cells of a coarse
+lattice are sampled first, then those of a finer one, conditioned on the residuals (sampled minus
+predicted) of their neighbours. In training all cells are known, so that one pass gives the exact
+likelihood of the image.
 """
 
 import torch.nn.functional as F
@@ -26,7 +29,8 @@ def step_ratio(coarse: tuple[int, int], fine: tuple[int, int]) -> tuple[int, int
 
 
 class LatticeRefinement(nn.Module):
-    """Updates the features of a lattice by the residuals of the next coarser one. Starts as the identity.
+    """Updates the features of a lattice by the residuals of the next coarser one. Starts as the
+    identity.
 
     Args:
         channels: of the features.
@@ -38,14 +42,15 @@ class LatticeRefinement(nn.Module):
     def __init__(self, channels: int, residuals: int, hidden: int, steps: tuple[int, int]) -> None:
         super().__init__()
         self.steps = steps
-        self.own, self.others = nn.Conv2d(channels, hidden, 1), WrapConv(residuals, hidden, bias=False)
+        self.own = nn.Conv2d(channels, hidden, 1)
+        self.others = WrapConv(residuals, hidden, bias=False)
         self.answer = nn.Conv2d(hidden, channels, 1)
         nn.init.zeros_(self.answer.weight)
         nn.init.zeros_(self.answer.bias)  # type: ignore[arg-type]  # it has one
 
     def forward(self, x: Tensor, residual: Tensor) -> Tensor:
-        """Features (B, C, h, w) of this lattice and residuals (B, R, h', w') of the coarser one to features (B, C, h,
-        w)."""
+        """Features (B, C, h, w) of this lattice and residuals (B, R, h', w') of the coarser one to
+        features (B, C, h, w)."""
         wide = residual.new_zeros(*residual.shape[:2], *x.shape[-2:])
         at_lattice(self.steps, wide)[:] = residual
         out: Tensor = x + self.answer(F.silu(self.own(x) + self.others(wide.to(x.dtype))))

@@ -1,8 +1,10 @@
-"""Ranges as planes: each patch of a range image predicts a few planes, and each cell chooses among them.
+"""Ranges as planes: each patch of a range image predicts a few planes, and each cell chooses among
+them.
 
-Seen from the sensor, the inverse range of a plane is linear in the ray's direction: of n . x = d, along x = r u,
-follows 1 / r = n . u / d. Within a patch of a few cells the direction is linear in row and column, so that three
-numbers describe a plane. Walls and roads come out straight, and edges stay sharp.
+Seen from the sensor, the inverse range of a plane is linear in the ray's direction: of n . x = d,
+along x = r u, follows 1 / r = n . u / d. Within a patch of a few cells the direction is linear in
+row and column, so that three numbers describe a plane. Walls and roads come out straight, and edges
+stay sharp.
 """
 
 import math
@@ -17,8 +19,8 @@ from lidar_synth.geometry.normalize import Normalisation
 SLOPES = 0.3, 0.1
 """Relative change of the inverse range per row and per column for a slope of 1."""
 SPREADS = 5e-3, 0.3
-"""Limits of the predicted scale, in normalised range. With a smaller lower limit, the road, which is easy, would
-dominate the loss."""
+"""Limits of the predicted scale, in normalised range. With a smaller lower limit, the road, which
+is easy, would dominate the loss."""
 
 
 class RangeMixture(NamedTuple):
@@ -75,7 +77,9 @@ class Planes(nn.Module):
         consensus: PlaneFit | None = None,
     ) -> None:
         super().__init__()
-        self.patch, self.normalisation, self.consensus = patch, normalisation, consensus
+        self.patch = patch
+        self.normalisation = normalisation
+        self.consensus = consensus
         self.planes = nn.Conv2d(channels, 4 * count, 1)
         nn.init.normal_(self.planes.weight, std=0.02)
         with torch.no_grad():  # starts near and far, facing the sensor, with a wide scale
@@ -85,7 +89,9 @@ class Planes(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Maps (B, C, h, w) to normalised ranges and log spreads (B, count, H, W)."""
-        with torch.autocast(x.device.type, enabled=False):  # bfloat16 would round off half a per cent of a range
+        with torch.autocast(
+            x.device.type, enabled=False
+        ):  # bfloat16 would round off half a per cent of a range
             return self._ranges(x.to(self.planes.weight.dtype))
 
     def _ranges(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,7 +104,8 @@ class Planes(nn.Module):
         if self.consensus is not None:
             agreed, trust = self.consensus(x, distance)
             inverse = torch.lerp(inverse, agreed.float(), self._up(trust.float()))
-        low, high = self.normalisation.range_min, self.normalisation.range_max
+        low = self.normalisation.range_min
+        high = self.normalisation.range_max
         metres = 1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low))
         return self.normalisation.encode(metres), self._up(spread.clamp(*map(math.log, SPREADS)))
 

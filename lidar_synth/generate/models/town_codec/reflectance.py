@@ -1,7 +1,7 @@
 """Zero-inflated reflectance: a logistic distribution with a separate probability of 0.
 
-One return in eleven has reflectance 0 in KITTI-360, one in six in KITTI. A distribution with one mode samples too few
-of them, or makes everything darker.
+One return in eleven has reflectance 0 in KITTI-360, one in six in KITTI. A distribution with one
+mode samples too few of them, or makes everything darker.
 """
 
 from typing import NamedTuple
@@ -30,8 +30,8 @@ class ZeroInflatedLogistic(NamedTuple):
     blank: Tensor
 
     def nll(self, x: Tensor) -> Tensor:
-        """(B, V, H, W) negative log-likelihood of normalised values (B, V, H, W). The logistic mass below 0 counts as
-        0."""
+        """(B, V, H, W) negative log-likelihood of normalised values (B, V, H, W). The logistic mass
+        below 0 counts as 0."""
         off = (x - self.middles) * torch.exp(-self.spreads)
         number = F.logsigmoid(-self.blank)
         below = torch.logaddexp(F.logsigmoid(self.blank), number + F.logsigmoid(off))
@@ -39,18 +39,21 @@ class ZeroInflatedLogistic(NamedTuple):
         return -torch.where(x > BLANK, density, below)
 
     def residual(self, x: Tensor) -> Tensor:
-        """(B, 2 V, H, W) of values (B, V, H, W): whether 0 minus its probability, and the distance to the median in
-        scales."""
+        """(B, 2 V, H, W) of values (B, V, H, W): whether 0 minus its probability, and the distance
+        to the median in scales."""
         nothing = x <= BLANK
         off = ((x - self.middles) * torch.exp(-self.spreads)).clamp(-_FAR, _FAR) / 2
-        return torch.cat([nothing.float() - torch.sigmoid(self.blank), torch.where(nothing, 0.0, off)], 1)
+        return torch.cat(
+            [nothing.float() - torch.sigmoid(self.blank), torch.where(nothing, 0.0, off)], 1
+        )
 
     def mode(self) -> Tensor:
         """(B, V, H, W) 0 where that is more likely than not, else the median."""
         return torch.where(self.blank > 0, BLANK, self.middles)
 
     def sample(self, uniform_noise: Tensor) -> Tensor:
-        """(B, V, H, W) values from uniform numbers (B, V, H, W) in (0, 1), by the inverse distribution function."""
+        """(B, V, H, W) values from uniform numbers (B, V, H, W) in (0, 1), by the inverse
+        distribution function."""
         blank = torch.sigmoid(self.blank)
         rest = ((uniform_noise - blank) / (1 - blank)).clamp(_SURE, 1 - _SURE)
         numbers = (self.middles + self.spreads.exp() * torch.logit(rest)).clamp(min=BLANK)

@@ -1,4 +1,5 @@
-"""Reading of the archives in which the extractors' authors publish weights: a folder, or a ``.tar`` with one folder.
+"""Reading of the archives in which the extractors' authors publish weights: a folder, or a ``.tar``
+with one folder.
 
 Nothing is unpacked to disk, and no code of a file runs.
 """
@@ -25,12 +26,14 @@ class Archive:
     """The files of a published archive.
 
     Args:
-        path: a folder with the files, or a ``.tar``, ``.tar.gz`` or ``.tgz`` that holds them, in one folder or none.
+        path: a folder with the files, or a ``.tar``, ``.tar.gz`` or ``.tgz`` that holds them, in
+            one folder or none.
         project: the project that publishes it, for errors.
     """
 
     def __init__(self, path: Path, project: str) -> None:
-        self.path, self.project = Path(path), project
+        self.path = Path(path)
+        self.project = project
 
     def yaml(self, name: str) -> dict[str, Any]:
         """The settings in a YAML file.
@@ -42,7 +45,10 @@ class Archive:
         where = self.path / name
         content = parse_yaml(self._read(name, LONGEST_YAML).decode(errors="replace"), str(where))
         if not isinstance(content, dict):
-            raise DataError(f"{where} holds {type(content).__name__}", f"the settings that {self.project} writes")
+            raise DataError(
+                f"{where} holds {type(content).__name__}",
+                f"the settings that {self.project} writes",
+            )
         return content
 
     def weights(self, name: str) -> Any:
@@ -58,7 +64,10 @@ class Archive:
         if self.path.is_dir():
             return read_file(self.path / name, f"a file of {self.project}", at_most)
         if not self.path.is_file():
-            raise FileError(f"{self.path} does not exist", f"an archive of {self.project}, or a folder with its files")
+            raise FileError(
+                f"{self.path} does not exist",
+                f"an archive of {self.project}, or a folder with its files",
+            )
         try:
             with tarfile.open(self.path) as tar:
                 return self._member(tar, name, at_most)
@@ -66,7 +75,8 @@ class Archive:
             if isinstance(error, LidarSynthError):
                 raise
             raise DataError(
-                f"{self.path} is truncated, damaged or no archive ({error})", f"an intact archive of {self.project}"
+                f"{self.path} is truncated, damaged or no archive ({error})",
+                f"an intact archive of {self.project}",
             ) from error
 
     def _member(self, tar: tarfile.TarFile, name: str, at_most: int) -> bytes:
@@ -74,7 +84,9 @@ class Archive:
             parts = PurePosixPath(member.name).parts
             if parts[-1:] == (name,) and len(parts) <= 3 and member.isfile():
                 if member.size > at_most:
-                    raise DataError(f"{self.path}: {name} declares {member.size} bytes", f"at most {at_most}")
+                    raise DataError(
+                        f"{self.path}: {name} declares {member.size} bytes", f"at most {at_most}"
+                    )
                 file = tar.extractfile(member)
                 assert file is not None  # it is a file
                 return file.read()
@@ -92,24 +104,37 @@ def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False)
         module: takes the weights.
         state: what the file holds.
         where: the file, for errors.
-        extra: whether names that the module does not have are left out, as the peers' own loaders do.
+        extra: whether names that the module does not have are left out, as the peers' own loaders
+            do.
 
     Raises:
         DataError: on weights of another architecture, or values that are not finite.
     """
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise DataError(f"{where}: its weights are not tensors by name", "the state dictionary of a network")
+    if not isinstance(state, Mapping) or not all(
+        isinstance(value, Tensor) for value in state.values()
+    ):
+        raise DataError(
+            f"{where}: its weights are not tensors by name", "the state dictionary of a network"
+        )
     own = module.state_dict()
-    counters = {k: v for k, v in own.items() if k.endswith("num_batches_tracked")}  # absent before PyTorch 0.4.1
+    counters = {
+        k: v for k, v in own.items() if k.endswith("num_batches_tracked")
+    }  # absent before PyTorch 0.4.1
     chosen = counters | {k: v for k, v in state.items() if k in own or not extra}
     differences = {
         "lacks": [k for k in own if k not in chosen],
-        "has another shape of": [k for k, v in chosen.items() if k in own and v.shape != own[k].shape],
+        "has another shape of": [
+            k for k, v in chosen.items() if k in own and v.shape != own[k].shape
+        ],
         "has": [k for k in chosen if k not in own],
     }
     if any(differences.values()):
-        found = "; ".join(f"it {what} {_some(names)}" for what, names in differences.items() if names)
-        raise DataError(f"{where}: weights of another architecture ({found})", "those of the published network")
+        found = "; ".join(
+            f"it {what} {_some(names)}" for what, names in differences.items() if names
+        )
+        raise DataError(
+            f"{where}: weights of another architecture ({found})", "those of the published network"
+        )
     module.load_state_dict(chosen)
     if bad := [k for k, v in chosen.items() if v.is_floating_point() and not v.isfinite().all()]:
         raise DataError(f"{where}: {bad[0]} holds values that are not finite", "finite weights")

@@ -1,6 +1,7 @@
-"""Segmentation networks of lidar-bonnetal (https://github.com/PRBonn/lidar-bonnetal): an archive with
-``arch_cfg.yaml``, ``data_cfg.yaml`` and the state dictionaries ``backbone``, ``segmentation_decoder`` and
-``segmentation_head``. R2Flow publishes its RangeNet-21 in the same form.
+"""Segmentation networks of lidar-bonnetal (https://github.com/PRBonn/lidar-bonnetal): an archive
+with ``arch_cfg.yaml``, ``data_cfg.yaml`` and the state dictionaries ``backbone``,
+``segmentation_decoder`` and ``segmentation_head``. R2Flow publishes its RangeNet-21 in the same
+form.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,14 +27,18 @@ from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
 
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head")
 OWN_GRID = "bonnetal"
-"""The preparation in which scans are projected to the grid that the archive's settings describe, as in training."""
+"""The preparation in which scans are projected to the grid that the archive's settings describe, as
+in training."""
 
 
 def _darknet(channels: int, classes: int, backbone: Mapping[str, Any]) -> RangeNet:
-    layers, stride = backbone["extra"]["layers"], backbone["OS"]
+    layers = backbone["extra"]["layers"]
+    stride = backbone["OS"]
     if layers not in BLOCKS or stride != 32:
-        raise ConfigError(f"darknet with {layers} layers and output stride {stride}",
-                          f"{' or '.join(map(str, BLOCKS))} layers, output stride 32")  # fmt: skip
+        raise ConfigError(
+            f"darknet with {layers} layers and output stride {stride}",
+            f"{' or '.join(map(str, BLOCKS))} layers, output stride 32",
+        )
     return RangeNet(channels, classes, layers)
 
 
@@ -41,7 +46,8 @@ NETWORKS: dict[str, Callable[[int, int, Mapping[str, Any]], nn.Module]] = {
     "squeezeseg": lambda channels, classes, backbone: SqueezeSeg(channels, classes),
     "darknet": _darknet,
 }
-"""Networks by the name of backbone and decoder in ``arch_cfg.yaml``: (channels, classes, settings) -> network."""
+"""Networks by the name of backbone and decoder in ``arch_cfg.yaml``: (channels, classes, settings)
+-> network."""
 
 HALVINGS = {"squeezeseg": 16, "darknet": 32}
 """By what each network divides the number of columns."""
@@ -65,9 +71,12 @@ class Segmenter:
     deviation: Tensor
 
     def normalise(self, image: NDArray[np.float32]) -> Tensor:
-        """(5, H, W) of ``CHANNELS`` to the network's input (C, H, W), 0 where there is no return."""
+        """(5, H, W) of ``CHANNELS`` to the network's input (C, H, W), 0 where there is no
+        return."""
         values = torch.from_numpy(image)
-        scaled = (values[list(self.channels)] - self.mean[:, None, None]) / self.deviation[:, None, None]
+        scaled = (values[list(self.channels)] - self.mean[:, None, None]) / self.deviation[
+            :, None, None
+        ]
         return scaled * (values[0] > 0)
 
     def decode(self, image: Tensor) -> Tensor:
@@ -91,24 +100,32 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
     settings = archive.yaml("arch_cfg.yaml")
     states = {part: archive.weights(part) for part in PARTS}
     try:
-        backbone, sensor = settings["backbone"], settings["dataset"]["sensor"]
+        backbone = settings["backbone"]
+        sensor = settings["dataset"]["sensor"]
         names = backbone["name"], settings["decoder"]["name"], settings["head"]["name"]
         channels = _channels(backbone["input_depth"])
         mean, deviation = (
-            torch.tensor(sensor[key], dtype=torch.float32)[: len(channels)] for key in ("img_means", "img_stds")
+            torch.tensor(sensor[key], dtype=torch.float32)[: len(channels)]
+            for key in ("img_means", "img_stds")
         )
         if names[0] != names[1] or names[0] not in NETWORKS or names[2] != "segmentation":
-            raise ConfigError(f"backbone, decoder and head {names}", f"one of {', '.join(NETWORKS)}")
+            raise ConfigError(
+                f"backbone, decoder and head {names}", f"one of {', '.join(NETWORKS)}"
+            )
         grid = _grid(sensor, columns, HALVINGS[names[0]])
         network = NETWORKS[names[0]](len(channels), _classes(states["segmentation_head"]), backbone)
     except MISFITS as error:
         if isinstance(error, ConfigError):
             raise ConfigError(f"{archive.path}: {error}") from error
-        raise ConfigError(f"{archive.path}: its settings lack or misstate {error}", "arch_cfg.yaml and data_cfg.yaml "
-                          "as lidar-bonnetal writes them") from error  # fmt: skip
+        raise ConfigError(
+            f"{archive.path}: its settings lack or misstate {error}",
+            "arch_cfg.yaml and data_cfg.yaml as lidar-bonnetal writes them",
+        ) from error
     if mean.shape != (len(channels),) or deviation.shape != mean.shape or not (deviation > 0).all():
-        raise ConfigError(f"{archive.path} with {len(channels)} inputs, {mean.tolist()} and {deviation.tolist()}",
-                          "a mean and a positive deviation for each input")  # fmt: skip
+        raise ConfigError(
+            f"{archive.path} with {len(channels)} inputs, {mean.tolist()} and {deviation.tolist()}",
+            "a mean and a positive deviation for each input",
+        )
     for part, state in states.items():
         load_weights(network.get_submodule(part), state, str(archive.path / part))
     return Segmenter(network.eval(), grid, channels, mean, deviation)
@@ -116,12 +133,15 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
 
 def _channels(inputs: Mapping[str, bool]) -> tuple[int, ...]:
     if inputs.get("range") is not True or inputs.get("xyz") is not True:
-        raise ConfigError(f"a network with input {dict(inputs)}", "range and xyz, with or without remission")
+        raise ConfigError(
+            f"a network with input {dict(inputs)}", "range and xyz, with or without remission"
+        )
     return tuple(range(len(CHANNELS) if inputs.get("remission") else len(CHANNELS) - 1))
 
 
 def _classes(head: Any) -> int:
-    """The number of classes that a head's state dictionary has; 20 where it does not tell, so that loading fails."""
+    """The number of classes that a head's state dictionary has; 20 where it does not tell, so that
+    loading fails."""
     bias = head.get("1.bias") if isinstance(head, Mapping) else None
     return len(bias) if isinstance(bias, Tensor) and bias.ndim == 1 else 20
 
@@ -132,8 +152,12 @@ def _grid(sensor: Mapping[str, Any], columns: int | None, factor: int) -> Sensor
     width = columns or size["width"]
     if width % factor:
         raise ConfigError(f"{width} columns", f"a multiple of {factor}")
-    name, up, down = f"{sensor['name']}/{width}", float(sensor["fov_up"]), float(sensor["fov_down"])
-    return Sensor(name, width, range_min=0.0, range_max=1000.0, rows=size["height"], fov_up=up, fov_down=down)
+    name = f"{sensor['name']}/{width}"
+    up = float(sensor["fov_up"])
+    down = float(sensor["fov_down"])
+    return Sensor(
+        name, width, range_min=0.0, range_max=1000.0, rows=size["height"], fov_up=up, fov_down=down
+    )
 
 
 def mean_over_returns(features: Tensor, image: Tensor) -> Tensor:
@@ -162,7 +186,9 @@ def load_bonnetal(path: Path, prepared: str, pool: str, project: str = "lidar-bo
     inputs = None if prepared == OWN_GRID else preparation(prepared)
 
     def describe(scan: Scan, generated: bool) -> Tensor:
-        image = inputs.image(scan, generated) if inputs else nearest_points(scan, segmenter.sensor)[0]
+        image = (
+            inputs.image(scan, generated) if inputs else nearest_points(scan, segmenter.sensor)[0]
+        )
         some(image[0][image[0] > 0])
         normalised = segmenter.normalise(image)
         return POOLS[pool](segmenter.decode(normalised), normalised)
@@ -171,18 +197,23 @@ def load_bonnetal(path: Path, prepared: str, pool: str, project: str = "lidar-bo
 
 
 def load_lidm(path: Path, prepared: str) -> PerScan:
-    """LiDM's RangeNet-21: range, x, y and z in metres without normalisation; see ``load_extractor``."""
+    """LiDM's RangeNet-21: range, x, y and z in metres without normalisation; see
+    ``load_extractor``."""
     archive = Archive(path, "LiDM")
     settings = archive.yaml("config.yaml")
     try:
-        network = _darknet(len(_channels(settings["backbone"]["input_depth"])), 0, settings["backbone"])
+        network = _darknet(
+            len(_channels(settings["backbone"]["input_depth"])), 0, settings["backbone"]
+        )
     except MISFITS as error:
-        raise ConfigError(f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's RangeNet"
-                          ) from error  # fmt: skip
+        raise ConfigError(
+            f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's RangeNet"
+        ) from error
     for part in PARTS[:2]:
         load_weights(network.get_submodule(part), archive.weights(part), str(path / part))
     network.eval()
-    inputs, channels = preparation(prepared), network.backbone.conv1.in_channels
+    inputs = preparation(prepared)
+    channels = network.backbone.conv1.in_channels
 
     def describe(scan: Scan, generated: bool) -> Tensor:
         image = torch.from_numpy(inputs.image(scan, generated))

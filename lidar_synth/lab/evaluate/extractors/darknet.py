@@ -1,7 +1,8 @@
-"""RangeNet++ (Milioto et al., IROS 2019) with the parameter names of lidar-bonnetal's archives, for inference.
+"""RangeNet++ (Milioto et al., IROS 2019) with the parameter names of lidar-bonnetal's archives, for
+inference.
 
-An encoder of residual blocks halves the columns five times; the decoder doubles them again and adds the encoder's
-features of the same width. Rows are kept.
+An encoder of residual blocks halves the columns five times; the decoder doubles them again and adds
+the encoder's features of the same width. Rows are kept.
 """
 
 from collections import OrderedDict
@@ -27,7 +28,9 @@ class _Residual(nn.Module):
         return x + F.leaky_relu(self.bn2(self.conv2(y)), 0.1)
 
 
-def _stage(name: str, conv: nn.Module, inputs: int, outputs: int, residuals: list[str]) -> nn.Sequential:
+def _stage(
+    name: str, conv: nn.Module, inputs: int, outputs: int, residuals: list[str]
+) -> nn.Sequential:
     layers = [(name, conv), ("bn", nn.BatchNorm2d(outputs)), ("relu", nn.LeakyReLU(0.1))]
     return nn.Sequential(OrderedDict(layers + [(r, _Residual(outputs, inputs)) for r in residuals]))
 
@@ -38,10 +41,12 @@ class _Encoder(nn.Module):
         self.conv1 = nn.Conv2d(channels, width, 3, padding=1, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         for i, count in enumerate(BLOCKS[layers]):
-            inputs, outputs = width << i, width << (i + 1)
+            inputs = width << i
+            outputs = width << (i + 1)
             conv = nn.Conv2d(inputs, outputs, 3, stride=(1, 2), padding=1, bias=False)
             self.add_module(
-                f"enc{i + 1}", _stage("conv", conv, inputs, outputs, [f"residual_{k}" for k in range(count)])
+                f"enc{i + 1}",
+                _stage("conv", conv, inputs, outputs, [f"residual_{k}" for k in range(count)]),
             )
 
     def forward(self, x: Tensor) -> list[Tensor]:
@@ -77,15 +82,20 @@ class RangeNet(nn.Module):
         width: channels of the first feature map.
     """
 
-    def __init__(self, channels: int = 5, classes: int = 20, layers: int = 53, width: int = 32) -> None:
+    def __init__(
+        self, channels: int = 5, classes: int = 20, layers: int = 53, width: int = 32
+    ) -> None:
         super().__init__()
         self.backbone = _Encoder(channels, layers, width)
         self.segmentation_decoder = _Decoder(width)
         if classes:
-            self.segmentation_head = nn.Sequential(nn.Identity(), nn.Conv2d(width, classes, 3, padding=1))
+            self.segmentation_head = nn.Sequential(
+                nn.Identity(), nn.Conv2d(width, classes, 3, padding=1)
+            )
 
     def decode(self, x: Tensor) -> Tensor:
-        """(B, channels, H, W), W a multiple of 32, to the decoder's feature map (B, width, H, W)."""
+        """(B, channels, H, W), W a multiple of 32, to the decoder's feature map (B, width, H,
+        W)."""
         features: Tensor = self.segmentation_decoder(self.backbone(x))
         return features
 

@@ -1,5 +1,6 @@
-"""LIP-Loc's encoder of range images (Puligilla et al., WACVW 2024, https://github.com/Shubodh/lidar-image-pretrain-VPR)
-as R3DPA uses it for FLD: a network of timm on an image of 224 x 224.
+"""LIP-Loc's encoder of range images (Puligilla et al., WACVW 2024,
+https://github.com/Shubodh/lidar-image-pretrain-VPR) as R3DPA uses it for FLD: a network of timm on
+an image of 224 x 224.
 """
 
 from pathlib import Path
@@ -18,14 +19,15 @@ SIZE = 224
 """Rows and columns of the network's input."""
 PREFIX = "encoder_lidar.model."
 """Names of the encoder's weights in the archive."""
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+MEAN = (0.485, 0.456, 0.406)
+DEVIATION = (0.229, 0.224, 0.225)
 
 
 def picture(depth: Tensor) -> Tensor:
     """The network's input (3, 224, 224).
 
-    Metres times 5.1 become bytes. As in LIP-Loc's code, a byte overflows: from 50.2 m on, ranges begin again at 0, and
-    -1 (no return) becomes 251.
+    Metres times 5.1 become bytes. As in LIP-Loc's code, a byte overflows: from 50.2 m on, ranges
+    begin again at 0, and -1 (no return) becomes 251.
 
     Args:
         depth: (H, W) metres, -1 where there is no return.
@@ -36,7 +38,8 @@ def picture(depth: Tensor) -> Tensor:
 
 
 def load_liploc(path: Path, prepared: str) -> PerScan:
-    """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see ``load_extractor``.
+    """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see
+    ``load_extractor``.
 
     Raises:
         LibraryError: without timm.
@@ -44,10 +47,14 @@ def load_liploc(path: Path, prepared: str) -> PerScan:
     try:
         import timm
     except ImportError as error:
-        raise LibraryError("LIP-Loc's encoder needs timm", hint="pip install 'lidar_synth[metrics]'") from error
+        raise LibraryError(
+            "LIP-Loc's encoder needs timm", hint="pip install 'lidar_synth[metrics]'"
+        ) from error
     except RuntimeError as error:  # of torchvision, which timm imports
-        raise LibraryError(f"timm cannot be imported ({error})", hint="Install torchvision of the same build as torch."
-                           ) from error  # fmt: skip
+        raise LibraryError(
+            f"timm cannot be imported ({error})",
+            hint="Install torchvision of the same build as torch.",
+        ) from error
     archive = Archive(path, "R3DPA")
     name = archive.yaml("config.yaml").get("trained_image_model_name")
     if not isinstance(name, str) or not timm.is_model(name):
@@ -56,7 +63,8 @@ def load_liploc(path: Path, prepared: str) -> PerScan:
     content = archive.weights("model.ckpt")
     state = content.get("state_dict") if isinstance(content, dict) else None
     if isinstance(state, dict):
-        # Averaging patches, timm normalises with a layer that LIP-Loc's weights lack; R3DPA leaves it as it is made.
+        # Averaging patches, timm normalises with a layer that LIP-Loc's weights lack; R3DPA leaves
+        # it as it is made.
         made = {k: v for k, v in network.state_dict().items() if k.startswith("fc_norm.")}
         state = made | {k.removeprefix(PREFIX): v for k, v in state.items() if k.startswith(PREFIX)}
     load_weights(network, state, str(path / "model.ckpt"), extra=True)

@@ -26,8 +26,8 @@ class PerScan:
         """n scans to (n, D) features; see ``Extractor``.
 
         Raises:
-            DataError: without scans, on a scan without a return in the protocol's range, or features that are not
-                finite.
+            DataError: without scans, on a scan without a return in the protocol's range, or
+                features that are not finite.
         """
         if len(scans) == 0:
             raise DataError("no scans", "at least one")
@@ -40,7 +40,9 @@ class PerScan:
         except DataError as error:
             raise DataError(f"scan {scan.id!r}: {error}") from error
         if not np.isfinite(row).all():
-            raise DataError(f"scan {scan.id!r}: features that are not finite", "finite points and reflectances")
+            raise DataError(
+                f"scan {scan.id!r}: features that are not finite", "finite points and reflectances"
+            )
         return row
 
 

@@ -1,4 +1,5 @@
-"""PointNet as SpareNet (https://github.com/microsoft/SpareNet) publishes it, trained on ShapeNet; R2Flow's FPD.
+"""PointNet as SpareNet (https://github.com/microsoft/SpareNet) publishes it, trained on ShapeNet;
+R2Flow's FPD.
 
 Its 1,808 features are the pooled vector and the three layers after it: 1,024, 512, 256 and 16.
 """
@@ -26,7 +27,8 @@ BLOCK = 8192
 
 
 class _Points(nn.Module):
-    """The layers that every point passes: 3, 64, 128, 1,024 channels (for ``widths`` of the published network)."""
+    """The layers that every point passes: 3, 64, 128, 1,024 channels (for ``widths`` of the
+    published network)."""
 
     def __init__(self, widths: tuple[int, int, int]) -> None:
         super().__init__()
@@ -35,7 +37,8 @@ class _Points(nn.Module):
             self.add_module(f"bn{i}", nn.BatchNorm1d(outputs))
 
     def pooled(self, points: Tensor) -> Tensor:
-        """(1, 3, N) to (1, widths[2]): the largest value of each feature over all points, before the last ReLU."""
+        """(1, 3, N) to (1, widths[2]): the largest value of each feature over all points, before
+        the last ReLU."""
         best = [self._features(part).amax(2) for part in torch.split(points, BLOCK, 2)]
         return torch.stack(best).amax(0)
 
@@ -51,8 +54,11 @@ class _Transform(_Points):
 
     def __init__(self, widths: tuple[int, int, int], hidden: tuple[int, int]) -> None:
         super().__init__(widths)
-        self.fc1, self.fc2, self.fc3 = nn.Linear(widths[2], hidden[0]), nn.Linear(*hidden), nn.Linear(hidden[1], 9)
-        self.bn4, self.bn5 = nn.BatchNorm1d(hidden[0]), nn.BatchNorm1d(hidden[1])
+        self.fc1 = nn.Linear(widths[2], hidden[0])
+        self.fc2 = nn.Linear(*hidden)
+        self.fc3 = nn.Linear(hidden[1], 9)
+        self.bn4 = nn.BatchNorm1d(hidden[0])
+        self.bn5 = nn.BatchNorm1d(hidden[1])
 
     def forward(self, points: Tensor) -> Tensor:
         """(1, 3, N) to (1, 3, 3)."""
@@ -82,13 +88,18 @@ class PointNet(nn.Module):
     """
 
     def __init__(
-        self, widths: tuple[int, int, int] = (64, 128, 1024), hidden: tuple[int, int] = (512, 256), classes: int = 16
+        self,
+        widths: tuple[int, int, int] = (64, 128, 1024),
+        hidden: tuple[int, int] = (512, 256),
+        classes: int = 16,
     ) -> None:
         super().__init__()
         self.feat = _Encoder(widths, hidden)
-        self.fc1, self.fc2 = nn.Linear(widths[2], hidden[0]), nn.Linear(*hidden)
+        self.fc1 = nn.Linear(widths[2], hidden[0])
+        self.fc2 = nn.Linear(*hidden)
         self.fc3 = nn.Linear(hidden[1], classes)
-        self.bn1, self.bn2 = nn.BatchNorm1d(hidden[0]), nn.BatchNorm1d(hidden[1])
+        self.bn1 = nn.BatchNorm1d(hidden[0])
+        self.bn2 = nn.BatchNorm1d(hidden[1])
 
     def forward(self, points: Tensor) -> Tensor:
         """(1, 3, N) to (1, D): the pooled features and those of the three layers after them."""
@@ -107,7 +118,9 @@ def load_pointnet(path: Path, prepared: str) -> PerScan:
 
     def describe(scan: Scan, generated: bool) -> Tensor:
         cloud = torch.from_numpy(inputs.cloud(scan, generated)) / METRES
-        if some(cloud) < CELLS:  # features are maxima, so that one point at the origin stands for all empty cells
+        if (
+            some(cloud) < CELLS
+        ):  # features are maxima, so that one point at the origin stands for all empty cells
             cloud = torch.cat([cloud, torch.zeros(1, 3)])
         return network(cloud.T[None])[0]  # type: ignore[no-any-return]
 

@@ -14,7 +14,8 @@ SUBSAMPLE = 4096
 
 
 def subsample(features: Tensor) -> Tensor:
-    """(C, H, W) to (4096,): the same random choice of features for every scan (LiDARGen; R2Flow's FRD)."""
+    """(C, H, W) to (4096,): the same random choice of features for every scan (LiDARGen; R2Flow's
+    FRD)."""
     return features.reshape(-1)[_chosen(features.numel())]
 
 
@@ -24,14 +25,17 @@ def _chosen(count: int) -> Tensor:
 
 
 def mean_over_bands(features: Tensor) -> Tensor:
-    """(C, H, W), H a multiple of 16, to (16 C,): means over 16 bands of rows, channels first (LiDM's FRID)."""
+    """(C, H, W), H a multiple of 16, to (16 C,): means over 16 bands of rows, channels first
+    (LiDM's FRID)."""
     return features.reshape(len(features), BANDS, -1).mean(2).flatten()
 
 
 def mean_over_rings(features: Tensor, voxels: Tensor, size: float, furthest: float) -> Tensor:
-    """Means of the features over 16 rings of distance from the centre of gravity of the voxels (LiDM's FSVD, FPVD).
+    """Means of the features over 16 rings of distance from the centre of gravity of the voxels
+    (LiDM's FSVD, FPVD).
 
-    The first ring ends 4 m and 1/16 of the rest from the centre; voxels beyond the last ring do not count.
+    The first ring ends 4 m and 1/16 of the rest from the centre; voxels beyond the last ring do not
+    count.
 
     Args:
         features: (N, C).
@@ -48,6 +52,8 @@ def mean_over_rings(features: Tensor, voxels: Tensor, size: float, furthest: flo
     edges[0] = 0
     ring = torch.bucketize(distance, edges, right=True) - 1
     inside = ring < BANDS
-    sums = features.new_zeros(BANDS, features.shape[1]).index_add_(0, ring[inside], features[inside])
+    sums = features.new_zeros(BANDS, features.shape[1]).index_add_(
+        0, ring[inside], features[inside]
+    )
     counts = torch.bincount(ring[inside], minlength=BANDS).clamp(min=1)
     return (sums / counts[:, None]).flatten()

@@ -1,5 +1,6 @@
-"""RangeViT (Ando et al., CVPR 2023, https://github.com/valeoai/rangevit) as R3DPA uses it for FRID, and with remission
-for FRD: the feature map before the classifier, averaged over eight bands of rows.
+"""RangeViT (Ando et al., CVPR 2023, https://github.com/valeoai/rangevit) as R3DPA uses it for FRID,
+and with remission for FRD: the feature map before the classifier, averaged over eight bands of
+rows.
 """
 
 from collections.abc import Mapping
@@ -16,8 +17,11 @@ from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.inputs import preparation
 from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some
 
-BACKBONES = {"vit_small_patch16_384": (384, 12, 6), "vit_base_patch16_384": (768, 12, 12),
-             "vit_large_patch16_384": (1024, 24, 16)}  # fmt: skip
+BACKBONES = {
+    "vit_small_patch16_384": (384, 12, 6),
+    "vit_base_patch16_384": (768, 12, 12),
+    "vit_large_patch16_384": (1024, 24, 16),
+}
 """Width, blocks and heads of the transformer by the name in the settings."""
 
 PATCH = (2, 8)
@@ -35,8 +39,10 @@ class _Context(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, outputs, 1)
-        self.conv2, self.bn1 = nn.Conv2d(outputs, outputs, 3, padding=1), nn.BatchNorm2d(outputs)
-        self.conv3, self.bn2 = nn.Conv2d(outputs, outputs, 3, dilation=2, padding=2), nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv3 = nn.Conv2d(outputs, outputs, 3, dilation=2, padding=2)
+        self.bn2 = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         own = F.leaky_relu(self.conv1(x))
@@ -49,10 +55,14 @@ class _Wide(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, outputs, 1)
-        self.conv2, self.bn1 = nn.Conv2d(inputs, outputs, 3, padding=1), nn.BatchNorm2d(outputs)
-        self.conv3, self.bn2 = nn.Conv2d(outputs, outputs, 3, dilation=2, padding=2), nn.BatchNorm2d(outputs)
-        self.conv4, self.bn3 = nn.Conv2d(outputs, outputs, 2, dilation=2, padding=1), nn.BatchNorm2d(outputs)
-        self.conv5, self.bn4 = nn.Conv2d(3 * outputs, outputs, 1), nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv3 = nn.Conv2d(outputs, outputs, 3, dilation=2, padding=2)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.conv4 = nn.Conv2d(outputs, outputs, 2, dilation=2, padding=1)
+        self.bn3 = nn.BatchNorm2d(outputs)
+        self.conv5 = nn.Conv2d(3 * outputs, outputs, 1)
+        self.bn4 = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         first = self.bn1(F.leaky_relu(self.conv2(x)))
@@ -67,7 +77,10 @@ class _Stem(nn.Module):
     def __init__(self, channels: int, base: int, hidden: int, width: int) -> None:
         super().__init__()
         self.conv_block = nn.Sequential(
-            _Context(channels, base), _Context(base, base), _Context(base, base), _Wide(base, hidden)
+            _Context(channels, base),
+            _Context(base, base),
+            _Context(base, base),
+            _Wide(base, hidden),
         )
         pool = nn.AvgPool2d((PATCH[0] + 1, PATCH[1] + 1), PATCH, (PATCH[0] // 2, PATCH[1] // 2))
         self.proj_block = nn.Sequential(pool, nn.Conv2d(hidden, width, 1))
@@ -77,7 +90,8 @@ class _Attention(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
@@ -88,7 +102,8 @@ class _Attention(nn.Module):
 class _MLP(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+        self.fc1 = nn.Linear(width, 4 * width)
+        self.fc2 = nn.Linear(4 * width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         y: Tensor = self.fc2(F.gelu(self.fc1(x)))
@@ -98,8 +113,10 @@ class _MLP(nn.Module):
 class _Block(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.norm1, self.attn = nn.LayerNorm(width), _Attention(width, heads)
-        self.norm2, self.mlp = nn.LayerNorm(width), _MLP(width)
+        self.norm1 = nn.LayerNorm(width)
+        self.attn = _Attention(width, heads)
+        self.norm2 = nn.LayerNorm(width)
+        self.mlp = _MLP(width)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.attn(self.norm1(x))
@@ -108,19 +125,25 @@ class _Block(nn.Module):
 
 
 class _Encoder(nn.Module):
-    def __init__(self, stem: _Stem, size: tuple[int, int], width: int, blocks: int, heads: int) -> None:
+    def __init__(
+        self, stem: _Stem, size: tuple[int, int], width: int, blocks: int, heads: int
+    ) -> None:
         super().__init__()
-        self.patch_embed, self._grid = stem, (size[0] // PATCH[0], size[1] // PATCH[1])
+        self.patch_embed = stem
+        self._grid = (size[0] // PATCH[0], size[1] // PATCH[1])
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, self._grid[0] * self._grid[1] + 1, width))
         self.blocks = nn.ModuleList(_Block(width, heads) for _ in range(blocks))
         self.norm = nn.LayerNorm(width)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, C, H, W) to patches (B, width, H/2, W/8) and the stem's feature map (B, hidden, H, W)."""
+        """(B, C, H, W) to patches (B, width, H/2, W/8) and the stem's feature map (B, hidden, H,
+        W)."""
         fine = self.patch_embed.conv_block(image)
         patches = self.patch_embed.proj_block(fine)
-        x = torch.cat([self.cls_token.expand(len(image), -1, -1), patches.flatten(2).transpose(1, 2)], 1)
+        x = torch.cat(
+            [self.cls_token.expand(len(image), -1, -1), patches.flatten(2).transpose(1, 2)], 1
+        )
         x = x + self._positions(patches.shape[2:])
         for block in self.blocks:
             x = block(x)
@@ -137,13 +160,19 @@ class _Encoder(nn.Module):
 class _Decoder(nn.Module):
     def __init__(self, width: int, hidden: int, decoded: int) -> None:
         super().__init__()
-        self.up_conv_block = nn.ModuleDict({
-            "conv_upsample": nn.Sequential(nn.Conv2d(width, decoded * PATCH[0] * PATCH[1], 1)),
-            "conv1": nn.Sequential(
-                nn.Conv2d(decoded + hidden, decoded, 3, padding=1), nn.LeakyReLU(), nn.BatchNorm2d(decoded)
-            ),
-            "conv_output": nn.Sequential(nn.Conv2d(decoded, decoded, 1), nn.LeakyReLU(), nn.BatchNorm2d(decoded)),
-        })  # fmt: skip
+        self.up_conv_block = nn.ModuleDict(
+            {
+                "conv_upsample": nn.Sequential(nn.Conv2d(width, decoded * PATCH[0] * PATCH[1], 1)),
+                "conv1": nn.Sequential(
+                    nn.Conv2d(decoded + hidden, decoded, 3, padding=1),
+                    nn.LeakyReLU(),
+                    nn.BatchNorm2d(decoded),
+                ),
+                "conv_output": nn.Sequential(
+                    nn.Conv2d(decoded, decoded, 1), nn.LeakyReLU(), nn.BatchNorm2d(decoded)
+                ),
+            }
+        )
 
     def forward(self, patches: Tensor, fine: Tensor) -> Tensor:
         """Patches (B, width, h, w) and (B, hidden, 2 h, 8 w) to (B, decoded, 2 h, 8 w)."""
@@ -169,19 +198,28 @@ class RangeViT(nn.Module):
     image_std: Tensor
 
     def __init__(
-        self, channels: int, size: tuple[int, int], transformer: tuple[int, int, int] = (384, 12, 6), base: int = 32,
-        hidden: int = 128, decoded: int = DECODED,
-    ) -> None:  # fmt: skip
+        self,
+        channels: int,
+        size: tuple[int, int],
+        transformer: tuple[int, int, int] = (384, 12, 6),
+        base: int = 32,
+        hidden: int = 128,
+        decoded: int = DECODED,
+    ) -> None:
         super().__init__()
         self.channels = channels
         stem = _Stem(channels, base, hidden, transformer[0])
-        parts = {"encoder": _Encoder(stem, size, *transformer), "decoder": _Decoder(transformer[0], hidden, decoded)}
+        parts = {
+            "encoder": _Encoder(stem, size, *transformer),
+            "decoder": _Decoder(transformer[0], hidden, decoded),
+        }
         self.rangevit = nn.ModuleDict(parts)
         self.register_buffer("image_mean", torch.tensor(MEAN)[None, :, None, None])
         self.register_buffer("image_std", torch.tensor(DEVIATION)[None, :, None, None])
 
     def forward(self, image: Tensor) -> Tensor:
-        """(B, 5, H, W) range, x, y, z and remission, H a multiple of 8, W of 8, to (B, 8 * decoded)."""
+        """(B, 5, H, W) range, x, y, z and remission, H a multiple of 8, W of 8, to (B, 8 *
+        decoded)."""
         normalised = ((image - self.image_mean) / self.image_std)[:, : self.channels]
         features = self.rangevit["decoder"](*self.rangevit["encoder"](normalised))
         bands: Tensor = features.unflatten(2, (BANDS, -1)).mean((3, 4)).flatten(1)
@@ -201,21 +239,34 @@ def build(settings: Mapping[str, Any]) -> RangeViT:
             settings["conv_stem"],
             settings["decoder"],
         )
-        if kind != (PATCH, PATCH, "ConvStem", "up_conv") or settings["skip_filters"] != settings["D_h"]:
-            raise ConfigError(f"RangeViT with patches, stride, stem and decoder {kind}",
-                              "2 x 8 patches, ConvStem and up_conv with its skip connection")  # fmt: skip
+        if (
+            kind != (PATCH, PATCH, "ConvStem", "up_conv")
+            or settings["skip_filters"] != settings["D_h"]
+        ):
+            raise ConfigError(
+                f"RangeViT with patches, stride, stem and decoder {kind}",
+                "2 x 8 patches, ConvStem and up_conv with its skip connection",
+            )
         height, width = settings["image_size"]
         transformer = BACKBONES[settings["vit_backbone"]]
-        return RangeViT(settings["in_channels"], (height, width), transformer, settings["stem_base_channels"],
-                        settings["D_h"])  # fmt: skip
+        return RangeViT(
+            settings["in_channels"],
+            (height, width),
+            transformer,
+            settings["stem_base_channels"],
+            settings["D_h"],
+        )
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"config.yaml lacks or misstates {error}", "the settings of R3DPA's RangeViT") from error
+        raise ConfigError(
+            f"config.yaml lacks or misstates {error}", "the settings of R3DPA's RangeViT"
+        ) from error
 
 
 def load_rangevit(path: Path, prepared: str) -> PerScan:
-    """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see ``load_extractor``."""
+    """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see
+    ``load_extractor``."""
     archive = Archive(path, "R3DPA")
     network = build(archive.yaml("config.yaml"))
     content = archive.weights("model.ckpt")

@@ -1,6 +1,8 @@
-"""Sparse convolution by sorting, gathering and matrix products, with the weights of torchsparse 1.4.
+"""Sparse convolution by sorting, gathering and matrix products, with the weights of torchsparse
+1.4.
 
-Voxels (N, 3) are integers from 0, sorted by x, then y, then z. A kernel is (K, C_in, C_out) for K offsets::
+Voxels (N, 3) are integers from 0, sorted by x, then y, then z. A kernel is (K, C_in, C_out) for K
+offsets::
 
     size 3    offsets -1, 0, 1, x fastest:    k = 9 (z + 1) + 3 (y + 1) + (x + 1)
     size 2    offsets 0, 1, z fastest:        k = 4 x + 2 y + z        (stride 2, and its transpose)
@@ -59,7 +61,9 @@ def keys(voxels: Tensor) -> Tensor:
         DataError: on coordinates outside.
     """
     if len(voxels) and not (int(voxels.min()) >= -1 and int(voxels.max()) < 2**_BITS - 1):
-        raise DataError(f"voxels from {int(voxels.min())} to {int(voxels.max())}", "a scan of less than 100 km")
+        raise DataError(
+            f"voxels from {int(voxels.min())} to {int(voxels.max())}", "a scan of less than 100 km"
+        )
     x, y, z = (voxels + 1).unbind(1)
     return (x << 2 * _BITS) | (y << _BITS) | z
 
@@ -77,7 +81,8 @@ def find(wanted: Tensor, among: Tensor) -> Tensor:
 
 
 def neighbours(voxels: Tensor) -> Pairs:
-    """The pairs of a kernel of size 3 over sorted voxels. An offset and its opposite have the same pairs, exchanged."""
+    """The pairs of a kernel of size 3 over sorted voxels. An offset and its opposite have the same
+    pairs, exchanged."""
     sorted_keys = keys(voxels)
     steps = torch.tensor([(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)])
     shifts = (steps[:, 0] << 2 * _BITS) + (steps[:, 1] << _BITS) + steps[:, 2]
@@ -88,7 +93,11 @@ def neighbours(voxels: Tensor) -> Pairs:
         before.append((found[target], target))
     all_of_them = torch.arange(len(voxels))
     pairs = [*before, (all_of_them, all_of_them), *((t, s) for s, t in reversed(before))]
-    return Pairs(torch.cat([s for s, _ in pairs]), torch.cat([t for _, t in pairs]), [len(s) for s, _ in pairs])
+    return Pairs(
+        torch.cat([s for s, _ in pairs]),
+        torch.cat([t for _, t in pairs]),
+        [len(s) for s, _ in pairs],
+    )
 
 
 def pyramid(voxels: Tensor, depth: int) -> list[Level]:
@@ -130,7 +139,9 @@ def convolve(features: Tensor, kernel: Tensor, pairs: Pairs, count: int) -> Tens
         part = slice(start, start + size)
         start += size
         if size and not (own and k == _CENTRE):
-            total.index_add_(0, pairs.target[part], features.index_select(0, pairs.source[part]) @ kernel[k])
+            total.index_add_(
+                0, pairs.target[part], features.index_select(0, pairs.source[part]) @ kernel[k]
+            )
     return total
 
 
@@ -148,7 +159,9 @@ class Convolution(nn.Module):
         shape = (inputs, outputs) if size == 1 else (size**3, inputs, outputs)
         self.kernel = nn.Parameter(torch.zeros(shape))
 
-    def forward(self, features: Tensor, pairs: Pairs | None = None, count: int | None = None) -> Tensor:
+    def forward(
+        self, features: Tensor, pairs: Pairs | None = None, count: int | None = None
+    ) -> Tensor:
         """(N, C_in) to (M, C_out); M is N by default."""
         if pairs is None:
             return features @ self.kernel
@@ -156,13 +169,15 @@ class Convolution(nn.Module):
 
 
 def mean_in(features: Tensor, voxel: Tensor, count: int) -> Tensor:
-    """(N, C) features of points to (count, C) means over the points of each voxel; ``voxel`` (N,) is its index."""
+    """(N, C) features of points to (count, C) means over the points of each voxel; ``voxel`` (N,)
+    is its index."""
     sums = features.new_zeros(count, features.shape[1]).index_add_(0, voxel, features)
     return sums / torch.bincount(voxel, minlength=count).clamp(min=1)[:, None]
 
 
 def interpolate(features: Tensor, coarse: Tensor, points: Tensor, size: int) -> Tensor:
-    """Trilinear interpolation of the features of coarse voxels at points; missing voxels have no weight.
+    """Trilinear interpolation of the features of coarse voxels at points; missing voxels have no
+    weight.
 
     Args:
         features: (M, C) of the voxels.
@@ -176,7 +191,8 @@ def interpolate(features: Tensor, coarse: Tensor, points: Tensor, size: int) -> 
     sorted_keys = keys(coarse)
     corner = points // size
     share = (points % size).float() / size
-    total, sum_of_weights = features.new_zeros(len(points), features.shape[1]), features.new_zeros(len(points))
+    total = features.new_zeros(len(points), features.shape[1])
+    sum_of_weights = features.new_zeros(len(points))
     for step in [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]:
         upper = torch.tensor(step)
         found = find(keys(corner + upper), sorted_keys)

@@ -23,8 +23,8 @@ class Extractor(Protocol):
 
         Args:
             scans: the scans; each is projected to the grid of the extractor's protocol.
-            generated: whether the points are put on the rays of the range image where the protocol does so for
-                generated scans only (R2Flow's).
+            generated: whether the points are put on the rays of the range image where the protocol
+                does so for generated scans only (R2Flow's).
         """
 
 
@@ -32,17 +32,19 @@ class ExtractorSpec(NamedTuple):
     """A published feature extractor.
 
     Args:
-        measure: the distance that papers compute on its features: FRD, FRID, FPD, FSVD, FPVD or FLD.
+        measure: the distance that papers compute on its features: FRD, FRID, FPD, FSVD, FPVD or
+            FLD.
         input: what its network takes.
         width: number of features D.
-        archives: names under which the archive, the folder or the file is published, and looked for.
+        archives: names under which the archive, the folder or the file is published, and looked
+            for.
         files: the files in the archive or the folder.
         source: the project that publishes the weights, and where its page says to fetch them.
         licence: of the weights.
         load: ``(path, preparation) -> extractor``; see ``load_extractor``.
         preparation: how scans become inputs by default: a name of ``PREPARATIONS``.
-        git_blob: hash of the published file, as git computes it, where the file lies in a git repository. The other
-            projects state no hash.
+        git_blob: hash of the published file, as git computes it, where the file lies in a git
+            repository. The other projects state no hash.
     """
 
     measure: str
@@ -58,10 +60,13 @@ class ExtractorSpec(NamedTuple):
 
     def paths(self, folder: Path) -> list[Path]:
         """Where in a folder the weights may lie, an unpacked archive first."""
-        return [folder / f"{archive}{suffix}" for archive in self.archives for suffix in ("", ".tar.gz")]
+        return [
+            folder / f"{archive}{suffix}" for archive in self.archives for suffix in ("", ".tar.gz")
+        ]
 
     def found(self, folder: Path | None = None) -> Path | None:
-        """The path of the weights in a folder, by default the one that LIDAR_SYNTH_METRICS names; None without."""
+        """The path of the weights in a folder, by default the one that LIDAR_SYNTH_METRICS names;
+        None without."""
         named = os.environ.get(FOLDER_VARIABLE)
         folder = folder or (Path(named) if named else None)
         return next((p for p in self.paths(folder) if p.exists()), None) if folder else None
@@ -69,4 +74,7 @@ class ExtractorSpec(NamedTuple):
     def is_published(self, path: Path) -> bool:
         """Whether a file has the hash of the published one."""
         content = path.read_bytes()
-        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest() == self.git_blob
+        return (
+            hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+            == self.git_blob
+        )

@@ -1,8 +1,8 @@
-"""SqueezeSeg (Wu et al., ICRA 2018, https://arxiv.org/abs/1710.07368) with the parameter names of lidar-bonnetal's
-archives, for inference.
+"""SqueezeSeg (Wu et al., ICRA 2018, https://arxiv.org/abs/1710.07368) with the parameter names of
+lidar-bonnetal's archives, for inference.
 
-The columns are halved by the first convolution and by the pooling before each group of fire modules; the decoder
-doubles them again and adds the encoder's features of the same width.
+The columns are halved by the first convolution and by the pooling before each group of fire
+modules; the decoder doubles them again and adds the encoder's features of the same width.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,9 @@ class Fire(nn.Module):
         super().__init__()
         self.squeeze = nn.Conv2d(inputs, squeezed, 1)
         if upsample:
-            self.upconv = nn.ConvTranspose2d(squeezed, squeezed, (1, 4), stride=(1, 2), padding=(0, 1))
+            self.upconv = nn.ConvTranspose2d(
+                squeezed, squeezed, (1, 4), stride=(1, 2), padding=(0, 1)
+            )
         self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
         self._upsample = upsample

@@ -1,8 +1,9 @@
-"""LiDM's networks of voxels (https://github.com/hancyran/LiDAR-Diffusion): MinkowskiNet (Choy et al., CVPR 2019) and
-SPVCNN (Tang et al., ECCV 2020), in the form and with the parameter names of 2DPASS and torchsparse 1.4.
+"""LiDM's networks of voxels (https://github.com/hancyran/LiDAR-Diffusion): MinkowskiNet (Choy et
+al., CVPR 2019) and SPVCNN (Tang et al., ECCV 2020), in the form and with the parameter names of
+2DPASS and torchsparse 1.4.
 
-A cloud becomes voxels of 5 cm, each with the position of its first point; the remission is -1. Features are averaged
-over rings of distance. R2Flow and R3DPA use the same weights.
+A cloud becomes voxels of 5 cm, each with the position of its first point; the remission is -1.
+Features are averaged over rings of distance. R2Flow and R3DPA use the same weights.
 """
 
 from collections.abc import Sequence
@@ -49,11 +50,16 @@ class _Block(nn.Module):
 class _Residual(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        first, second = Convolution(inputs, outputs, 3), Convolution(outputs, outputs, 3)
-        self.net = nn.Sequential(first, nn.BatchNorm1d(outputs), nn.Identity(), second, nn.BatchNorm1d(outputs))
+        first = Convolution(inputs, outputs, 3)
+        second = Convolution(outputs, outputs, 3)
+        self.net = nn.Sequential(
+            first, nn.BatchNorm1d(outputs), nn.Identity(), second, nn.BatchNorm1d(outputs)
+        )
         own = inputs == outputs
         self.downsample = (
-            nn.Sequential() if own else nn.Sequential(Convolution(inputs, outputs, 1), nn.BatchNorm1d(outputs))
+            nn.Sequential()
+            if own
+            else nn.Sequential(Convolution(inputs, outputs, 1), nn.BatchNorm1d(outputs))
         )
 
     def forward(self, features: Tensor, pairs: Pairs) -> Tensor:
@@ -74,10 +80,17 @@ class MinkowskiNet(nn.Module):
     def __init__(self, widths: Sequence[int], inputs: int = 4, classes: int = 20) -> None:
         super().__init__()
         w = list(widths)
-        self.stem = nn.Sequential(Convolution(inputs, w[0], 3), nn.BatchNorm1d(w[0]), nn.Identity(),
-                                  Convolution(w[0], w[0], 3), nn.BatchNorm1d(w[0]))  # fmt: skip
+        self.stem = nn.Sequential(
+            Convolution(inputs, w[0], 3),
+            nn.BatchNorm1d(w[0]),
+            nn.Identity(),
+            Convolution(w[0], w[0], 3),
+            nn.BatchNorm1d(w[0]),
+        )
         for i in range(4):
-            down = nn.Sequential(_Block(w[i], w[i]), _Residual(w[i], w[i + 1]), _Residual(w[i + 1], w[i + 1]))
+            down = nn.Sequential(
+                _Block(w[i], w[i]), _Residual(w[i], w[i + 1]), _Residual(w[i + 1], w[i + 1])
+            )
             self.add_module(f"stage{i + 1}", down)
             out = w[i + 5]
             after = nn.Sequential(_Residual(out + w[3 - i], out), _Residual(out, out))
@@ -108,7 +121,8 @@ class MinkowskiNet(nn.Module):
         return x
 
     def _up(self, i: int, x: Tensor, skip: Tensor, levels: list[Level]) -> Tensor:
-        children, fine = levels[4 - i].children, levels[3 - i]
+        children = levels[4 - i].children
+        fine = levels[3 - i]
         assert children is not None  # only the finest level has none
         block, residuals = self.get_submodule(f"up{i + 1}").children()
         x = torch.cat([block(x, children.reversed(), len(fine.voxels)), skip], 1)
@@ -136,12 +150,15 @@ class SPVCNN(MinkowskiNet):
         maps = [self._stem(features, levels[0])]
         for i in range(4):
             maps.append(self._down(i, maps[-1], levels))
-        branch, x = maps[0], maps[4]
+        branch = maps[0]
+        x = maps[4]
         for i in range(4):
             if i in (0, 2):
                 level = levels[4 - i]
                 size = 2 ** (4 - i)
-                branch = self.point_transforms[i // 2](branch) + interpolate(x, level.voxels, points, size)
+                branch = self.point_transforms[i // 2](branch) + interpolate(
+                    x, level.voxels, points, size
+                )
                 x = mean_in(branch, _containing(levels, 4 - i), len(level.voxels))
             x = self._up(i, x, maps[3 - i], levels)
         last: Tensor = x + self.point_transforms[2](branch)
@@ -164,7 +181,8 @@ def voxelise(cloud: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
         cloud: (N, 3) float32, metres.
 
     Returns:
-        (M, 3) int64 voxels from 0, sorted, and (M, 4) float32: x, y, z of the first point in each, and -1.
+        (M, 3) int64 voxels from 0, sorted, and (M, 4) float32: x, y, z of the first point in each,
+        and -1.
     """
     rounded = np.round(cloud / np.float32(VOXEL))
     packed = keys(torch.from_numpy((rounded - rounded.min(0)).astype(np.int64)))
@@ -192,8 +210,9 @@ def load_voxel_network(path: Path, prepared: str, network: str) -> PerScan:
         widths = [int(given["cr"] * width) for width in given["layer_num"]]
         net = NETWORKS[network](widths, given["input_dims"], given["num_class"])
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ConfigError(f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's network"
-                          ) from error  # fmt: skip
+        raise ConfigError(
+            f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's network"
+        ) from error
     content = archive.weights("model.ckpt")
     state = content.get("state_dict") if isinstance(content, dict) else None
     load_weights(net, state, str(path / "model.ckpt"), extra=True)

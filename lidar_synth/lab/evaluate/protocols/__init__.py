@@ -1,6 +1,8 @@
-"""Protocols as data: how a paper prepares scans, how many it compares, and what its tables call each figure.
+"""Protocols as data: how a paper prepares scans, how many it compares, and what its tables call
+each figure.
 
-Each YAML file in this folder is one protocol; ``Protocol`` says what it contains. To add a protocol, write a file.
+Each YAML file in this folder is one protocol; ``Protocol`` says what it contains. To add a
+protocol, write a file.
 """
 
 from collections.abc import Mapping
@@ -37,8 +39,8 @@ class Preparation(_Data):
 
     Args:
         sensor: preset of the grid; None = the scan's own.
-        real, generated: where the points of each set lie: ``points`` keeps those that cells show, ``corner`` and
-            ``centre`` put them on the rays through the cells' corners or centres.
+        real, generated: where the points of each set lie: ``points`` keeps those that cells show,
+            ``corner`` and ``centre`` put them on the rays through the cells' corners or centres.
         before: ranges kept before the projection, both exclusive, metres.
         after: ranges kept after it, both exclusive, metres.
     """
@@ -57,16 +59,24 @@ class Preparation(_Data):
         sensor = presets()[self.sensor]
         if self.before is None:
             return sensor
-        low, high = np.float32(self.before[0]), np.float32(self.before[1])
-        near, far = np.nextafter(low, high), np.nextafter(high, low)
+        low = np.float32(self.before[0])
+        high = np.float32(self.before[1])
+        near = np.nextafter(low, high)
+        far = np.nextafter(high, low)
         return Sensor(
-            f"{self.sensor} from {self.before[0]:g} m to {self.before[1]:g} m", sensor.columns, float(near), float(far),
-            rows=sensor.rows, fov_up=sensor.fov_up, fov_down=sensor.fov_down,
-        )  # fmt: skip
+            f"{self.sensor} from {self.before[0]:g} m to {self.before[1]:g} m",
+            sensor.columns,
+            float(near),
+            float(far),
+            rows=sensor.rows,
+            fov_up=sensor.fov_up,
+            fov_down=sensor.fov_down,
+        )
 
     def apply(self, scan: Scan, generated: bool) -> Scan:
         """The points that the protocol compares, with their labels."""
-        sensor, placement = self.grid or scan.sensor, self.generated if generated else self.real
+        sensor = self.grid or scan.sensor
+        placement = self.generated if generated else self.real
         if placement == "points":
             shown = locate(scan.points, sensor).point
             prepared = scan[shown[shown >= 0]]
@@ -89,7 +99,8 @@ class Measure(_Data):
         table: what the paper's tables call it; "" where no paper reports it.
         times: the factor by which the tables show it.
         options: of the kind.
-        extractor, preparation: for ``frechet``: a name of ``EXTRACTORS``, and how scans become its input.
+        extractor, preparation: for ``frechet``: a name of ``EXTRACTORS``, and how scans become its
+            input.
         real: number of real scans, chosen at random with seed 0; None = all.
         generated: number of generated scans, the first ones; None = all.
         least: the smallest possible value, if there is one.
@@ -158,8 +169,8 @@ class Protocol(_Data):
     measures: dict[str, Measure]
 
     def cloud(self, scan: Scan, generated: bool) -> NDArray[np.float32]:
-        """(N, 3) the points of a scan that the protocol compares, metres; ``generated`` is whether it is a generated
-        one."""
+        """(N, 3) the points of a scan that the protocol compares, metres; ``generated`` is whether
+        it is a generated one."""
         return self.prepare.apply(scan, generated).points
 
     @property
@@ -183,14 +194,18 @@ def parse_protocol(text: str, where: str) -> Protocol:
     try:
         return Protocol(**yaml.safe_load(text))
     except (ValidationError, TypeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{where}: {error}", "a protocol as lidar_synth/lab/evaluate/protocols/ has them") from error
+        raise ConfigError(
+            f"{where}: {error}", "a protocol as lidar_synth/lab/evaluate/protocols/ has them"
+        ) from error
 
 
 @cache
 def _shipped() -> Mapping[str, Protocol]:
     folder = files("lidar_synth.lab.evaluate.protocols")
     names = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml"))
-    read = (parse_protocol(folder.joinpath(name).read_text(encoding="utf-8"), name) for name in names)
+    read = (
+        parse_protocol(folder.joinpath(name).read_text(encoding="utf-8"), name) for name in names
+    )
     return {protocol.name: protocol for protocol in read}
 
 

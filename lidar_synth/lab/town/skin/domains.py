@@ -10,14 +10,25 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import laser_rows
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.town.skin.features import CELLS, HEIGHTS, KINDS, RANGES, ROUGH, STRATA, Features, Floats, Ints
+from lidar_synth.lab.town.skin.features import (
+    CELLS,
+    HEIGHTS,
+    KINDS,
+    RANGES,
+    ROUGH,
+    STRATA,
+    Features,
+    Floats,
+    Ints,
+)
 from lidar_synth.lab.town.skin.features import features as features_of
 from lidar_synth.lab.town.skin.features import strata as strata_of
 from lidar_synth.lab.town.skin.skin import PARTS
 from lidar_synth.lab.town.skin.tables import pooled
 
 _ANOTHER = np.radians(1.0)
-"""Mean distance between the elevations of rings and lasers above which a scan is of another sensor."""
+"""Mean distance between the elevations of rings and lasers above which a scan is of another
+sensor."""
 
 
 class Returns(NamedTuple):
@@ -25,7 +36,8 @@ class Returns(NamedTuple):
 
     Args:
         found: their features.
-        points, bright, rows: (N, 3) metres, (N,) reflectance with its rounding undone at random, (N,) laser.
+        points, bright, rows: (N, 3) metres, (N,) reflectance with its rounding undone at random,
+            (N,) laser.
         boxed: (N,) whether a point belongs to an object with a box.
     """
 
@@ -36,7 +48,9 @@ class Returns(NamedTuple):
     boxed: NDArray[np.bool_]
 
 
-def returns_of(scan: Scan, lasers: Sensor, step: float, rng: np.random.Generator, centred: bool) -> Returns:
+def returns_of(
+    scan: Scan, lasers: Sensor, step: float, rng: np.random.Generator, centred: bool
+) -> Returns:
     """The returns of a scan in the order of features.
 
     Args:
@@ -50,19 +64,24 @@ def returns_of(scan: Scan, lasers: Sensor, step: float, rng: np.random.Generator
         DataError: on a scan that is not in ring order, or of another sensor.
     """
     rows = laser_rows(scan, lasers.by_beams())
-    points, reflectance = scan.points, scan.reflectance
+    points = scan.points
+    reflectance = scan.reflectance
     boxed = np.zeros(len(points), bool) if scan.instance is None else scan.instance > 0
     if scan.ring is not None:
         order = np.lexsort((np.arctan2(points[:, 1], points[:, 0]), rows))
         boxed = boxed[order]
-        points, reflectance, rows = points[order], reflectance[order], rows[order]
+        points = points[order]
+        reflectance = reflectance[order]
+        rows = rows[order]
     distance = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
     away = np.abs(np.arcsin(points[:, 2] / distance) - lasers.laser_elevations[rows])[distance > 5]
     if len(away) and np.median(away) > _ANOTHER:
         raise DataError(
-            f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the lasers of "
-            f"{lasers.name!r} (median)", "scans of this sensor",
-        )  # fmt: skip
+            f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
+            "lasers of "
+            f"{lasers.name!r} (median)",
+            "scans of this sensor",
+        )
     dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step
     bright = (reflectance + dither).astype(np.float32)
     laser = rows.astype(np.int32)
@@ -86,18 +105,25 @@ class Domain:
     @classmethod
     def of(cls, scans: list[Returns]) -> "Domain":
         """Rank the roughness of the returns of some scans."""
-        cell, rough = (np.concatenate([getattr(s.found, name) for s in scans]) for name in ("cell", "roughness"))
+        cell, rough = (
+            np.concatenate([getattr(s.found, name) for s in scans])
+            for name in ("cell", "roughness")
+        )
         coarse = np.arange(CELLS) // (len(RANGES) + 1)
-        [table] = pooled([(rough, cell)], [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)], ROUGH + 1)
+        [table] = pooled(
+            [(rough, cell)], [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)], ROUGH + 1
+        )
         cuts = np.ascontiguousarray(table[:, 1:-1])
         return cls(scans, cuts, [strata_of(s.found, cuts) for s in scans])
 
 
 def levels(parts: int = 1) -> list[NDArray[np.int64]]:
-    """From fine to coarse, the set of strata to which each stratum belongs: without range, without height, all."""
+    """From fine to coarse, the set of strata to which each stratum belongs: without range, without
+    height, all."""
     stratum, part = np.divmod(np.arange(STRATA * parts), parts)
     cell, rank = np.divmod(stratum, ROUGH)
-    place, kind = cell // (len(RANGES) + 1), cell // ((len(RANGES) + 1) * (len(HEIGHTS) + 1))
+    place = cell // (len(RANGES) + 1)
+    kind = cell // ((len(RANGES) + 1) * (len(HEIGHTS) + 1))
     assert kind.max() == len(KINDS) - 1
     return [
         np.arange(STRATA * parts),
@@ -107,4 +133,5 @@ def levels(parts: int = 1) -> list[NDArray[np.int64]]:
     ]
 
 
-PART_LEVELS, STRATUM_LEVELS = levels(PARTS), levels()
+PART_LEVELS = levels(PARTS)
+STRATUM_LEVELS = levels()

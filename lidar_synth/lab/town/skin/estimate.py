@@ -1,4 +1,5 @@
-"""The parts of a skin from two domains: maps of distributions, offsets of lasers, missing returns."""
+"""The parts of a skin from two domains: maps of distributions, offsets of lasers, missing
+returns."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,12 +10,22 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.town.skin.domains import PART_LEVELS, STRATUM_LEVELS, Domain
-from lidar_synth.lab.town.skin.features import BAND, BANDS, STRATA, STRATUM_KIND, Floats, Ints, features
+from lidar_synth.lab.town.skin.features import (
+    BAND,
+    BANDS,
+    STRATA,
+    STRATUM_KIND,
+    Floats,
+    Ints,
+    features,
+)
 from lidar_synth.lab.town.skin.skin import MEANS, RESIDUALS, Skin, part_of
 from lidar_synth.lab.town.skin.tables import FEWEST, pooled
 
-ROUNDS, SHARE = 3, 0.6
-"""Corrections of the maps after the first, and the share of the remaining difference that each removes."""
+ROUNDS = 3
+SHARE = 0.6
+"""Corrections of the maps after the first, and the share of the remaining difference that each
+removes."""
 _SMOOTH = 9
 """Neighbouring lasers over which the running median is taken."""
 _LARGEST_FACTOR = 5.0
@@ -26,7 +37,12 @@ Pair = tuple[Floats, NDArray[np.integer]]
 
 
 def estimate(
-    real: Domain, town: Domain, sensor: Sensor, step: float, provenance: dict[str, Any], lasers: bool = False
+    real: Domain,
+    town: Domain,
+    sensor: Sensor,
+    step: float,
+    provenance: dict[str, Any],
+    lasers: bool = False,
 ) -> Skin:
     """Compare two domains.
 
@@ -36,7 +52,8 @@ def estimate(
         sensor: the sensor of both.
         step: of the real reflectance, 0 if unknown.
         provenance: of the skin.
-        lasers: whether lasers get offsets of their own; otherwise their spread is part of the distributions.
+        lasers: whether lasers get offsets of their own; otherwise their spread is part of the
+            distributions.
     """
     offset = np.stack([laser_offsets(real, sensor.shape[0], kind) for kind in (0, 1)])
     if not lasers:
@@ -56,7 +73,9 @@ def estimate(
 def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> dict[str, Pair]:
     """Values and groups of the local mean, the residual of reflectance and that of range."""
     kinds = [np.minimum(STRATUM_KIND[stratum], 1) for stratum in domain.strata]
-    mean = np.concatenate([s.found.mean - offset[k, s.rows] for s, k in zip(domain.scans, kinds, strict=True)])
+    mean = np.concatenate(
+        [s.found.mean - offset[k, s.rows] for s, k in zip(domain.scans, kinds, strict=True)]
+    )
     residual = np.concatenate([s.bright - s.found.mean for s in domain.scans])
     distance = np.concatenate([s.found.residual for s in domain.scans])
     stratum = np.concatenate(domain.strata)
@@ -80,14 +99,16 @@ def _both(name: str, town: Pair, real: Pair) -> tuple[Floats, Floats]:
 def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     """A skin whose maps leave less difference between the town with it and the real scans.
 
-    The residuals of neighbouring returns depend on each other, so that a map of each does not give their distribution
-    at once.
+    The residuals of neighbouring returns depend on each other, so that a map of each does not give
+    their distribution at once.
     """
     zeros = np.zeros((2, skin.sensor.shape[0]), np.float32)
     level = replace(skin, arrays={**skin.arrays, "offset": zeros}, step=0.0)
     scans = []
     for one, stratum in zip(town.scans, town.strata, strict=True):
-        dressed = level.dress(one.found, stratum, one.bright, one.rows, one.boxed, np.ones(len(stratum), np.float32))
+        dressed = level.dress(
+            one.found, stratum, one.bright, one.rows, one.boxed, np.ones(len(stratum), np.float32)
+        )
         far = np.maximum(np.linalg.norm(one.points, axis=1), 1e-3)
         points = one.points * (1 + dressed.shift / far)[:, None].astype(np.float32)
         found = features(points, dressed.reflectance, one.rows, skin.sensor)
@@ -104,15 +125,18 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
 def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     """(rows,) reflectance of each laser on one kind of surface, beyond that of its neighbours.
 
-    It is the sum of the median differences between neighbouring rings on the same surface, less its running median.
+    It is the sum of the median differences between neighbouring rings on the same surface, less its
+    running median.
     """
-    difference, ring = [], []
+    difference = []
+    ring = []
     for scan, stratum in zip(domain.scans, domain.strata, strict=True):
         pairs = np.flatnonzero((scan.found.below >= 0) & (STRATUM_KIND[stratum] == kind))
         below = scan.found.below[pairs]
         difference.append(scan.found.mean[below] - scan.found.mean[pairs])
         ring.append(scan.rows[pairs])
-    value, upper = np.concatenate(difference), np.concatenate(ring)
+    value = np.concatenate(difference)
+    upper = np.concatenate(ring)
     [table] = pooled([(value, upper)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
@@ -141,7 +165,8 @@ def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
 
 def _rate(stratum: Ints, gap: Ints) -> NDArray[np.float64]:
     """(STRATA,) share of missing returns among the firings between returns of one surface."""
-    rate, open_ = np.zeros(STRATA), np.ones(STRATA, bool)
+    rate = np.zeros(STRATA)
+    open_ = np.ones(STRATA, bool)
     for level in STRATUM_LEVELS:
         count = int(level.max()) + 1
         fired = np.bincount(level[stratum], gap, count)[level]

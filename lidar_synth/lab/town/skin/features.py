@@ -1,7 +1,7 @@
 """What a skin looks at: features of each return that come from the scan alone, without labels.
 
-Points are in the order ring by ring, each ring by azimuth. A neighbour lies on the same surface if it is in the same
-ring, at most a few firings away, and at nearly the same distance.
+Points are in the order ring by ring, each ring by azimuth. A neighbour lies on the same surface if
+it is in the same ring, at most a few firings away, and at nearly the same distance.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,8 @@ HEIGHTS = np.array([-0.4, 0.25, 0.8, 1.6, 3.0], np.float32)
 KINDS = ("level", "upright", "isolated")
 """Orientation of the surface, by the slope to the neighbouring ring."""
 ROUGH = 4
-"""Bins of the rank of roughness among the returns of the same range, kind and height in one domain."""
+"""Bins of the rank of roughness among the returns of the same range, kind and height in one
+domain."""
 CELLS = (len(RANGES) + 1) * len(KINDS) * (len(HEIGHTS) + 1)
 """Combinations of range, kind and height."""
 STRATA = CELLS * ROUGH
@@ -48,10 +49,13 @@ class Features(NamedTuple):
     Args:
         mean: (N,) mean reflectance over the neighbours on the same surface.
         residual: (N,) metres, range minus the mean of the two neighbours in the ring; NaN at edges.
-        roughness: (N,) metres, mean absolute residual around the return; an edge counts as ``LARGEST``.
+        roughness: (N,) metres, mean absolute residual around the return; an edge counts as
+            ``LARGEST``.
         cell: (N,) number of the combination of range, kind and height.
-        below: (N,) the return of the next ring below in the same direction, -1 if there is none on the same surface.
-        gap: (N,) firings to the next return of the ring, if that lies on the same surface; otherwise 0.
+        below: (N,) the return of the next ring below in the same direction, -1 if there is none on
+            the same surface.
+        gap: (N,) firings to the next return of the ring, if that lies on the same surface;
+            otherwise 0.
     """
 
     mean: Floats
@@ -75,8 +79,11 @@ def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) ->
     turn = np.arctan2(points[:, 1], points[:, 0]) * np.float32(firings / (2 * np.pi))
     level = np.hypot(points[:, 0], points[:, 1])
     distance = np.sqrt(np.einsum("ij,ij->i", points, points))
-    rows, z = np.ascontiguousarray(ring, np.int32), np.ascontiguousarray(points[:, 2])
-    mean, residual, gap = _along(rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings)
+    rows = np.ascontiguousarray(ring, np.int32)
+    z = np.ascontiguousarray(points[:, 2])
+    mean, residual, gap = _along(
+        rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings
+    )
     roughness = _roughness(rows, residual)
     kind, below = _across(rows, turn, distance, level, z, sensor.shape[0], firings)
     cell = _cells(distance, kind, z - ground_height(z, level, kind))
@@ -84,7 +91,8 @@ def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) ->
 
 
 def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
-    """Metres, height of the road below the sensor: the most frequent height of level surfaces within 15 m."""
+    """Metres, height of the road below the sensor: the most frequent height of level surfaces
+    within 15 m."""
     near = z[(kind == 0) & (level > 3) & (level < 15) & (np.abs(z) < 5)]
     if not len(near):
         return np.float32(-1.73)
@@ -108,10 +116,12 @@ def _along(
     ring: Ints, turn: Floats, distance: Floats, reflectance: Floats, firings: int
 ) -> tuple[Floats, Floats, Ints]:
     count = len(ring)
-    mean, residual = np.empty(count, np.float32), np.empty(count, np.float32)
+    mean = np.empty(count, np.float32)
+    residual = np.empty(count, np.float32)
     gap = np.zeros(count, np.int32)
     for i in range(count):
-        total, weight = reflectance[i], np.float32(1)
+        total = reflectance[i]
+        weight = np.float32(1)
         limit = np.float32(0.15) + np.float32(0.02) * distance[i]
         for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
             if j == i or ring[j] != ring[i] or abs(distance[j] - distance[i]) > limit:
@@ -132,7 +142,9 @@ def _along(
                 back = min(back, firings - back)
                 if step < 3.5 and back < 3.5:
                     value = distance[i] - (distance[i - 1] + distance[i + 1]) / 2
-                    ends = max(abs(distance[i - 1] - distance[i]), abs(distance[i + 1] - distance[i]))
+                    ends = max(
+                        abs(distance[i - 1] - distance[i]), abs(distance[i + 1] - distance[i])
+                    )
                     if abs(value) < LARGEST and ends < LARGEST + limit:
                         residual[i] = value
     return mean, residual, gap
@@ -143,7 +155,8 @@ def _roughness(ring: Ints, residual: Floats) -> Floats:
     count = len(ring)
     out = np.empty(count, np.float32)
     for i in range(count):
-        total, weight = np.float32(0), np.float32(0)
+        total = np.float32(0)
+        weight = np.float32(0)
         for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
             if ring[j] == ring[i]:
                 total += np.float32(LARGEST) if np.isnan(residual[j]) else abs(residual[j])
@@ -163,7 +176,8 @@ def _across(
     for i in range(count):
         column[i] = int(np.floor(turn[i])) % firings
         table[ring[i], column[i]] = i
-    kind, below = np.full(count, 2, np.int32), np.full(count, -1, np.int32)
+    kind = np.full(count, 2, np.int32)
+    below = np.full(count, -1, np.int32)
     for i in range(count):
         for side in (1, -1):
             row = ring[i] + side
@@ -180,7 +194,9 @@ def _across(
             rise = abs(z[i] - z[other])
             if kind[i] == 2:
                 kind[i] = 0 if rise < _LEVEL * along else 1
-            if side == 1 and (abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i] or rise < 0.05 * along):
+            if side == 1 and (
+                abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i] or rise < 0.05 * along
+            ):
                 below[i] = other
     return kind, below
 

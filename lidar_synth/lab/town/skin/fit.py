@@ -1,7 +1,8 @@
-"""Learn a skin from unlabelled real scans: the same features of real scans and of scans of the town, tabulated.
+"""Learn a skin from unlabelled real scans: the same features of real scans and of scans of the
+town, tabulated.
 
-Within each stratum, the map from the town's quantiles to the real ones keeps the town's order of materials and gives
-it the real distribution.
+Within each stratum, the map from the town's quantiles to the real ones keeps the town's order of
+materials and gives it the real distribution.
 """
 
 import hashlib
@@ -55,7 +56,8 @@ def fit_skin(
 
     Raises:
         ConfigError: on an unknown sensor.
-        DataError: on fewer than 5 scans, on scans of another sensor, not in ring order, or without reflectance.
+        DataError: on fewer than 5 scans, on scans of another sensor, not in ring order, or without
+            reflectance.
 
     Example:
         >>> from lidar_synth import Town, fit_skin
@@ -65,11 +67,14 @@ def fit_skin(
         (6, 'town')
     """
     if len(scans) < FEWEST_SCANS:
-        raise DataError(f"{len(scans)} scans", f"at least {FEWEST_SCANS} scans of one sensor, better 20 to 100")
+        raise DataError(
+            f"{len(scans)} scans", f"at least {FEWEST_SCANS} scans of one sensor, better 20 to 100"
+        )
     own = scans[0].sensor if sensor is None else load_sensor(sensor)
     rng = np.random.Generator(np.random.Philox(key=seed))
     step = _step(np.concatenate([scans[i].reflectance for i in range(FEWEST_SCANS)]))
-    digest, real = hashlib.sha256(), []
+    digest = hashlib.sha256()
+    real = []
     for i in tqdm(range(len(scans)), desc="real scans", disable=not progress):
         scan = scans[i]
         digest.update(np.ascontiguousarray(scan.points).tobytes() + scan.reflectance.tobytes())
@@ -81,9 +86,12 @@ def fit_skin(
         for i in tqdm(picked, desc="town", disable=not progress)
     ]
     provenance = {
-        "source": source, "licence": licence, "scans": len(scans), "sha256": digest.hexdigest(),
+        "source": source,
+        "licence": licence,
+        "scans": len(scans),
+        "sha256": digest.hexdigest(),
         "town": {"version": version("lidar_synth"), "seed": seed, "scans": len(picked)},
-    }  # fmt: skip
+    }
     return estimate(Domain.of(real), Domain.of(cast), own, step, provenance, lasers)
 
 

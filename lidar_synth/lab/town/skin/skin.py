@@ -1,4 +1,5 @@
-"""A skin: what the returns of a real sensor look like, as maps from the town's distributions to those of real scans."""
+"""A skin: what the returns of a real sensor look like, as maps from the town's distributions to
+those of real scans."""
 
 import hashlib
 import json
@@ -37,17 +38,21 @@ FORMAT = "lidar-synth-skin/1"
 SUFFIX = ".skin"
 LONGEST = 4 << 20
 """Bytes, largest file of a skin."""
-MEANS, RESIDUALS = 65, 33
+MEANS = 65
+RESIDUALS = 33
 """Quantiles of the local mean, and of the residuals of reflectance and range."""
 PARTS = 4
-"""Parts of a stratum, by the rank of the local mean, in which residuals of reflectance are tabulated."""
+"""Parts of a stratum, by the rank of the local mean, in which residuals of reflectance are
+tabulated."""
 TOWN_STEP = 1 / 256
 """Step of the reflectance of the physical model."""
-SOFT, BOXED = 0.3, 0.05
+SOFT = 0.3
+BOXED = 0.05
 """Metres by which a point moves at most, and a point of an object with a box."""
 
 WHITE = 0.6
-"""Share of the change of a residual by which its return moves: its neighbours move, too. (White noise has 1 / 1.67.)"""
+"""Share of the change of a residual by which its return moves: its neighbours move, too. (White
+noise has 1 / 1.67.)"""
 
 _FINE = 129
 """Grid points of the tables that are computed from the quantiles."""
@@ -94,10 +99,11 @@ class Skin:
     Args:
         sensor: the sensor.
         step: step of its reflectance, 0 if it is not known.
-        provenance: the scans that it was learnt from, their licence, and the town that they were compared with.
-        arrays: {name: values} of ``shapes``: ``cuts`` of the roughness, quantiles of the town and the real ones that
-            replace them, the ``offset`` of each laser's reflectance, and the probability that a return is ``missing``
-            by stratum, with a factor by laser.
+        provenance: the scans that it was learnt from, their licence, and the town that they were
+            compared with.
+        arrays: {name: values} of ``shapes``: ``cuts`` of the roughness, quantiles of the town and
+            the real ones that replace them, the ``offset`` of each laser's reflectance, and the
+            probability that a return is ``missing`` by stratum, with a factor by laser.
 
     Example:
         >>> from lidar_synth import Town, load_skin
@@ -117,8 +123,13 @@ class Skin:
         given = {name: array.shape for name, array in self.arrays.items()}
         if given != expected:
             raise ConfigError(f"a skin with arrays {given}", f"{expected}")
-        if not all(np.isfinite(array).all() and np.abs(array).max() <= 1000 for array in self.arrays.values()):
-            raise ConfigError("a skin with values that are not finite, or too large", "those of fit_skin")
+        if not all(
+            np.isfinite(array).all() and np.abs(array).max() <= 1000
+            for array in self.arrays.values()
+        ):
+            raise ConfigError(
+                "a skin with values that are not finite, or too large", "those of fit_skin"
+            )
         if not 0 <= self.step <= 0.5:
             raise ConfigError(f"a skin whose reflectance has a step of {self.step}", "0 to 0.5")
 
@@ -140,53 +151,85 @@ class Skin:
         Raises:
             ConfigError: if it is another one.
         """
-        mine, other = self.sensor.laser_elevations, sensor.laser_elevations
+        mine = self.sensor.laser_elevations
+        other = sensor.laser_elevations
         if mine.shape != other.shape or np.abs(mine - other).max() > np.radians(0.3):
             raise ConfigError(
-                f"sensor {sensor.name!r} with a skin of {self.sensor.name!r}", "a sensor with the same beams",
+                f"sensor {sensor.name!r} with a skin of {self.sensor.name!r}",
+                "a sensor with the same beams",
                 f"Use sensor={self.sensor.name!r}, or fit a skin for {sensor.name!r}.",
-            )  # fmt: skip
+            )
         fired = [s.firings or s.columns for s in (self.sensor, sensor)]
         if fired[0] != fired[1]:
-            raise ConfigError(f"{fired[1]} firings with a skin of {fired[0]} firings per turn", "the same number")
+            raise ConfigError(
+                f"{fired[1]} firings with a skin of {fired[0]} firings per turn", "the same number"
+            )
 
     def apply(
-        self, points: Floats, reflectance: Floats, ring: NDArray[np.integer], boxed: NDArray[np.bool_],
+        self,
+        points: Floats,
+        reflectance: Floats,
+        ring: NDArray[np.integer],
+        boxed: NDArray[np.bool_],
         rng: np.random.Generator,
-    ) -> Dressed:  # fmt: skip
+    ) -> Dressed:
         """Give the returns of a town's scan the look of the real sensor's.
 
         Args:
             points: (N, 3) metres, ring by ring, each ring by azimuth.
             reflectance: (N,) in [0, 1) in steps of ``TOWN_STEP``, by lasers of equal gain.
             ring: (N,) row of each point's laser.
-            boxed: (N,) whether a point belongs to an object with a box; such points move by ``BOXED`` at most.
+            boxed: (N,) whether a point belongs to an object with a box; such points move by
+                ``BOXED`` at most.
             rng: samples the returns that are missing.
         """
         uniform = rng.random((2, len(points)), np.float32)
         bright = reflectance + uniform[0] * np.float32(TOWN_STEP)
         rows = np.ascontiguousarray(ring, np.int32)
         found = features(points, bright, rows, self.sensor)
-        return self.dress(found, strata(found, self.arrays["cuts"]), bright, rows, boxed, uniform[1])
+        return self.dress(
+            found, strata(found, self.arrays["cuts"]), bright, rows, boxed, uniform[1]
+        )
 
     def dress(
-        self, found: Features, stratum: Ints, bright: Floats, rows: Ints, boxed: NDArray[np.bool_], uniform: Floats
+        self,
+        found: Features,
+        stratum: Ints,
+        bright: Floats,
+        rows: Ints,
+        boxed: NDArray[np.bool_],
+        uniform: Floats,
     ) -> Dressed:
         """``apply`` with features and random numbers (N,) that are at hand."""
         a, (mean, residual, distance) = self.arrays, self._maps
         cuts = np.ascontiguousarray(a["mean_town"][:, _part_quantiles()])
         return Dressed(
             *_dress(
-                found.mean, found.residual, stratum, bright, rows, boxed, uniform, cuts, mean, residual, distance,
-                a["offset"], a["missing"], a["missing_laser"], float(self.step),
+                found.mean,
+                found.residual,
+                stratum,
+                bright,
+                rows,
+                boxed,
+                uniform,
+                cuts,
+                mean,
+                residual,
+                distance,
+                a["offset"],
+                a["missing"],
+                a["missing_laser"],
+                float(self.step),
                 max(float(np.median(a["mean_real"])), 1e-3),
             )
-        )  # fmt: skip
+        )
 
     def summary(self) -> dict[str, Any]:
         """Provenance and a few figures, as plain values."""
-        spread = {name: np.ptp(self.arrays[name][:, [RESIDUALS // 4, -1 - RESIDUALS // 4]], axis=1)
-                  for name in ("residual_town", "residual_real", "range_town", "range_real")}  # fmt: skip
+        spread = {
+            name: np.ptp(self.arrays[name][:, [RESIDUALS // 4, -1 - RESIDUALS // 4]], axis=1)
+            for name in ("residual_town", "residual_real", "range_town", "range_real")
+        }
         return {
             "sensor": self.sensor.name,
             **{k: v for k, v in self.provenance.items() if k != "town"},
@@ -195,7 +238,9 @@ class Skin:
             "reflectance, median": float(np.median(self.arrays["mean_real"]).round(3)),
             "lasers, spread of reflectance": float(self.arrays["offset"][0].std().round(3)),
             "returns missing, at most": float(self.arrays["missing"].max().round(3)),
-            **{f"{name}, median spread": float(np.median(v).round(4)) for name, v in spread.items()},
+            **{
+                f"{name}, median spread": float(np.median(v).round(4)) for name, v in spread.items()
+            },
         }
 
     @cached_property
@@ -205,9 +250,15 @@ class Skin:
 
     def _content(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The header of the file, without its checksum, and the arrays."""
-        header = {"format": FORMAT, "sensor": self.sensor.to_dict(), "reflectance_step": self.step,
-                  "provenance": self.provenance}  # fmt: skip
-        return header, {name: np.ascontiguousarray(v, np.float16) for name, v in self.arrays.items()}
+        header = {
+            "format": FORMAT,
+            "sensor": self.sensor.to_dict(),
+            "reflectance_step": self.step,
+            "provenance": self.provenance,
+        }
+        return header, {
+            name: np.ascontiguousarray(v, np.float16) for name, v in self.arrays.items()
+        }
 
     def save(self, path: str | Path) -> None:
         """Write the skin to a file; the same skin gives the same bytes.
@@ -220,11 +271,16 @@ class Skin:
             raise ConfigError(f"skin {path}", f"a name that ends in {SUFFIX}")
         header, arrays = self._content()
         header["checksum"] = _checksum(header, arrays)
-        write_file(Path(path), save(arrays, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True)
+        write_file(
+            Path(path),
+            save(arrays, {"lidar_synth": json.dumps(header, sort_keys=True)}),
+            durable=True,
+        )
 
 
 def part_of(mean: Floats, stratum: Ints, quantiles: Floats) -> NDArray[np.int64]:
-    """(N,) stratum and part of each return: the rank of its local mean among the quantiles (BANDS, MEANS)."""
+    """(N,) stratum and part of each return: the rank of its local mean among the quantiles (BANDS,
+    MEANS)."""
     cuts = quantiles[:, _part_quantiles()]
     part: NDArray[np.int64] = (mean[:, None] >= cuts[BAND[stratum]]).sum(1)
     return stratum.astype(np.int64) * PARTS + part
@@ -250,12 +306,27 @@ def _root(x: float) -> float:
 
 @njit(cache=True)
 def _dress(
-    mean: Floats, residual: Floats, stratum: Ints, bright: Floats, ring: Ints, boxed: NDArray[np.bool_],
-    uniform: Floats, cuts: Floats, to_mean: Floats, to_residual: Floats, to_range: Floats, offset: Floats,
-    missing: Floats, missing_laser: Floats, step: float, middle: float,
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:  # fmt: skip
+    mean: Floats,
+    residual: Floats,
+    stratum: Ints,
+    bright: Floats,
+    ring: Ints,
+    boxed: NDArray[np.bool_],
+    uniform: Floats,
+    cuts: Floats,
+    to_mean: Floats,
+    to_residual: Floats,
+    to_range: Floats,
+    offset: Floats,
+    missing: Floats,
+    missing_laser: Floats,
+    step: float,
+    middle: float,
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     count = len(mean)
-    shift, value, kept = np.zeros(count, np.float32), np.empty(count, np.float32), np.ones(count, np.bool_)
+    shift = np.zeros(count, np.float32)
+    value = np.empty(count, np.float32)
+    kept = np.ones(count, np.bool_)
     for i in range(count):
         s = stratum[i]
         part = 0
@@ -281,7 +352,9 @@ def _checksum(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     """sha256 of a header and of the names, types, shapes and bytes of arrays."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode() + arrays[name].tobytes())
+        digest.update(
+            f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode() + arrays[name].tobytes()
+        )
     return digest.hexdigest()
 
 
@@ -289,7 +362,8 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
     """Load a skin: one that ships with the package by its name, or one of your own from a file.
 
     Args:
-        skin: the name of a shipped skin; the path of a file that ends in ``.skin``; or a ``Skin``, which is returned.
+        skin: the name of a shipped skin; the path of a file that ends in ``.skin``; or a ``Skin``,
+            which is returned.
 
     Raises:
         ConfigError: on an unknown name.
@@ -320,9 +394,24 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
             raise ConfigError(f"format {header['format']!r}", repr(FORMAT))
         stored = load(content)
         if header.pop("checksum", None) != _checksum(header, stored):
-            raise ConfigError("content that does not match its checksum", "an intact file", "Copy it again.")
+            raise ConfigError(
+                "content that does not match its checksum", "an intact file", "Copy it again."
+            )
         arrays = {name: values.astype(np.float32) for name, values in stored.items()}
-        return Skin(Sensor.from_dict(header["sensor"]), float(header["reflectance_step"]),
-                    dict(header["provenance"]), arrays)  # fmt: skip
-    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DataError(f"{path} is not a skin of this version ({error})", f"an intact file of {FORMAT}") from error
+        return Skin(
+            Sensor.from_dict(header["sensor"]),
+            float(header["reflectance_step"]),
+            dict(header["provenance"]),
+            arrays,
+        )
+    except (
+        SafetensorError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise DataError(
+            f"{path} is not a skin of this version ({error})", f"an intact file of {FORMAT}"
+        ) from error

@@ -1,4 +1,5 @@
-"""Quantiles by stratum, and the monotone map from the quantiles of one domain to those of another."""
+"""Quantiles by stratum, and the monotone map from the quantiles of one domain to those of
+another."""
 
 from collections.abc import Sequence
 
@@ -7,10 +8,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 FEWEST = 400
-"""Values of a group in both domains from which its own quantiles are taken; smaller groups use coarser ones."""
+"""Values of a group in both domains from which its own quantiles are taken; smaller groups use
+coarser ones."""
 
 
-def grouped_quantiles(value: Floats, group: NDArray[np.integer], groups: int, count: int) -> tuple[Floats, Floats]:
+def grouped_quantiles(
+    value: Floats, group: NDArray[np.integer], groups: int, count: int
+) -> tuple[Floats, Floats]:
     """Quantiles of values by group.
 
     Args:
@@ -34,7 +38,8 @@ def grouped_quantiles(value: Floats, group: NDArray[np.integer], groups: int, co
 
 
 def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
-    """(N,) the values in the order of groups, ascending within each; by one sort of integers, which is fast."""
+    """(N,) the values in the order of groups, ascending within each; by one sort of integers, which
+    is fast."""
     bits = np.ascontiguousarray(value, np.float32).view(np.uint32)
     negative = (bits >> np.uint32(31)).astype(bool)
     ascending = np.where(negative, ~bits, bits | np.uint32(1 << 31))
@@ -45,13 +50,17 @@ def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
 
 
 def pooled(
-    pairs: Sequence[tuple[Floats, NDArray[np.integer]]], levels: Sequence[NDArray[np.integer]], count: int
+    pairs: Sequence[tuple[Floats, NDArray[np.integer]]],
+    levels: Sequence[NDArray[np.integer]],
+    count: int,
 ) -> list[Floats]:
-    """Quantiles of several domains by group, where a group with few values takes those of a coarser one.
+    """Quantiles of several domains by group, where a group with few values takes those of a coarser
+    one.
 
     Args:
         pairs: of each domain, (N,) values and (N,) groups.
-        levels: from fine to coarse, (G,) the set to which each group belongs; the first is ``arange(G)``, the last 0.
+        levels: from fine to coarse, (G,) the set to which each group belongs; the first is
+            ``arange(G)``, the last 0.
         count: Q, quantiles.
 
     Returns:
@@ -60,7 +69,10 @@ def pooled(
     tables = [np.zeros((len(levels[0]), count), np.float32) for _ in pairs]
     missing = np.ones(len(levels[0]), bool)
     for level in levels:
-        found = [grouped_quantiles(value, level[group], int(level.max()) + 1, count) for value, group in pairs]
+        found = [
+            grouped_quantiles(value, level[group], int(level.max()) + 1, count)
+            for value, group in pairs
+        ]
         enough = np.min([number for _, number in found], axis=0) >= FEWEST
         now = missing & enough[level]
         for table, (quantiles, _) in zip(tables, found, strict=True):
@@ -70,7 +82,8 @@ def pooled(
 
 
 def lookup(source: Floats, target: Floats, grid: Floats) -> Floats:
-    """(G, len(grid)) images of the values of ``grid`` by the map from quantiles (G, Q) to quantiles (G, Q).
+    """(G, len(grid)) images of the values of ``grid`` by the map from quantiles (G, Q) to quantiles
+    (G, Q).
 
     Values beyond the outer quantiles keep their distance from them.
     """

@@ -1,7 +1,8 @@
-"""What an adapted model is: its figures on held-out scans, its provenance, and its card in Markdown.
+"""What an adapted model is: its figures on held-out scans, its provenance, and its card in
+Markdown.
 
-Whether it repeats its training data is seen in the distances of generated scans to the nearest training scan, beside
-those of held-out real scans, in the features of the shipped segmenter.
+Whether it repeats its training data is seen in the distances of generated scans to the nearest
+training scan, beside those of held-out real scans, in the features of the shipped segmenter.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,8 @@ def figures(work: Work, made: Checkpoint) -> dict[str, Any]:
     """The figures of an adapted model, plain values.
 
     Returns:
-        ``stages``: {name: steps, minutes, and the loss on held-out scans before and after}; ``reconstruction``, of the
+        ``stages``: {name: steps, minutes, and the loss on held-out scans before and after};
+            ``reconstruction``, of the
         held-out scans; ``nearest``: median distances to the nearest training scan.
     """
     found: dict[str, Any] = {"stages": {}}
@@ -42,10 +44,14 @@ def figures(work: Work, made: Checkpoint) -> dict[str, Any]:
         history = read_history(work.runs.folder_of(name))
         best = min(history, key=lambda m: m.loss)
         found["stages"][name] = {
-            "steps": history[-1].step, "best_step": best.step, "minutes": round(history[-1].seconds / 60, 1),
-            "loss_before": history[0].loss, "loss": best.loss,
-        }  # fmt: skip
-    train, held = work.scans.images(TRAIN), work.scans.images(HELD)
+            "steps": history[-1].step,
+            "best_step": best.step,
+            "minutes": round(history[-1].seconds / 60, 1),
+            "loss_before": history[0].loss,
+            "loss": best.loss,
+        }
+    train = work.scans.images(TRAIN)
+    held = work.scans.images(HELD)
     if CODEC in made.networks:
         found["reconstruction"] = _reconstruction(made, held)
         if not work.scans.labelled:  # their labels are the autoencoder's own
@@ -58,12 +64,19 @@ def _reconstruction(made: Checkpoint, images: Sequence[RangeImage]) -> dict[str,
     """Means over images of what the autoencoder keeps."""
     tensors = made.header.tensors
     codec: Any = make_codec(made.networks[CODEC], tensors, made.header.sensor.shape)
-    rows = [reconstruction_figures(codec, tensors.from_images([image]), made.header.sensor) for image in images]
+    rows = [
+        reconstruction_figures(codec, tensors.from_images([image]), made.header.sensor)
+        for image in images
+    ]
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def _nearest(made: Checkpoint, train: Sequence[RangeImage], held: Sequence[RangeImage]) -> dict[str, float]:
-    generator = Generator("adapted", join(made.networks), made.header, made.hash, autoencoder=made.networks.get(CODEC))
+def _nearest(
+    made: Checkpoint, train: Sequence[RangeImage], held: Sequence[RangeImage]
+) -> dict[str, float]:
+    generator = Generator(
+        "adapted", join(made.networks), made.header, made.hash, autoencoder=made.networks.get(CODEC)
+    )
     conditions = None
     if generator.condition is not None:  # label maps of scans that it has not seen
         conditions = np.stack([held[i % len(held)].channels["label"] for i in range(GENERATED)])
@@ -91,16 +104,23 @@ def _scans(images: Sequence[RangeImage]) -> list[Scan]:
     return [unproject(image) for image in images]
 
 
-def provenance_of(name: str, model: Checkpoint, work: Work, made: Checkpoint, found: dict[str, Any]) -> dict[str, Any]:
+def provenance_of(
+    name: str, model: Checkpoint, work: Work, made: Checkpoint, found: dict[str, Any]
+) -> dict[str, Any]:
     """The provenance of an adapted model: what it was, what it learnt from, and how well."""
     return {
-        "data": f"{len(work.scans.train)} scans of {work.header.sensor.name}, {len(work.scans.held_out)} held out",
+        "data": (
+            f"{len(work.scans.train)} scans of {work.header.sensor.name}, "
+            f"{len(work.scans.held_out)} held out"
+        ),
         "data_licence": work.licence,
         "licence": work.licence,
         "adapted_from": name,
         "init": model.hash,
         "init_provenance": model.header.provenance,
-        "labels": "those of the scans" if work.scans.labelled else "guesses of a model that learnt them on the town",
+        "labels": "those of the scans"
+        if work.scans.labelled
+        else "guesses of a model that learnt them on the town",
         "scans": {"train": list(work.scans.train), "held_out": list(work.scans.held_out)},
         "seen": seen_by(made.header.provenance).to_list(),
         "figures": found,
@@ -108,34 +128,44 @@ def provenance_of(name: str, model: Checkpoint, work: Work, made: Checkpoint, fo
     }
 
 
-def write_card(path: Path, checkpoint: Path, work: Work, header: Header, found: dict[str, Any]) -> None:
+def write_card(
+    path: Path, checkpoint: Path, work: Work, header: Header, found: dict[str, Any]
+) -> None:
     """Write the card of an adapted model."""
-    facts, near = header.provenance, found["nearest"]
+    facts = header.provenance
+    near = found["nearest"]
     lines = [
         f"# {checkpoint.stem}",
         "",
         f'`load_generator("{checkpoint.name}")` generates scans of {header.sensor.name} '
-        f"({header.sensor.shape[0]} x {header.sensor.columns} cells, {header.sensor.range_min:g} to "
-        f"{header.sensor.range_max:g} m). It is `{facts['adapted_from']}`, adapted to {facts['data']}.",
+        f"({header.sensor.shape[0]} x {header.sensor.columns} cells, {header.sensor.range_min:g} "
+        "to "
+        f"{header.sensor.range_max:g} m). It is `{facts['adapted_from']}`, adapted to "
+        f"{facts['data']}.",
         "",
-        f"**Licence.** {header.provenance['licence']}. The licence of `{facts['adapted_from']}` applies too.",
+        f"**Licence.** {header.provenance['licence']}. The licence of `{facts['adapted_from']}` "
+        "applies too.",
         "",
         f"**Labels.** They are {facts['labels']}.",
         "",
-        f"**Scans.** Trained on {_span(work.scans.train)}; held out: {_span(work.scans.held_out)}. The checkpoint "
+        f"**Scans.** Trained on {_span(work.scans.train)}; held out: "
+        f"{_span(work.scans.held_out)}. The checkpoint "
         "lists them, and tests on them are refused.",
         "",
         "stage | steps | minutes | loss on held-out scans before | after",
         "---|---:|---:|---:|---:",
         *(
-            f"{name} | {s['best_step']} of {s['steps']} | {s['minutes']:g} | {s['loss_before']:.3f} | {s['loss']:.3f}"
+            f"{name} | {s['best_step']} of {s['steps']} | {s['minutes']:g} | "
+            f"{s['loss_before']:.3f} | {s['loss']:.3f}"
             for name, s in found["stages"].items()
         ),
         "",
     ]
     if "reconstruction" in found:
         lines += ["held-out scans, encoded and decoded |", "---|---:"]
-        lines += [f"{_NAMES[name]} | {value:.3f}" for name, value in found["reconstruction"].items()] + [""]
+        lines += [
+            f"{_NAMES[name]} | {value:.3f}" for name, value in found["reconstruction"].items()
+        ] + [""]
     lines += [
         "median distance to the nearest training scan (features of the shipped segmenter) |",
         "---|---:",
@@ -143,10 +173,12 @@ def write_card(path: Path, checkpoint: Path, work: Work, header: Header, found: 
         f"of held-out scans | {near['held_out']:.3f}",
         f"of training scans, to another one | {near['training']:.3f}",
         "",
-        f"{near['closer']:.0%} of the generated scans are nearer to a training scan than 95 % of the held-out ones "
-        "are. About 5 % are expected of new scans; many more are copies, or scans that are more ordinary.",
+        f"{near['closer']:.0%} of the generated scans are nearer to a training scan than 95 % of "
+        "the held-out ones "
+        "are. About 5 % are expected of new scans; many more are copies, or scans that are more "
+        "ordinary.",
         "",
-    ]  # fmt: skip
+    ]
     write_file(path, "\n".join(lines).encode())
 
 

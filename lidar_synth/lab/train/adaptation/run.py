@@ -9,7 +9,13 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
-from lidar_synth.generate.checkpoint import CODEC, Checkpoint, Header, load_checkpoint, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    Checkpoint,
+    Header,
+    load_checkpoint,
+    save_checkpoint,
+)
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.regrid import check_movable, fitting, regrid, with_codec
@@ -69,12 +75,16 @@ class AdaptPlan:
             f"sensor {own.name}: {own.shape[0]} x {own.columns}, as {rows} x {columns} cells from "
             f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m",
             f"{len(self.parts.train)} scans to train on, {len(self.parts.between)} left out, "
-            f"{len(self.parts.held_out)} held out: the last ones, from {self.source.ids[self.parts.held_out[0]]}",
+            f"{len(self.parts.held_out)} held out: the last ones, from "
+            f"{self.source.ids[self.parts.held_out[0]]}",
             "with their labels"
             if self.labelled
             else "without labels: generated labels are the model's own guess, learnt on the town",
             f"at most {self.minutes:g} minutes:",
-            *(f"  {name:<10} {minutes:6.1f}  {self.stages[name].about}" for name, minutes in budgets.items()),
+            *(
+                f"  {name:<10} {minutes:6.1f}  {self.stages[name].about}"
+                for name, minutes in budgets.items()
+            ),
             f"the folder {self.work} keeps what is needed to resume",
         ]
         return "\n".join(lines)
@@ -89,29 +99,47 @@ def plan_adaptation(
     town: int = TOWN_SCANS,
 ) -> AdaptPlan:
     """The plan of an adaptation; the arguments and errors are those of ``adapt``."""
-    out, root = Path(out), Path(scans)
+    out = Path(out)
+    root = Path(scans)
     if out.suffix != ".safetensors" or out.exists():
         given = f"{out}, which exists" if out.exists() else str(out)
         raise ConfigError(f"the output {given}", "a new file whose name ends in .safetensors")
     if minutes <= 0 or town < 0:
-        raise ConfigError(f"{minutes:g} minutes and {town} scans of the town", "more than 0, and at least 0")
+        raise ConfigError(
+            f"{minutes:g} minutes and {town} scans of the town", "more than 0, and at least 0"
+        )
     start = load_checkpoint(find_model(model))
     check_movable(start.header)
     layout = layout_of(root)
     source = open_scans(root, sensor=sensor, layout=layout)
-    parts, first = split(source.ids), source[0]
+    parts = split(source.ids)
+    first = source[0]
     labelled = first.label is not None
     header = start.header
     if not labelled and "label" in header.channels and (CODEC not in header.networks or not town):
         raise DataError(
             f"scans without labels, such as {first.id!r}, for a model with labels",
-            "scans with labels; or a model with an autoencoder and scans of the town, on which it learns to label",
+            "scans with labels; or a model with an autoencoder and scans of the town, on which "
+            "it learns to label",
             "lidar-synth adapt town-dense",
         )
     stages = stages_for(header, labelled, town)
     grid = fitting(source.sensor, header)
-    return AdaptPlan(start, Path(str(model)).stem, source, root, layout, grid, labelled, parts, stages, minutes, town,
-                     out, out.with_suffix(".adapt"))  # fmt: skip
+    return AdaptPlan(
+        start,
+        Path(str(model)).stem,
+        source,
+        root,
+        layout,
+        grid,
+        labelled,
+        parts,
+        stages,
+        minutes,
+        town,
+        out,
+        out.with_suffix(".adapt"),
+    )
 
 
 def adapt(
@@ -128,20 +156,22 @@ def adapt(
 ) -> Path:
     """Adapt a model to the sensor and the streets of 20 to 200 scans.
 
-    The autoencoder, the flow and the student are trained one after the other, with early stopping on the last fifth of
-    the scans. A card is written beside the checkpoint. The same call resumes an interrupted adaptation.
+    The autoencoder, the flow and the student are trained one after the other, with early stopping
+    on the last fifth of the scans. A card is written beside the checkpoint. The same call resumes
+    an interrupted adaptation.
 
     Args:
-        model: ``"town-dense"``, or ``"town-semantic"``, which then takes anyone's label maps; or the path of a
-            checkpoint.
-        scans: scans of one sensor, in any layout that is read. Labelled scans teach the model their labels. Without
-            labels it keeps guesses, which it learns on the town.
+        model: ``"town-dense"``, or ``"town-semantic"``, which then takes anyone's label maps; or
+            the path of a checkpoint.
+        scans: scans of one sensor, in any layout that is read. Labelled scans teach the model their
+            labels. Without labels it keeps guesses, which it learns on the town.
         out: the checkpoint to write, a ``.safetensors`` file.
         minutes: limit of the time of all trainings.
         licence: of the scans, and therefore of the weights.
         sensor: of the scans, if it is not the one that they or their layout name.
-        town: number of scans of the town, cast through the sensor, on which the flow is trained first, and which the
-            autoencoder learns beside yours, so that it does not forget classes that yours lack; 0 = none.
+        town: number of scans of the town, cast through the sensor, on which the flow is trained
+            first, and which the autoencoder learns beside yours, so that it does not forget classes
+            that yours lack; 0 = none.
         overrides: {name of a stage: values of its recipe}.
         progress: show bars.
 
@@ -149,10 +179,10 @@ def adapt(
         The path of the checkpoint, for ``load_generator``.
 
     Raises:
-        ConfigError: if the output exists, its folder holds another adaptation, the model cannot be adapted, or the
-            sensor has rows that its networks cannot have.
-        DataError: on fewer than 12 scans, scans of several sensors, some scans without labels, or labels of another
-            table.
+        ConfigError: if the output exists, its folder holds another adaptation, the model cannot be
+            adapted, or the sensor has rows that its networks cannot have.
+        DataError: on fewer than 12 scans, scans of several sensors, some scans without labels, or
+            labels of another table.
         LibraryError: if Accelerate is not installed.
 
     Example:
@@ -166,20 +196,36 @@ def adapt(
     plan = plan_adaptation(model, scans, out, minutes, sensor, town)
     require_accelerate()
     claim(plan.work / SETTINGS, _settings(plan))
-    prepared = prepare(plan.source, plan.layout, plan.root, plan.sensor, plan.work / "scans", progress)
+    prepared = prepare(
+        plan.source, plan.layout, plan.root, plan.sensor, plan.work / "scans", progress
+    )
     if prepared.labelled != plan.labelled:
-        raise DataError(f"{plan.root}: some scans have labels, some have none", "labels for all or none")
+        raise DataError(
+            f"{plan.root}: some scans have labels, some have none", "labels for all or none"
+        )
     start = plan.work / "start.safetensors"
     if not start.is_file():
         header, networks = regrid(plan.model, plan.sensor)
-        provenance = header.provenance | {"init": plan.model.hash, "init_provenance": plan.model.header.provenance}
+        provenance = header.provenance | {
+            "init": plan.model.hash,
+            "init_provenance": plan.model.header.provenance,
+        }
         save_checkpoint(start, replace(header, provenance=provenance), networks)
-    work = Work(plan.work, load_checkpoint(start).header, prepared, licence, town, plan.stages, overrides or {})
+    work = Work(
+        plan.work,
+        load_checkpoint(start).header,
+        prepared,
+        licence,
+        town,
+        plan.stages,
+        overrides or {},
+    )
     return _finish(plan, _train(work, start, minutes), start, licence)
 
 
 def _train(work: Work, start: Path, minutes: float) -> Work:
-    """Run all stages, each from the checkpoint of the one before; return the work with the scans' labels."""
+    """Run all stages, each from the checkpoint of the one before; return the work with the scans'
+    labels."""
     flow = start
     for name in work.stages:
         if name in ("labels", "codec"):
@@ -200,9 +246,17 @@ def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
     """The flow of one checkpoint with the autoencoder of another, as the start of a stage."""
     path = work.folder / f"{name}_start.safetensors"
     if not path.is_file():
-        one, other = load_checkpoint(flow), load_checkpoint(codec)
-        provenance = one.header.provenance | {"codec": other.hash, "codec_provenance": other.header.provenance}
-        save_checkpoint(path, replace(one.header, provenance=provenance), with_codec(one.networks, other.networks))
+        one = load_checkpoint(flow)
+        other = load_checkpoint(codec)
+        provenance = one.header.provenance | {
+            "codec": other.hash,
+            "codec_provenance": other.header.provenance,
+        }
+        save_checkpoint(
+            path,
+            replace(one.header, provenance=provenance),
+            with_codec(one.networks, other.networks),
+        )
     return path
 
 

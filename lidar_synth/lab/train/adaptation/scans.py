@@ -1,7 +1,8 @@
 """A user's scans as an adaptation trains on them: checked, split by time, and kept as range images.
 
-The last drives are held out, about a fifth of the scans. Of a single drive, or where the last one is too long, the last
-fifth of the scans is held out, and the scans before it are left out, so that no neighbouring frames lie on both sides.
+The last drives are held out, about a fifth of the scans. Of a single drive, or where the last one
+is too long, the last fifth of the scans is held out, and the scans before it are left out, so that
+no neighbouring frames lie on both sides.
 """
 
 import json
@@ -29,13 +30,18 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, contents, recordings_of
 
-FEWEST, MOST = 12, 200
+FEWEST = 12
+MOST = 200
 """Scans that are needed, and that are used of more, evenly spaced."""
-HELD_OUT, GAP = 0.2, 0.05
+HELD_OUT = 0.2
+GAP = 0.05
 """Shares of the scans that are held out, and that are left out before them."""
 LEAST_LABELLED = 0.1
-"""Share of the returns that have a label, below which a scan's labels are taken for those of another table."""
-TRAIN, HELD, NOTE = "train", "held_out", "scans.json"
+"""Share of the returns that have a label, below which a scan's labels are taken for those of
+another table."""
+TRAIN = "train"
+HELD = "held_out"
+NOTE = "scans.json"
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,8 @@ class Split:
 
 
 def split(names: Sequence[str]) -> Split:
-    """Split scans by drives, or by time where the last drive is too long or too short to be held out.
+    """Split scans by drives, or by time where the last drive is too long or too short to be held
+    out.
 
     Args:
         names: of the scans in order, "drive/frame".
@@ -68,7 +75,9 @@ def split(names: Sequence[str]) -> Split:
     if near:
         first = min(near, key=lambda n: abs(n - first))
         gap = 0
-    return Split(tuple(picked[: first - gap]), tuple(picked[first - gap : first]), tuple(picked[first:]))
+    return Split(
+        tuple(picked[: first - gap]), tuple(picked[first - gap : first]), tuple(picked[first:])
+    )
 
 
 @dataclass(frozen=True)
@@ -101,7 +110,8 @@ class Prepared:
 def prepare(
     source: ScanFiles, layout: str, root: Path, sensor: Sensor, folder: Path, progress: bool = True
 ) -> Prepared:
-    """Check the scans, and write them as range images of ``sensor``; an interrupted call is continued.
+    """Check the scans, and write them as range images of ``sensor``; an interrupted call is
+    continued.
 
     Args:
         source: the scans.
@@ -112,7 +122,8 @@ def prepare(
         progress: show a bar.
 
     Raises:
-        DataError: on too few scans, scans of several sensors, some without labels, or labels of nearly nothing.
+        DataError: on too few scans, scans of several sensors, some without labels, or labels of
+            nearly nothing.
     """
     note = folder / NOTE
     if note.is_file():
@@ -122,18 +133,28 @@ def prepare(
     kinds: set[bool] = set()
     hashes: dict[str, list[str]] = {}
     for part, indices in ((TRAIN, parts.train), (HELD, parts.held_out)):
-        for place, index in enumerate(tqdm(indices, desc=f"scans, {part}", unit="scan", disable=not progress)):
+        for place, index in enumerate(
+            tqdm(indices, desc=f"scans, {part}", unit="scan", disable=not progress)
+        ):
             scan = source[index]
             kinds.add(_checked(scan, source.sensor, usual))
             if len(kinds) > 1:
-                raise DataError(f"scan {scan.id!r}: some scans have labels, some have none", "labels for all or none")
+                raise DataError(
+                    f"scan {scan.id!r}: some scans have labels, some have none",
+                    "labels for all or none",
+                )
             hashes.setdefault(part, []).append(content_of(scan))
             channels = [name for name in ("reflectance", "label") if name in scan.fields()]
             path = folder / part / f"{place:06d}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_range_image(path, project(scan, sensor, channels), replace(scan, sensor=sensor))
-    ids = {part: [source.ids[i] for i in some] for part, some in ((TRAIN, parts.train), (HELD, parts.held_out))}
-    recordings = _recorded(source, layout, root, ids[TRAIN] + ids[HELD]) | contents(hashes[TRAIN] + hashes[HELD])
+    ids = {
+        part: [source.ids[i] for i in some]
+        for part, some in ((TRAIN, parts.train), (HELD, parts.held_out))
+    }
+    recordings = _recorded(source, layout, root, ids[TRAIN] + ids[HELD]) | contents(
+        hashes[TRAIN] + hashes[HELD]
+    )
     values = {"labelled": kinds.pop(), **ids, "recordings": recordings.to_list()}
     write_file(note, json.dumps(values).encode())
     return _read(folder, values)
@@ -141,11 +162,14 @@ def prepare(
 
 def _read(folder: Path, values: Any) -> Prepared:
     recordings = Recordings.from_list(values["recordings"])
-    return Prepared(folder, values["labelled"], tuple(values[TRAIN]), tuple(values[HELD]), recordings)
+    return Prepared(
+        folder, values["labelled"], tuple(values[TRAIN]), tuple(values[HELD]), recordings
+    )
 
 
 def _recorded(source: ScanFiles, layout: str, root: Path, ids: Sequence[str]) -> Recordings:
-    """The recordings of some scans of a source; of the whole one where frames cannot be told apart."""
+    """The recordings of some scans of a source; of the whole one where frames cannot be told
+    apart."""
     every = recordings_of(source, layout, root)
     if layout not in PLACES or any(dataset == TOWN for dataset, _ in every.drives):
         return every
@@ -159,9 +183,14 @@ def _checked(scan: Scan, sensor: Sensor, usual: float) -> bool:
         DataError: on a scan of another sensor, or with labels of nearly nothing.
     """
     outside = agreement(scan.points, sensor).outside
-    if scan.sensor.shape != sensor.shape or scan.sensor.name != sensor.name or outside > usual + MOST_OUTSIDE:
+    if (
+        scan.sensor.shape != sensor.shape
+        or scan.sensor.name != sensor.name
+        or outside > usual + MOST_OUTSIDE
+    ):
         raise DataError(
-            f"scan {scan.id!r} of sensor {scan.sensor.name!r}, with {outside:.0%} of the points outside of the view of "
+            f"scan {scan.id!r} of sensor {scan.sensor.name!r}, with {outside:.0%} of the points "
+            "outside of the view of "
             f"{sensor.name!r}",
             "scans of one sensor",
             "Adapt a model to each sensor by itself; --sensor names that of the scans.",

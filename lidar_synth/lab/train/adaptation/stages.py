@@ -1,7 +1,9 @@
-"""The trainings of an adaptation, one after the other, each a recipe of ``configs/`` on the user's scans.
+"""The trainings of an adaptation, one after the other, each a recipe of ``configs/`` on the user's
+scans.
 
-The limit of time is divided by ``STAGES``; what an early stop leaves goes to the stages after it. A stage is a training
-run in a folder of its own, so that an interrupted adaptation goes on where it stopped.
+The limit of time is divided by ``STAGES``; what an early stop leaves goes to the stages after it. A
+stage is a training run in a folder of its own, so that an interrupted adaptation goes on where it
+stopped.
 """
 
 from collections.abc import Mapping
@@ -17,9 +19,12 @@ from lidar_synth.lab.train.runs import run
 from lidar_synth.lab.train.schedules import ENDLESS
 from lidar_synth.lab.train.staged import StagedRuns
 
-TOWN_SEED, TOWN_HELD, TOWN_HELD_SCANS = 0, 7100, 16
+TOWN_SEED = 0
+TOWN_HELD = 7100
+TOWN_HELD_SCANS = 16
 """Seeds of the towns to train on and to hold out, and the scans that are held out."""
-CODEC_SAMPLES, FLOW_SAMPLES = 12, 32
+CODEC_SAMPLES = 12
+FLOW_SAMPLES = 32
 """Samples of a measurement on held-out scans."""
 INTERVAL = 2.0
 """Seconds between two scans of the town."""
@@ -34,7 +39,8 @@ class Stage(NamedTuple):
     Args:
         recipe: a name in ``configs/``.
         share: of the limit of time.
-        town: whether it learns from the town cast through the user's sensor, in place of the user's scans.
+        town: whether it learns from the town cast through the user's sensor, in place of the user's
+            scans.
         about: what it does, for the plan.
     """
 
@@ -110,7 +116,8 @@ class Work:
         return StagedRuns(self.folder, shares(self.stages))
 
     def train(self, name: str, start: Path, limit: float) -> Path:
-        """Run or resume a stage, unless it is done: more steps would change what the next one began with.
+        """Run or resume a stage, unless it is done: more steps would change what the next one began
+        with.
 
         Args:
             name: of the stage.
@@ -128,21 +135,30 @@ class Work:
 
     def config(self, name: str, start: Path) -> TrainConfig | DistillConfig:
         """The configuration of a stage."""
-        kind: type[TrainConfig] | type[DistillConfig] = DistillConfig if name == "student" else TrainConfig
+        kind: type[TrainConfig] | type[DistillConfig] = (
+            DistillConfig if name == "student" else TrainConfig
+        )
         values = merged(self._own(name, start), dict(self.overrides.get(name, {})))
         return load_config(kind, self.stages[name].recipe, values=values)
 
     def _own(self, name: str, start: Path) -> dict[str, Any]:
         stage = self.stages[name]
         data = self._town(TOWN_SEED, self.town) if stage.town else self._scans(TRAIN)
-        held = self._town(TOWN_HELD, min(TOWN_HELD_SCANS, self.town)) if stage.town else self._scans(HELD)
+        held = (
+            self._town(TOWN_HELD, min(TOWN_HELD_SCANS, self.town))
+            if stage.town
+            else self._scans(HELD)
+        )
         codec = stage.recipe == "adapt_codec"
         latents = {"latents": self.latent and not codec}
         values: dict[str, Any] = {
             "output": str(self.runs.folder_of(name)),
             "licence": self.licence,
             "data": data | latents,
-            "held_out": {"data": held | latents | {"flip": True}, "samples": CODEC_SAMPLES if codec else FLOW_SAMPLES},
+            "held_out": {
+                "data": held | latents | {"flip": True},
+                "samples": CODEC_SAMPLES if codec else FLOW_SAMPLES,
+            },
             "recipe": {"iterations": ENDLESS},
         }
         if name == "student":
@@ -157,8 +173,17 @@ class Work:
 
     def _scans(self, part: str) -> dict[str, Any]:
         seen = self.scans.recordings.to_list()
-        return {"path": str(self.scans.path(part)), "layout": "range", "licence": self.licence, "seen": seen}
+        return {
+            "path": str(self.scans.path(part)),
+            "layout": "range",
+            "licence": self.licence,
+            "seen": seen,
+        }
 
     def _town(self, seed: int, count: int) -> dict[str, Any]:
         cast = {"town": count, "seed": seed, "interval": INTERVAL, "motion": False}
-        return cast | {"path": None, "licence": TOWN_LICENCE, "cache": str(self.folder / f"town-{seed}")}
+        return cast | {
+            "path": None,
+            "licence": TOWN_LICENCE,
+            "cache": str(self.folder / f"town-{seed}"),
+        }

@@ -1,6 +1,7 @@
 """Configuration files of training runs.
 
-What a run needs is built from the checked values by the caller, so that nothing below knows of configurations.
+What a run needs is built from the checked values by the caller, so that nothing below knows of
+configurations.
 """
 
 from lidar_synth.files.recipes import Listed, command_of, find_recipe, published, validated
@@ -13,7 +14,15 @@ from lidar_synth.lab.train.config.models import (
     load_model,
     published_models,
 )
-from lidar_synth.lab.train.config.sections import Condition, Data, HeldOut, Network, Run, Samples, Section
+from lidar_synth.lab.train.config.sections import (
+    Condition,
+    Data,
+    HeldOut,
+    Network,
+    Run,
+    Samples,
+    Section,
+)
 from lidar_synth.lab.train.config.training import DistillConfig, SelectionSettings, TrainConfig
 
 __all__ = [

@@ -18,14 +18,18 @@ Config = TypeVar("Config", bound=Run)
 
 
 def load_config(
-    kind: type[Config], recipe: str | Path, overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None
+    kind: type[Config],
+    recipe: str | Path,
+    overrides: Sequence[str] = (),
+    values: Mapping[str, Any] | None = None,
 ) -> Config:
     """The configuration of a recipe.
 
     Args:
         kind: ``TrainConfig`` or ``DistillConfig``.
         recipe: a published recipe's name, such as ``town_teacher``, or a YAML file.
-        overrides: ``key=value`` with dots between levels and values in YAML, such as ``recipe.batch=4``.
+        overrides: ``key=value`` with dots between levels and values in YAML, such as
+            ``recipe.batch=4``.
         values: plain values on top of the recipe's and below the overrides.
 
     Returns:
@@ -33,8 +37,8 @@ def load_config(
 
     Raises:
         FileError: where the file cannot be read.
-        ConfigError: on a file that is not YAML, an unknown key, an invalid value or a resolution that the network
-            cannot have.
+        ConfigError: on a file that is not YAML, an unknown key, an invalid value or a resolution
+            that the network cannot have.
 
     Example:
         >>> from lidar_synth.lab.train import TrainConfig, load_config
@@ -51,7 +55,8 @@ def load_config(
 
 
 def read_values(given: str | Path, kind: type[BaseModel]) -> dict[str, Any]:
-    """The values of a recipe for a ``kind``, its bases included, not checked yet; raises as ``load_config``.
+    """The values of a recipe for a ``kind``, its bases included, not checked yet; raises as
+    ``load_config``.
 
     A run without ``output`` gets the folder ``runs/NAME``.
     """
@@ -75,19 +80,35 @@ def check(config: Run) -> None:
         _check_train(config)
     if isinstance(config, DistillConfig) and config.grid is not None:
         grid = config.grid
-        if len(grid) != config.intervals + 1 or (grid[0], grid[-1]) != (1, 0) or sorted(set(grid))[::-1] != list(grid):
-            raise ConfigError(f"grid {list(grid)}", f"{config.intervals + 1} descending times from 1 to 0")
+        if (
+            len(grid) != config.intervals + 1
+            or (grid[0], grid[-1]) != (1, 0)
+            or sorted(set(grid))[::-1] != list(grid)
+        ):
+            raise ConfigError(
+                f"grid {list(grid)}", f"{config.intervals + 1} descending times from 1 to 0"
+            )
 
 
 def _check_train(config: TrainConfig) -> None:
     if config.autoencodes and (config.codec or config.condition):
-        raise ConfigError("an autoencoder with a codec or a condition", "neither: they belong to a flow")
+        raise ConfigError(
+            "an autoencoder with a codec or a condition", "neither: they belong to a flow"
+        )
     if config.decoder and (config.init is None or config.condition):
-        raise ConfigError("decoder without init, or with a condition", "init: a latent model, with its own condition")
+        raise ConfigError(
+            "decoder without init, or with a condition",
+            "init: a latent model, with its own condition",
+        )
     if config.data.roll and config.condition and not CONDITIONS[config.condition.kind].turns:
-        raise ConfigError(f"data.roll with the condition {config.condition.kind!r}", "data.roll=false")
+        raise ConfigError(
+            f"data.roll with the condition {config.condition.kind!r}", "data.roll=false"
+        )
     if config.codec is not None and config.recipe.weights:
-        raise ConfigError(f"recipe.weights {dict(config.recipe.weights)} of a latent model", "none: latents are mixed")
+        raise ConfigError(
+            f"recipe.weights {dict(config.recipe.weights)} of a latent model",
+            "none: latents are mixed",
+        )
     if config.init is None and config.codec is None:  # what a codec makes is in its file
         resolution = load_sensor(config.sensor).shape
         config.parts((config.tensors().size, *resolution), resolution)

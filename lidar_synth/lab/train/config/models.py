@@ -1,4 +1,5 @@
-"""Models that several runs make one after the other: a YAML file names each run's recipe and its share of the time.
+"""Models that several runs make one after the other: a YAML file names each run's recipe and its
+share of the time.
 
 Published ones are in ``configs/models``; ``lidar-synth train NAME`` runs their stages.
 """
@@ -10,7 +11,15 @@ from typing import Annotated
 from pydantic import Field
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.recipes import SUFFIXES, Listed, folder, head_of, read_file, read_recipe, validated
+from lidar_synth.files.recipes import (
+    SUFFIXES,
+    Listed,
+    folder,
+    head_of,
+    read_file,
+    read_recipe,
+    validated,
+)
 from lidar_synth.lab.train.config.sections import Run, Section
 
 PARENTS = ("teacher", "weaker", "init", "codec")
@@ -23,8 +32,8 @@ class Stage(Section):
     Args:
         recipe: a published recipe's name, or a YAML file beside that of the model.
         minutes: of training, as long as ``--minutes`` gives no other sum.
-        needs: {key of the recipe: the earlier stage whose checkpoint it names}; ``MODEL/STAGE`` is a stage of another
-            model, whose folder lies beside that of this one.
+        needs: {key of the recipe: the earlier stage whose checkpoint it names}; ``MODEL/STAGE`` is
+            a stage of another model, whose folder lies beside that of this one.
     """
 
     recipe: str
@@ -46,8 +55,8 @@ def find_model_file(given: str | Path) -> Path | None:
     """The file of a model of stages; None for a recipe.
 
     Args:
-        given: the name of a published model, such as ``town-dense``, or a YAML file, which is a model's if it has the
-            key ``stages``.
+        given: the name of a published model, such as ``town-dense``, or a YAML file, which is a
+            model's if it has the key ``stages``.
     """
     path = Path(given)
     if path.suffix in SUFFIXES:
@@ -67,13 +76,19 @@ def load_model(path: Path) -> ModelConfig:
     earlier: list[str] = []
     for name, stage in model.stages.items():
         if not name.isidentifier() or name in Run.model_fields:
-            raise ConfigError(f"{path}: stage {name!r}", "a name of letters, digits and _, and no key of a recipe")
+            raise ConfigError(
+                f"{path}: stage {name!r}", "a name of letters, digits and _, and no key of a recipe"
+            )
         for key, other in stage.needs.items():
             if key not in PARENTS:
-                raise ConfigError(f"{path}: {name}.needs with {key!r}", f"keys among {', '.join(PARENTS)}")
+                raise ConfigError(
+                    f"{path}: {name}.needs with {key!r}", f"keys among {', '.join(PARENTS)}"
+                )
             if "/" not in other and other not in earlier:
                 known = ", ".join(earlier) or "none"
-                raise ConfigError(f"{path}: {name}.needs with the stage {other!r}", f"an earlier one ({known})")
+                raise ConfigError(
+                    f"{path}: {name}.needs with the stage {other!r}", f"an earlier one ({known})"
+                )
         earlier.append(name)
     return model
 

@@ -40,8 +40,8 @@ class Data(Section):
         flip: mirror every other sample.
         roll: rotate every sample by a random number of columns.
         latents: cache the latents of the autoencoder too.
-        seen: recordings behind the scans, where ``path`` has copies of them (``Recordings.to_list``); by default they
-            follow from the layout.
+        seen: recordings behind the scans, where ``path`` has copies of them
+            (``Recordings.to_list``); by default they follow from the layout.
     """
 
     licence: str
@@ -69,14 +69,20 @@ class Data(Section):
             return Town(self.seed, sensor, self.town, self.interval, motion=self.motion)
         path = os.path.expandvars(self.path or "")
         if "$" in path:
-            raise ConfigError(f"data.path {self.path!r}", "variables that are set", "Or give data.path=FOLDER.")
+            raise ConfigError(
+                f"data.path {self.path!r}", "variables that are set", "Or give data.path=FOLDER."
+            )
         return open_scans(path, layout=self.layout, split=self.split, on_bad=self.on_bad)
 
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
-        keys = {"seed", "interval", "motion"} if self.path else {"path", "layout", "split", "on_bad"}
+        keys = (
+            {"seed", "interval", "motion"} if self.path else {"path", "layout", "split", "on_bad"}
+        )
         keys |= {"motion"} if self.motion else set()  # caches of earlier versions do not name it
-        return self.model_dump(mode="json", exclude=keys | {"cache", "flip", "roll", "latents", "seen"})
+        return self.model_dump(
+            mode="json", exclude=keys | {"cache", "flip", "roll", "latents", "seen"}
+        )
 
 
 class Samples(Section):
@@ -94,12 +100,13 @@ class Samples(Section):
 class HeldOut(Section):
     """Scans that are not trained on, by which a run keeps its best weights and stops early.
 
-    The loss on them is measured whenever the run is saved, and at its start; it always sees the same samples with the
-    same noise. The checkpoint has the weights with the least loss.
+    The loss on them is measured whenever the run is saved, and at its start; it always sees the
+    same samples with the same noise. The checkpoint has the weights with the least loss.
 
     Args:
         data: the scans.
-        samples: number of samples of a measurement; every scan counts several times if there are fewer.
+        samples: number of samples of a measurement; every scan counts several times if there are
+            fewer.
         patience: measurements without a new least loss after which the run stops.
     """
 
@@ -117,14 +124,16 @@ class Run(Section):
         data: the scans.
         recipe: the optimisation.
         seed: seed of the order of the data, the noise and the timesteps.
-        precision: "no" = float32; "bf16" = bfloat16, except on a processor that is slower in it than in float32.
+        precision: "no" = float32; "bf16" = bfloat16, except on a processor that is slower in it
+            than in float32.
         compile: whether to use ``torch.compile``.
         gradient_checkpointing: whether to save memory at the cost of time.
         save_every: iterations between two saves.
         samples: pictures of samples.
         held_out: scans for early stopping; None = train to the end.
-        rehearsal: scans that take the place of every other sample, so that a network that starts from another one does
-            not forget what it has learnt from scans like these; None = ``data`` alone. Not for conditional models.
+        rehearsal: scans that take the place of every other sample, so that a network that starts
+            from another one does not forget what it has learnt from scans like these; None =
+            ``data`` alone. Not for conditional models.
     """
 
     output: Path
@@ -132,7 +141,9 @@ class Run(Section):
     data: Data
     recipe: Recipe
     seed: Annotated[int, Field(ge=0, lt=2**62)] = 0
-    precision: Annotated[Literal["no", "bf16"], BeforeValidator(lambda v: "no" if v is False else v)] = "no"
+    precision: Annotated[
+        Literal["no", "bf16"], BeforeValidator(lambda v: "no" if v is False else v)
+    ] = "no"
     compile: bool = False
     gradient_checkpointing: bool = False
     save_every: Count = 1000
@@ -160,9 +171,11 @@ class Condition(Section):
         kind: a name of ``CONDITIONS``: "semantic", "camera" or "layout".
         encoder: architecture of the encoder; by default the first one for this kind.
         arguments: arguments of the encoder, without sizes, which follow from the data.
-        dropout: share of blank conditions in training; above 0, classifier-free guidance is possible.
+        dropout: share of blank conditions in training; above 0, classifier-free guidance is
+            possible.
         view_dropout: share of camera images of which only one view is kept.
-        outline_dropout: share of layouts without outlines, with the ground of a random surrounding only.
+        outline_dropout: share of layouts without outlines, with the ground of a random surrounding
+            only.
         height: metres of the sensor above the ground, which a layout has to confirm.
         image: rows and columns of the camera's images.
         focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
@@ -187,13 +200,18 @@ class Condition(Section):
         encoders = encoders_of(self.kind)
         if (encoder := self.encoder or encoders[0]) not in encoders:
             raise ConfigError(f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}")
-        sizes = {"resolution": list(resolution), "target": list(target), "image": list(self.image or ())}
+        sizes = {
+            "resolution": list(resolution),
+            "target": list(target),
+            "image": list(self.image or ()),
+        }
         derived = network_class(encoder).derived_arguments
         return NetworkSpec(encoder, {name: sizes[name] for name in derived} | self.arguments)
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""
         values = self.model_dump(
-            mode="json", include={"dropout", "view_dropout", "outline_dropout", "height", "image", "focal"}
+            mode="json",
+            include={"dropout", "view_dropout", "outline_dropout", "height", "image", "focal"},
         )
         return {key: value for key, value in values.items() if value}

@@ -22,13 +22,16 @@ class TrainConfig(Run):
         sensor: a preset's name or a YAML file.
         channels: channels of the range image, in order.
         normalisation: a name of ``NORMALISATIONS``.
-        rays: the point of a cell whose angles the network sees: "centre", or "corner" as in R2Flow and LiDM.
+        rays: the point of a cell whose angles the network sees: "centre", or "corner" as in R2Flow
+            and LiDM.
         network: the network to train.
-        codec: checkpoint of an autoencoder, for a latent model; it determines sensor, channels and normalisation.
-        condition: the condition of the model.
-        decoder: whether to train only the decoder of ``init``, a latent model, on the latents of its last step.
-        init: checkpoint, or name of a shipped model, to start from; it determines networks, sensor, channels and
+        codec: checkpoint of an autoencoder, for a latent model; it determines sensor, channels and
             normalisation.
+        condition: the condition of the model.
+        decoder: whether to train only the decoder of ``init``, a latent model, on the latents of
+            its last step.
+        init: checkpoint, or name of a shipped model, to start from; it determines networks, sensor,
+            channels and normalisation.
         timesteps: a name of ``TIMESTEPS``.
         steps: number of steps of the uniform time grid with which the checkpoint samples.
         losses: weights of an autoencoder's losses.
@@ -65,10 +68,14 @@ class TrainConfig(Run):
             ConfigError: on an unknown channel or normalisation.
         """
         if self.normalisation not in NORMALISATIONS:
-            raise ConfigError(f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}")
+            raise ConfigError(
+                f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}"
+            )
         return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
 
-    def parts(self, state: tuple[int, int, int], resolution: tuple[int, int]) -> dict[str, NetworkSpec]:
+    def parts(
+        self, state: tuple[int, int, int], resolution: tuple[int, int]
+    ) -> dict[str, NetworkSpec]:
         """The networks to train: the velocity (or the autoencoder) and the condition's encoder.
 
         Args:
@@ -78,7 +85,11 @@ class TrainConfig(Run):
         Raises:
             ConfigError: on values that do not fit together.
         """
-        run = {"resolution": list(state[1:]), "channels": state[0], "normalisation": self.normalisation}
+        run = {
+            "resolution": list(state[1:]),
+            "channels": state[0],
+            "normalisation": self.normalisation,
+        }
         derived = network_class(self.network.architecture).derived_arguments
         given: dict[str, Any] = {name: run[name] for name in derived}
         parts = {}
@@ -88,7 +99,10 @@ class TrainConfig(Run):
             assert isinstance(encoder, Encoder)
             given[encoder.argument] = encoder.channels
         if twice := sorted(set(given) & set(self.network.arguments)):
-            raise ConfigError(f"network.arguments with {twice}", "no such keys: they follow from what the states are")
+            raise ConfigError(
+                f"network.arguments with {twice}",
+                "no such keys: they follow from what the states are",
+            )
         part = NetworkSpec(self.network.architecture, given | self.network.arguments)
         _checked(part)
         return parts | {CODEC if self.autoencodes else VELOCITY: part}
@@ -124,18 +138,24 @@ class DistillConfig(Run):
         strategy: a name of ``STRATEGIES``.
         steps: Euler steps of the teacher in each interval.
         guidance: guidance scale of the teacher, which the student learns; 1 = none.
-        weaker: checkpoint of a weaker teacher for autoguidance; without it, guidance is classifier-free.
+        weaker: checkpoint of a weaker teacher for autoguidance; without it, guidance is
+            classifier-free.
         within: interval of the times at which autoguidance applies.
         intervals: N, the number of steps of the student.
-        grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them and the other
-            strategies take uniform ones.
-        also: other numbers of steps that the student learns as well, such as [2, 1]; it is then told where a step ends.
+        grid: N + 1 descending times from 1 to 0; without it, ``adaptive_piecewise`` selects them
+            and the other strategies take uniform ones.
+        also: other numbers of steps that the student learns as well, such as [2, 1]; it is then
+            told where a step ends.
         selection: the selection of these times.
     """
 
     teacher: Path
     strategy: Literal[
-        "adaptive_piecewise", "uniform_piecewise", "piecewise_reflow", "reflow", "timestep_distillation"
+        "adaptive_piecewise",
+        "uniform_piecewise",
+        "piecewise_reflow",
+        "reflow",
+        "timestep_distillation",
     ] = "adaptive_piecewise"
     steps: Count = 20
     guidance: float = 1.0
