@@ -148,7 +148,10 @@ def write_kitti_raw(root: Path, count: int = 3) -> list[Path]:
     for i, path in enumerate(paths):
         scan = some_scan(i)
         np.column_stack([scan.points, scan.reflectance]).astype("<f4").tofile(path)
-    pose = "<item><tx>10</tx><ty>{}</ty><tz>-1.5</tz><rz>{}</rz><occlusion>1</occlusion><truncation>0</truncation></item>"
+    pose = (
+        "<item><tx>10</tx><ty>{}</ty><tz>-1.5</tz><rz>{}</rz>"
+        "<occlusion>1</occlusion><truncation>0</truncation></item>"
+    )
     poses = "".join(pose.format(k, 4 + k) for k in range(count - 1))
     (drive / "tracklet_labels.xml").write_text(
         "<boost_serialization><tracklets><count>1</count><item><objectType>Person "

@@ -104,7 +104,10 @@ def test_samples_of_the_same_form_are_accepted(name: str) -> None:
 def test_a_missing_label_would_cost_the_real_samples_theirs() -> None:
     """What torch makes of such a batch, and that it does not come to it."""
     form = FORMS["dict"]
-    without = lambda p, s: {"coord": p[:, :3], "feat": p, "name": "x"}
+
+    def without(p: Any, s: Any) -> dict[str, Any]:
+        return {"coord": p[:, :3], "feat": p, "name": "x"}
+
     options = {"to_sample": as_sample(without), "seed": 2}
     mixed = MixedScans.wrap(Theirs(form), Endless(), 0.5, compare=False, **options)
     samples = sorted((mixed[i] for i in range(len(mixed))), key=lambda s: "segment" in s)

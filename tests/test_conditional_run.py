@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 from conftest import random_scan
-from latent_runs import (
+from latent_runs import (  # noqa: F401 - fixtures
     CODEC_NETWORK,
     SEMANTIC,
     SENSOR,
@@ -21,7 +21,7 @@ from latent_runs import (
     scans,
     teacher,
     write_config,
-)  # noqa: F401 - fixtures
+)
 from PIL import Image
 
 from lidar_synth.bake.conditions import conditions_for

@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from conftest import random_scan
-from latent_runs import (
+from latent_runs import (  # noqa: F401 - fixtures
     CODEC_NETWORK,
     SEMANTIC,
     SENSOR,
@@ -22,7 +22,7 @@ from latent_runs import (
     scans,
     teacher,
     write_config,
-)  # noqa: F401 - fixtures
+)
 from torch import nn
 
 from lidar_synth.errors import ConfigError, DataError

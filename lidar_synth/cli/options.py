@@ -1,4 +1,4 @@
-"""Command-line options generated from the fields of a pydantic model, and those of all commands that read scans."""
+"""Command-line options from the fields of a pydantic model, and those of all commands that read."""
 
 import inspect
 from collections.abc import Callable
@@ -18,12 +18,13 @@ class Reading(BaseModel):
     fields: int | None = Field(None, description="floats per point in plain .bin files [4]")
     reflectance_max: float | None = Field(
         None,
-        description="highest reflectance value in plain files, for instance 255 [1; 255 in logs of drivers]",
+        description="highest reflectance value in plain files, for instance 255 "
+        "[1; 255 in logs of drivers]",
     )
     on_bad: str | None = Field(
         None,
-        description="bad scans: error = stop at the first one | skip = leave them out | drop-points = leave out their "
-        "NaN and infinite points [error]",
+        description="bad scans: error = stop at the first one | skip = leave them out | "
+        "drop-points = leave out their NaN and infinite points [error]",
     )
 
 
@@ -35,10 +36,10 @@ def only_given(values: dict[str, Any]) -> dict[str, Any]:
 def options_from(
     kind: type[BaseModel], after: str
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator that replaces a command's ``**values`` by one option for each field of a pydantic model.
+    """A decorator that replaces a command's ``**values`` by one option for each field of a model.
 
-    An option that is not given is None, so that the command can tell it from one that is given. The help text is the
-    field's description and default; the model itself checks the values.
+    An option that is not given is None, so that the command can tell it from one that is given.
+    The help text is the field's description and default; the model itself checks the values.
 
     Args:
         kind: the model; its fields need descriptions.
@@ -73,7 +74,7 @@ def _option(name: str, field: FieldInfo) -> inspect.Parameter:
 
 
 def _base_type(annotation: Any) -> Any:
-    """int, float, str or tuple: what an annotation is without None, constraints and the list of its literals."""
+    """int, float, str or tuple: an annotation without None, constraints and literals."""
     origin = get_origin(annotation)
     arguments = get_args(annotation)
     if origin in (Union, UnionType):
