@@ -3,7 +3,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11 python3.10,$(shell \
 	$(p) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $(p))))
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 READY := $(VENV)/.ready
 # The package as it is installed, with integrations inside: mypy does not know setuptools' package-dir.
 TYPES := $(VENV)/types
@@ -12,7 +12,7 @@ SCANS ?= 24
 # Two test processes of one thread each; `make test PARALLEL=` runs all tests in one.
 PARALLEL ?= -n 2 --dist loadfile
 
-.PHONY: demo test quick test-lowest lint docs notebooks bench clean
+.PHONY: demo test quick test-lowest lint types lock docs notebooks bench clean
 
 demo: $(READY)  ## scans mixed with synthetic ones, a comparison of trainings, a page to look at
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
@@ -26,9 +26,11 @@ quick: $(READY)  ## the tests that are not marked slow
 test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
 	$(BIN)/python tools/test_lowest_versions.py
 
-lint: $(READY)  ## style and types
+lint: types  ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(READY)  ## types alone
 	rm -rf $(TYPES) && mkdir -p $(TYPES)/lidar_synth
 	ln -s $(CURDIR)/lidar_synth/* $(CURDIR)/integrations $(TYPES)/lidar_synth
 	cd $(TYPES) && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache
@@ -41,6 +43,13 @@ notebooks: $(READY)  ## runs the notebooks of docs/notebooks and keeps their out
 
 bench: $(READY)  ## every table of tools/bench
 	for script in tools/bench/*.py; do case $$script in */timing.py) ;; *) $(BIN)/python $$script || exit 1;; esac; done
+
+# Versions of constraints.txt for Linux, macOS and Windows, Python 3.11.5 and later: mkdocs-material asks for that.
+lock: $(READY)  ## requirements-dev.txt, the development versions with hashes; needs a network connection
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==0.13.9
+	$(BIN)/uv pip compile pyproject.toml --extra dev --constraint constraints.txt --universal --python-version 3.11.5 \
+		--generate-hashes --no-annotate --no-emit-index-url --custom-compile-command "make lock" --quiet \
+		--output-file requirements-dev.txt
 
 clean:
 	rm -rf $(VENV) $(VENV)-lowest $(DEMO_OUT) site build dist *.egg-info

@@ -1,10 +1,18 @@
 """Hostile inputs that several tests share: arrays in the .npy format, bodies of point clouds, a
-sensor."""
+sensor, names."""
 
 import io
+import re
 import struct
 
+import markdown
 import numpy as np
+
+MARKUP = """<img src=x onerror="alert(1)"> | [x](javascript:y) ![z](data:w) `<b>` <http://a.b>
+# title
+
+<script>s</script>"""
+"""A name, licence or data set's description that Markdown would show as elements of a page."""
 
 POINTS = np.random.default_rng(0).uniform(0, 1, (20, 4)).astype("<f4")
 
@@ -75,3 +83,9 @@ LINEAR = {
     "range_min": 1.0,
     "range_max": 80.0,
 }
+
+
+def tags_of(card: str) -> set[str]:
+    """The HTML elements that a card in Markdown is shown with, its header left out."""
+    body = card.split("---\n", 2)[2] if card.startswith("---\n") else card
+    return set(re.findall(r"<(\w+)", markdown.markdown(body, extensions=["tables", "fenced_code"])))

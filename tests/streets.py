@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from box_scenes import car, cast, wall
 from layouts import write_all
 from lidar_synth.integrations.folders import write_planes
-from worlds import car, cast, wall
 
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
 from lidar_synth.geometry.scan import Boxes, Scan

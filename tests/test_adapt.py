@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hostile import MARKUP, tags_of
 from latent_runs import call
 from small_models import write as write_pixel_model
 
@@ -237,16 +238,10 @@ def test_a_model_of_label_maps_is_adapted_with_its_encoder(
     scans: Path, own_scans: list[Scan], tmp_path: Path
 ) -> None:
     model = tiny_model(tmp_path / "maps.safetensors", semantic=True)
-    out = adapt(
-        model,
-        scans,
-        tmp_path / "mine.safetensors",
-        minutes=0.02,
-        town=2,
-        overrides=QUICK,
-        progress=False,
-    )
+    out = tmp_path / "mine.safetensors"
+    adapt(model, scans, out, minutes=0.02, town=2, licence=MARKUP, overrides=QUICK, progress=False)
     generator = load_generator(out)
+    assert not tags_of(out.with_suffix(".md").read_text()) & {"img", "a", "script", "b"}
     assert (generator.condition, generator.sensor.shape) == ("semantic", (16, 128))
     wanted = project(own_scans[0], generator.sensor, ["label"]).channels["label"]
     [image] = generator.range_images(0, [0], own_scans[0])

@@ -8,9 +8,9 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from box_scenes import SENSOR, car, cast, wall
 from conftest import random_scan
 from hypothesis import given, settings
-from worlds import SENSOR, car, cast, wall
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import locate

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile import MARKUP, tags_of
 from PIL import Image
 from project import ROOT
 
@@ -73,3 +74,16 @@ def test_a_picture_has_all_its_images_side_by_side(
     half = gallery.WIDTH // 2
     assert is_red[:, :half].mean() > 2 * is_blue[:, :half].mean()
     assert is_blue[:, half:].mean() > 0.5
+
+
+def test_tables_of_models_show_their_names_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    from layout_quality import line
+    from model_card import BEND, CLASSES, Measured, table
+
+    classes = dict.fromkeys((*CLASSES, BEND), 1.0)
+    text = (
+        table([Measured(MARKUP, [], classes)])
+        + f"\n\n| a |{' b |' * 6}\n|---|{'---|' * 6}\n{line(MARKUP, None)}"
+    )
+    assert tags_of(text) == {"table", "thead", "tbody", "tr", "th", "td"}

@@ -1,8 +1,6 @@
 """Conversion: everything arrives, reruns do what is missing, bad scans are named."""
 
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -314,14 +312,6 @@ def test_the_error_of_a_wrong_call_names_the_right_one(
     result = CliRunner().invoke(app, [str(dataset), str(tmp_path / "out"), *options])
     assert isinstance(result.exception, ConfigError) and error in str(result.exception)
     assert not (tmp_path / "out").exists()
-
-
-def test_the_script_in_tools_is_the_command(tmp_path: Path) -> None:
-    script = Path(__file__).parents[1] / "tools" / "convert.py"
-    result = subprocess.run(
-        [sys.executable, str(script), "--help"], capture_output=True, text=True, timeout=120
-    )
-    assert result.returncode == 0 and "--as-sensor" in result.stdout
 
 
 def test_a_folder_filled_from_something_else_is_refused(tmp_path: Path) -> None:

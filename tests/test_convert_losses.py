@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_scenes import car, cast
 from conversions import app
 from layouts import WRITTEN_AS, some_boxes, some_scan, write_all
 from roundtrips import back, same
 from test_write_then_read import complete
 from typer.testing import CliRunner
-from worlds import car, cast
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans

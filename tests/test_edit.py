@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from box_scenes import CAR, WALL, car, cast, wall
 from pasting import assert_nothing_shares_a_ray
 from streets import kitti
 from typer.testing import CliRunner
-from worlds import CAR, WALL, car, cast, wall
 
 from lidar_synth import ObjectBank, Town, load_generator, load_sensor, open_scans
 from lidar_synth.cli import app

@@ -23,7 +23,7 @@ FURTHER = {
     "lidar_synth.lab.evaluate.segmentation": ("load_judge",),
     "lidar_synth.generate.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
-    "lidar_synth.geometry.projection": ("fill_points", "locate", "project_batch"),
+    "lidar_synth.geometry.projection": ("locate", "project_batch"),
     "lidar_synth.geometry.transfer": ("Mount", "SeenAs", "Transfer"),
     "lidar_synth.generate.generator": ("Generated",),
     "lidar_synth.generate.inpaint": ("inpaint",),

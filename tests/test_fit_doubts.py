@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from turns import BEAMS, turned
+from simulated_sweeps import BEAMS, turned
 
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import Scan

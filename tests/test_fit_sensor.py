@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from turns import BEAMS, compensated, driving, turned
+from simulated_sweeps import BEAMS, compensated, driving, turned
 
 from lidar_synth.cli import main
 from lidar_synth.errors import DataError

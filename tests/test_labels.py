@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worlds import CAR, ROAD, SENSOR, car, cast, wall
+from box_scenes import CAR, ROAD, SENSOR, car, cast, wall
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError

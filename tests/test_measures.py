@@ -9,17 +9,15 @@ from conftest import random_scan
 from scipy.spatial.distance import jensenshannon
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
+from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.evaluate.conditions import AGREEMENTS, obstacles, sight_agreement
-from lidar_synth.lab.evaluate.detection import detect
 from lidar_synth.lab.evaluate.labels import class_histogram, class_shares
 from lidar_synth.lab.evaluate.measures import KINDS
 from lidar_synth.lab.evaluate.ranges import range_histogram, step_histogram
 from lidar_synth.lab.evaluate.segmentation import load_judge
-from lidar_synth.lab.evaluate.sequences import chamfer_error, register, registration_error
 
 SENSOR = presets()["hdl64e_kitti360"]
 SMALL = Sensor("small", 8, 1.0, 90.0, rows=3, fov_up=5.0, fov_down=-20.0)
@@ -111,118 +109,6 @@ def test_ranges_and_steps_by_hand() -> None:
     for measure in (range_histogram, step_histogram):
         with pytest.raises(DataError, match="without"):
             measure(unproject(RangeImage(np.zeros((3, 8), np.float32), SMALL)))
-
-
-# --- sequences
-# ----------------------------------------------------------------------------------------------------
-
-
-def drive(count: int = 5, step: float = 0.4) -> list[Scan]:
-    """A street seen from a sensor that turns a little and moves ``step`` metres ahead per frame."""
-    street = np.random.default_rng(0).uniform((-30, -15, -2), (30, 15, 3), (4000, 3))
-    scans = []
-    for i in range(count):
-        pose = np.eye(4)
-        turn = 0.01 * i
-        pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-        pose[0, 3] = step * i
-        scans.append(scan_of((street - pose[:3, 3]) @ pose[:3, :3], pose=pose, id=f"frame {i}"))
-    return scans
-
-
-def test_a_sequence_that_moves_as_its_poses_say_has_no_error() -> None:
-    scans = drive()
-    assert registration_error(scans, 1) == pytest.approx(0, abs=1e-3)
-    assert chamfer_error(scans, 1) == pytest.approx(0, abs=1e-9)
-
-
-def test_a_sequence_that_moves_otherwise_has_an_error() -> None:
-    scans = drive()
-    standing = [replace(s, pose=np.eye(4)) for s in scans]
-    assert registration_error(standing, 1) == pytest.approx(
-        0.4 / 3, abs=5e-3
-    )  # of three coordinates, one is wrong
-    near, far = (chamfer_error(standing, n) for n in (1, 4))
-    assert 0 < near < far
-    jumping = [
-        scan_of(s.points + np.float32([0.3 * (i % 2), 0, 0]), pose=s.pose)
-        for i, s in enumerate(scans)
-    ]
-    assert registration_error(jumping, 1) > 0.09 and registration_error(jumping, 2) < 0.01
-
-
-def test_registration_finds_a_turn() -> None:
-    street = drive(1)[0].points.astype(np.float64)
-    turn = np.radians(3)
-    rotation = np.array(
-        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
-    )
-    found = register(street, street @ rotation.T + (0.2, -0.1, 0.05))
-    assert np.allclose(found[:3, :3], rotation, atol=1e-4) and np.allclose(
-        found[:3, 3], (0.2, -0.1, 0.05), atol=1e-3
-    )
-
-
-def test_sequences_refuse_what_they_cannot_compare() -> None:
-    scans = drive(3)
-    with pytest.raises(DataError, match="3 scans, compared 3 frames apart; expected more than 3"):
-        registration_error(scans, 3)
-    with pytest.raises(DataError, match="scan 'frame 0' without a pose"):
-        chamfer_error([replace(s, pose=None) for s in scans])
-    with pytest.raises(ConfigError, match="0 frames apart"):
-        chamfer_error(scans, 0)
-    with pytest.raises(DataError, match="0 of 4000 points match within 2 m"):
-        register(scans[0].points.astype(np.float64), scans[0].points + 500.0)
-
-
-# --- detections
-# ---------------------------------------------------------------------------------------------------
-
-
-def boxes(*places: tuple[float, float], name: str = "Car") -> Boxes:
-    values = np.array([(x, y, 0, 4, 2, 1.5, 0) for x, y in places], np.float32).reshape(-1, 7)
-    return Boxes(values, (name,) * len(values))
-
-
-def test_detections_by_hand() -> None:
-    """Confidences 0.9 (hit), 0.8 (none near), 0.7 (hit): precision 1, then 2/3, at recalls 1/2 and
-    1."""
-    scan = scan_of([(9, 0, 0)], boxes=boxes((10, 0), (20, 0)))
-    found = boxes((10.2, 0), (40, 0), (20, 0.3)), np.array([0.9, 0.8, 0.7])
-    result = detect(lambda s: found, [scan], distances=(0.5,))
-    assert result.precision == {"Car": pytest.approx((1 + 2 / 3) / 2)} and result.boxes == {
-        "Car": 2
-    }
-    assert (
-        result.confidence == {"Car": pytest.approx(0.8)}
-        and result.mean_precision == result.precision["Car"]
-    )
-    strict = detect(lambda s: found, [scan], distances=(0.1,))
-    assert strict.precision == {"Car": 0.0}
-
-
-def test_a_box_is_found_once_and_by_its_class() -> None:
-    scan = scan_of([(9, 0, 0)], boxes=boxes((10, 0)))
-    twice = detect(lambda s: (boxes((10, 0), (10, 0)), np.array([0.5, 0.6])), [scan])
-    assert twice.precision == {"Car": 1.0}  # the second one comes after full recall
-    other = detect(lambda s: (boxes((10, 0), name="Van"), np.array([0.5])), [scan])
-    assert other.precision == {"Car": 0.0} and other.confidence == {"Van": 0.5}
-    nothing = detect(lambda s: (boxes(), np.zeros(0)), [scan])
-    assert nothing.precision == {"Car": 0.0} and nothing.confidence == {}
-
-
-def test_detections_refuse_what_they_cannot_score() -> None:
-    scan = scan_of([(9, 0, 0)], boxes=boxes((10, 0)), id="one")
-    with pytest.raises(DataError, match="without boxes"):
-        detect(lambda s: (boxes(), np.zeros(0)), [scan_of([(9, 0, 0)])])
-    for confidence in (np.zeros(2), np.array([1.5]), np.array([np.nan])):
-        with pytest.raises(
-            DataError,
-            match=r"scan 'one': 1 boxes with confidences .* one confidence in \[0, 1\] per box",
-        ):
-            detect(lambda s, c=confidence: (boxes((1, 1)), c), [scan])
-    with pytest.raises(ConfigError, match="positive metres"):
-        detect(lambda s: (boxes(), np.zeros(0)), [scan], distances=())
 
 
 # --- conditions

@@ -7,9 +7,9 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from banks import add_stray
+from box_scenes import CAR, HEIGHT, car, cast
 from hypothesis import given
 from pasting import assert_nothing_shares_a_ray
-from worlds import CAR, HEIGHT, car, cast
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError, FileError

@@ -1,12 +1,14 @@
 """What gets installed is what is in the repository."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
 import venv
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -49,11 +51,15 @@ def test_every_recipe_is_listed() -> None:
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sdist, and the wheel that was built from it."""
-    folder = tmp_path_factory.mktemp("built")
+    return build(tmp_path_factory.mktemp("built"))
+
+
+def build(folder: Path) -> Path:
+    """Build a fresh copy of the checkout in ``folder``."""
     rubbish = shutil.ignore_patterns(
         ".*", "__pycache__", "*.egg-info", "build", "dist", "runs", "demo_out"
     )
-    shutil.copytree(ROOT, folder / "checkout", ignore=rubbish)
+    shutil.copytree(ROOT, folder / "checkout", ignore=rubbish, copy_function=shutil.copy)
     shutil.copytree(ROOT / ".ci", folder / "checkout" / ".ci")
     run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "checkout"],
@@ -106,10 +112,25 @@ def test_the_wheel_works_from_any_folder(built: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_two_builds_have_the_same_bytes(built: Path, tmp_path: Path) -> None:
+    """At other times, in other folders, and with other permissions of new files."""
+    old = os.umask(0o077)
+    try:
+        again = build(tmp_path)
+    finally:
+        os.umask(old)
+    for pattern, most in (("*.tar.gz", 60e6), ("*.whl", 55e6)):
+        [first] = built.glob(pattern)
+        [second] = again.glob(pattern)
+        assert first.name == second.name
+        assert first.read_bytes() == second.read_bytes()
+        assert first.stat().st_size < most
+
+
+@pytest.mark.slow
 def test_the_unpacked_sdist_runs_its_tests(built: Path, tmp_path: Path) -> None:
     """Those of a minute; all of them take as long as those of the checkout."""
     [archive] = built.glob("*.tar.gz")
-    assert archive.stat().st_size < 70e6
     with tarfile.open(archive) as file:
         file.extractall(tmp_path, filter="data")
     [root] = tmp_path.iterdir()
@@ -130,7 +151,40 @@ def test_the_unpacked_sdist_runs_its_tests(built: Path, tmp_path: Path) -> None:
 def test_the_versions_agree() -> None:
     import lidar_synth
 
-    assert lidar_synth.__version__ == PYPROJECT["project"]["version"]
+    version = PYPROJECT["project"]["version"]
+    assert lidar_synth.__version__ == version
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
+
+
+def test_the_lock_file_has_the_pinned_versions_and_a_hash_for_each_package() -> None:
+    """``make lock`` writes it."""
+    text = (ROOT / "requirements-dev.txt").read_text()
+    found = re.findall(
+        r"^([\w-]+)==(\S+)([^\n]*\n(?: +--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.M
+    )
+    locked = {name: version for name, version, _ in found}
+    assert len(found) == len(re.findall(r"^\w", text, re.M))
+    pins = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.M)
+    assert {plain_name(name): version for name, version in pins}.items() <= locked.items()
+    project = PYPROJECT["project"]
+    wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
+    assert set(names_of(wanted)) - set(locked) == {"tomli"}, "which is for Python 3.10"
+
+
+def names_of(requirements: list[str]) -> Iterator[str]:
+    """The packages of requirements, those of this package's extras too."""
+    for text in requirements:
+        [(name, extras)] = re.findall(r"^([\w.-]+)(?:\[([\w,]+)\])?", text)
+        if name == "lidar_synth":
+            for extra in extras.split(","):
+                yield from names_of(PYPROJECT["project"]["optional-dependencies"][extra])
+        else:
+            yield plain_name(name)
+
+
+def plain_name(name: str) -> str:
+    """https://packaging.python.org/en/latest/specifications/name-normalization/"""
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def test_integrations_are_part_of_the_package() -> None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from box_scenes import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 from hypothesis import assume, example, given, settings
 from pasting import assert_nothing_shares_a_ray
-from worlds import CAR, HEIGHT, SENSOR, WALL, car, cast, wall
 
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.assign import assign_beams

@@ -14,14 +14,12 @@ from hypothesis.extra import numpy as hnp
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import (
-    fill_points,
     locate,
     project,
     project_batch,
     ring_numbers,
     unfold,
     unproject,
-    unproject_batch,
 )
 from lidar_synth.geometry.projection.batch import torch_asin, torch_atan2
 from lidar_synth.geometry.projection.kernels import asin, atan2
@@ -205,8 +203,6 @@ def test_batches_on_any_device_equal_single_projections(
         assert np.array_equal(batch.channels[b, 0].cpu().numpy(), image.reflectance)
         shown = batch.point[b].cpu().numpy()
         assert np.array_equal(shown - np.where(shown >= 0, int(offsets[b]), 0), cells.point)
-        xyz = unproject_batch(batch.range[b : b + 1], sensor)[0].cpu().numpy()
-        assert np.array_equal(xyz[:, image.mask].T, unproject(image).points)
 
 
 def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
@@ -319,64 +315,6 @@ def test_row_edges_of_a_beam_table_are_halfway_between_beams() -> None:
         for side, expected in ((1e-4, row), (-1e-4, row + 1)):
             point = np.array([[np.cos(half + side), 0, np.sin(half + side)]], np.float32) * 10
             assert locate(point, sensor).cell // 16 == expected
-
-
-def test_neighbours_vote_across_the_seam_but_not_beyond_the_cutoff() -> None:
-    sensor = SMALL["linear"]
-    image = np.full(sensor.shape, 30, np.float32)
-    labels = np.full(sensor.shape, 12, np.uint8)
-    image[:, -4:] = 20
-    labels[:, -4:] = 3
-    shown = unproject(RangeImage(image, sensor)).points
-    rays = sensor.ray_directions()
-    behind_column_0 = (
-        rays[4, 0] * 50
-    )  # all neighbours differ by more than a metre: the nearest in range decides
-    at_the_seam = (
-        rays[4, -1] * 30.2
-    )  # hidden behind a cell at 20 m: its wall continues in columns 0 and 1
-    near_its_neighbours = rays[4, 10] * 30.9  # four of five votes are within the cutoff
-    points = np.concatenate([shown, [behind_column_0, at_the_seam, near_its_neighbours]]).astype(
-        np.float32
-    )
-    filled = fill_points(labels, image, locate(points, sensor))
-    assert filled[-3:].tolist() == [12, 12, 12]
-    image[4, 10], image[3:6, 9], image[3:6, 11] = (
-        28,
-        33,
-        33,
-    )  # one near neighbour, many beyond the cutoff
-    labels[3:6, 9:12] = 7
-    image[2, 10] = 31
-    labels[2, 10] = 5
-    points[-1] = rays[4, 10] * 31.1
-    shown = unproject(RangeImage(image, sensor)).points
-    filled = fill_points(
-        labels,
-        image,
-        locate(np.concatenate([shown, points[-1:]]), sensor),
-        k=5,
-        window=5,
-        cutoff=0.5,
-    )
-    assert filled[-1] == 5
-
-
-def test_hidden_points_take_the_label_of_their_neighbours() -> None:
-    sensor = SMALL["linear"]
-    wall = np.full(sensor.shape, 30, np.float32)
-    wall[3:6, 10:20] = 8  # a car in front of the wall
-    labels = np.where(wall < 10, 0, 12).astype(np.uint8)
-    car = unproject(RangeImage(wall, sensor))
-    hidden = sensor.ray_directions()[4, 10] * 30.2  # wall behind the car's left edge
-    beyond = sensor.ray_directions()[4, 15] * 95  # outside the range limits
-    points = np.concatenate([car.points, hidden[None], beyond[None]]).astype(np.float32)
-    cells = locate(points, sensor)
-    filled = fill_points(labels, project(car).range, cells)
-    assert np.array_equal(filled[:-2], labels[wall > 0])
-    assert filled[-2:].tolist() == [12, IGNORE]
-    with pytest.raises(DataError, match="odd window"):
-        fill_points(labels, wall, cells, window=4)
 
 
 def test_invalid_input_is_refused() -> None:

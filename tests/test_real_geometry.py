@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.projection import (
-    fill_points,
-    locate,
-    project,
-    ring_numbers,
-    unfold,
-    unproject,
-)
+from lidar_synth.geometry.projection import locate, project, ring_numbers, unfold, unproject
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -100,20 +93,3 @@ def test_the_beam_table_matches_the_rings_of_real_scans(scans: list[Scan]) -> No
         assert ring[-1] == 63, scan.id
         medians.append([np.median(elevation(scan.points[ring == i])) for i in range(64)])
     assert np.degrees(np.abs(np.median(medians, axis=0) - sensor.laser_elevations)).max() < 0.03
-
-
-def test_labels_are_transferred_back_to_points(real_scans: Path) -> None:
-    """Nearly all points of a labelled scan get their own class back from the labels of the
-    cells."""
-    points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
-    raw = np.fromfile(real_scans / "semantic_kitti/sequences/00/labels/000000.label", np.uint32)
-    label = (raw & 0xFF).astype(np.uint8)
-    scan = Scan(points[:, :3], points[:, 3], load_sensor("hdl64e_semantic_kitti"), label=label)
-    image = project(scan)
-    filled = fill_points(image.label, image.range, locate(scan.points, scan.sensor))
-    shown = locate(scan.points, scan.sensor).point
-    shown = shown[shown >= 0]
-    assert np.array_equal(filled[shown], label[shown])
-    naive = image.label.reshape(-1)[locate(scan.points, scan.sensor).cell]
-    assert (filled == label).mean() > 0.985
-    assert (filled == label).mean() > (naive == label).mean()

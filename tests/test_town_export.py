@@ -2,11 +2,13 @@
 resumes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hostile import MARKUP, tags_of
 
 from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, FileError
@@ -197,6 +199,19 @@ def test_fewer_scans_than_there_are_keep_all_times(tmp_path: Path) -> None:
         Town(seed=5, scans=1), tmp_path, "semantic_kitti", camera=False, progress=False
     ) == (0, 1)
     assert times.read_text() == before and len(before.splitlines()) == 2
+
+
+def test_the_readme_shows_a_sensor_s_name_as_text(tmp_path: Path) -> None:
+    sensor = replace(load_sensor("town"), name=MARKUP)
+    export_town(Town(5, sensor, 0), tmp_path, "kitti", camera=False, progress=False)
+    assert tags_of((tmp_path / "README.md").read_text()) == {
+        "h1",
+        "p",
+        "strong",
+        "code",
+        "ul",
+        "li",
+    }
 
 
 def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town) -> None:

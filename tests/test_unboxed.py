@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from box_scenes import CAR, car, cast, wall
 from mixtures import Endless
-from worlds import CAR, car, cast, wall
 
 from lidar_synth import Boxes, MixedScans, ObjectBank, make_policy
 from lidar_synth.errors import ConfigError, DataError

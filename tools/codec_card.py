@@ -19,6 +19,7 @@ from model_card import open_codec, town
 from tqdm import tqdm
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.lab.train import reconstruct
@@ -47,7 +48,9 @@ def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
     off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
     right = [((a > 0) == (b > 0)).mean(), (labels == decoded)[both & (labels != IGNORE)].mean()]
     medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
-    return f"| {name} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
+    return (
+        f"| {escape_markdown(name)} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
+    )
 
 
 def main() -> None:

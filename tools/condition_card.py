@@ -41,6 +41,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, load_generator, open_scans
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.conditions import AGREEMENTS
@@ -57,7 +58,7 @@ def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], j
     measure, agreement = AGREEMENTS[kind]
     other = [*real[len(real) // 2 :], *real[: len(real) // 2]]
     values = [f"{100 * agreement(scans, some, judge):.1f}" for some in (real, other)]
-    return f"| {name} | {measure} | {' | '.join(values)} |"
+    return f"| {escape_markdown(name)} | {measure} | {' | '.join(values)} |"
 
 
 def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, list[Scan]]:

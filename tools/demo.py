@@ -31,13 +31,14 @@ from pathlib import Path
 import numpy as np
 from comparison import AUGMENTATION, Protocol, Result, compare
 from numpy.typing import NDArray
+from panels import classes_panel, mixture_panel, scores_panel
 
 from lidar_synth import KITTI360, Bank, Scan, Source, open_scans
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import REAL
-from lidar_synth.viz import classes_panel, html_page, mixture_panel, scores_panel
+from lidar_synth.viz import html_page
 
 SHOWN = 4
 """Scans of each kind on the page."""

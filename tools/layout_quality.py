@@ -22,6 +22,7 @@ from model_card import SEED, Comparison, Measured, needs_images, shrink, table, 
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, layout_of, load_generator
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.geometry.layout import Layout
 from lidar_synth.lab.evaluate.layouts import LayoutAgreement, layout_agreement
 from lidar_synth.lab.evaluate.segmentation import load_judge
@@ -48,11 +49,11 @@ def generate(
 def line(name: str, found: LayoutAgreement | None) -> str:
     """A row of the second table."""
     if found is None:
-        return f"| {name} | - | - | - | - | - | - |"
+        return f"| {escape_markdown(name)} | - | - | - | - | - | - |"
     shares = " | ".join(
         f"{100 * s:.2f}" for s in (found.inside_share, found.filled_share, found.kept_share)
     )
-    return f"| {name} | {shares} | {found.points} | {found.boxes} | {found.seen} |"
+    return f"| {escape_markdown(name)} | {shares} | {found.points} | {found.boxes} | {found.seen} |"
 
 
 def draw(path: Path, made: list[Scan], real: list[Scan], layouts: list[Layout]) -> None:

@@ -39,6 +39,7 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
@@ -244,7 +245,10 @@ def table(sets: Sequence[Measured]) -> str:
     """Figures as rows, sets as columns; then IoU between the labels and the segmenter's prediction
     by class, and the bend of walls."""
     titles = list(dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores))
-    lines = [f"| figure | {' | '.join(one.name for one in sets)} |", f"|---|{'---:|' * len(sets)}"]
+    lines = [
+        f"| figure | {' | '.join(escape_markdown(one.name) for one in sets)} |",
+        f"|---|{'---:|' * len(sets)}",
+    ]
     for title in titles:
         found = [
             next((s for s in one.scores if f"{s.metric} ({s.protocol})" == title), None)
@@ -263,7 +267,7 @@ def table(sets: Sequence[Measured]) -> str:
         values = [
             f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}" for c in columns
         ]
-        lines.append(f"| {one.name} | {' | '.join(values)} |")
+        lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
     return "\n".join(lines)
 
 

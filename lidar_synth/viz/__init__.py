@@ -13,7 +13,6 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.colour import Scale, scales
 from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
-from lidar_synth.viz.panels import classes_panel, mixture_panel, scores_panel, verdict
 from lidar_synth.viz.render import Camera, Orbit, bird, render
 from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
@@ -23,18 +22,14 @@ __all__ = [
     "Orbit",
     "Scale",
     "bird",
-    "classes_panel",
     "contact_sheet",
     "histograms",
     "html_page",
-    "mixture_panel",
     "picture",
     "render",
     "scales",
-    "scores_panel",
     "sheet",
     "show",
-    "verdict",
     "view_suffix",
     "write_view",
 ]

@@ -1,12 +1,11 @@
 """The cost of a bake: generating alone and with writing, one process and two, memory of short and
 long bakes.
 
-    python tools/bench/bake.py [--model town] [--count 256] [--lengths 400 4000]
+    python tools/bench/bake.py [--model town] [--count 256] [--lengths 400 4000] [--rounds 3]
 
 Speeds are those of the named model. Memory is measured with a fast model with random weights,
 because the memory per scan does not depend on the model. Every bake runs in its own process with
-one thread per worker; the machine has to be idle. Compared runs take turns, three times; the table
-has medians.
+one thread per worker; the machine has to be idle. Compared runs take turns; the table has medians.
 """
 
 import argparse
@@ -25,8 +24,6 @@ from untrained import write_untrained
 
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.shard import images, load_checked, torch_threads
-
-ROUNDS = 3
 
 
 def alone(call: Callable[..., Any], *arguments: Any) -> Any:
@@ -48,10 +45,12 @@ def by_processes(out: Path, model: str, count: int, workers: int) -> float:
     return time.perf_counter() - start
 
 
-def generated_and_baked(out: Path, model: str, count: int) -> list[tuple[float, float]]:
+def generated_and_baked(
+    out: Path, model: str, count: int, rounds: int
+) -> list[tuple[float, float]]:
     """Seconds of generating the scans and of baking them, in turns."""
     found = []
-    for number in range(ROUNDS + 1):
+    for number in range(rounds + 1):
         plan = plan_of(out / str(number), model, count, count)
         generator = load_checked(plan.job, plan.facts)
         start = time.perf_counter()
@@ -84,12 +83,13 @@ def main() -> None:
         default=(400, 4000),
         help="scans of the bakes whose memory is measured",
     )
+    parser.add_argument("--rounds", type=int, default=3)
     given = parser.parse_args()
     print(f"\n### Baking\n\n{machine()}\n\n| what | |\n|---|---:|")
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         seconds: dict[int, list[float]] = {1: [], 2: []}
-        for turn in range(ROUNDS):
+        for turn in range(given.rounds):
             for workers, times in seconds.items():
                 times.append(
                     alone(
@@ -104,7 +104,7 @@ def main() -> None:
         print(f"| {given.count} scans by one process | {one:.1f} s |")
         print(f"| by two processes | {two:.1f} s, {one / two:.2f} times as fast |")
         few = max(1, given.count // 4)
-        turns = alone(generated_and_baked, root / "turns", given.model, few)
+        turns = alone(generated_and_baked, root / "turns", given.model, few, given.rounds)
         plain, whole = (median(times) for times in zip(*turns, strict=True))
         print(f"| generating only, in one process | {few / plain:.2f} scans/s |")
         print(

@@ -1,6 +1,6 @@
 """Speed of ``fit_sensor`` and ``assign_beams`` on scans of the town.
 
-python tools/bench/fit.py [--rounds N]
+python tools/bench/fit.py [--rounds N] [--sensor os1_128] [--scans 5]
 """
 
 import argparse
@@ -19,8 +19,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--sensor", default="os1_128")
+    parser.add_argument("--scans", type=int, default=5)
     given = parser.parse_args()
-    scans = [Town(0, "os1_128", 5)[index] for index in range(5)]
+    scans = list(Town(0, given.sensor, given.scans))
     raw = [replace(scan, ring=None) for scan in scans]
     rng = np.random.default_rng(0)
     shuffled = [scan[rng.permutation(len(scan))] for scan in raw]
@@ -33,7 +35,10 @@ def main() -> None:
     }
     seconds = time_in_turns(calls, given.rounds, time.process_time)
     points = sum(map(len, scans))
-    print(f"\n### Fitting a sensor to 5 scans ({points:,} points), processor time\n\n{machine()}\n")
+    print(
+        f"\n### Fitting a sensor to {len(scans)} scans ({points:,} points), processor "
+        f"time\n\n{machine()}\n"
+    )
     print("| operation | seconds |\n|---|---:|")
     for name, value in seconds.items():
         print(f"| {name} | {value:.2f} |")

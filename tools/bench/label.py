@@ -74,20 +74,22 @@ def print_confidence(town: Path, out: Path) -> None:
         print(f"| {low:.1f} to {min(high, 1):.1f} | {shares} |")
 
 
-def fill(root: Path, points: int) -> None:
+def fill(root: Path, points: int) -> int:
     """Fill the first static window of a town up to a number of points, and remove the other
-    windows."""
+    windows; its points."""
     drive = next((root / "data_3d_raw").iterdir()).name
     windows = find_windows(root, drive)
     for window in windows[1:]:
         window.static.unlink()
     rng = np.random.default_rng(0)
     cloud = read_cloud(windows[0].static)
+    points = max(points, len(cloud))
     values = {name: np.resize(cloud[name], points) for name in PROPERTIES if name != "timestamp"}
     for axis in "xyz":
         values[axis] = values[axis] + rng.normal(0, COPY, points).astype(np.float32)
         values[axis][: len(cloud)] = cloud[axis]
     write_cloud(windows[0].static, values)
+    return points
 
 
 def main() -> None:
@@ -123,15 +125,15 @@ def main() -> None:
             f"{2 / each:.1f} scans/s on 2 dedicated cores; {arguments.scans / clock:.1f} scans/s "
             "by one process here"
         )
-        fill(town, arguments.points)
+        points = fill(town, arguments.points)
         used = time.process_time()
         report = label_scans(town, again, against=town)
         used = time.process_time() - used
         scans = sum(report.labelled.values())
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         print(
-            f"\nA window of {arguments.points:,} points: {used:.1f} s of processor time for "
-            f"{scans} scans, with reading"
+            f"\nA window of {points:,} points: {used:.1f} s of processor time for {scans} scans, "
+            "with reading"
         )
         print(f"at most {peak:.1f} GiB of memory\n")
         print_right(report)

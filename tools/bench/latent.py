@@ -1,6 +1,6 @@
 """Speed of the networks of LiDAR-Flow's latent models at full size, against a large matrix product.
 
-    python tools/bench/latent.py [--rounds N] [--threads N] [--busy]
+    python tools/bench/latent.py [--rounds N] [--threads N] [--busy] [--width N]
 
 LiDM's U-Net (257.8 M parameters, 171.7 GFLOP) on a latent of 8 x 16 x 128, its autoencoder (15.1 M;
 93 GFLOP to encode and 120 to decode) at 64 x 1024, and the small ones of configs/town_*.yaml.
@@ -35,10 +35,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--busy", action="store_true", help="measure processor time")
+    parser.add_argument(
+        "--width", type=int, help="of narrow networks in place of LiDM's, to try the script"
+    )
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    full = network("unet", resolution=(16, 128))
-    codec = network("vqvae", resolution=(64, 1024))
+    width = {"width": given.width} if given.width else {}
+    full = network("unet", resolution=(16, 128), **width)
+    codec = network("vqvae", resolution=(64, 1024), **width)
     shipped = load_generator("town")
     town = shipped.autoencoder
     town_flow = shipped.network

@@ -20,6 +20,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from timing import machine
@@ -47,7 +48,7 @@ KINDS = {
 }
 
 
-def full_network(model: Path | None) -> nn.Module:
+def full_network(model: Path | None) -> Any:
     """The checkpoint's network, or one with random nonzero weights."""
     if model is not None:
         return load_checkpoint(model).networks[VELOCITY]
@@ -68,9 +69,9 @@ def seconds(call: Callable[[], object], cuda: bool = False) -> float:
     return time.perf_counter() - start
 
 
-def on_cpu(net: nn.Module, rounds: int) -> None:
+def on_cpu(net: Any, rounds: int) -> None:
     """Evaluation and product in turns, then the profile."""
-    y = torch.randn(1, 2, 64, 1024)
+    y = torch.randn(1, net.channels, 64, 1024)
     a, b = torch.randn(2, 4096, 4096)
     product = []
     evaluation = []
@@ -125,10 +126,11 @@ def breakdown(net: nn.Module, y: Tensor) -> None:
         print(f"| {kind} | {spent[kind] / sum(spent.values()):.1%} |")
 
 
-def peak_memory() -> float:
+def peak_memory(model: Path | None) -> float:
     """Peak memory of a fresh process in GB, including Python and torch."""
+    given = [] if model is None else ["--model", model]
     out = subprocess.run(
-        [sys.executable, __file__, "--peak"], check=True, capture_output=True, text=True
+        [sys.executable, __file__, "--peak", *given], check=True, capture_output=True, text=True
     )
     return float(out.stdout)
 
@@ -217,14 +219,21 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     torch.set_grad_enabled(False)
     if options.peak:
-        full_network(options.model)(torch.randn(1, 2, 64, 1024), 0.5)
+        net = full_network(options.model)
+        net(torch.randn(1, net.channels, 64, 1024), 0.5)
         scale = 1 if sys.platform == "darwin" else 1024
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale / 1e9)
         return
-    peak = peak_memory()  # first, because a child's peak starts with the memory of its parent
+    peak = peak_memory(
+        options.model
+    )  # first, because a child's peak starts with the memory of its parent
     net = full_network(options.model)
     on_cpu(net, options.rounds)
-    print(f"\nPeak memory of a process that does one evaluation: {peak:.2f} GB (weights: 0.32 GB).")
+    weights = sum(values.nbytes for values in net.parameters()) / 1e9
+    print(
+        f"\nPeak memory of a process that does one evaluation: {peak:.2f} GB (weights: "
+        f"{weights:.2f} GB)."
+    )
     if torch.cuda.is_available():
         on_cuda(net, options.rounds)
 

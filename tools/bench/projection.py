@@ -1,6 +1,6 @@
 """Processor time of projecting points to a range image and back, on one core.
 
-    python tools/bench/projection.py [SCAN.bin]
+    python tools/bench/projection.py [SCAN.bin] [--rounds N]
 
 SCAN.bin is any KITTI or KITTI-360 scan; the default is a random scan of 120,000 points.
 """
@@ -64,7 +64,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
-    path: Path | None = parser.parse_args().scan
+    parser.add_argument("--rounds", type=int, default=60)
+    given = parser.parse_args()
+    path: Path | None = given.scan
     torch.set_num_threads(1)
     sensor = load_sensor("hdl64e_kitti360")
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +90,7 @@ def main() -> None:
         }
         print_table(
             f"{len(points):,} points, 64 x 1024, one core",
-            time_in_turns(calls, clock=time.process_time),
+            time_in_turns(calls, given.rounds, time.process_time),
             ours,
         )
 
@@ -104,7 +106,8 @@ def main() -> None:
                 "project": lambda: project(scan),
                 both: lambda: project(read()),
             },
-            clock=time.process_time,
+            given.rounds,
+            time.process_time,
         )
         print_table("From the file to the range image", seconds, both)
         print(

@@ -1,6 +1,6 @@
 """Time and memory of a labelled scan by model, steps and columns, against a large matrix product.
 
-    python tools/bench/scans.py [MODEL ...] [--rounds N] [--threads N] [--busy]
+    python tools/bench/scans.py [MODEL ...] [--steps 4 2 1] [--rounds N] [--threads N] [--busy]
 
 MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise
 to points with labels. All measurements of the first table take turns. With --busy, processor time
@@ -23,7 +23,6 @@ from timing import print_table, time_in_turns
 
 from lidar_synth import Generator, Scan, Town, load_generator
 
-STEPS = (4, 2, 1)
 TOGETHER = 6
 """Scans of each process in the second table."""
 
@@ -49,13 +48,13 @@ def conditions(generator: Generator) -> list[Scan] | None:
     return None if generator.condition is None else [Town(0, generator.sensor, 1)[0]]
 
 
-def kinds(models: list[str]) -> list[Kind]:
+def kinds(models: list[str], numbers: list[int]) -> list[Kind]:
     """All columns and steps of the models."""
     found = []
     for model in models:
         generator = load_generator(model)
         widths = getattr(generator.autoencoder, "widths", (generator.sensor.columns,))
-        found += [Kind(model, width, steps) for width in widths for steps in STEPS]
+        found += [Kind(model, width, steps) for width in widths for steps in numbers]
     return found
 
 
@@ -101,6 +100,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("model", nargs="*", default=["town"])
+    parser.add_argument("--steps", type=int, nargs="+", default=[4, 2, 1])
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--busy", action="store_true", help="measure processor time")
@@ -109,7 +109,7 @@ def main() -> None:
     a = torch.randn(4096, 4096)
     index = count()
     calls = {"product of 4096 x 4096 (137 GFLOP)": lambda: a @ a}
-    for kind in kinds(given.model):
+    for kind in kinds(given.model, given.steps):
         generator = kind.generator()
         streets = conditions(generator)
         calls[str(kind)] = lambda g=generator, k=kind, c=streets: g.scans(
@@ -131,7 +131,7 @@ def main() -> None:
         "each |"
     )
     print("|---|---:|---:|---:|")
-    for kind in kinds(given.model):
+    for kind in kinds(given.model, given.steps):
         rate, memory = together(kind)
         print(f"| {kind} | {rate:.2f} | {rate * seconds[base]:.1f} | {memory:.0f} |", flush=True)
 

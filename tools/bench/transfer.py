@@ -1,6 +1,6 @@
 """Processor time of turning a scan of one sensor into a scan of another, on one core.
 
-    python tools/bench/transfer.py [SCAN.bin]
+    python tools/bench/transfer.py [SCAN.bin] [--rounds N]
 
 SCAN.bin is any scan of KITTI or KITTI-360; the default is a scan of the shipped model, and one of
 the town.
@@ -37,7 +37,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
-    path: Path | None = parser.parse_args().scan
+    parser.add_argument("--rounds", type=int, default=20)
+    given = parser.parse_args()
+    path: Path | None = given.scan
     torch.set_num_threads(1)
     sensor = replace(load_sensor("hdl64e_semantic_kitti"), firings=HDL64E_FIRINGS)
     if path is None:
@@ -61,7 +63,7 @@ def main() -> None:
             surfaces: partial(estimate, scan),
             grid: partial(_through_cells, scan, sensors["OS1-128"]),
         }
-        seconds = time_in_turns(calls, rounds=20, clock=time.process_time)
+        seconds = time_in_turns(calls, given.rounds, time.process_time)
         print_table(f"A scan of {name}, {len(scan):,} points, one core", seconds, surfaces)
 
 

@@ -14,7 +14,6 @@ from detector.bev import REACH, Found
 from detector.classes import LEAST
 from detector.pools import classes_of, detected, points_in
 from lidar_synth import Boxes, Scan
-from lidar_synth.lab.evaluate.detection import average_precision
 
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""
@@ -120,3 +119,20 @@ def _common_area(polygon: NDArray[np.float64], window: NDArray[np.float64]) -> f
         polygon = np.array(clipped)
     x, y = (polygon - polygon[0]).T
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
+
+
+def average_precision(
+    confidence: NDArray[np.floating], hits: NDArray[np.floating] | NDArray[np.integer], boxes: int
+) -> float:
+    """Area under precision over recall, where precision is the best at that recall or a higher one.
+
+    Args:
+        confidence: (D,) of detections.
+        hits: (D,) 1 for those that match a box, else 0.
+        boxes: number of boxes; without any, NaN.
+    """
+    if not boxes:
+        return float("nan")
+    right = np.cumsum(hits[np.argsort(-confidence, kind="stable")])
+    precision = np.maximum.accumulate((right / np.arange(1, len(right) + 1))[::-1])[::-1]
+    return float((precision * np.diff(right, prepend=0)).sum() / boxes)

@@ -271,7 +271,7 @@ def wheel_of_checkout(folder: Path) -> Path:
     folder has one."""
     if not list(folder.glob("lidar_synth-*.whl")):
         source = folder / "source"
-        for name in ("lidar_synth", "integrations", "configs"):
+        for name in ("lidar_synth", "integrations", "configs", "tools/backend"):
             shutil.copytree(
                 ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__")
             )

@@ -1,7 +1,6 @@
 """Points to range image and back (geometry only: no networks, no files)."""
 
-from lidar_synth.geometry.projection.batch import BatchImage, project_batch, unproject_batch
-from lidar_synth.geometry.projection.fill import fill_points
+from lidar_synth.geometry.projection.batch import BatchImage, project_batch
 from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import Cells, carry, locate, project, unproject
 from lidar_synth.geometry.projection.unfold import laser_rows, unfold
@@ -10,7 +9,6 @@ __all__ = [
     "BatchImage",
     "Cells",
     "carry",
-    "fill_points",
     "laser_rows",
     "locate",
     "project",
@@ -18,5 +16,4 @@ __all__ = [
     "ring_numbers",
     "unfold",
     "unproject",
-    "unproject_batch",
 ]

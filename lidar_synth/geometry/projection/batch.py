@@ -17,7 +17,7 @@ from lidar_synth.geometry.projection.kernels import (
     Grid,
     grid_of,
 )
-from lidar_synth.geometry.sensor import Rays, Sensor
+from lidar_synth.geometry.sensor import Sensor
 
 _NONE = torch.iinfo(torch.int64).max
 
@@ -116,31 +116,6 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
     shown = torch.where(hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0)
     distances = torch.where(hit.view_as(point), distance[point.clamp(min=0)], 0.0)
     return BatchImage(distances, shown.movedim(-1, 1), point)
-
-
-def unproject_batch(image: torch.Tensor, sensor: Sensor, rays: Rays = "centre") -> torch.Tensor:
-    """Convert every cell of a batch of range images to a point.
-
-    Args:
-        image: (B, H, W) float32 metres, 0 = no return.
-        sensor: the sensor that defines the grid.
-        rays: through the cells' centres or corners.
-
-    Returns:
-        (B, 3, H, W) float32 metres; the origin where there is no return.
-
-    Raises:
-        DataError: on a shape that is not the sensor's.
-    """
-    if tuple(image.shape[1:]) != sensor.shape:
-        raise DataError(
-            f"range images {tuple(image.shape)}", f"(B, {sensor.shape[0]}, {sensor.shape[1]})"
-        )
-    directions = torch.tensor(sensor.ray_directions(rays), device=image.device).movedim(-1, 0)
-    points = image[:, None] * directions
-    if len(sensor.starts):
-        points[:, 2] += (image > 0) * torch.tensor(sensor.starts, device=image.device)[:, None]
-    return points
 
 
 def torch_atan2(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,6 @@ To add a protocol, write a file in ``protocols/``; to add a kind of measure, a l
 """
 
 from lidar_synth.lab.evaluate.comparison import evaluate
-from lidar_synth.lab.evaluate.detection import Detection, Detector, detect
 from lidar_synth.lab.evaluate.distances import (
     frechet_distance,
     jensen_shannon_distance,
@@ -17,26 +16,20 @@ from lidar_synth.lab.evaluate.intervals import Interval, bootstrap, extrapolated
 from lidar_synth.lab.evaluate.metric import Metric, Score
 from lidar_synth.lab.evaluate.neighbours import manifold, nearest_training
 from lidar_synth.lab.evaluate.protocols import PROTOCOLS, Protocol
-from lidar_synth.lab.evaluate.sequences import chamfer_error, registration_error
 
 __all__ = [
     "PROTOCOLS",
-    "Detection",
-    "Detector",
     "Extractor",
     "Interval",
     "Metric",
     "Protocol",
     "Score",
     "bootstrap",
-    "chamfer_error",
-    "detect",
     "evaluate",
     "extrapolated_frechet",
     "frechet_distance",
     "jensen_shannon_distance",
     "manifold",
     "nearest_training",
-    "registration_error",
     "squared_mmd",
 ]

@@ -34,14 +34,6 @@ def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
     return np.convolve(histogram, kernel / kernel.sum(), "same"), centres
 
 
-def sharpness(elevations: Floats, width: float) -> float:
-    """How much the elevations concentrate: the mean density at a point, relative to that of a five
-    times wider one."""
-    fine, _ = density(elevations, width)
-    coarse, _ = density(elevations, 5 * width)
-    return float((fine**2).sum() / max((coarse**2).sum(), 1e-9))
-
-
 def beam_peaks(elevations: Floats, width: float) -> Floats:
     """(B,) elevations of the beams, highest first, radians.
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.files.claims import claim, writing
 from lidar_synth.files.disk import read_text, write_file
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.files.processes import in_processes
 from lidar_synth.formats.description import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
@@ -130,7 +131,11 @@ def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: boo
     settings = {"layout": layout, "sequence": sequence, "camera": camera, **town.settings}
     claim(out / SETTINGS, settings)
     if not (out / "README.md").exists():
-        names = {"sensor": town.sensor.name, "frames": STRETCH_FRAMES, "settings": SETTINGS}
+        names = {
+            "sensor": escape_markdown(town.sensor.name),
+            "frames": STRETCH_FRAMES,
+            "settings": SETTINGS,
+        }
         text = _README.format(**settings | names)
         write_file(out / "README.md", text.encode())
 

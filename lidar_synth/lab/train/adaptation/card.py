@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.generate.checkpoint import CODEC, Checkpoint, Header, join
 from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.generator import Generator
@@ -134,17 +135,23 @@ def write_card(
     """Write the card of an adapted model."""
     facts = header.provenance
     near = found["nearest"]
+    sensor = header.sensor
+    model = escape_markdown(facts["adapted_from"])
     lines = [
-        f"# {checkpoint.stem}",
+        f"# {escape_markdown(checkpoint.stem)}",
         "",
-        f'`load_generator("{checkpoint.name}")` generates scans of {header.sensor.name} '
-        f"({header.sensor.shape[0]} x {header.sensor.columns} cells, {header.sensor.range_min:g} "
-        "to "
-        f"{header.sensor.range_max:g} m). It is `{facts['adapted_from']}`, adapted to "
-        f"{facts['data']}.",
+        "```python",
+        "from lidar_synth import load_generator",
         "",
-        f"**Licence.** {header.provenance['licence']}. The licence of `{facts['adapted_from']}` "
-        "applies too.",
+        f"load_generator({checkpoint.name!r})",
+        "```",
+        "",
+        f"It generates scans of {escape_markdown(sensor.name)} ({sensor.shape[0]} x "
+        f"{sensor.columns} cells, "
+        f"{sensor.range_min:g} to {sensor.range_max:g} m). It is {model}, adapted to "
+        f"{escape_markdown(facts['data'])}.",
+        "",
+        f"**Licence.** {escape_markdown(facts['licence'])}. The licence of {model} applies too.",
         "",
         f"**Labels.** They are {facts['labels']}.",
         "",
@@ -192,4 +199,4 @@ _NAMES = {
 
 
 def _span(ids: Sequence[str]) -> str:
-    return f"{len(ids)} scans, {ids[0]} to {ids[-1]}"
+    return f"{len(ids)} scans, {escape_markdown(ids[0])} to {escape_markdown(ids[-1])}"

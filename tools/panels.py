@@ -1,0 +1,133 @@
+"""Panels of the HTML page: the samples of a mixture, a comparison of trainings, and a table of
+classes.
+
+Each function returns HTML for the argument ``panels`` of ``html_page``, whose style sheet it relies
+on.
+"""
+
+import html
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.datasets.classes import COLOURS, NAMES
+from lidar_synth.viz.colour import DOMAINS
+
+
+def mixture_panel(domains: Sequence[int], names: Sequence[str], notes: Sequence[str] = ()) -> str:
+    """The samples of an epoch in their order, each as a square in the colour of its domain.
+
+    Args:
+        domains: of the samples: 0 = real, 1 = synthetic.
+        names: what the panel calls the two domains.
+        notes: paragraphs below.
+    """
+    counts = [sum(domain == d for domain in domains) for d in (0, 1)]
+    squares = "".join(_swatch(d, f"sample {i}: {names[d]}") for i, d in enumerate(domains))
+    share = 100 * counts[1] / max(len(domains), 1)
+    text = (
+        f"{len(domains)} samples in training order: {_swatch(0)}{counts[0]} "
+        f"{html.escape(names[0])}, "
+    )
+    text += f"{_swatch(1)}{counts[1]} {html.escape(names[1])} ({share:.0f} %)."
+    return _panel(
+        "Samples of the first epoch", f'<div class="samples">{squares}</div><p>{text}</p>', notes
+    )
+
+
+def scores_panel(arms: Mapping[str, Sequence[float]], notes: Sequence[str] = ()) -> str:
+    """mIoU on held-out scans of two trainings, each repeated with several seeds.
+
+    Args:
+        arms: the mIoU in [0, 1] of each seed: first without synthetic scans, then with them, the
+            seeds in one order.
+        notes: paragraphs below: the protocol.
+    """
+    top = 0.05 * np.ceil(20 * 1.15 * max(max(scores) for scores in arms.values()))
+    rows = "".join(
+        _score_row(d, name, scores, top) for d, (name, scores) in enumerate(arms.items())
+    )
+    ends = f'<div class="score"><span></span><div class="ends"><span>0</span><span>{100 * top:.0f} %</span></div></div>'
+    without, with_synthetic = arms.values()
+    body = f'{rows}{ends}<p class="large">{verdict(without, with_synthetic)}</p>'
+    return _panel("mIoU on held-out scans, without and with synthetic scans", body, notes)
+
+
+def verdict(without: Sequence[float], with_synthetic: Sequence[float]) -> str:
+    """What the scores of two trainings with the same seeds show, in one or two sentences."""
+    gains = 100 * np.subtract(with_synthetic, without)
+    count = len(gains)
+    better = int((gains > 0).sum())
+    change = f"Synthetic scans changed the mIoU by {gains.mean():+.1f} percentage points"
+    if count == 1:
+        return f"{change}. One seed cannot tell a difference from chance."
+    change += f" (by seed: {', '.join(f'{gain:+.1f}' for gain in gains)})"
+    if better == count:
+        return f"{change}. In this comparison they helped with each of the {count} seeds."
+    if better == 0:
+        return f"{change}. In this comparison they did not help with any of the {count} seeds."
+    return (
+        f"{change}. They helped with {better} of {count} seeds: this comparison shows no clear "
+        "difference."
+    )
+
+
+def classes_panel(columns: Mapping[str, NDArray[np.floating]], notes: Sequence[str] = ()) -> str:
+    """A table with one row for each class and one column for each quantity.
+
+    Args:
+        columns: (19,) values in [0, 1] of each quantity, NaN = unknown. Classes for which all are 0
+            or unknown are left out; the first column orders the rows.
+        notes: paragraphs below.
+    """
+    values = np.stack(list(columns.values()))
+    order = np.argsort(-np.nan_to_num(values[0]), kind="stable")
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in ["class", *columns])
+    body = "".join(
+        f'<tr><td><i style="background:rgb({",".join(map(str, COLOURS[i]))})"></i>{NAMES[i]}</td>'
+        + "".join(f"<td>{_percent(value)}</td>" for value in values[:, i])
+        + "</tr>"
+        for i in order
+        if np.nan_to_num(values[:, i]).any()
+    )
+    return _panel(
+        "By class", f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>", notes
+    )
+
+
+def _panel(title: str, body: str, notes: Sequence[str]) -> str:
+    paragraphs = "".join(f'<p class="dim">{html.escape(note)}</p>' for note in notes)
+    return f'<section class="panel"><h2>{html.escape(title)}</h2>{body}{paragraphs}</section>'
+
+
+def _colour(domain: int) -> str:
+    return f"rgb({','.join(map(str, list(DOMAINS.values())[domain]))})"
+
+
+def _swatch(domain: int, title: str = "") -> str:
+    shown = f' title="{html.escape(title)}"' if title else ""
+    return f'<i style="background:{_colour(domain)}"{shown}></i>'
+
+
+def _score_row(domain: int, name: str, scores: Sequence[float], top: float) -> str:
+    """A row of the comparison: the name, a dot for each seed, a line for the mean, and mean ±
+    standard deviation."""
+    dots = "".join(
+        f'<span class="seed" style="left:{100 * score / top:.2f}%;background:{_colour(domain)}" '
+        f'title="{100 * score:.1f} %"></span>'
+        for score in scores
+    )
+    mean = float(np.mean(scores))
+    spread = f" ± {100 * np.std(scores, ddof=1):.1f}" if len(scores) > 1 else ""
+    return (
+        f'<div class="score"><span>{html.escape(name)}</span><div class="track">'
+        f'<span class="mean" style="left:{100 * mean / top:.2f}%"></span>{dots}</div>'
+        f'<span class="value">{100 * mean:.1f}{spread} %</span></div>'
+    )
+
+
+def _percent(share: float) -> str:
+    if np.isnan(share):
+        return "–"
+    return "&lt;0.1" if 0 < share < 0.0005 else f"{100 * share:.1f}"
