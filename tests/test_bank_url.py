@@ -18,7 +18,7 @@ import lidar_synth.bank.storage as storage
 import lidar_synth.bank.writer as writer
 from lidar_synth.bank import Bank
 from lidar_synth.bank.shard import _GAP, _side_by_side
-from lidar_synth.bank.storage import LocalFile, RemoteFile, View
+from lidar_synth.bank.storage import LocalFile, RangedFile, RemoteFile
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.sensor import load_sensor
@@ -204,7 +204,7 @@ def test_a_view_reads_like_the_file(
     path.write_bytes(content)
     file = LocalFile(path)
     file.window = 100
-    view = View(file, head)
+    view = RangedFile(file, head)
     for offset, length in reads:
         view.seek(offset)
         with suppress(OSError):

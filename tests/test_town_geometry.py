@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lidar_synth.lab.town.bodywork import GLASS
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.ground import KINDS, NAMES, Ground
-from lidar_synth.lab.town.materials import MATERIALS, Finish, Surfaces
+from lidar_synth.lab.town.materials import MATERIALS, Finish, Finishes
 from lidar_synth.lab.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
 from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.plants import CORE, LEAF, SPECIES, VARIANTS, coarse_plant, plant
@@ -266,7 +266,7 @@ def test_movers_do_not_collide() -> None:
 
 
 def test_surfaces_are_frozen_into_columns() -> None:
-    surfaces = Surfaces()
+    surfaces = Finishes()
     dark = surfaces.add(Finish("paint", (0.03, 0.03, 0.03)), 10, 7)
     white = surfaces.add(Finish("paint", (0.9, 0.9, 0.9)), 10, 8)
     road = surfaces.add(Finish("asphalt"), 40)

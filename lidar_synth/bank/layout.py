@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import FILTERS
 from lidar_synth.bank.index import SCAN_NUMBERS, Facts
-from lidar_synth.bank.storage import Storage, View
+from lidar_synth.bank.storage import RangedFile, Storage
 
 T = TypeVar("T")
 
@@ -61,7 +61,7 @@ class Chunks:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ShardLayout:
     """The numbers of a shard and the addresses of its chunks.
 
     Args:
@@ -102,7 +102,7 @@ def with_hdf5(
         OSError, RuntimeError: from HDF5, if it is not a valid file.
         FileError, DataError: as ``Storage.read``.
     """
-    view = View(storage, max(storage.window, 0 if facts is None else head_size(facts, scans)))
+    view = RangedFile(storage, max(storage.window, 0 if facts is None else head_size(facts, scans)))
     for _ in range(_PASSES):
         view.fetch_missing()
         try:
@@ -130,7 +130,7 @@ def read_attributes(file: h5py.File) -> dict[str, Any]:
 
 def read_layout(
     file: h5py.File, storage: Storage, scans: int, arrays: Arrays, compression: str
-) -> Layout:
+) -> ShardLayout:
     """Validate the datasets of a shard and locate their values.
 
     Raises:
@@ -158,7 +158,7 @@ def read_layout(
         name: _chunks(_stored(file, name), scans, *kind, compression)
         for name, kind in arrays.items()
     }
-    return Layout(numbers, conditions, chunks)
+    return ShardLayout(numbers, conditions, chunks)
 
 
 def _attribute(file: h5py.File, name: str) -> Any:

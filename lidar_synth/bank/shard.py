@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.bank.chunks import checksum, filters, unpack
 from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
-from lidar_synth.bank.layout import Layout, read_attributes, read_layout, with_hdf5
+from lidar_synth.bank.layout import ShardLayout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files.disk import naming
@@ -121,10 +121,10 @@ class ShardReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, Layout]:
+    def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, ShardLayout]:
         """Facts and entry from the file's attributes, and the addresses of its scans."""
 
-        def work(file: h5py.File) -> tuple[Facts, Entry, Layout]:
+        def work(file: h5py.File) -> tuple[Facts, Entry, ShardLayout]:
             with self._reading("its attributes"):
                 attributes = read_attributes(file)
                 numbers = [

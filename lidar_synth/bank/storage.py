@@ -244,7 +244,7 @@ def _may_pass(error: Exception) -> bool:
     return not isinstance(error, FileNotFoundError | PermissionError | ValueError)
 
 
-class View(io.RawIOBase):
+class RangedFile(io.RawIOBase):
     """A file object for HDF5 over the parts of a file that have been read so far.
 
     HDF5 holds a lock while it reads. Fetching from a URL uses other threads, and one of them that

@@ -20,7 +20,7 @@ from lidar_synth.labels.boxes import overlapping, unseen, widened
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
 from lidar_synth.labels.merge import merged
 from lidar_synth.labels.objects import Object
-from lidar_synth.labels.view import View, VisibleReturns, refuse_coarser
+from lidar_synth.labels.view import Composition, VisibleReturns, refuse_coarser
 
 LIFT = 1.0
 """Maximum height by which an object is raised or lowered, metres; beyond it the sensor would see
@@ -61,7 +61,7 @@ def paste(
         if fitted is not None:
             placed.append(fitted)
     placed.sort(key=lambda o: float(np.hypot(o.box[0], o.box[1])))
-    view = View(scan)
+    view = Composition(scan)
     shown = [o for o in placed if view.add(o, least)]
     own = _own(scan, view.parts[0].seen, least)
     pasted = [_as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)]

@@ -36,7 +36,7 @@ class VisibleReturns:
         return float(self.seen.sum() / max(self.total, 1))
 
 
-class View:
+class Composition:
     """The range image of a scan to which objects are added, preferably from near to far.
 
     Args:

@@ -20,7 +20,7 @@ from lidar_synth.generate.models.layers import rms_norm
 from lidar_synth.generate.models.network import Network
 
 
-class Residual(nn.Module):
+class NormedResidual(nn.Module):
     """x + conv(silu(conv(norm(x)))).
 
     Args:
@@ -68,9 +68,9 @@ class BoundedAutoencoder(Network, ABC):
         # A learned bias by row: on a road, a beam's elevation gives its range.
         self.place_stem = row_bias(outer, rows)
         self.stem = stem
-        self.encode_outer = Residual(outer)
+        self.encode_outer = NormedResidual(outer)
         self.merge = nn.Conv2d(outer, inner, 2, 2)
-        self.encode_inner = nn.Sequential(*(Residual(inner) for _ in range(depth)))
+        self.encode_inner = nn.Sequential(*(NormedResidual(inner) for _ in range(depth)))
         self.to_latent = nn.Conv2d(inner, latent_channels, 1)
         # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
         # needs.

@@ -17,7 +17,7 @@ from lidar_synth.geometry.transfer.hits import (
     rows_above,
 )
 from lidar_synth.geometry.transfer.rays import Rays
-from lidar_synth.geometry.transfer.surfaces import Surfaces
+from lidar_synth.geometry.transfer.surfaces import ScanSurfaces
 
 FRONT = 0.5, 0.03
 """Metres, and share of its distance, by which the footprint of a return has to lie in front of a
@@ -62,7 +62,7 @@ class Hits:
 
 
 def first_hits(
-    surfaces: Surfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]
+    surfaces: ScanSurfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]
 ) -> Hits:
     """Cast rays at the surfaces of a scan.
 

@@ -30,7 +30,7 @@ sensor with fewer beams."""
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class ScanSurfaces:
     """The surfaces of a scan, in the frame of the sensor that recorded it.
 
     Args:
@@ -55,7 +55,7 @@ class Surfaces:
     bounds: tuple[float, float]
 
 
-def estimate(scan: Scan) -> Surfaces:
+def estimate(scan: Scan) -> ScanSurfaces:
     """Estimate the surfaces of a scan.
 
     Args:
@@ -107,7 +107,7 @@ def estimate(scan: Scan) -> Surfaces:
     bounds = float(middle.min() - down[-1]), float(middle.max() + up[0])
     up = np.repeat(np.tan(up), counts)
     down = np.repeat(np.tan(down), counts)
-    return Surfaces(scan, azimuth, triangles, rim, level, step, up, down, bounds)
+    return ScanSurfaces(scan, azimuth, triangles, rim, level, step, up, down, bounds)
 
 
 def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:

@@ -17,7 +17,7 @@ from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.mount import Mount
 from lidar_synth.geometry.transfer.rays import Rays, rays_of
 from lidar_synth.geometry.transfer.returns import Measurement, gather_hits, place_returns
-from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate
+from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
 
@@ -105,7 +105,7 @@ class Transfer:
 
     def _seen_by_target(
         self, scan: Scan, rng: np.random.Generator, sweeps: Sequence[Scan]
-    ) -> tuple[Scan, Surfaces]:
+    ) -> tuple[Scan, ScanSurfaces]:
         """The scan as the target sensor would have recorded it, and the surfaces of the given
         one."""
         rays = rays_of(self.target)
@@ -252,7 +252,7 @@ def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched:
         log.warning("scans of %r as %r: %s", given.name, target.name, "; ".join(lacks))
 
 
-def _seen(surfaces: Surfaces, target: Sensor, mount: Mount) -> float:
+def _seen(surfaces: ScanSurfaces, target: Sensor, mount: Mount) -> float:
     """The share of the target's rays that lie in the field of view of the sensor that recorded the
     surfaces."""
     elevation, sector = _views(target, mount)

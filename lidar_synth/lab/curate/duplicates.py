@@ -23,7 +23,7 @@ def most_similar(
     stays when the others are dropped.
 
     Args:
-        signatures: (N, D) unit vectors, as ``Features.signature``.
+        signatures: (N, D) unit vectors, as ``ScanFeatures.signature``.
         progress: show a bar.
 
     Returns:

@@ -26,7 +26,7 @@ _SAME_SURFACE = 0.02  # relative range difference of two neighbouring cells on t
 
 
 @dataclass(frozen=True)
-class Measure:
+class Score:
     """One number that describes a scan.
 
     Args:
@@ -69,21 +69,21 @@ def _confidence(image: RangeImage, scan: Scan) -> float:
     return float(image.channels["confidence"][image.mask].mean()) if image.mask.any() else 0.0
 
 
-MEASURES: dict[str, Measure] = {
-    "empty": Measure("share of cells without a return", None, _empty),
-    "unlabelled": Measure("share of returns without a label", "label", _unlabelled),
-    "floating": Measure(
+MEASURES: dict[str, Score] = {
+    "empty": Score("share of cells without a return", None, _empty),
+    "unlabelled": Score("share of returns without a label", "label", _unlabelled),
+    "floating": Score(
         "share of ground returns (road to terrain) above the sensor", "label", _floating
     ),
-    "speckle": Measure(
+    "speckle": Score(
         "share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle
     ),
-    "confidence": Measure("mean confidence of the returns", "confidence", _confidence),
+    "confidence": Score("mean confidence of the returns", "confidence", _confidence),
 }
 """Measures by the name of their score; a share of an empty set is 0."""
 
 
-class Features(NamedTuple):
+class ScanFeatures(NamedTuple):
     """The features of one scan.
 
     Args:
@@ -111,14 +111,14 @@ def measured(fields: Collection[str]) -> tuple[str, ...]:
     )
 
 
-def features(image: RangeImage) -> Features:
+def features(image: RangeImage) -> ScanFeatures:
     """The features of a range image; measures of missing channels are left out."""
     scan = unproject(image)
     numbers = {name: MEASURES[name].of(image, scan) for name in measured(image.channels)}
     ranges, _ = np.histogram(image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max))
     labels = np.zeros(0, np.uint8) if scan.label is None else scan.label
     classes = np.bincount(labels[labels != IGNORE], minlength=len(NAMES))
-    return Features(numbers, ranges, classes, _signature(scan.points))
+    return ScanFeatures(numbers, ranges, classes, _signature(scan.points))
 
 
 def _signature(points: NDArray[np.float32]) -> NDArray[np.float16]:

@@ -43,7 +43,7 @@ class Store:
 
     Attributes:
         dtype: type of a row: ``ranges``, ``classes``, ``numbers`` and ``signature``, as in
-            ``Features``.
+            ``ScanFeatures``.
     """
 
     def __init__(self, folder: Path, count: int, names: tuple[str, ...]) -> None:

@@ -45,7 +45,7 @@ from lidar_synth.formats.points import read_points
 from lidar_synth.lab.kitti360.accumulated import Window, find_windows
 from lidar_synth.lab.kitti360.movers import inside
 from lidar_synth.lab.kitti360.recovery import Recovery
-from lidar_synth.lab.kitti360.report import Counts, LabelReport
+from lidar_synth.lab.kitti360.report import LabelCounts, LabelReport
 
 VERSION = 2
 """Raised when the rules change, so that a rerun replaces labels of older versions."""
@@ -239,7 +239,7 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
     )
     for frame in job.frames:  # labels of an earlier run with other clouds or poses
         (folder / f"{frame:010d}.label").unlink(missing_ok=True)
-    counts = Counts()
+    counts = LabelCounts()
     fitting = []
     misfits = []
     moved = {}

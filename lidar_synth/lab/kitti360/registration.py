@@ -39,7 +39,7 @@ _FEW = 100  # points near a cube, below which there is nothing to register
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class SurfaceMap:
     """The cubes of a cloud that say where points lie.
 
     Args:
@@ -68,7 +68,7 @@ class Surfaces:
         return hit, np.concatenate([axes, off[:, :, None]], axis=2)
 
 
-def find_surfaces(cloud: NearestLabels) -> Surfaces:
+def find_surfaces(cloud: NearestLabels) -> SurfaceMap:
     """The cubes of an indexed cloud that say where points lie."""
     points = cloud.points[:: max(1, -(-len(cloud) // _MOST))]
     cells = (points / np.float32(_SIDE)).astype(np.int32)
@@ -93,10 +93,10 @@ def find_surfaces(cloud: NearestLabels) -> Surfaces:
     trust = np.ones(len(means), np.float32)
     high = means.max(axis=0, initial=0) + _SIDE
     index = index_cloud([(means + cloud.low, numbers, trust)], cloud.low, cloud.low + high)
-    return Surfaces(index, means, scaled, cloud.low)
+    return SurfaceMap(index, means, scaled, cloud.low)
 
 
-def register(points: NDArray[np.float64], surfaces: Surfaces) -> NDArray[np.float64]:
+def register(points: NDArray[np.float64], surfaces: SurfaceMap) -> NDArray[np.float64]:
     """(4, 4) the transform in the world that lays points (N, 3) onto surfaces; the identity if it
     gains too little."""
     given = np.eye(4)
@@ -117,7 +117,7 @@ def register(points: NDArray[np.float64], surfaces: Surfaces) -> NDArray[np.floa
 def _descend(
     transform: NDArray[np.float64],
     points: NDArray[np.float64],
-    surfaces: Surfaces,
+    surfaces: SurfaceMap,
     radii: tuple[float, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """The transform after some steps, and its (6, 6) certainty, translation first; None without
@@ -146,7 +146,7 @@ def _descend(
 
 
 def _score(
-    transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: Surfaces
+    transform: NDArray[np.float64], points: NDArray[np.float64], surfaces: SurfaceMap
 ) -> float:
     return float(
         _robust(

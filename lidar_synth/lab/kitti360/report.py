@@ -15,7 +15,7 @@ labels of this class: all points, those that got a label, and those that got the
 
 
 @dataclass
-class Counts:
+class LabelCounts:
     """The points of some scans.
 
     Args:
@@ -83,7 +83,7 @@ class Counts:
         masks = (known, covered, covered & right, cars, cars & covered, cars & covered & right)
         self.compared[frame] = [int(mask.sum()) for mask in masks]
 
-    def __iadd__(self, other: "Counts") -> "Counts":
+    def __iadd__(self, other: "LabelCounts") -> "LabelCounts":
         for name in ("scans", "fit", "points", "far", "disputed", "void", "moving"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name, values in other.classes.items():
@@ -97,7 +97,7 @@ class Counts:
         }
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> "Counts":
+    def from_dict(cls, values: dict[str, Any]) -> "LabelCounts":
         """The inverse of ``to_dict``, also after a round trip through JSON.
 
         Raises:
@@ -127,7 +127,7 @@ class LabelReport:
         moved: {drive: metres by which scans were laid onto the clouds, of those that lay off}.
         kept: number of windows that were complete before this run.
         counts: of all labelled frames.
-        compared: {drive/frame: see ``Counts``}.
+        compared: {drive/frame: see ``LabelCounts``}.
     """
 
     without_pose: dict[str, int]
@@ -137,12 +137,12 @@ class LabelReport:
     misfits: dict[str, list[int]] = field(default_factory=dict)
     moved: dict[str, list[float]] = field(default_factory=dict)
     kept: int = 0
-    counts: Counts = field(default_factory=Counts)
+    counts: LabelCounts = field(default_factory=LabelCounts)
     compared: dict[str, list[int]] = field(default_factory=dict)
 
     def add(self, drive: str, record: dict[str, Any]) -> None:
         """Add the record of a window."""
-        own = Counts.from_dict(record["counts"])
+        own = LabelCounts.from_dict(record["counts"])
         self.counts += own
         self.compared |= {f"{drive}/{frame:010d}": counts for frame, counts in own.compared.items()}
         self.labelled[drive] = self.labelled.get(drive, 0) + len(record["fitting"])

@@ -5,7 +5,7 @@ places left out.
 compared.
 """
 
-from lidar_synth.lab.proof.arms import ARMS, Arm, Row, Stage
+from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage, Row
 from lidar_synth.lab.proof.command import CommandTrainer
 from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.study import prove
@@ -15,13 +15,13 @@ from lidar_synth.lab.proof.trial import Job, Outcome, Trainer, reference
 __all__ = [
     "ARMS",
     "Arm",
+    "ArmStage",
     "CommandTrainer",
     "Job",
     "Outcome",
     "Proof",
     "ProofSettings",
     "Row",
-    "Stage",
     "Trainer",
     "prove",
     "reference",

@@ -20,7 +20,7 @@ ones."""
 
 
 @dataclass(frozen=True)
-class Stage:
+class ArmStage:
     """A part of a training with one mixture.
 
     Args:
@@ -56,7 +56,7 @@ class Arm:
     """
 
     title: str
-    stages: Callable[[float], tuple[Stage, ...]]
+    stages: Callable[[float], tuple[ArmStage, ...]]
     swept: bool = False
     iterations: float = 1.0
     synthetic: bool = True
@@ -83,33 +83,36 @@ PRETRAINING = 0.75
 """Share of the iterations on synthetic scans alone, in the arms that begin with them."""
 
 
-def _then_real(pool: str) -> tuple[Stage, Stage]:
+def _then_real(pool: str) -> tuple[ArmStage, ArmStage]:
     """Synthetic scans first, then half real ones, at a lower learning rate."""
-    return Stage(PRETRAINING, 1, pool), Stage(1 - PRETRAINING, 0.5, pool, rate=0.25)
+    return ArmStage(PRETRAINING, 1, pool), ArmStage(1 - PRETRAINING, 0.5, pool, rate=0.25)
 
 
 ARMS: dict[str, Arm] = {
-    "real": Arm("real scans only", lambda ratio: (Stage(),), synthetic=False),
+    "real": Arm("real scans only", lambda ratio: (ArmStage(),), synthetic=False),
     "longer": Arm(
-        "real scans only, twice as long", lambda ratio: (Stage(),), iterations=2, synthetic=False
+        "real scans only, twice as long", lambda ratio: (ArmStage(),), iterations=2, synthetic=False
     ),
     "exchange": Arm(
         "real scans, PolarMix and LaserMix",
-        lambda ratio: (Stage(1, 0.5, REAL, "mix", _EXCHANGE),),
+        lambda ratio: (ArmStage(1, 0.5, REAL, "mix", _EXCHANGE),),
         synthetic=False,
     ),
     "town": Arm(
-        "with scans of the town", lambda ratio: (Stage(1, ratio, "town"),), swept=True, budget=_TOWN
+        "with scans of the town",
+        lambda ratio: (ArmStage(1, ratio, "town"),),
+        swept=True,
+        budget=_TOWN,
     ),
     "skin": Arm(
         "with scans of the town in your skin",
-        lambda ratio: (Stage(1, ratio, "skin"),),
+        lambda ratio: (ArmStage(1, ratio, "skin"),),
         swept=True,
         budget=_SKIN,
     ),
     "generator": Arm(
         "with generated scans",
-        lambda ratio: (Stage(1, ratio, "generator"),),
+        lambda ratio: (ArmStage(1, ratio, "generator"),),
         swept=True,
         budget=GENERATOR_BUDGET,
     ),
@@ -128,7 +131,7 @@ ARMS: dict[str, Arm] = {
     ),
     "paste": Arm(
         "real scans, rare objects pasted",
-        lambda ratio: (Stage(1, 0.5, REAL, "mix", _RARE),),
+        lambda ratio: (ArmStage(1, 0.5, REAL, "mix", _RARE),),
         budget=_SKIN,
     ),
 }
@@ -165,12 +168,12 @@ class Row:
         """The row in tables."""
         return self.arm.title if self.ratio is None else f"{self.arm.title}, {100 * self.ratio:g} %"
 
-    def stages(self) -> tuple[Stage, ...]:
+    def stages(self) -> tuple[ArmStage, ...]:
         """The stages of the training."""
         return self.arm.stages(0.5 if self.ratio is None else self.ratio)
 
     @property
-    def pretraining(self) -> Stage | None:
+    def pretraining(self) -> ArmStage | None:
         """The first of several stages if it has no real scan, so that all labelled scans can share
         it."""
         first, *later = self.stages()
@@ -199,7 +202,7 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
 
 
 def policy_of(
-    stage: Stage, real: Any, objects: ObjectBank | None, fields: frozenset[str]
+    stage: ArmStage, real: Any, objects: ObjectBank | None, fields: frozenset[str]
 ) -> LabelPolicy:
     """The label policy of a stage.
 
@@ -212,7 +215,7 @@ def policy_of(
     return make_policy(stage.labels, real=real, fields=fields, **options_of(stage, real, objects))
 
 
-def options_of(stage: Stage, real: Any, objects: ObjectBank | None) -> dict[str, Any]:
+def options_of(stage: ArmStage, real: Any, objects: ObjectBank | None) -> dict[str, Any]:
     """The options of the label policy of a stage; arguments as for ``policy_of``."""
     options = dict(stage.options)
     if options.pop("objects", False):

@@ -29,7 +29,7 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.segmentation import Images, confusion
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
-from lidar_synth.lab.proof.arms import REAL, Row, Stage, policy_of
+from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
 from lidar_synth.lab.train.segmentation import RATE, endless_batches, train_segmenter
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.augment import mirrored, rotated
@@ -80,7 +80,7 @@ class Job:
     pool_folders: dict[str, Path] = field(default_factory=dict)
     start: Path | None = None
 
-    def stages(self) -> Iterator[tuple[Stage, int]]:
+    def stages(self) -> Iterator[tuple[ArmStage, int]]:
         """The stages with their iterations, which add up to ``iterations``."""
         stages = self.row.stages()
         done = 0
@@ -246,7 +246,7 @@ def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
 def _learn(
     network: RangeSegmenter,
     job: Job,
-    stage: Stage,
+    stage: ArmStage,
     mixed: MixedScans,
     count: int,
     height: Tensor,

@@ -35,7 +35,7 @@ class Hits(NamedTuple):
     normal: Floats
 
 
-class _Shape(NamedTuple):
+class _CastShape(NamedTuple):
     """A prototype as an Embree scene, with its bounding sphere.
 
     It holds a reference to its mesh: ``_SHAPES`` is keyed by ``id(mesh)``, which must not be
@@ -48,15 +48,15 @@ class _Shape(NamedTuple):
     radius: float
 
 
-_SHAPES: dict[int, _Shape] = {}
+_SHAPES: dict[int, _CastShape] = {}
 
 
-def _shape(mesh: Mesh) -> _Shape:
+def _shape(mesh: Mesh) -> _CastShape:
     shape = _SHAPES.get(id(mesh))
     if shape is None:
         low, high = mesh.bounds
         radius = float(np.linalg.norm(high - low)) / 2
-        shape = _SHAPES[id(mesh)] = _Shape(
+        shape = _SHAPES[id(mesh)] = _CastShape(
             mesh, Solid(mesh.triangles), np.asarray((low + high) / 2, np.float32), radius
         )
     return shape

@@ -192,7 +192,7 @@ def _reflectance(finish: Finish) -> float:
 
 
 @dataclass
-class Surfaces:
+class Finishes:
     """All surfaces of a scene, each a finish on one object; triangles refer to surfaces by number.
 
     ``freeze`` returns them as columns, for lookups by the surface numbers of ray hits.

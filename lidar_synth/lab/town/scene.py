@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lidar_synth.lab.town.furniture import StaticObject
 from lidar_synth.lab.town.ground import Ground
-from lidar_synth.lab.town.materials import RGB, Surfaces
+from lidar_synth.lab.town.materials import RGB, Finishes
 from lidar_synth.lab.town.meshes import Mesh, merge
 from lidar_synth.lab.town.prototype import Prototype
 
@@ -52,7 +52,7 @@ class Scene:
     """
 
     ground: Ground
-    surfaces: Surfaces = field(default_factory=Surfaces)
+    surfaces: Finishes = field(default_factory=Finishes)
     pending: list[tuple[StaticObject, float, float, float, float]] = field(default_factory=list)
     meshes: list[Mesh] = field(default_factory=list)
     placed: list[PlacedObject] = field(default_factory=list)

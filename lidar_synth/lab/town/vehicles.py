@@ -26,7 +26,7 @@ from lidar_synth.lab.town.prototype import Prototype
 
 
 @dataclass(frozen=True)
-class _Shape:
+class _CarShape:
     """Dimensions of a car or van.
 
     Args:
@@ -57,26 +57,30 @@ class _Shape:
 
 
 _SHAPES = {
-    "hatchback": _Shape(3.95, 1.68, 1.46, 0.90, 0.25, 0.43, 0.88, 0.965),
-    "compact": _Shape(4.25, 1.76, 1.48, 0.92, 0.26, 0.44, 0.89, 0.97),
-    "small": _Shape(3.50, 1.60, 1.48, 0.90, 0.21, 0.40, 0.90, 0.97, pillars=(0.60,)),
-    "sedan": _Shape(4.65, 1.78, 1.44, 0.92, 0.29, 0.44, 0.70, 0.83, boot=1.03),
-    "old_sedan": _Shape(4.70, 1.72, 1.43, 0.90, 0.31, 0.43, 0.69, 0.79, boot=0.97),
-    "estate": _Shape(4.70, 1.78, 1.47, 0.92, 0.28, 0.43, 0.92, 0.975, pillars=(0.55, 0.70, 0.83)),
-    "suv": _Shape(4.55, 1.84, 1.70, 1.06, 0.25, 0.41, 0.90, 0.97, pillars=(0.54, 0.71)),
-    "mpv": _Shape(4.40, 1.78, 1.64, 0.98, 0.18, 0.40, 0.92, 0.975, pillars=(0.54, 0.72)),
-    "minivan": _Shape(
+    "hatchback": _CarShape(3.95, 1.68, 1.46, 0.90, 0.25, 0.43, 0.88, 0.965),
+    "compact": _CarShape(4.25, 1.76, 1.48, 0.92, 0.26, 0.44, 0.89, 0.97),
+    "small": _CarShape(3.50, 1.60, 1.48, 0.90, 0.21, 0.40, 0.90, 0.97, pillars=(0.60,)),
+    "sedan": _CarShape(4.65, 1.78, 1.44, 0.92, 0.29, 0.44, 0.70, 0.83, boot=1.03),
+    "old_sedan": _CarShape(4.70, 1.72, 1.43, 0.90, 0.31, 0.43, 0.69, 0.79, boot=0.97),
+    "estate": _CarShape(
+        4.70, 1.78, 1.47, 0.92, 0.28, 0.43, 0.92, 0.975, pillars=(0.55, 0.70, 0.83)
+    ),
+    "suv": _CarShape(4.55, 1.84, 1.70, 1.06, 0.25, 0.41, 0.90, 0.97, pillars=(0.54, 0.71)),
+    "mpv": _CarShape(4.40, 1.78, 1.64, 0.98, 0.18, 0.40, 0.92, 0.975, pillars=(0.54, 0.72)),
+    "minivan": _CarShape(
         4.40, 1.79, 1.82, 1.02, 0.20, 0.37, 0.95, 0.985, pillars=(0.53,), panel_from=0.60, roof=0.86
     ),
-    "van": _Shape(4.85, 1.88, 1.95, 1.10, 0.13, 0.29, 0.96, 0.99, pillars=(0.43, 0.66), roof=0.87),
-    "panel_van": _Shape(
+    "van": _CarShape(
+        4.85, 1.88, 1.95, 1.10, 0.13, 0.29, 0.96, 0.99, pillars=(0.43, 0.66), roof=0.87
+    ),
+    "panel_van": _CarShape(
         5.30, 1.95, 2.30, 1.20, 0.13, 0.27, 0.97, 0.99, pillars=(0.40,), panel_from=0.41, roof=0.88
     ),
 }
 VANS = ("minivan", "van", "panel_van")
 
 
-def _stations(s: _Shape) -> list[Station]:
+def _stations(s: _CarShape) -> list[Station]:
     """The cross-sections of a car or van, front to rear."""
     nose = 0.66 * s.belt + 0.08
     bend = s.belt - 0.05
@@ -107,7 +111,7 @@ def _stations(s: _Shape) -> list[Station]:
     return stations
 
 
-def _seats(s: _Shape) -> Mesh:
+def _seats(s: _CarShape) -> Mesh:
     """Seats and floor, which rays through the windows hit."""
     rows = [
         0.5 * s.length - s.length * f

@@ -18,7 +18,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
-from lidar_synth.geometry.transfer.surfaces import Surfaces, estimate, rings_of
+from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
 from lidar_synth.labels.boxes import grown, joined, overlapping
 from lidar_synth.labels.edit.compose import composed, next_instance
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
@@ -325,7 +325,7 @@ def _hits(
     return rho, hits, at
 
 
-def _surfaces(part: Scan) -> Surfaces:
+def _surfaces(part: Scan) -> ScanSurfaces:
     """The surfaces of an object's returns."""
     ring, on_grid = rings_of(part)
     sensor = replace(part.sensor, firings=None) if on_grid else part.sensor

@@ -27,10 +27,10 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention
 from lidar_synth.generate.models.convolution import check_condition
 from lidar_synth.generate.models.hdit.transformer import (
-    Block,
     Expand,
     Level,
     Merge,
+    TransformerBlock,
     from_patches,
     to_patches,
 )
@@ -139,7 +139,8 @@ class HDiT(Network):
 
         def blocks(i: int, context: int = 0) -> nn.ModuleList:
             return nn.ModuleList(
-                Block(widths[i], time_width, heads[i], ratio, context) for _ in range(depths[i])
+                TransformerBlock(widths[i], time_width, heads[i], ratio, context)
+                for _ in range(depths[i])
             )
 
         upper = range(len(depths) - 1)

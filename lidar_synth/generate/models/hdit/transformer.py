@@ -131,7 +131,7 @@ class FeedForward(nn.Module):
         return torch.cat([p + self.layer(self.norm(p, time)) for p in torch.split(x, length, 1)], 1)
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Self-attention, cross-attention if the context has channels, then feed-forward.
 
     The arguments are those of the three layers.

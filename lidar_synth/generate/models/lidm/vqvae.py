@@ -57,7 +57,7 @@ _STEPS: dict[Grid, _Step] = {
 }  # by stride
 
 
-class Encoding(NamedTuple):
+class Reconstruction(NamedTuple):
     """Result of a forward pass, for the training loss.
 
     Args:
@@ -151,7 +151,7 @@ class VQVAE(Network):
         cells = self.patch[0] * self.patch[1]
         attends = [level in attention_levels for level in range(len(widths))]
         levels = (widths, steps, blocks, attends, attention, groups)
-        self.encoder = Encoder(cells * channels, latent_channels, width, *levels)
+        self.encoder = ImageEncoder(cells * channels, latent_channels, width, *levels)
         self.to_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.from_latent = nn.Conv2d(latent_channels, latent_channels, 1)
         self.decoder = Decoder(cells * (channels + mask), latent_channels, *levels)
@@ -181,7 +181,7 @@ class VQVAE(Network):
             else output
         )
 
-    def forward(self, x: Tensor) -> Encoding:
+    def forward(self, x: Tensor) -> Reconstruction:
         """Encode and decode images (B, C, H, W).
 
         In training mode, this updates the running statistics of the latents and the codes of an
@@ -195,7 +195,7 @@ class VQVAE(Network):
             self.codebook.follow(z.detach(), index)
         through = z + (quantised - z).detach() if len(self.codebook) else z
         gap = (z - quantised.detach()).float().square().flatten(1).mean(1)
-        return Encoding(
+        return Reconstruction(
             self._decode(through), gap, (quantised - z.detach()).float().square().flatten(1).mean(1)
         )
 
@@ -211,7 +211,7 @@ class VQVAE(Network):
         return unfold(self.decoder(self.from_latent(z), self.gradient_checkpointing), self.patch)
 
 
-class Encoder(nn.Module):
+class ImageEncoder(nn.Module):
     """Images (B, C, H, W) to (B, K, h, w). Arguments are those of ``VQVAE``; ``widths`` and
     ``attends`` are per level, finest first."""
 

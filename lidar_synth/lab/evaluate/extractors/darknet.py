@@ -15,7 +15,7 @@ BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}
 """Residual blocks of each stage of the encoder, by the name of the network."""
 
 
-class _Residual(nn.Module):
+class _DarknetResidual(nn.Module):
     def __init__(self, channels: int, between: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(channels, between, 1, bias=False)
@@ -32,10 +32,12 @@ def _stage(
     name: str, conv: nn.Module, inputs: int, outputs: int, residuals: list[str]
 ) -> nn.Sequential:
     layers = [(name, conv), ("bn", nn.BatchNorm2d(outputs)), ("relu", nn.LeakyReLU(0.1))]
-    return nn.Sequential(OrderedDict(layers + [(r, _Residual(outputs, inputs)) for r in residuals]))
+    return nn.Sequential(
+        OrderedDict(layers + [(r, _DarknetResidual(outputs, inputs)) for r in residuals])
+    )
 
 
-class _Encoder(nn.Module):
+class _DarknetEncoder(nn.Module):
     def __init__(self, channels: int, layers: int, width: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(channels, width, 3, padding=1, bias=False)
@@ -57,7 +59,7 @@ class _Encoder(nn.Module):
         return maps
 
 
-class _Decoder(nn.Module):
+class _DarknetDecoder(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         for i, (inputs, outputs) in enumerate(pairwise(width << j for j in (5, 4, 3, 2, 1, 0))):
@@ -86,8 +88,8 @@ class RangeNet(nn.Module):
         self, channels: int = 5, classes: int = 20, layers: int = 53, width: int = 32
     ) -> None:
         super().__init__()
-        self.backbone = _Encoder(channels, layers, width)
-        self.segmentation_decoder = _Decoder(width)
+        self.backbone = _DarknetEncoder(channels, layers, width)
+        self.segmentation_decoder = _DarknetDecoder(width)
         if classes:
             self.segmentation_head = nn.Sequential(
                 nn.Identity(), nn.Conv2d(width, classes, 3, padding=1)

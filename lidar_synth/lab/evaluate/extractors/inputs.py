@@ -25,7 +25,7 @@ _UP = 3.0 / 180.0 * np.pi
 _DOWN = 25.0 / 180.0 * np.pi
 
 
-class Preparation(NamedTuple):
+class NetworkInputs(NamedTuple):
     """The inputs of a protocol.
 
     Args:
@@ -129,14 +129,14 @@ def _corner_rays() -> NDArray[np.float64]:
 
 
 PREPARATIONS = {
-    "r2flow": Preparation(_r2flow_image, _r2flow_cloud),
-    "lidm": Preparation(_lidm_image, _lidm_cloud),
-    "r3dpa": Preparation(_r3dpa_image, _lidm_cloud),
+    "r2flow": NetworkInputs(_r2flow_image, _r2flow_cloud),
+    "lidm": NetworkInputs(_lidm_image, _lidm_cloud),
+    "r3dpa": NetworkInputs(_r3dpa_image, _lidm_cloud),
 }
 """Inputs by the name of their protocol."""
 
 
-def preparation(name: str) -> Preparation:
+def preparation(name: str) -> NetworkInputs:
     """The inputs of a protocol.
 
     Raises:

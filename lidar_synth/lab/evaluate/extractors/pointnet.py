@@ -68,7 +68,7 @@ class _Transform(_Points):
         return matrix
 
 
-class _Encoder(_Points):
+class _PointEncoder(_Points):
     def __init__(self, widths: tuple[int, int, int], hidden: tuple[int, int]) -> None:
         super().__init__(widths)
         self.stn = _Transform(widths, hidden)
@@ -94,7 +94,7 @@ class PointNet(nn.Module):
         classes: int = 16,
     ) -> None:
         super().__init__()
-        self.feat = _Encoder(widths, hidden)
+        self.feat = _PointEncoder(widths, hidden)
         self.fc1 = nn.Linear(widths[2], hidden[0])
         self.fc2 = nn.Linear(*hidden)
         self.fc3 = nn.Linear(hidden[1], classes)

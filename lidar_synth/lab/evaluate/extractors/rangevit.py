@@ -110,7 +110,7 @@ class _MLP(nn.Module):
         return y
 
 
-class _Block(nn.Module):
+class _TransformerBlock(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width)
@@ -124,7 +124,7 @@ class _Block(nn.Module):
         return y
 
 
-class _Encoder(nn.Module):
+class _TransformerEncoder(nn.Module):
     def __init__(
         self, stem: _Stem, size: tuple[int, int], width: int, blocks: int, heads: int
     ) -> None:
@@ -133,7 +133,7 @@ class _Encoder(nn.Module):
         self._grid = (size[0] // PATCH[0], size[1] // PATCH[1])
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, self._grid[0] * self._grid[1] + 1, width))
-        self.blocks = nn.ModuleList(_Block(width, heads) for _ in range(blocks))
+        self.blocks = nn.ModuleList(_TransformerBlock(width, heads) for _ in range(blocks))
         self.norm = nn.LayerNorm(width)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +157,7 @@ class _Encoder(nn.Module):
         return torch.cat([self.pos_embed[:, :1], resized], 1)
 
 
-class _Decoder(nn.Module):
+class _ConvolutionDecoder(nn.Module):
     def __init__(self, width: int, hidden: int, decoded: int) -> None:
         super().__init__()
         self.up_conv_block = nn.ModuleDict(
@@ -210,8 +210,8 @@ class RangeViT(nn.Module):
         self.channels = channels
         stem = _Stem(channels, base, hidden, transformer[0])
         parts = {
-            "encoder": _Encoder(stem, size, *transformer),
-            "decoder": _Decoder(transformer[0], hidden, decoded),
+            "encoder": _TransformerEncoder(stem, size, *transformer),
+            "decoder": _ConvolutionDecoder(transformer[0], hidden, decoded),
         }
         self.rangevit = nn.ModuleDict(parts)
         self.register_buffer("image_mean", torch.tensor(MEAN)[None, :, None, None])

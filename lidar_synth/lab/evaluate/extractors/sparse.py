@@ -38,7 +38,7 @@ class Pairs(NamedTuple):
         return Pairs(self.target, self.source, self.sizes)
 
 
-class Level(NamedTuple):
+class SparseLevel(NamedTuple):
     """The voxels of one resolution.
 
     Args:
@@ -100,14 +100,14 @@ def neighbours(voxels: Tensor) -> Pairs:
     )
 
 
-def pyramid(voxels: Tensor, depth: int) -> list[Level]:
+def pyramid(voxels: Tensor, depth: int) -> list[SparseLevel]:
     """The levels of a network: each halves the resolution of the one before.
 
     Args:
         voxels: (N, 3) int64 from 0, unique and sorted.
         depth: number of levels.
     """
-    levels = [Level(voxels, neighbours(voxels))]
+    levels = [SparseLevel(voxels, neighbours(voxels))]
     for _ in range(depth - 1):
         fine = levels[-1].voxels
         packed, parent = torch.unique(keys(fine >> 1), return_inverse=True)
@@ -116,7 +116,7 @@ def pyramid(voxels: Tensor, depth: int) -> list[Level]:
         offset = 4 * x + 2 * y + z
         order = offset.argsort(stable=True)
         children = Pairs(order, parent[order], torch.bincount(offset, minlength=8).tolist())
-        levels.append(Level(coarse, neighbours(coarse), children, parent))
+        levels.append(SparseLevel(coarse, neighbours(coarse), children, parent))
     return levels
 
 

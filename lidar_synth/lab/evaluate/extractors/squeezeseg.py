@@ -45,7 +45,7 @@ def _pool() -> nn.MaxPool2d:
     return nn.MaxPool2d(3, stride=(1, 2), padding=1)
 
 
-class _Encoder(nn.Module):
+class _FireEncoder(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.conv1a = nn.Sequential(nn.Conv2d(channels, 64, 3, stride=(1, 2), padding=1), nn.ReLU())
@@ -64,7 +64,7 @@ class _Encoder(nn.Module):
         return maps
 
 
-class _Decoder(nn.Module):
+class _FireDecoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.firedec10 = Fire(512, 64, 128, upsample=True)
@@ -90,8 +90,8 @@ class SqueezeSeg(nn.Module):
 
     def __init__(self, channels: int = 5, classes: int = 20) -> None:
         super().__init__()
-        self.backbone = _Encoder(channels)
-        self.segmentation_decoder = _Decoder()
+        self.backbone = _FireEncoder(channels)
+        self.segmentation_decoder = _FireDecoder()
         self.segmentation_head = nn.Sequential(nn.Identity(), nn.Conv2d(64, classes, 3, padding=1))
 
     def decode(self, x: Tensor) -> Tensor:

@@ -23,8 +23,8 @@ from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some
 from lidar_synth.lab.evaluate.extractors.pooling import mean_over_rings
 from lidar_synth.lab.evaluate.extractors.sparse import (
     Convolution,
-    Level,
     Pairs,
+    SparseLevel,
     interpolate,
     keys,
     mean_in,
@@ -36,7 +36,7 @@ VOXEL = 0.05
 """Size of a voxel, metres."""
 
 
-class _Block(nn.Module):
+class _SparseBlock(nn.Module):
     """Convolution, normalisation, ReLU; ``net`` names them as in the archives."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -47,7 +47,7 @@ class _Block(nn.Module):
         return F.relu(self.net[1](self.net[0](features, pairs, count)))
 
 
-class _Residual(nn.Module):
+class _SparseResidual(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         first = Convolution(inputs, outputs, 3)
@@ -89,15 +89,17 @@ class MinkowskiNet(nn.Module):
         )
         for i in range(4):
             down = nn.Sequential(
-                _Block(w[i], w[i]), _Residual(w[i], w[i + 1]), _Residual(w[i + 1], w[i + 1])
+                _SparseBlock(w[i], w[i]),
+                _SparseResidual(w[i], w[i + 1]),
+                _SparseResidual(w[i + 1], w[i + 1]),
             )
             self.add_module(f"stage{i + 1}", down)
             out = w[i + 5]
-            after = nn.Sequential(_Residual(out + w[3 - i], out), _Residual(out, out))
-            self.add_module(f"up{i + 1}", nn.ModuleList([_Block(w[i + 4], out), after]))
+            after = nn.Sequential(_SparseResidual(out + w[3 - i], out), _SparseResidual(out, out))
+            self.add_module(f"up{i + 1}", nn.ModuleList([_SparseBlock(w[i + 4], out), after]))
         self.classifier = nn.Sequential(nn.Linear(w[8], classes))
 
-    def forward(self, features: Tensor, levels: list[Level]) -> Tensor:
+    def forward(self, features: Tensor, levels: list[SparseLevel]) -> Tensor:
         """(N, inputs) features of the voxels of the first of five levels to (N, widths[8])."""
         maps = [self._stem(features, levels[0])]
         for i in range(4):
@@ -107,12 +109,12 @@ class MinkowskiNet(nn.Module):
             x = self._up(i, x, maps[3 - i], levels)
         return x
 
-    def _stem(self, features: Tensor, level: Level) -> Tensor:
+    def _stem(self, features: Tensor, level: SparseLevel) -> Tensor:
         first, normalise, _, second, normalise_again = self.stem
         x = F.relu(normalise(first(features, level.neighbours)))
         return F.relu(normalise_again(second(x, level.neighbours)))
 
-    def _down(self, i: int, x: Tensor, levels: list[Level]) -> Tensor:
+    def _down(self, i: int, x: Tensor, levels: list[SparseLevel]) -> Tensor:
         coarse = levels[i + 1]
         block, *residuals = self.get_submodule(f"stage{i + 1}").children()
         x = block(x, coarse.children, len(coarse.voxels))
@@ -120,7 +122,7 @@ class MinkowskiNet(nn.Module):
             x = residual(x, coarse.neighbours)
         return x
 
-    def _up(self, i: int, x: Tensor, skip: Tensor, levels: list[Level]) -> Tensor:
+    def _up(self, i: int, x: Tensor, skip: Tensor, levels: list[SparseLevel]) -> Tensor:
         children = levels[4 - i].children
         fine = levels[3 - i]
         assert children is not None  # only the finest level has none
@@ -144,7 +146,7 @@ class SPVCNN(MinkowskiNet):
             nn.Sequential(nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()) for a, b in pairs
         )
 
-    def forward(self, features: Tensor, levels: list[Level]) -> Tensor:
+    def forward(self, features: Tensor, levels: list[SparseLevel]) -> Tensor:
         """(N, inputs) features of the voxels of the first of five levels to (N, widths[8])."""
         points = levels[0].voxels
         maps = [self._stem(features, levels[0])]
@@ -165,7 +167,7 @@ class SPVCNN(MinkowskiNet):
         return last
 
 
-def _containing(levels: list[Level], depth: int) -> Tensor:
+def _containing(levels: list[SparseLevel], depth: int) -> Tensor:
     """The voxel of a level that contains each finest voxel."""
     index = torch.arange(len(levels[0].voxels))
     for level in levels[1 : depth + 1]:

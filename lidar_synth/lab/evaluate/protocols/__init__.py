@@ -140,7 +140,7 @@ class Reference(_Data):
     training: str | None = None
 
 
-class Counts(NamedTuple):
+class NeededScans(NamedTuple):
     """Numbers of scans that a paper compares; None = any."""
 
     real: int | None = None
@@ -163,7 +163,7 @@ class Protocol(_Data):
     name: str
     source: str = ""
     unverified: str = ""
-    needs: Counts = Counts()
+    needs: NeededScans = NeededScans()
     reference: Reference | None = None
     prepare: Preparation = Preparation()
     measures: dict[str, Measure]

@@ -17,9 +17,9 @@ from lidar_synth.lab.town.skin.features import (
     RANGES,
     ROUGH,
     STRATA,
-    Features,
     Floats,
     Ints,
+    RayFeatures,
 )
 from lidar_synth.lab.town.skin.features import features as features_of
 from lidar_synth.lab.town.skin.features import strata as strata_of
@@ -41,7 +41,7 @@ class Returns(NamedTuple):
         boxed: (N,) whether a point belongs to an object with a box.
     """
 
-    found: Features
+    found: RayFeatures
     points: Floats
     bright: Floats
     rows: Ints

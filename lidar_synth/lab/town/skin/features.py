@@ -43,7 +43,7 @@ _LEVEL = 0.3
 """Slope below which a surface is level."""
 
 
-class Features(NamedTuple):
+class RayFeatures(NamedTuple):
     """Features of N returns.
 
     Args:
@@ -66,7 +66,7 @@ class Features(NamedTuple):
     gap: Ints
 
 
-def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) -> Features:
+def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) -> RayFeatures:
     """Compute the features of a scan.
 
     Args:
@@ -87,7 +87,7 @@ def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) ->
     roughness = _roughness(rows, residual)
     kind, below = _across(rows, turn, distance, level, z, sensor.shape[0], firings)
     cell = _cells(distance, kind, z - ground_height(z, level, kind))
-    return Features(mean, residual, roughness, cell, below, gap)
+    return RayFeatures(mean, residual, roughness, cell, below, gap)
 
 
 def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
@@ -101,7 +101,7 @@ def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
     return np.float32((np.argmax(smooth) + 1.5) / 20 - 5)
 
 
-def strata(found: Features, cuts: Floats) -> Ints:
+def strata(found: RayFeatures, cuts: Floats) -> Ints:
     """(N,) stratum of each return, by its cell and the rank of its roughness.
 
     Args:

@@ -26,9 +26,9 @@ from lidar_synth.lab.town.skin.features import (
     ROUGH,
     STRATA,
     STRATUM_KIND,
-    Features,
     Floats,
     Ints,
+    RayFeatures,
     features,
     strata,
 )
@@ -193,7 +193,7 @@ class Skin:
 
     def dress(
         self,
-        found: Features,
+        found: RayFeatures,
         stratum: Ints,
         bright: Floats,
         rows: Ints,

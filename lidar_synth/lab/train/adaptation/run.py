@@ -22,7 +22,7 @@ from lidar_synth.generate.regrid import check_movable, fitting, regrid, with_cod
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.lab.train.adaptation.scans import Split, label, prepare, split
-from lidar_synth.lab.train.adaptation.stages import Stage, Work, shares, stages_for
+from lidar_synth.lab.train.adaptation.stages import AdaptationStage, Work, shares, stages_for
 from lidar_synth.lab.train.runs import require_accelerate
 from lidar_synth.lab.train.staged import StagedRuns
 
@@ -60,7 +60,7 @@ class AdaptPlan:
     sensor: Sensor
     labelled: bool
     parts: Split
-    stages: Mapping[str, Stage]
+    stages: Mapping[str, AdaptationStage]
     minutes: float
     town: int
     out: Path

@@ -33,7 +33,7 @@ UNLABELLED = 0.5
 """Share of the town's images that an autoencoder labels without having seen their labels."""
 
 
-class Stage(NamedTuple):
+class AdaptationStage(NamedTuple):
     """One training.
 
     Args:
@@ -51,16 +51,24 @@ class Stage(NamedTuple):
 
 
 STAGES = {
-    "labels": Stage("adapt_codec", 0.2, True, "the autoencoder learns to label scans, on the town"),
-    "codec": Stage("adapt_codec", 0.35, False, "the autoencoder, on your scans and the town"),
-    "flow_town": Stage("adapt_flow", 0.2, True, "the flow, on the town as your sensor sees it"),
-    "flow": Stage("adapt_flow", 0.25, False, "the flow, on your scans"),
-    "student": Stage("adapt_student", 0.2, False, "the student of few steps, on your scans"),
+    "labels": AdaptationStage(
+        "adapt_codec", 0.2, True, "the autoencoder learns to label scans, on the town"
+    ),
+    "codec": AdaptationStage(
+        "adapt_codec", 0.35, False, "the autoencoder, on your scans and the town"
+    ),
+    "flow_town": AdaptationStage(
+        "adapt_flow", 0.2, True, "the flow, on the town as your sensor sees it"
+    ),
+    "flow": AdaptationStage("adapt_flow", 0.25, False, "the flow, on your scans"),
+    "student": AdaptationStage(
+        "adapt_student", 0.2, False, "the student of few steps, on your scans"
+    ),
 }
 """Stages by name, in order."""
 
 
-def stages_for(header: Header, labelled: bool, town: int) -> dict[str, Stage]:
+def stages_for(header: Header, labelled: bool, town: int) -> dict[str, AdaptationStage]:
     """The stages of a model.
 
     Args:
@@ -78,7 +86,7 @@ def stages_for(header: Header, labelled: bool, town: int) -> dict[str, Stage]:
     return {name: stage for name, stage in STAGES.items() if name not in left_out}
 
 
-def shares(stages: Mapping[str, Stage]) -> dict[str, float]:
+def shares(stages: Mapping[str, AdaptationStage]) -> dict[str, float]:
     """The share of each stage of the limit of time."""
     return {name: stage.share for name, stage in stages.items()}
 
@@ -102,7 +110,7 @@ class Work:
     scans: Prepared
     licence: str
     town: int
-    stages: Mapping[str, Stage]
+    stages: Mapping[str, AdaptationStage]
     overrides: Mapping[str, Mapping[str, Any]]
 
     @property
