@@ -136,3 +136,26 @@ def test_no_beam_of_a_sparse_town_is_wrong_without_a_doubt() -> None:
     wrong = np.abs(np.array(fit.sensor.elevations)[:, None] - beams).min(1) > 0.05
     for elevation in np.array(fit.sensor.elevations)[wrong]:
         assert f"{elevation:.2f}" in " ".join(fit.uncertain)
+
+
+@pytest.mark.parametrize("encoder", [None, 4000])
+def test_the_firings_of_a_thinned_scan_are_not_known(encoder: int | None) -> None:
+    made = turned(azimuths=OFFSETS, firings=2170, encoder=encoder)
+    rng = np.random.default_rng(0)
+    thinned = made.scan[rng.permutation(len(made.scan))[: len(made.scan) // 3]]
+    untimed = fit_sensor([replace(thinned, time=None)])
+    assert untimed.sensor.firings is None and untimed.azimuths.offsets is None
+    assert "number of firings is not known" in " ".join(untimed.uncertain)
+    timed = fit_sensor([thinned])
+    assert timed.sensor.firings is None
+    wrong = np.asarray(timed.sensor.azimuths) - OFFSETS
+    assert np.abs(wrong - np.median(wrong)).max() < 0.1
+
+
+def test_near_returns_beside_a_beam_are_none() -> None:
+    scan = turned().scan
+    angle = np.radians(np.linspace(20, 40, 100))
+    elevation = np.radians((BEAMS[13] + BEAMS[14]) / 2)
+    wall = 0.9 * np.stack([np.cos(angle), np.sin(angle), np.full(100, np.tan(elevation))], 1)
+    fit = fit_sensor([with_points(scan, wall)])
+    assert len(fit.points) == 16

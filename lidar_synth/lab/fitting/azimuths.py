@@ -40,6 +40,11 @@ FEWEST = 10
 FEW = 100
 """A beam needs as many points in a scan."""
 
+UNEVEN = 0.23
+"""Spread of the steps between neighbouring points, in their mean, from which too many firings
+between them are missing: an encoder's is 0.21, that of points of which half are missing at random
+0.34."""
+
 
 @dataclass(frozen=True)
 class Azimuths:
@@ -90,6 +95,10 @@ def turn_of(points: Floats, ring: Integers, time: Floats | None) -> Turn:
 def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
     """Firings and offsets from some scans of a sensor with this number of beams."""
     counts = [count for turn in turns if (count := _firings(turn, beams))]
+    timed = all(turn.time is not None for turn in turns)
+    if not counts and timed:
+        by_scan = np.stack([_offsets_by_time(turn, beams) for turn in turns])
+        return Azimuths(None, None, *_combined(by_scan, beams, "time"))
     if not counts:
         return Azimuths()
     firings = float(np.median(counts))
@@ -99,7 +108,7 @@ def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
     locked = on_lattice and abs(lattice / firings - 1) < 0.02
     count = lattice if locked else round(firings)
     size = lattice if on_lattice else None
-    if all(turn.time is not None for turn in turns):
+    if timed:
         by_scan = np.stack([_offsets_by_time(turn, beams) for turn in turns])
         return Azimuths(count, size, *_combined(by_scan, beams, "time"))
     if not on_lattice:
@@ -146,8 +155,8 @@ def _combined(
 
 
 def _firings(turn: Turn, beams: int) -> float:
-    """Firings per turn: one over the mean step between neighbouring points of a beam; 0 if there
-    are too few."""
+    """Firings per turn: one over the mean step between neighbouring points of a beam; 0 if too many
+    are missing."""
     steps = []
     for beam in range(beams):
         own = np.sort(turn.azimuth[turn.ring == beam])
@@ -159,7 +168,10 @@ def _firings(turn: Turn, beams: int) -> float:
     typical = float(np.median(np.concatenate(positive)))
     # Longer steps are missing returns. An encoder makes single steps up to half as long.
     single = [step[(step > 0.3 * typical) & (step < 1.4 * typical)] for step in positive]
-    return float(np.median([1 / step.mean() for step in single if len(step)]))
+    single = [step for step in single if len(step)]
+    if np.median([step.std() / step.mean() for step in single]) > UNEVEN:
+        return 0.0
+    return float(np.median([1 / step.mean() for step in single]))
 
 
 def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:

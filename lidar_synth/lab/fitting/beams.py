@@ -54,6 +54,10 @@ WINDOW = np.radians(0.025)
 LOST = 15
 """A lost beam has at least as many points."""
 
+LOST_NEAREST = 1.5
+"""Metres; nearer points are none of a lost beam: there, a laser that stands 5 mm off leaves its
+line by 0.2 degrees."""
+
 ROUNDS = 3
 """Number of times that peaks are looked for, each time with what is known of mounting and
 motion."""
@@ -407,7 +411,7 @@ def with_lost_beams(model: Model, points: Floats) -> Model:
     ring = nearest_beams(points, model.tangents, model.heights)
     rho = np.hypot(points[:, 0], points[:, 1])
     above = points[:, 2] - model.heights[ring]
-    elevation = np.sort(np.arctan2(above, rho)[rho > NEAREST])
+    elevation = np.sort(np.arctan2(above, rho)[rho > LOST_NEAREST])
     beams = list(np.arctan(model.tangents))
     heights = list(model.heights)
     stray = elevation[_distance(elevation, np.array(beams)) > STRAY]

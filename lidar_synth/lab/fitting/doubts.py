@@ -65,7 +65,9 @@ def _listed(values: Floats) -> str:
 def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
     found = []
     if known.firings is None:
-        found.append("The number of firings is not known: too few points for each beam.")
+        found.append(
+            "The number of firings is not known: too many points of each beam are missing."
+        )
     if known.offsets is None:
         return [
             *found,

@@ -31,6 +31,16 @@ REACH = (2.0, 2.0, 3.0)
 TILT = np.radians(6.0)
 """Largest tilt about x and y, radians."""
 
+STARTS = 5
+"""Places of the grid from which a search starts, until one leads to sharp elevations; scans share
+them."""
+
+SHARP = 2.0
+"""Sharpness all around from which a place is the sensor's; at a wrong one it is 1 to 1.8."""
+
+FLAT = 1.15
+"""Sharpness up to which there are no beams."""
+
 SHIFTS = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0)
 """Distances driven during a turn that ``find_motion`` tries, metres."""
 
@@ -40,6 +50,9 @@ MOTION_POINTS = 4000
 GRID_POINTS = 9000
 """Number of points with which the grid is searched; they fill whole sectors, where pairs of points
 tell beams."""
+
+WIDE = 5
+"""Bins of a window, with whose pairs of points those within one bin are compared."""
 
 _BIN = np.radians(0.05)
 _NARROW = 128  # sectors within which a tilt of a degree moves no point by more than 0.05 degrees
@@ -59,8 +72,16 @@ def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
     chosen = [
         scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
     ]
-    found = [_place_in(scan, seed) for scan in chosen if len(scan)]
-    _, place = max(found, key=lambda item: item[0])
+    chosen = [scan for scan in chosen if len(scan)]
+    best = FLAT
+    place = np.zeros(5)
+    for scan in chosen:
+        sharp, found = _place_in(scan, -(-STARTS // len(chosen)), seed)
+        if sharp > best:
+            best = sharp
+            place = found
+        if best > SHARP:
+            break
     return place[:3], tilt_of(place[3:])
 
 
@@ -101,21 +122,31 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
     return climb(lambda motion: -mean_residual(motion), min(tried, key=mean_residual), step, 4)
 
 
-def _place_in(points: Floats, seed: int) -> tuple[float, Floats]:
-    """The sharpness of one scan's elevations at its best place, and the place."""
+def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
+    """The sharpness of one scan's elevations at its best place, and the place, from some starts on
+    the grid."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
     part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     dense = points[(part * _NARROW / 2).astype(np.int64) % max(len(points) // GRID_POINTS, 1) == 0]
     if len(points) > POINTS:
         points = points[np.random.default_rng(seed).choice(len(points), POINTS, replace=False)]
-    place = _best_on_grid(dense)
-    for sectors in _SECTORS:
-        step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
-        step = step * (1 if sectors < 32 else 4)
-        place = climb(
-            partial(_sharpness_within, dense if sectors > 32 else points, sectors), place, step
-        )
-    return sector_sharpness(points, place, 1), place
+    best = FLAT
+    found = np.zeros(5)
+    for place in _best_on_grid(dense, starts):
+        for sectors in _SECTORS:
+            value = partial(_sharpness_within, dense if sectors > 32 else points, sectors)
+            step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
+            step = step * (1 if sectors < 32 else 4)
+            place = climb(value, place, step)
+            sharp = value(place)
+            if sharp <= best:  # fewer sectors do not raise it
+                break
+        else:
+            best = sharp
+            found = place
+        if best > SHARP:
+            break
+    return best, found
 
 
 def tilt_of(angles: Floats) -> Floats:
@@ -136,14 +167,21 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     elevation = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
     azimuth = np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5
     rows = round(np.pi / _BIN)
-    row = np.clip(((elevation / np.pi + 0.5) * rows).astype(np.int64), 0, rows - 1)
-    sector = np.minimum((azimuth * sectors).astype(np.int64), sectors - 1)
-    fine = np.bincount(sector * rows + row, minlength=rows * sectors).astype(np.float64)
-    total = np.concatenate([[0.0], np.cumsum(fine)])
-    coarse = total[5:] - total[:-5]
+    row = np.clip((elevation / np.pi + 0.5) * rows, 0, rows - 1).astype(np.int32)
+    sector = np.minimum((azimuth * sectors).astype(np.int32), sectors - 1)
+    # Bins that hold points, since most hold none.
+    ordered = np.sort(sector * np.int32(rows) + row)
+    first = np.flatnonzero(np.diff(ordered, prepend=-1))
+    count = np.diff(first, append=len(ordered)).astype(np.float64)
+    filled = ordered[first]
     # Pairs of points in a bin; counting a point with itself would reward emptiness where points are
     # few.
-    return float(25 * (fine * (fine - 1)).sum() / max((coarse * (coarse - 1)).sum(), 1.0))
+    fine = float((count * (count - 1)).sum())
+    coarse = WIDE * fine
+    for lag in range(1, WIDE):
+        shared = np.maximum(WIDE - (filled[lag:] - filled[:-lag]), 0)
+        coarse += float(2 * (shared * count[lag:] * count[:-lag]).sum())
+    return WIDE**2 * fine / max(coarse, 1.0)
 
 
 def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
@@ -151,35 +189,53 @@ def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
     return sector_sharpness(points, place, sectors) if (np.abs(place) <= limit).all() else 0.0
 
 
-def _best_on_grid(points: Floats) -> Floats:
+def _best_on_grid(points: Floats, count: int) -> list[Floats]:
+    """The places of the grid where elevations concentrate most within narrow sectors, the best one
+    first."""
     sides = (-1.2, 0.0, 1.2)
     heights = (-0.2, 0.6, 1.4, 2.2)
     tilts = np.radians([-5.0, -2.5, 0.0, 2.5, 5.0])
     places = [np.array(place) for place in itertools.product(sides, sides, heights, tilts, tilts)]
-    return max(places, key=lambda place: sector_sharpness(points, place, _NARROW))
+    return sorted(places, key=lambda place: -sector_sharpness(points, place, _NARROW))[:count]
 
 
 def climb(
     value: Callable[[Floats], float], place: Floats, step: Floats, halvings: int = 6
 ) -> Floats:
-    """Pattern search: the best neighbour along each axis, with steps that halve when none is
-    better.
+    """Pattern search (Hooke and Jeeves): steps along each axis in turn, then as far again the same
+    way while it helps.
 
     Args:
         value: what to make as large as possible.
         place: (K,) where to start.
-        step: (K,) length of the first steps; axes with 0 stay.
+        step: (K,) length of the first steps, which halve when none is better; axes with 0 stay.
         halvings: number of times that the steps halve.
     """
     best = value(place)
-    moves = np.concatenate([np.diag(step), -np.diag(step)])[np.tile(step > 0, 2)]
     for _ in range(halvings):
-        while True:
-            near = [place + move for move in moves]
-            values = [value(other) for other in near]
-            if max(values) <= best + 1e-6 * abs(best):
-                break
-            best = max(values)
-            place = near[int(np.argmax(values))]
-        moves = moves / 2
+        found, reached = _explored(value, place, best, step)
+        while reached > best:
+            ahead = 2 * found - place
+            place = found
+            best = reached
+            found, reached = _explored(value, ahead, value(ahead), step)
+            if reached <= best:
+                found, reached = _explored(value, place, best, step)
+        step = step / 2
     return place
+
+
+def _explored(
+    value: Callable[[Floats], float], place: Floats, best: float, step: Floats
+) -> tuple[Floats, float]:
+    """The place after one step along each axis, where it is better, and its value."""
+    for axis in np.flatnonzero(step):
+        for side in (step[axis], -step[axis]):
+            other = place.copy()
+            other[axis] += side
+            reached = value(other)
+            if reached > best + 1e-6 * abs(best):
+                place = other
+                best = reached
+                break
+    return place, best
