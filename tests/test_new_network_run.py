@@ -14,7 +14,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models import NETWORKS, encoders_of, network_class
-from lidar_synth.generate.models.lidm.vqvae import Encoding
+from lidar_synth.generate.models.lidm.vqvae import Reconstruction
 from lidar_synth.generate.models.network import Encoder, Network
 
 
@@ -67,9 +67,9 @@ class PointwiseCodec(Network):
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         return self.decoder(z)
 
-    def forward(self, x: Tensor) -> Encoding:
+    def forward(self, x: Tensor) -> Reconstruction:
         gap = x.new_zeros(len(x))
-        return Encoding(self.decode(self.encode(x)), gap, gap)
+        return Reconstruction(self.decode(self.encode(x)), gap, gap)
 
 
 class ClassPresence(Encoder):

@@ -70,9 +70,12 @@ def _arguments(content: dict[str, Any], name: str) -> dict[str, Any]:
         )
     lasers = lasers[:, (lasers != 0).any(axis=0)]
     lasers = lasers[:, np.argsort(-lasers[0], kind="stable")]
-    columns = data_format.get("columns_per_frame") or int(
-        re.fullmatch(r"(\d{1,5})x\d{1,3}", mode)[1]
-    )  # type: ignore[index]
+    columns = data_format.get("columns_per_frame")
+    if not columns:
+        by_mode = re.fullmatch(r"(\d{1,5})x\d{1,3}", mode)
+        if by_mode is None:
+            raise ValueError(f"lidar_mode is {mode!r}, not such as '1024x10'")
+        columns = int(by_mode[1])
     profile = data_format.get("udp_profile_lidar") or ""
     range_min, range_max = next(
         (r for start, r in RANGES.items() if product.startswith(start)), (0.5, 400.0)

@@ -35,7 +35,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.codec import Latent, expected
 from lidar_synth.generate.flow.path import Example, Metric
 from lidar_synth.generate.models.convolution import Norm, WrapConv
-from lidar_synth.generate.models.lidm.vqvae import VQVAE, Encoding
+from lidar_synth.generate.models.lidm.vqvae import VQVAE, Reconstruction
 from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.generate.models.surface_codec.blocks import PATCH, to_patches
 from lidar_synth.generate.models.surface_codec.measure_noise import measure_noise
@@ -144,7 +144,7 @@ class Autoencoding(nn.Module):
             noise = torch.zeros_like(x) if noise is None else noise
             some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
             return self.nll(self.network(self._shown(x, noise), self.losses.noise * some), x)
-        encoding: Encoding = self.network(x)
+        encoding: Reconstruction = self.network(x)
         output, mask = encoding.output.float().tensor_split([self.tensors.size], 1)
         loss = self.reconstruction(output, x)
         if mask.shape[1]:
@@ -183,9 +183,9 @@ class Autoencoding(nn.Module):
         """The weighted sum over channels, a scalar."""
         sizes = [CHANNELS[name] for name in self.tensors.channels]
         loss = output.new_zeros(())
-        for name, a, b in zip(
-            self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True
-        ):  # type: ignore[no-untyped-call]
+        outputs = torch.split(output, sizes, 1)
+        wanted = torch.split(x, sizes, 1)
+        for name, a, b in zip(self.tensors.channels, outputs, wanted, strict=True):
             label = name == "label"
             part = (
                 F.binary_cross_entropy_with_logits(a, (b + 1) / 2)

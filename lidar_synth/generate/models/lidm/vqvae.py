@@ -297,9 +297,8 @@ class _Upsample(nn.Module):
         self.conv = WrapConv(channels, channels, _STEPS[stride].up)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.conv(
-            F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True)
-        )  # type: ignore[no-any-return]
+        x = F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True)
+        return self.conv(x)  # type: ignore[no-any-return]
 
 
 def _level(

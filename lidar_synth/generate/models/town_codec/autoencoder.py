@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, Residual, row_bias
+from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, NormedResidual, row_bias
 from lidar_synth.generate.models.convolution import WrapConv, check_shape, pair, reduced
 from lidar_synth.generate.models.town_codec.distributions import CellDistributions
 from lidar_synth.generate.models.town_codec.multiscale import (
@@ -219,7 +219,7 @@ class Autoencoder(BoundedAutoencoder):
 
 
 def _blocks(channels: int, depth: int, wide: Sequence[int] = ()) -> nn.Sequential:
-    return nn.Sequential(*(Residual(channels, reach) for reach in (*[1] * depth, *wide)))
+    return nn.Sequential(*(NormedResidual(channels, reach) for reach in (*[1] * depth, *wide)))
 
 
 def _unpatch(x: Tensor, channels: int) -> Tensor:
