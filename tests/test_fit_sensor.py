@@ -189,7 +189,7 @@ BAD: dict[str, tuple[Callable[[], list[Scan]], str]] = {
         "no beams|fewer than two",
     ),
     "tilted by 20 degrees": (
-        lambda: moved(some(), np.zeros(3), tilt_of(np.radians([20.0, 5]))),
+        lambda: moved(some(1), np.zeros(3), tilt_of(np.radians([20.0, 5]))),
         "no beams|fewer than two",
     ),
     "points anywhere": (
@@ -301,7 +301,8 @@ def test_the_command_writes_a_sensor_and_a_picture(
     )
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert sensor_yaml(sensor) == out.read_text()
-    bad = write(moved(some(), np.array([10.0, 4, 0]), np.eye(3)), tmp_path / "bad")
+    made = turned()
+    bad = write([made.scan[made.ring == 12]], tmp_path / "bad")
     assert run("sensor", "fit", bad, "--out", tmp_path / "bad.yaml") == 1
     assert "expected" in capsys.readouterr().err and not (tmp_path / "bad.yaml").exists()
     assert run("sensor", "fit", folder, "--out", tmp_path / "mine.txt") == 2
