@@ -195,8 +195,6 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             ConfigError: on a checkpoint of another mixture; or from the middle of an epoch with
                 another batch size, which Lightning would miscount.
         """
-        if set(state_dict) == {"seed"}:  # checkpoints before version 2 have no position
-            state_dict = {"seed": state_dict["seed"], "epoch": 0, "position": 0}
         checked_state(state_dict, self.train.mixture)
         self._resume = state_dict
         if self._batches is not None:

@@ -22,6 +22,7 @@ from small_models import write as write_pixel_model
 
 from lidar_synth import Town, adapt, load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.datasets.recordings import seen_by
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, layout_of
 from lidar_synth.generate.checkpoint import (
@@ -42,7 +43,7 @@ from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, sensor_yaml
-from lidar_synth.lab.evaluate.leakage import measured, overlap, seen_by, town
+from lidar_synth.lab.evaluate.leakage import measured, overlap, town
 from lidar_synth.lab.train.adaptation import card
 from lidar_synth.lab.train.adaptation.stages import TOWN_SEED
 from lidar_synth.lab.train.held_out import read_history

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import Report, convert
-from lidar_synth.formats.description import MARK
 from lidar_synth.geometry.projection import project, unfold, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import load_sensor
@@ -183,8 +182,6 @@ def test_real_scans_stay_real(tmp_path: Path) -> None:
         open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
     )
     assert {scan.domain for scan in open_scans(tmp_path / "out")} == {REAL}
-    (tmp_path / MARK).write_text("{}")  # above a dataset, not beside it
-    assert open_scans(tmp_path / "out")[0].domain == REAL
 
 
 def test_an_interrupted_run_marks_existing_scans_as_synthetic(tmp_path: Path) -> None:

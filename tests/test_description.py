@@ -3,7 +3,6 @@ them."""
 
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,7 @@ from lidar_synth.formats.convert import convert
 from lidar_synth.formats.description import (
     FORMAT,
     LINE,
-    MARK,
     NAME,
-    TOWN,
     Description,
     Origin,
     record,
@@ -141,9 +138,6 @@ def test_a_town_of_any_sensor_is_read_as_what_it_is(tmp_path: Path, layout: str)
     convert(source, WRITERS["range"](tmp_path / "range"), progress=False)
     read = open_scans(tmp_path / "range")
     assert np.array_equal(read.image(0).range, project(expected).range)  # type: ignore[attr-defined]
-    (tmp_path / "town" / NAME).unlink()  # as earlier versions wrote it
-    old = open_scans(tmp_path / "town")
-    assert old.sensor == sensor and Origin.of(old[0]) == Origin.of(expected)
 
 
 @pytest.mark.parametrize("to", BESIDE)
@@ -315,45 +309,6 @@ def test_a_damaged_provenance_is_refused(
     write_all(to, tmp_path, [a_scan(origin=origin)])
     with pytest.raises(DataError, match="not a short text or a number"):
         open_scans(tmp_path)[0]
-
-
-def _marked(root: Path) -> None:
-    (root / MARK).write_text('{"domain": "synthetic"}')
-
-
-def _a_town(root: Path) -> None:
-    settings = {
-        "seed": 7,
-        "interval": 0.5,
-        "layout": "kitti",
-        "sensor": SENSORS["preset"].to_dict(),
-    }
-    (root / TOWN).write_text(json.dumps(settings))
-
-
-OLDER: dict[str, tuple[Callable[[Path], None], str, dict[str, Any]]] = {
-    "marked": (_marked, "hdl64e_kitti", {}),
-    "town": (_a_town, "os1_128", {"made_by": "town", "seed": 7, "interval": 0.5}),
-}
-
-
-@pytest.mark.parametrize("name", OLDER)
-def test_folders_of_earlier_versions_stay_synthetic(tmp_path: Path, name: str) -> None:
-    mark, sensor, provenance = OLDER[name]
-    write_all("kitti_object", tmp_path, [a_scan()])
-    (tmp_path / NAME).unlink()
-    mark(tmp_path)
-    source = open_scans(tmp_path)
-    assert source.sensor.name == sensor and Origin.of(source[0]) == Origin(SYNTHETIC, provenance)
-
-
-@pytest.mark.parametrize("content", ["{", '{"sensor": 5}', '{"seed": [1]}'])
-def test_a_damaged_town_is_refused(tmp_path: Path, content: str) -> None:
-    write_all("kitti_object", tmp_path, [a_scan()])
-    (tmp_path / NAME).unlink()
-    (tmp_path / TOWN).write_text(content)
-    with pytest.raises(DataError, match=TOWN):
-        open_scans(tmp_path)
 
 
 def test_users_describe_their_own_folders(tmp_path: Path) -> None:

@@ -16,14 +16,24 @@ from layouts import some_scan, write_all
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
-from lidar_synth.datasets.recordings import NOTE, frames_of
+from lidar_synth.datasets.recordings import (
+    FILES,
+    KITTI360_SPLITS,
+    NOTE,
+    Recordings,
+    frames_of,
+    seen_by,
+    whole,
+)
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans
+from lidar_synth.formats.semantic_kitti import SPLITS
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.evaluate import PROTOCOLS, evaluate
-from lidar_synth.lab.evaluate.leakage import measured, overlap, recordings_of, seen_by, town
+from lidar_synth.lab.evaluate.leakage import measured, overlap, recordings_of, town
+from lidar_synth.lab.importers import lidm
 from lidar_synth.lab.town.export import SETTINGS
 
 
@@ -145,8 +155,9 @@ def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None
     assert result.exit_code == 2
 
 
-def trained_on(folder: Path, data: dict[str, object]) -> None:
-    (folder / NOTE).write_text(json.dumps({"seed": 0, "trained_on": data}))
+def trained_on(folder: Path, seen: Recordings) -> None:
+    note = {"seed": 0, "trained_on": "?", "seen": seen.to_list()}
+    (folder / NOTE).write_text(json.dumps(note))
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -155,11 +166,10 @@ def test_training_data_is_refused_as_reference(
 ) -> None:
     real, fake = (shutil.copytree(folder, tmp_path / folder.name) for folder in folders)
     call = ["evaluate", str(real), str(fake), "--protocol", "town", "--json"]
-    trained_on(
-        fake, {"path": f"{real.parent}/../{tmp_path.name}/real", "split": None if same else "train"}
-    )
+    path = f"{real.parent}/../{tmp_path.name}/real"
+    trained_on(fake, whole(FILES, [path if same else f"{path}#train"]))
     by_path = CliRunner().invoke(app, call)
-    trained_on(fake, {"town": 3000, "seed": 5})
+    trained_on(fake, town(5))
     (real / SETTINGS).write_text(json.dumps({"seed": 5 if same else 6}))
     by_town = CliRunner().invoke(app, call)
     for result in (by_path, by_town):
@@ -226,16 +236,22 @@ def refused(result: Result) -> str | None:
     return str(result.exception)
 
 
-LIDM_SOURCE = {"source": "https://github.com/hancyran/LiDAR-Diffusion", "split": "lidm/train"}
-OLDER: dict[str, dict[str, Any]] = {
-    "own lidm/train": {"data": {"path": "/data", "layout": "kitti360", "split": "lidm/train"}},
-    "own r2flow/train": {"data": {"path": "/data", "layout": None, "split": "r2flow/train"}},
-    "own SemanticKITTI": {"data": {"path": "/data", "layout": "semantic_kitti", "split": "train"}},
-    "imported R2Flow": {"data": "KITTI-360", "split": "r2flow/train"},
-    "imported LiDM": {"data": "KITTI-360", **LIDM_SOURCE},
-    "imported LiDM of maps": {"data": "SemanticKITTI", **LIDM_SOURCE},
+def of_splits(*splits: str) -> dict[str, Any]:
+    """The provenance of a model that was trained on splits of KITTI-360."""
+    seen = Recordings()
+    for split in splits:
+        seen |= frames_of("kitti360", KITTI360_SPLITS[split] or ())
+    return {"data": "?", "seen": seen.to_list()}
+
+
+TRAINED: dict[str, dict[str, Any]] = {
+    "own lidm/train": of_splits("lidm/train"),
+    "own r2flow/train": of_splits("r2flow/train"),
+    "own SemanticKITTI": {"seen": frames_of("semantic_kitti", SPLITS["train"]).to_list()},
+    "imported LiDM": {"seen": lidm.seen("KITTI-360", generates=True).to_list()},
+    "imported LiDM of maps": {"seen": lidm.seen("SemanticKITTI", generates=True).to_list()},
 }
-"""Provenances of version 0.1.0, which name splits."""
+"""Provenances of models."""
 
 
 @pytest.mark.parametrize(
@@ -245,9 +261,8 @@ OLDER: dict[str, dict[str, Any]] = {
         ("own lidm/train", "lidm/val", []),
         ("own r2flow/train", "r2flow/test", []),
         ("own r2flow/train", "lidm/val", ["0003"]),
-        ("imported R2Flow", "r2flow/train", ["0003"]),
-        ("imported R2Flow", "r2flow/test", []),
-        ("imported R2Flow", "lidm/train", []),  # it has drives 00 and 02 of it here
+        ("own r2flow/train", "r2flow/train", ["0003"]),
+        ("own r2flow/train", "lidm/train", []),  # it has drives 00 and 02 of it here
         ("imported LiDM", "r2flow/test", ["0000", "0002"]),
         ("imported LiDM", "lidm/val", []),
         ("imported LiDM of maps", "r2flow/test", ["0000", "0002"]),  # its autoencoder's
@@ -256,9 +271,7 @@ OLDER: dict[str, dict[str, Any]] = {
 def test_overlapping_drives_are_refused(
     model: str, split: str, shared: list[str], kitti360: Path, fake: Path
 ) -> None:
-    (fake / NOTE).write_text(
-        json.dumps({"trained_on": "?", "seen": seen_by(OLDER[model]).to_list()})
-    )
+    trained_on(fake, seen_by(TRAINED[model]))
     message = refused(judge(kitti360, fake, "--split", split))
     if not shared:
         assert message is None
@@ -270,17 +283,17 @@ def test_overlapping_drives_are_refused(
 
 
 @pytest.mark.parametrize("parent", ["teacher", "weaker", "init", "codec"])
-@pytest.mark.parametrize("model", OLDER)
+@pytest.mark.parametrize("model", TRAINED)
 def test_training_data_of_parent_checkpoints_counts(model: str, parent: str) -> None:
-    own = {"data": {"town": 5, "seed": 1}}
-    child = own | {f"{parent}_provenance": {"data": "?", "init_provenance": OLDER[model]}}
-    assert seen_by(OLDER[model])
-    assert seen_by(child) == seen_by(own) | seen_by(OLDER[model])
+    own = {"seen": town(1).to_list()}
+    child = own | {f"{parent}_provenance": {"data": "?", "init_provenance": TRAINED[model]}}
+    assert seen_by(TRAINED[model])
+    assert seen_by(child) == seen_by(own) | seen_by(TRAINED[model])
 
 
 def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
     def trained(ids: list[str]) -> None:
-        (fake / NOTE).write_text(json.dumps({"seen": frames_of("kitti_raw", ids).to_list()}))
+        trained_on(fake, frames_of("kitti_raw", ids))
 
     trained(["2011_09_30_drive_0028_sync/0000001103"])
     assert "KITTI 2011_09_30_drive_0028 (frame 1103)" in str(
@@ -289,7 +302,7 @@ def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
     trained(["2011_09_30_drive_0028_sync/0000000003", "2011_10_03_drive_0027_sync/0000000003"])
     assert refused(judge(odometry, fake, "--split", "val")) is None
     assert "2011_10_03_drive_0027 (frame 3)" in str(refused(judge(odometry, fake)))
-    (fake / NOTE).write_text(json.dumps({"seen": seen_by(OLDER["imported LiDM"]).to_list()}))
+    trained_on(fake, seen_by(TRAINED["imported LiDM"]))
     assert refused(judge(odometry, fake, "--split", "val")) is None
     assert refused(judge(odometry, fake, "--split", "train")) is not None
 
@@ -297,12 +310,12 @@ def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
 def test_an_exported_town_is_not_the_dataset_whose_layout_it_has(
     kitti360: Path, fake: Path, tmp_path: Path
 ) -> None:
-    town = shutil.copytree(kitti360, tmp_path / "town")
-    (town / SETTINGS).write_text(json.dumps({"seed": 4}))
-    (fake / NOTE).write_text(json.dumps({"seen": seen_by(OLDER["own lidm/train"]).to_list()}))
-    assert refused(judge(town, fake)) is None
-    (fake / NOTE).write_text(json.dumps({"trained_on": {"town": 100, "seed": 4}}))
-    assert "town seed 4 (all frames)" in str(refused(judge(town, fake)))
+    exported = shutil.copytree(kitti360, tmp_path / "town")
+    (exported / SETTINGS).write_text(json.dumps({"seed": 4}))
+    trained_on(fake, seen_by(TRAINED["own lidm/train"]))
+    assert refused(judge(exported, fake)) is None
+    trained_on(fake, town(4))
+    assert "town seed 4 (all frames)" in str(refused(judge(exported, fake)))
 
 
 def test_unknown_training_data_is_reported(kitti360: Path, fake: Path) -> None:
@@ -325,7 +338,7 @@ def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake
 
 def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path: Path) -> None:
     bank = tmp_path / "bank"
-    write_bank(bank, [some_image(i) for i in range(2)], provenance=OLDER["own lidm/train"])
+    write_bank(bank, [some_image(i) for i in range(2)], provenance=TRAINED["own lidm/train"])
     assert "2013_05_28_drive_0002_sync" in str(
         refused(judge(kitti360, bank, "--split", "r2flow/test"))
     )
@@ -417,24 +430,19 @@ DRIVES = {
 """As R2Flow's and LiDM's public code list them; KITTI-360 has no drive 1."""
 
 MODELS: dict[str, tuple[dict[str, Any], set[int]]] = {
-    **{
-        f"own {s}": ({"data": {"path": "/data", "layout": "kitti360", "split": s}}, d)
-        for s, d in DRIVES.items()
-        if s != "all"
-    },
-    "imported R2Flow": (OLDER["imported R2Flow"], DRIVES["r2flow/train"]),
-    "imported LiDM": (OLDER["imported LiDM"], DRIVES["lidm/train"]),
-    "imported LiDM of maps": (OLDER["imported LiDM of maps"], DRIVES["lidm/train"]),
+    **{f"own {s}": (of_splits(s), d) for s, d in DRIVES.items() if s != "all"},
+    "imported LiDM": (TRAINED["imported LiDM"], DRIVES["lidm/train"]),
+    "imported LiDM of maps": (TRAINED["imported LiDM of maps"], DRIVES["lidm/train"]),
     "R2Flow adapted to the town": (
-        {"data": {"town": 5, "seed": 1}, "init_provenance": OLDER["imported R2Flow"]},
+        {"seen": town(1).to_list(), "init_provenance": TRAINED["own r2flow/train"]},
         DRIVES["r2flow/train"],
     ),
     "student of an adapted LiDM": (
         {
-            "data": {"town": 5, "seed": 1},
+            "seen": town(1).to_list(),
             "teacher_provenance": {
-                "data": {"town": 2, "seed": 2},
-                "init_provenance": OLDER["imported LiDM"],
+                "seen": town(2).to_list(),
+                "init_provenance": TRAINED["imported LiDM"],
             },
         },
         DRIVES["lidm/train"],

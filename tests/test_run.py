@@ -314,15 +314,7 @@ def distilling(scans: Path, folder: Path, teacher: Path) -> Path:
     )
 
 
-def strip_settings(path: Path) -> None:
-    """Make a selection one of version 0.1.0."""
-    with np.load(path) as values:
-        held = {name: values[name] for name in values if name != "settings"}
-    np.savez(path, **held)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("old", [False, True], ids=["", "of version 0.1.0"])
 @pytest.mark.parametrize(
     ("override", "named"),
     [
@@ -335,7 +327,7 @@ def strip_settings(path: Path) -> None:
     ],
 )
 def test_a_selection_of_other_settings_is_refused(
-    override: str, named: str, old: bool, scans: Path, teacher: Path, tmp_path: Path
+    override: str, named: str, scans: Path, teacher: Path, tmp_path: Path
 ) -> None:
     config = distilling(scans, tmp_path, teacher)
     call("distill", config)
@@ -348,20 +340,7 @@ def test_a_selection_of_other_settings_is_refused(
         )
         save_checkpoint(tmp_path / "other.safetensors", header, checkpoint.networks)
         override = f"teacher={tmp_path / 'other.safetensors'}"
-    if old:
-        strip_settings(run / "selection.npz")
-        if not named.startswith(("intervals", "selection.candidates")):
-            with pytest.warns(UserWarning, match="kept no settings: only intervals"):
-                call("distill", config, override)
-            return
     before = (run / "config.yaml").read_bytes()
-    if old:
-        with (
-            pytest.warns(UserWarning, match="kept no settings"),
-            pytest.raises(ConfigError, match=re.escape(named)),
-        ):
-            call("distill", config, override)
-        return
     with pytest.raises(
         ConfigError, match=rf"selection.npz, which was made with .*{re.escape(named)}"
     ):

@@ -7,10 +7,11 @@ import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 
+from lidar_synth.datasets.recordings import seen_by
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import load_checkpoint
 from lidar_synth.generate.loading import find_model
-from lidar_synth.lab.evaluate.leakage import overlap, seen_by, town
+from lidar_synth.lab.evaluate.leakage import overlap, town
 from lidar_synth.lab.train import TrainConfig, load_config, precision, run
 from lidar_synth.lab.train.start import start_networks
 

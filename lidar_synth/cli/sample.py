@@ -1,12 +1,11 @@
 """``lidar-synth sample``: generates scans with a model."""
 
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lidar_synth.datasets.recordings import NOTE
+from lidar_synth.datasets.recordings import NOTE, seen_by
 
 
 def sample(
@@ -83,7 +82,6 @@ def sample(
     from lidar_synth.formats import WRITERS
     from lidar_synth.generate.loading import load_generator
 
-    leakage = import_module("lidar_synth.lab.evaluate.leakage")
     writer = choose("--to", to, WRITERS)(out)
     precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
     generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
@@ -102,7 +100,7 @@ def sample(
         **({} if columns is None else {"columns": columns}),
     }
     provenance = generator.header.provenance
-    trained = {"trained_on": provenance["data"], "seen": leakage.seen_by(provenance).to_list()}
+    trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
     with claimed(writer.root / NOTE, settings | trained):
         missing = [i for i in range(count) if not writer.complete(i)]
         with tqdm(total=len(missing), desc="scans", unit="scan") as bar:

@@ -154,6 +154,25 @@ def whole(dataset: str, drives: Iterable[str]) -> Recordings:
     return Recordings({(dataset, drive): None for drive in drives})
 
 
+def seen_by(provenance: Mapping[str, Any]) -> Recordings:
+    """All recordings that influenced weights, also through teachers, initial weights and
+    autoencoders.
+
+    Raises:
+        DataError: on invalid recordings.
+    """
+    return Recordings.from_list(provenance.get("seen", ())) | inherited(provenance)
+
+
+def inherited(provenance: Mapping[str, Any]) -> Recordings:
+    """The recordings behind the checkpoints from which weights were made; raises as ``seen_by``."""
+    seen = Recordings()
+    for key, value in provenance.items():
+        if key.endswith("_provenance") and isinstance(value, Mapping):
+            seen |= seen_by(value)
+    return seen
+
+
 def frames_of(layout: str, ids: Iterable[str]) -> Recordings:
     """The recordings behind the ids of scans, or of whole drives.
 

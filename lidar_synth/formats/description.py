@@ -17,8 +17,6 @@ say which scan has which.
 
 For your own folder, ``{"format": "lidar-synth-scans/1", "sensor": "os1_128"}`` is enough: the name
 of a preset, or the keys of ``sensors.yaml``. Without ``origins`` the scans are real.
-
-Folders of earlier versions have ``synthetic.json`` or ``town.json`` instead, which are read too.
 """
 
 import json
@@ -42,12 +40,6 @@ NAME = "scans.json"
 
 FORMAT = "lidar-synth-scans/1"
 _FORMATS = "lidar-synth-scans/"  # of any version
-
-MARK = "synthetic.json"
-"""File by which earlier versions marked all scans of a folder as synthetic."""
-
-TOWN = "town.json"
-"""File in the root of a town, with its settings."""
 
 DOMAINS = {"real": REAL, "synthetic": SYNTHETIC}
 
@@ -214,9 +206,8 @@ def read_description(root: Path, plain: bool = False) -> Description | None:
     folders = [folder, *folder.parents][:LEVELS]
     first = sum(1 for _ in takewhile(lambda each: _OF_A_LAYOUT.fullmatch(each.name), folders[:-1]))
     for each in folders[: first + 1]:
-        for name, read in ((NAME, _current), (TOWN, _of_town), (MARK, _of_mark)):
-            if (each / name).is_file():
-                return read(each / name)
+        if (each / NAME).is_file():
+            return _current(each / NAME)
     return _above(folders[first:]) if plain else None
 
 
@@ -254,26 +245,6 @@ def _current(path: Path) -> Description:
             expected,
             "Restore it; or remove it and name the sensor: --sensor (sensor=...).",
         ) from error
-
-
-def _of_mark(path: Path) -> Description:
-    return Description(None, (Origin(SYNTHETIC),))
-
-
-def _of_town(path: Path) -> Description:
-    """The description in the settings of a town, which earlier versions wrote without
-    ``scans.json``."""
-    expected = "the settings of a town"
-    settings = parse_json(read_text(path, expected, LONGEST), str(path), expected)
-    facts = settings if isinstance(settings, dict) else {}
-    provenance = {"made_by": "town"} | {
-        key: facts[key] for key in ("seed", "interval") if key in facts
-    }
-    try:
-        sensor = Sensor.from_dict(facts["sensor"]) if "sensor" in facts else None
-        return Description(sensor, (Origin(SYNTHETIC, check_provenance(provenance)),))
-    except ValueError as error:
-        raise DataError(f"{path} is damaged ({error})", expected) from error
 
 
 def record(root: Path, sensor: Sensor, origin: Origin) -> Description:

@@ -12,7 +12,7 @@ from lidar_synth.files.disk import write_file
 from lidar_synth.files.parsing import read_facts
 
 Provenances = list[dict[str, Any]]
-"""Of checkpoints; ``evaluate.leakage.seen_by`` finds the training data in each."""
+"""Of checkpoints; ``datasets.recordings.seen_by`` finds the training data in each."""
 
 
 def models_of(path: Path) -> Provenances:

@@ -7,7 +7,6 @@ can name what differs.
 
 import os
 import sys
-import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -18,7 +17,7 @@ from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture
 
 VERSION = 2
-"""The version of a state. Version 1 had only seed, epoch and position."""
+"""The version of a state."""
 
 
 def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
@@ -98,8 +97,11 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
         ConfigError: on missing or impossible values, or the state of another mixture.
     """
     values = [state.get(key) for key in ("seed", "epoch", "position")]
-    if not all(isinstance(value, int) and value >= 0 for value in values):
-        raise ConfigError(f"state {dict(state)}", "seed, epoch and position, integers of 0 or more")
+    if not all(isinstance(value, int) and value >= 0 for value in values) or "plan" not in state:
+        raise ConfigError(
+            f"state {dict(state)}",
+            "seed, epoch and position, integers of 0 or more, and the hash of the plan",
+        )
     seed, epoch, position = (int(value or 0) for value in values)
     if seed != mixture.seed:
         raise ConfigError(
@@ -107,9 +109,7 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
             "the seed of the state",
         )
     plan = MixingPlan(mixture, epoch)
-    if "plan" not in state:
-        _check_old(state, position)
-    elif state["plan"] != plan.hash:
+    if state.get("plan") != plan.hash:
         differences = list(_differences(state.get("mixture"), plan.facts, ""))
         raise ConfigError(
             "a state of another mixture: "
@@ -123,23 +123,6 @@ def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]
             f"position {position} of an epoch of {len(plan)} samples", "a state of this mixture"
         )
     return epoch, position
-
-
-def _check_old(state: Mapping[str, Any], position: int) -> None:
-    """Check a state of version 1, which does not identify its mixture and whose order no longer
-    exists."""
-    if position:
-        raise ConfigError(
-            f"a state without its plan, {dict(state)}, in the middle of an epoch; this version "
-            "has another order",
-            "a state that this version saved",
-            "To start that epoch from the beginning, set the state's position to 0; to skip the "
-            "rest of the epoch, "
-            "also add 1 to its epoch.",
-        )
-    warnings.warn(
-        "a state without its plan: it cannot be checked against this mixture", stacklevel=4
-    )
 
 
 def _differences(then: Any, now: Any, name: str) -> Iterator[str]:

@@ -2,9 +2,7 @@
 evaluation data.
 
 A checkpoint's provenance lists under ``seen`` all recordings that influenced its weights: its own
-training data and those of its teacher, its initial weights and its autoencoder. Provenances of
-version 0.1.0 have no ``seen`` but a split or a path; a split with known drives is replaced by these
-drives, a path is kept as a path.
+training data and those of its teacher, its initial weights and its autoencoder.
 """
 
 import hashlib
@@ -20,43 +18,20 @@ from lidar_synth.datasets.recordings import (
     CONTENT,
     FILES,
     KITTI,
-    KITTI360,
-    KITTI360_SPLITS,
     KITTI_OBJECT,
     PLACES,
     TOWN,
     Recordings,
     frames_of,
+    seen_by,
     whole,
 )
 from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats import BankScans
 from lidar_synth.formats.models import models_of
-from lidar_synth.formats.semantic_kitti import SPLITS as SEMANTIC_KITTI_SPLITS
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.lab.importers import lidm
 from lidar_synth.lab.town.export import SETTINGS
-
-
-def seen_by(provenance: Mapping[str, Any]) -> Recordings:
-    """All recordings that influenced weights, also through teachers, initial weights and
-    autoencoders.
-
-    Raises:
-        DataError: on invalid recordings.
-    """
-    own = Recordings.from_list(provenance["seen"]) if "seen" in provenance else _older(provenance)
-    return own | inherited(provenance)
-
-
-def inherited(provenance: Mapping[str, Any]) -> Recordings:
-    """The recordings behind the checkpoints from which weights were made; raises as ``seen_by``."""
-    seen = Recordings()
-    for key, value in provenance.items():
-        if key.endswith("_provenance") and isinstance(value, Mapping):
-            seen |= seen_by(value)
-    return seen
 
 
 def seen_by_model_of(path: Path, source: ScanFiles | None = None) -> Recordings | None:
@@ -156,29 +131,6 @@ def _of_models(provenances: Iterable[Mapping[str, Any]]) -> Recordings:
     for provenance in provenances:
         seen |= seen_by(provenance)
     return seen
-
-
-def _older(provenance: Mapping[str, Any]) -> Recordings:
-    """The recordings of a provenance without ``seen``, from its split, town or path."""
-    if provenance.get("source") == lidm.SOURCE:
-        return lidm.seen(str(provenance.get("data")), generates=True)
-    data = provenance.get("data")
-    split = provenance.get("split")
-    layout = None
-    path = None
-    if isinstance(data, Mapping):
-        if data.get("town") is not None:
-            return town(data.get("seed", 0))
-        layout = data.get("layout")
-        path = data.get("path")
-        split = data.get("split")
-    elif data == "KITTI-360":
-        layout = "kitti360"
-    if layout in (None, "kitti360") and (drives := KITTI360_SPLITS.get(str(split))):
-        return whole(KITTI360, drives)
-    if layout == "semantic_kitti" and (drives := SEMANTIC_KITTI_SPLITS.get(str(split))):
-        return frames_of(layout, drives)
-    return whole(FILES, [f"{path}#{split}" if split else str(path)] if path else [])
 
 
 def _resolved(recordings: Recordings) -> Recordings:

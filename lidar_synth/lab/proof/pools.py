@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.datasets.recordings import CONTENT, Recordings
+from lidar_synth.datasets.recordings import CONTENT, Recordings, seen_by
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, read_text, write_file
@@ -27,7 +27,7 @@ from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
-from lidar_synth.lab.evaluate.leakage import content_of, contents, overlap, seen_by, town
+from lidar_synth.lab.evaluate.leakage import content_of, contents, overlap, town
 from lidar_synth.lab.proof.arms import RARE
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from lidar_synth.datasets.recordings import PLACES
+from lidar_synth.datasets.recordings import PLACES, seen_by
 from lidar_synth.errors import DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_text, write_file
@@ -24,7 +24,6 @@ from lidar_synth.files.parsing import parse_json, read_sealed, seal
 from lidar_synth.files.processes import in_processes
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.lab.evaluate.leakage import seen_by
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.page import write_page
 from lidar_synth.lab.proof.plan import Pair, ProofPlan

@@ -15,7 +15,6 @@ from lidar_synth.files.claims import claim, writing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.files.processes import in_processes
-from lidar_synth.formats.description import TOWN
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
@@ -39,7 +38,7 @@ LAYOUTS: dict[str, type[Writer]] = {
 SEQUENCES = {"kitti360": 4, "semantic_kitti": 0}
 """The default drive or sequence of a layout: one that every split uses for training."""
 
-SETTINGS = TOWN
+SETTINGS = "town.json"
 _README = """# Synthetic street scans
 
 These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package lidar_synth). They are

@@ -2,7 +2,6 @@
 these."""
 
 import json
-import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -60,13 +59,6 @@ def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
         DataError: where it is damaged.
     """
     found, made = _read(path)
-    if made is None:
-        made = _shown_by(found)
-        settings = {key: settings[key] for key in made}
-        warnings.warn(
-            f"{path} is of a version that kept no settings: only {', '.join(made)} are compared",
-            stacklevel=2,
-        )
     if other := sorted(key for key in made | settings if made.get(key) != settings.get(key)):
         raise ConfigError(
             f"{path}, which was made with "
@@ -77,8 +69,8 @@ def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
     return found
 
 
-def _read(path: Path) -> tuple[Selection, dict[str, Any] | None]:
-    """A selection and its settings, which files of version 0.1.0 do not hold."""
+def _read(path: Path) -> tuple[Selection, dict[str, Any]]:
+    """A selection and its settings."""
     values = read_arrays(path)
     try:
         found = Selection(
@@ -89,17 +81,6 @@ def _read(path: Path) -> tuple[Selection, dict[str, Any] | None]:
             values["costs"],
             values["per_trajectory"],
         )
-        return found, dict(
-            parse_json(str(values["settings"]), str(path))
-        ) if "settings" in values else None
+        return found, dict(parse_json(str(values["settings"]), str(path)))
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise DataError(f"{path} is damaged ({error})", "a selection of timesteps") from error
-
-
-def _shown_by(selection: Selection) -> dict[str, Any]:
-    """The settings that a selection itself shows."""
-    return {
-        "intervals": len(selection.grid) - 1,
-        "selection.candidates": len(selection.candidates) - 1,
-        "selection.trajectories": len(selection.per_trajectory),
-    }

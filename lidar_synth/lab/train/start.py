@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from lidar_synth.datasets.recordings import Recordings
+from lidar_synth.datasets.recordings import Recordings, inherited
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import BankScans, ScanFiles, layout_of
 from lidar_synth.generate.checkpoint import (
@@ -28,7 +28,7 @@ from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network, network_class
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.lab.evaluate.leakage import inherited, recordings_of, town
+from lidar_synth.lab.evaluate.leakage import recordings_of, town
 from lidar_synth.lab.train.config import PARENTS, Condition, Data, Network, Run, TrainConfig
 
 

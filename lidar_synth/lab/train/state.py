@@ -224,8 +224,7 @@ def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
     with _opened(path) as file:
         facts = dict(file.metadata())
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
-        expected = facts.pop("checksum", None)  # older states have none
-        if expected not in (None, _checksum(facts, tensors)):
+        if facts.pop("checksum") != _checksum(facts, tensors):
             raise ValueError("its checksum differs")
         return _progress(file), tensors
 
@@ -236,9 +235,7 @@ def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
 
 def _progress(file: Any) -> Progress:
     held = file.metadata()
-    return Progress(
-        int(held["step"]), float(held.get("seconds", 0.0))
-    )  # older states have no seconds
+    return Progress(int(held["step"]), float(held["seconds"]))
 
 
 @contextmanager

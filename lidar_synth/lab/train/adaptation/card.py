@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lidar_synth.datasets.recordings import seen_by
 from lidar_synth.files.disk import write_file
 from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.generate.checkpoint import CODEC, Checkpoint, Header, join
@@ -20,7 +21,6 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.lab.evaluate.leakage import seen_by
 from lidar_synth.lab.evaluate.neighbours import nearest_training
 from lidar_synth.lab.evaluate.segmentation import load_judge
 from lidar_synth.lab.train.adaptation.scans import HELD, TRAIN
