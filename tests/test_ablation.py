@@ -1,4 +1,4 @@
-"""tools/ablation.py: students learn from recorded parts of trajectories what they would learn from
+"""tools/research/ablation.py: students learn from recorded parts of trajectories what they would learn from
 the teacher."""
 
 import pytest
@@ -12,7 +12,7 @@ GRIDS = {4: (1.0, 0.84, 0.56, 0.24, 0.0), 2: (1.0, 0.62, 0.0), 1: (1.0, 0.0)}
 def test_a_student_learns_the_recorded_slope_within_the_recorded_part(
     number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     from ablation import students, supervision
 
     student = students(GRIDS)[number]
@@ -32,7 +32,7 @@ def test_a_student_learns_the_recorded_slope_within_the_recorded_part(
 
 
 def test_students_that_equal_another_are_not_trained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     from ablation import students
 
     found = students(GRIDS)

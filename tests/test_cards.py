@@ -45,7 +45,7 @@ def test_the_method_has_the_timesteps_of_the_shipped_student() -> None:
 def test_the_gallery_shows_exactly_the_pictures_of_its_script(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     import gallery
 
     shown = PICTURE.findall((ROOT / "docs/gallery.md").read_text())
@@ -59,7 +59,7 @@ def test_the_gallery_shows_exactly_the_pictures_of_its_script(
 def test_a_picture_has_all_its_images_side_by_side(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     import gallery
 
     red, blue = (np.full((40, 60, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200)))
@@ -77,7 +77,7 @@ def test_a_picture_has_all_its_images_side_by_side(
 
 
 def test_tables_of_models_show_their_names_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     from layout_quality import line
     from model_card import BEND, CLASSES, Measured, table
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from project import ROOT
 
-sys.path.append(str(ROOT / "tools"))
+sys.path.append(str(ROOT / "tools" / "research"))
 
 from detector.bev import CELL, CHANNELS, REACH, SLICES, Found, decode, targets, view
 from detector.scores import Truth, average_precision, footprint_ious, matched, precisions

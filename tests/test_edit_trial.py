@@ -1,4 +1,4 @@
-"""Edited scans keep their boxes true; ``tools/edit_trial.py --inserts 500`` measures the same on
+"""Edited scans keep their boxes true; ``tools/research/edit_trial.py --inserts 500`` measures the same on
 more scans."""
 
 import sys
@@ -9,7 +9,7 @@ from project import ROOT
 
 from lidar_synth import Town, load_sensor
 
-sys.path.append(str(ROOT / "tools"))
+sys.path.append(str(ROOT / "tools" / "research"))
 
 from edit_trial import FAR, SENSORS, grown_by, outside_share
 

@@ -44,7 +44,7 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """An extractor's archive with random weights, written once."""
     folder = tmp_path_factory.mktemp("weights")
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+        patch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
         from random_archives import write
 
     def made(name: str) -> Path:
@@ -76,7 +76,7 @@ def _scan(points: NDArray[np.float32]) -> Scan:
 def inputs() -> Iterator[ModuleType]:
     """The random inputs that the peers' code was given."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+        patch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
         yield importlib.import_module("random_inputs")
 
 

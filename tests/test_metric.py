@@ -273,7 +273,7 @@ def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
 def test_published_weights_are_measured_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools" / "extractors"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
     from random_archives import write
 
     write("sparenet_pointnet", tmp_path / "weights")

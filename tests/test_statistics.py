@@ -156,7 +156,7 @@ def test_the_extrapolated_frechet_distance_loses_most_of_the_bias() -> None:
 def test_intervals_cover_the_truth(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With 200 trials, 92 to 98 % is two standard deviations; the tool measures all of them with
     more trials."""
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     import interval_coverage
 
     share, _ = interval_coverage.coverage(

@@ -135,7 +135,7 @@ def test_every_module_is_imported_by_something() -> None:
 LIMITS = {
     "plugin": (149_500, 6.6, 146),
     "laboratory": (116_500, 6.8, 173),
-    "tools": (52_500, 6.6, 196),
+    "tools": (48_500, 6.6, 196),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 from project import ROOT
 
-sys.path.append(str(ROOT / "tools"))
+sys.path.append(str(ROOT / "tools" / "research"))
 
 from surgery_trial import Emptied, fidelity, places_of
 

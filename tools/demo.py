@@ -213,7 +213,7 @@ def protocol_notes(protocol: Protocol, place: str) -> list[str]:
         "deviation.",
         "These are short trainings of a small network, made to finish in a minute or two: they "
         "show the procedure, and "
-        "the mIoU is far below that of a full training. tools/ratio_curve.py makes longer "
+        "the mIoU is far below that of a full training. lidar-synth prove makes longer "
         "comparisons.",
     ]
 

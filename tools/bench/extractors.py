@@ -17,7 +17,7 @@ from timing import print_table, time_in_turns
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.lab.town import Town
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "extractors"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "research" / "extractors"))
 from random_archives import write  # the folder of tools/extractors is on the path from here on
 
 

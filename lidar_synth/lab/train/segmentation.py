@@ -2,7 +2,7 @@
 
 All that a training with mixed data takes, in one file: ``endless_batches`` is the data loading,
     ``train_segmenter`` the
-loop. ``tools/train_segmenter.py`` calls it from the command line, on the town or on your own
+loop. ``tools/research/train_segmenter.py`` calls it from the command line, on the town or on your own
 dataset.
 """
 

@@ -1,7 +1,7 @@
 """Compare distillation strategies in 4, 2 and 1 steps (the paper's Table 4), each with several
 seeds.
 
-    python tools/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072]
+    python tools/research/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072]
     [--count 64]
 
 TEACHER is the checkpoint of a latent flow, LATENTS the file ``latents-*.npy`` that its training has
@@ -12,7 +12,7 @@ strategies are timestep distillation, and are not trained again. The time grids 
 ``adaptive_piecewise`` are selected on 64 trajectories; all others are uniform.
 
 The first table has means and standard deviations over the seeds, the second one all measures of
-tools/model_card.py for the first seed in 4 steps, with 95 % intervals. WORK keeps students and
+tools/research/model_card.py for the first seed in 4 steps, with 95 % intervals. WORK keeps students and
 trajectories: a second call resumes.
 """
 

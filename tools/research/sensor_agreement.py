@@ -1,7 +1,7 @@
 """Compare recorded scans with their own and with other sensors: the table of
 docs/research/sensors.md.
 
-    LIDAR_SYNTH_REAL_SCANS=FOLDER LIDAR_SYNTH_LABELLED_SCANS=FOLDER python tools/sensor_agreement.py
+    LIDAR_SYNTH_REAL_SCANS=FOLDER LIDAR_SYNTH_LABELLED_SCANS=FOLDER python tools/research/sensor_agreement.py
 
 The first folder contains ``kitti360``, ``semantic_kitti``, ``kitti_object``, ``kitti_raw`` and
 ``nuscenes``, the second ``semantic_kitti`` and ``pandaset``, where the scans of a Pandar64 are in

@@ -1,9 +1,9 @@
 """How good an adapted model is on scans that it has not seen, beside the model that it was adapted
 from.
 
-    python tools/adapt_quality.py pandaset FRAMES OUT
+    python tools/research/adapt_quality.py pandaset FRAMES OUT
     lidar-synth adapt town-dense --scans OUT/adapt --out mine.safetensors
-    python tools/adapt_quality.py measure mine.safetensors --train OUT/adapt --test OUT/test
+    python tools/research/adapt_quality.py measure mine.safetensors --train OUT/adapt --test OUT/test
         [--before town-dense] [--judge FOLDER] [--count 60]
 
 FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring,

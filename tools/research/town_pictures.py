@@ -1,6 +1,6 @@
 """Make the images of docs/town.md: streets from above, camera images, one scan as a sheet.
 
-python tools/town_pictures.py [OUT]            (OUT = docs/town)
+python tools/research/town_pictures.py [OUT]            (OUT = docs/town)
 """
 
 import argparse

@@ -10,7 +10,7 @@ whose surroundings have the most similar classes. A small convolutional network 
 the range image (range relative to the object's, reflectance, lost returns, number of points), is
 trained on some scans and tested on others.
 
-    python tools/surgery_trial.py --town 40 --labelled $LIDAR_SYNTH_LABELLED_SCANS/semantic_kitti
+    python tools/research/surgery_trial.py --town 40 --labelled $LIDAR_SYNTH_LABELLED_SCANS/semantic_kitti
 """
 
 import argparse

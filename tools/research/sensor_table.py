@@ -1,7 +1,7 @@
 """The table of docs/research/fitted-sensors.md: ``fit_sensor`` on real scans and on the town,
 beside what is known.
 
-    python tools/sensor_table.py REAL_SCANS LABELLED_SCANS
+    python tools/research/sensor_table.py REAL_SCANS LABELLED_SCANS
 
 The folders are laid out as LIDAR_SYNTH_REAL_SCANS and LIDAR_SYNTH_LABELLED_SCANS of the tests.
 "error" is the largest

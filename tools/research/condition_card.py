@@ -1,10 +1,10 @@
 """Does a model follow its condition? The figures and images of conditional models in
 docs/research/conditions.md.
 
-    python tools/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64]
+    python tools/research/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64]
     [--picture OUT.png]
 
-    python tools/condition_card.py "student, 4 steps=town-semantic" "teacher, 50
+    python tools/research/condition_card.py "student, 4 steps=town-semantic" "teacher, 50
     steps=RUN/teacher.safetensors:50"
 
 Every model gets the same noise and the conditions of the same real scans, from an unseen town or
@@ -65,7 +65,7 @@ def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, 
     """The kind of condition, and one generated scan for the condition of each real scan."""
     generator = load_generator(model)
     if generator.condition is None:
-        raise SystemExit(f"{model} is unconditional: see tools/model_card.py")
+        raise SystemExit(f"{model} is unconditional: see tools/research/model_card.py")
     made = (
         generator.scans(SEED, [i], condition=scan, steps=steps)[0]
         for i, scan in enumerate(tqdm(real, desc=Path(model).stem, unit="scan"))

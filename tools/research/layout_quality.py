@@ -1,6 +1,6 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
-    python tools/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
+    python tools/research/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
                                    [--picture OUT.png] [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of

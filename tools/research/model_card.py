@@ -1,10 +1,10 @@
 """The figures and images of docs/research/quality.md: how close generated scans are to scans of the
 town.
 
-    python tools/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--real
+    python tools/research/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--real
         A B] [--pictures OUT]
 
-    python tools/model_card.py "student, 4 steps=town" "teacher, 50
+    python tools/research/model_card.py "student, 4 steps=town" "teacher, 50
         steps=RUN/town_teacher.safetensors:50" \\ "teacher, 4 steps=RUN/town_teacher.safetensors:4"
         --pictures docs/models
 
@@ -20,7 +20,7 @@ The measures are those that need no published weights: R2Flow's, LiDM's, the pac
 those of the features of the town segmenter. 95 % intervals follow in brackets; the Fréchet distance
 gets one from 256 scans on.
 
-tools/condition_card.py is for conditional models.
+tools/research/condition_card.py is for conditional models.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Make the pictures of docs/gallery.md: scans of the shipped models beside scans of the town.
 
-    python tools/gallery.py [NAME ...] [--out docs/gallery]
+    python tools/research/gallery.py [NAME ...] [--out docs/gallery]
 
     pairs     generated scans on the left, scans of the town on the right
     channels  all channels of one generated scan

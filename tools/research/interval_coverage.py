@@ -1,7 +1,7 @@
 """How often do the 95 % intervals of the measures cover the truth? The table in
 docs/research/measures.md.
 
-    python tools/interval_coverage.py [--trials 400] [--replicates 200] [NAME ...]
+    python tools/research/interval_coverage.py [--trials 400] [--replicates 200] [NAME ...]
 
 Each trial draws two sets whose true distance is known, or is measured once on large sets.
 """

@@ -1,6 +1,6 @@
 """Learn the skin ``pandar64`` that ships with the package, and measure it on later frames.
 
-    python tools/make_pandar64_skin.py FRAMES [--measure]
+    python tools/research/make_pandar64_skin.py FRAMES [--measure]
 
 FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring) in
 the sensor's frame. The skin is learnt from frames 00 to 30; ``--measure`` compares the town with

@@ -1,7 +1,7 @@
 """Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on
 two others.
 
-    python tools/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations
+    python tools/research/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations
                                         1600] [--layout-model CHECKPOINT] [--minutes M] [--out
                                         TABLE.md]
 

@@ -4,7 +4,7 @@ On scans of the town for three sensors, or on real scans with boxes (--folder): 
 random places, moved away by 5 % of their distance, and removed and put back; scans are turned into
 those of other sensors.
 
-    python tools/edit_trial.py --inserts 500 --scans 8
+    python tools/research/edit_trial.py --inserts 500 --scans 8
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """How often the intervals of ``lidar-synth prove`` hold the true difference, in a simulation.
 
-    python tools/interval_of_places.py [--trials 600]
+    python tools/research/interval_of_places.py [--trials 600]
 
 Differences of places are normal with one standard deviation, those of seeds within a place with
 another. The table is that of docs/research/proof.md.

@@ -1,7 +1,7 @@
 """Compare the town with real KITTI-360 scans: angles, ranges, reflectance and missing returns in
 one Markdown table.
 
-    LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/town_statistics.py [--scans 120] [--seed 0]
+    LIDAR_SYNTH_REAL_SCANS=FOLDER python tools/research/town_statistics.py [--scans 120] [--seed 0]
 
 FOLDER contains ``kitti360`` in the dataset's own layout. Without the variable the table has the
 town only. Every figure is a mean over scans; both sides are projected onto the same 64 x 1024 range

@@ -1,0 +1,1 @@
+"""The detector of ``tools/research/detector_trial.py``: its scans, its network, its score."""
