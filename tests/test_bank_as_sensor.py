@@ -43,10 +43,10 @@ def contents(root: Path) -> dict[str, bytes]:
 class Stops(Transfer):
     """Ctrl-C at the third scan."""
 
-    def cast(self, scan: Scan, *others: object) -> object:  # type: ignore[override]
+    def __call__(self, scan: Scan, *others: object) -> object:  # type: ignore[override]
         if "shard-00001" in scan.id:
             raise KeyboardInterrupt
-        return super().cast(scan, *others)  # type: ignore[arg-type]
+        return super().__call__(scan, *others)  # type: ignore[arg-type]
 
 
 def test_a_bank_holds_what_its_transfer_gives(bank: Bank, tmp_path: Path) -> None:
