@@ -21,9 +21,8 @@ class Mixed:
     calls ``_start`` at the end of its ``__init__`` and defines ``_synthetic``.
 
     OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the
-    ratio, a real scan is
-    replaced by a real one here, and a synthetic one raises an error: ``labels: mix`` gives
-        synthetic scans boxes.
+    ratio, a real scan is replaced by a real one here, and a synthetic one raises an error:
+    ``labels: mix`` gives synthetic scans boxes.
     """
 
     _current: int | None = None  # the position whose sample is being made

@@ -4,10 +4,9 @@
     python -m lidar_synth.integrations.plan mix.yaml plan.npz --real 19130 --epochs 50
 
 ``plan.npz`` holds the order of each epoch, computed by the package: ``epoch-<n>`` (N, 2) int64 (0 =
-    real or 1 =
-synthetic, number of the sample), and ``settings``, the bytes of a JSON text: format, order, number
-of real samples, the bank's identity, label policy and threshold, length and hash of each epoch's
-plan.
+real or 1 = synthetic, number of the sample), and ``settings``, the bytes of a JSON text: format,
+order, number of real samples, the bank's identity, label policy and threshold, length and hash of
+each epoch's plan.
 """
 
 import argparse

@@ -6,8 +6,8 @@ module::
     dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
 
 For segmentation, a synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as
-    zeros, which mean
-"car". Self-supervised pretraining reads no labels, so that its mixture may have ``labels: none``.
+zeros, which mean "car". Self-supervised pretraining reads no labels, so that its mixture may have
+``labels: none``.
 """
 
 from collections.abc import Iterator

@@ -149,8 +149,7 @@ def main() -> None:
     """Run WaffleIron's training script with the dataset registered.
 
     The script is imported, not run as a file: so the processes of ``--multiprocessing-distributed``
-        import this module,
-    and register the dataset as well.
+    import this module, and register the dataset as well.
     """
     script = prepare_script(USAGE, "torch.load")
     with plain_errors():

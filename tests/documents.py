@@ -74,7 +74,7 @@ class Block:
     line of code.
 
     ``file`` is the name under which the reader saves it: the title of the fence, or a comment in
-        the first line.
+    the first line.
     """
 
     kind: str

@@ -1,8 +1,8 @@
 """A bank whose scans are those of another one as another sensor would have recorded them.
 
 Casting rays takes ten times as long as reading a scan: a bank that is used for more than one epoch
-    is turned once. Each
-cell of the target's grid keeps its nearest return; losses and noise are drawn once for each scan.
+is turned once. Each cell of the target's grid keeps its nearest return; losses and noise are drawn
+once for each scan.
 """
 
 from collections.abc import Iterator

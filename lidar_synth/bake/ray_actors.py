@@ -2,9 +2,8 @@
 node shares.
 
 An actor gets a shard only when it is running, so that a pending actor blocks no shard. When an
-actor or its node is
-lost, its shard returns to the queue and a new actor is requested: nodes may join and leave during
-    the bake.
+actor or its node is lost, its shard returns to the queue and a new actor is requested: nodes may
+join and leave during the bake.
 """
 
 import os

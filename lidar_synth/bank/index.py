@@ -20,8 +20,8 @@ stored directly, everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
     fields         what is stored beside the range: reflectance, label, confidence; in /2 instance,
-        boxes
-    model          the checkpoint's name; checkpoint: its hash; provenance: its header's provenance
+    boxes model          the checkpoint's name; checkpoint: its hash; provenance: its header's
+    provenance
     settings       of the bake: everything else that determines the scans
     label_policy   "generated", or "none"
     condition      the dataset that the scans are conditioned on, or null

@@ -12,9 +12,8 @@ An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``see
     seed, index, condition and arrays
 
 A chunk holds one array of one scan: shuffled, deflated (level 1), and followed by its Fletcher-32
-    checksum, as HDF5's
-own filters write it, so that any HDF5 library reads it. The file format is that of HDF5 1.10, whose
-metadata has
+checksum, as HDF5's own filters write it, so that any HDF5 library reads it. The file format is that
+of HDF5 1.10, whose metadata has
 checksums: in older formats a flipped bit in an attribute, such as the scale, would stay undetected.
     No byte of a file
 depends on the time of writing.

@@ -248,10 +248,9 @@ class RangedFile(io.RawIOBase):
     """A file object for HDF5 over the parts of a file that have been read so far.
 
     HDF5 holds a lock while it reads. Fetching from a URL uses other threads, and one of them that
-    happens to free an
-    object of HDF5 would wait for that lock: a deadlock. So ``readinto`` never fetches: it records
-        the missing range and
-    fails; the caller of HDF5 then calls ``fetch_missing`` and tries again.
+    happens to free an object of HDF5 would wait for that lock: a deadlock. So ``readinto`` never
+    fetches: it records the missing range and fails; the caller of HDF5 then calls ``fetch_missing``
+    and tries again.
 
     Args:
         file: the file to read from.

@@ -31,7 +31,7 @@ def check_mix(
     side.
 
     Exit status 2 if they certainly mean something else: another unit, axis, origin, scale or
-        numbering of classes.
+    numbering of classes.
 
     \b
     Examples:

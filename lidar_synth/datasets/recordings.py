@@ -1,9 +1,8 @@
 """The recorded frames of a set of scans, to detect evaluation of a model on its training data.
 
 A frame is identified by dataset, drive and number. Names of splits are not sufficient: the training
-    data of LiDM
-(``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of KITTI-360.
-Neither are names of
+data of LiDM (``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of
+KITTI-360. Neither are names of
 datasets: the sequences of SemanticKITTI are those of KITTI's odometry benchmark, which are parts of
     KITTI's raw
 drives. Both are therefore represented as raw drives, by the table in the odometry devkit's readme

@@ -56,7 +56,7 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
     so that the corrected call may use the folder.
 
     A claim that was there before is left alone: it may be that of a process that has not written
-        its first file yet.
+    its first file yet.
 
     Raises:
         ConfigError, DataError, FileError: as ``claim``.

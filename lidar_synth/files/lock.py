@@ -2,9 +2,8 @@
 
 Processes that work in one folder hold the lock together (``shared``); only a process that holds it
 exclusively (``alone``) removes leftover files. The lock is flock; over NFS, a lock on the server.
-On a file system without locks
-nothing is ever removed. On Windows every process counts as exclusive: an open file cannot be
-    removed there.
+On a file system without locks nothing is ever removed. On Windows every process counts as
+exclusive: an open file cannot be removed there.
 """
 
 import sys

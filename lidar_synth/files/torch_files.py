@@ -2,11 +2,9 @@
 ``torch.load``.
 
 A file is a ZIP archive (``data.pkl`` and one file for each storage), or, before PyTorch 1.6, a row
-of pickles followed
-by the storages. Either pickle is read as data: tensors are made of the storages, numbers of numpy
-    become numbers, and
-the objects of other classes become the plain values that they hold, or text with the name of the
-class.
+of pickles followed by the storages. Either pickle is read as data: tensors are made of the
+storages, numbers of numpy become numbers, and the objects of other classes become the plain values
+that they hold, or text with the name of the class.
 """
 
 import os

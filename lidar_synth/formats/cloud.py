@@ -6,10 +6,9 @@ a scan keep their names. ``raw_label`` is stored bit for bit as a signed integer
 PLY reader supports unsigned 32-bit values.
 
 The logs of drivers have other names and types, which are read too: ``ring`` or ``channel`` of any
-    integers, the time as
-``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or ``timestamp``, and Ouster's
-``reflectivity``, which is calibrated and takes precedence over its ``intensity``, the number of
-photons.
+integers, the time as ``time`` (float32 seconds), ``t`` or ``time_stamp`` (nanoseconds) or
+``timestamp``, and Ouster's ``reflectivity``, which is calibrated and takes precedence over its
+``intensity``, the number of photons.
 """
 
 import io

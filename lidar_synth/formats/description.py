@@ -2,8 +2,7 @@
 from.
 
 Formats with room hold it in each file: ``.npz``, PCD and PLY (as comments), PNG, WebDataset, and
-    banks. For all others
-it stands in ``scans.json`` in the root of their folder::
+banks. For all others it stands in ``scans.json`` in the root of their folder::
 
     {"format": "lidar-synth-scans/1",
      "sensor": {"name": "os1_128", "rows": 128, ...},            the keys of sensors.yaml
@@ -215,8 +214,7 @@ def _above(folders: Sequence[Path]) -> Description | None:
     """The description of a plain folder, from the folders above the first one.
 
     A folder has nothing to say about those below it if it is a dataset, or holds scans itself: the
-        ids of a source,
-    from which the names come, are of one form.
+    ids of a source, from which the names come, are of one form.
     """
     for below, folder in pairwise(folders):
         if _is_dataset(below):
@@ -274,7 +272,7 @@ def add_origin(root: Path, origin: Origin) -> Description:
     """Add an origin to the description of a folder, and return it.
 
     If two processes add one at the same moment, one of the two is lost: the process that started
-        them adds it again.
+    them adds it again.
 
     Raises:
         DataError, FileError: if the description is damaged, or cannot be read or written.

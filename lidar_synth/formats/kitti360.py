@@ -15,9 +15,8 @@ Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers
 labels per scan from them (kitti360_labels.py), and so does
 github.com/JulesSanchez/recoverKITTI360label, which writes DRIVE/labels/FFFFFFFFFF.bin: int16 per
-point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan,
-the reader accepts both and distinguishes the two encodings by their size: two bytes per point are
-    the encoding of that
+point, KITTI-360's semantic id, -1 = none found. Under data_3d_semantics_scan, the reader accepts
+both and distinguishes the two encodings by their size: two bytes per point are the encoding of that
 tool, four are SemanticKITTI's packing (KITTI-360's semantic id in the lower 16 bits, instance
 above), which the writer uses. Only frames of annotated windows can have labels; all others are read
 without labels.

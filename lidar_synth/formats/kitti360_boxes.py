@@ -1,12 +1,11 @@
 """KITTI-360's boxes: one XML per drive, in the world frame.
 
 Each object (https://www.cvlibs.net/datasets/kitti-360/documentation.php, data_3d_bboxes) is a unit
-cube, ``vertices``,
-that ``transform`` rotates, scales and moves into the world frame: its columns are the axes of the
-    box, scaled by its
-size. A moving object has one entry per frame, whose ``timestamp`` is the frame. A static object has
-one entry with timestamp -1; ``start_frame`` and ``end_frame`` bound the *window* of the drive,
-about 200 m, in which it was annotated. The file does not contain the frames in which it is visible.
+cube, ``vertices``, that ``transform`` rotates, scales and moves into the world frame: its columns
+are the axes of the box, scaled by its size. A moving object has one entry per frame, whose
+``timestamp`` is the frame. A static object has one entry with timestamp -1; ``start_frame`` and
+``end_frame`` bound the *window* of the drive, about 200 m, in which it was annotated. The file does
+not contain the frames in which it is visible.
 
 The reader therefore lists a static object in every frame whose sensor is within range of it, if its
 window is at most ``MARGIN`` frames away. Cars of the next window thus appear before it begins, and

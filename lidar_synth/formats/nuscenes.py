@@ -8,10 +8,9 @@ Layout (https://www.nuscenes.org/nuscenes#data-format, https://www.nuscenes.org/
 
 nuScenes has x right and y forward; both are converted to the package's x forward, y left. Intensity
 is divided by 255 and rings are counted from the top. Points nearer than one metre belong to the
-recording car or, in full sweeps, to
-firings without a return, which are stored at the origin: they are dropped with their labels, as in
-    nuScenes' own
-tools. The package reads this layout and does not write it.
+recording car or, in full sweeps, to firings without a return, which are stored at the origin: they
+are dropped with their labels, as in nuScenes' own tools. The package reads this layout and does not
+write it.
 """
 
 from collections.abc import Mapping

@@ -10,11 +10,10 @@ Layout (https://github.com/scaleapi/pandaset-devkit), a folder for each sequence
     six cameras, with poses.json, timestamps.json, intrinsics.json
 
 The tables are pickled by pandas; ``pandas_table`` reads them without running their code. The points
-are compensated
-for the motion of the vehicle: each is in the world frame. By default the reader undoes this,
-    because only then do
-points lie on the sensor's beams: every point is given in the frame of the sensor at the time of its
-own measurement. The package reads this layout and does not write it.
+are compensated for the motion of the vehicle: each is in the world frame. By default the reader
+undoes this, because only then do points lie on the sensor's beams: every point is given in the
+frame of the sensor at the time of its own measurement. The package reads this layout and does not
+write it.
 
 The data are licensed under CC BY 4.0 with PandaSet's Dataset Terms: name Scale AI and Hesai in what
 you publish.

@@ -2,9 +2,8 @@
 Lossless for a scan.
 
 The package reads ``ascii``, ``binary`` and ``binary_compressed`` files and writes ``binary``. The
-header is compared
-with the file before any value is read: a false header could otherwise drop points, or read beyond
-    the data.
+header is compared with the file before any value is read: a false header could otherwise drop
+points, or read beyond the data.
 """
 
 import re

@@ -8,11 +8,9 @@ Layout::
     with labels
 
 ``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of
-    sensors.yaml), ``id`` and
-``domain``. The format is lossy: rounding errors are at most half a step, 0.61 mm for a maximum
-    range of 80 m, and 8e-6
-for reflectance; instances, the dataset's own labels, confidence, boxes and pose are not stored.
-Labels are exact.
+sensors.yaml), ``id`` and ``domain``. The format is lossy: rounding errors are at most half a step,
+0.61 mm for a maximum range of 80 m, and 8e-6 for reflectance; instances, the dataset's own labels,
+confidence, boxes and pose are not stored. Labels are exact.
 """
 
 import json

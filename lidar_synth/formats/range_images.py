@@ -7,8 +7,7 @@
   cell, as used by several segmentation codes. ``CONVENTIONS`` defines their frames and classes.
 
 As a source of scans, a set has one point per return: on the ray through the cell's centre, or at x,
-    y, z if the file
-holds them. ``image`` returns the range image itself.
+y, z if the file holds them. ``image`` returns the range image itself.
 """
 
 from dataclasses import asdict, dataclass

@@ -23,10 +23,9 @@ generation needs::
     as JSON with sorted keys
 
 A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its
-checksum, which covers
-the header and, through ``weights``, the tensors. Version 1 has no checksum: its hash is the sha256
-    of the header's
-text, so that damage to its header can go unnoticed. Nothing is ever unpickled.
+checksum, which covers the header and, through ``weights``, the tensors. Version 1 has no checksum:
+its hash is the sha256 of the header's text, so that damage to its header can go unnoticed. Nothing
+is ever unpickled.
 """
 
 import hashlib

@@ -1,15 +1,13 @@
 """Do points come from the sensor that they are said to come from?
 
 A file of points names no sensor, and a wrong one loses points in silence: they fall into rows that
-    are not theirs, or
-outside of the field of view. ``agreement`` counts the points and the beams that contradict a
-sensor.
+are not theirs, or outside of the field of view. ``agreement`` counts the points and the beams that
+contradict a sensor.
 
 Recorded scans contradict their own sensor a little: they tilt by up to one degree against the table
-    of beams, motion
-compensation moves near points by 0.3 m, and the lasers of some sensors start up to 0.2 m above the
-origin. Therefore angles are compared only beyond ``NEAR`` metres, for each sector of azimuth at the
-tilt that fits best.
+of beams, motion compensation moves near points by 0.3 m, and the lasers of some sensors start up to
+0.2 m above the origin. Therefore angles are compared only beyond ``NEAR`` metres, for each sector
+of azimuth at the tilt that fits best.
 """
 
 from typing import NamedTuple

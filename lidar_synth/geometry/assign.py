@@ -34,8 +34,7 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
 
     Returns:
         The ring and firing of each point, and its distance from the beam: points that lie far off
-            are not from this
-        sensor, or not in its frame.
+        are not from this sensor, or not in its frame.
 
     Example:
         >>> from lidar_synth import Town, assign_beams

@@ -2,6 +2,5 @@
 curation, importers.
 
 The rest of the package, which a training imports, never imports the laboratory: public names and
-    commands load it by
-name (``tests/test_structure.py``).
+commands load it by name (``tests/test_structure.py``).
 """

@@ -39,10 +39,8 @@ def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
     """Replace a sector of columns of a scan by those of another scan.
 
     Boxes that an edge of the sector cuts are removed with their objects. The other boxes contain
-    only returns of their
-    own scan, and all returns of their instance: a box is enlarged by some centimetres if noise or
-        tilt puts a return
-    outside.
+    only returns of their own scan, and all returns of their instance: a box is enlarged by some
+    centimetres if noise or tilt puts a return outside.
 
     Args:
         scan: the scan that keeps the remaining columns.

@@ -1,12 +1,10 @@
 """Objects pasted into a scan at their recorded range, with occlusion as the sensor would see it.
 
 An object is raised or lowered to the ground at its place, and skipped if there is no ground or the
-place is occupied.
-In each cell of the range image the nearest return then wins: objects are hidden by what is in front
-    of them, and hide
-everything behind their outline, including the gaps between their returns. A box therefore contains
-only the returns of its object and, at its floor, of the ground, and there are no returns in its
-shadow.
+place is occupied. In each cell of the range image the nearest return then wins: objects are hidden
+by what is in front of them, and hide everything behind their outline, including the gaps between
+their returns. A box therefore contains only the returns of its object and, at its floor, of the
+ground, and there are no returns in its shadow.
 """
 
 from collections.abc import Iterable

@@ -128,13 +128,10 @@ class MixedBatches(Sampler[list[int]]):
     step.
 
     Pass it to a ``DataLoader`` as ``batch_sampler``. Over all ranks every position is yielded once.
-    Each position
-    carries the epoch in which iteration began, so that ``set_epoch`` may be called at any time: it
-        takes effect with
-    the next pass. If a library divides batch samplers among ranks itself, use ``rank=0,
-    world_size=1``; Accelerate's
-    ``prepare`` does so too, and repeats samples: use
-        ``lidar_synth.integrations.accelerate.prepare``.
+    Each position carries the epoch in which iteration began, so that ``set_epoch`` may be called at
+    any time: it takes effect with the next pass. If a library divides batch samplers among ranks
+    itself, use ``rank=0, world_size=1``; Accelerate's ``prepare`` does so too, and repeats samples:
+    use ``lidar_synth.integrations.accelerate.prepare``.
 
     Args:
         dataset: a ``MixedScans``.

@@ -1,8 +1,7 @@
 """Comparison of a synthetic sample with a real one of a trainer's dataset, before training.
 
 A collate function may silently accept samples of different forms: torch's takes the keys of a
-    batch's first sample and
-drops all other keys of the others.
+batch's first sample and drops all other keys of the others.
 """
 
 import logging

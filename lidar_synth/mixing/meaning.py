@@ -2,10 +2,9 @@
 contradict.
 
 Two samples may have the same keys, types and shapes and still mean different things: centimetres,
-    another axis, another
-numbering of classes. Their distributions tell. The limits of what is refused are far outside of
-what the public datasets, the town and the shipped models differ by among themselves
-(docs/how-to/mix.md).
+another axis, another numbering of classes. Their distributions tell. The limits of what is refused
+are far outside of what the public datasets, the town and the shipped models differ by among
+themselves (docs/how-to/mix.md).
 """
 
 from collections.abc import Iterator, Sequence

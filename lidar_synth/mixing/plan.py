@@ -6,12 +6,11 @@ the same memory, and workers, ranks, batch size and resumption cannot change it.
 
 A permutation keyed by (seed, epoch) maps a position to a *rank*; the ranks are divided among the
 sources in order, by their quotas (quotas.py). Within its source, a sample has a running number that
-counts over all epochs. Real sources are
-permuted again each time they are exhausted: after any number of epochs, the numbers of uses of two
-    real scans differ
-by at most one. Synthetic scans are numbered upwards, so that each is new. With ``reuse = k`` they
-come in laps whose length is the largest number that an epoch takes; every lap comes k times, in k
-epochs, before the next lap begins.
+counts over all epochs. Real sources are permuted again each time they are exhausted: after any
+number of epochs, the numbers of uses of two real scans differ by at most one. Synthetic scans are
+numbered upwards, so that each is new. With ``reuse = k`` they come in laps whose length is the
+largest number that an epoch takes; every lap comes k times, in k epochs, before the next lap
+begins.
 """
 
 import hashlib

@@ -3,10 +3,9 @@
 Every epoch of a mixture has the same length, because samplers and datasets that wrap another one
 ask for its length once. With ``epoch_size="add"`` that is the number of real scans and of the
 synthetic ones that the largest share of the schedule adds to them, rounded up; each epoch's share
-of it is rounded up too. Otherwise exact shares, which are
-fractions, are added up over the epochs and only the sum is rounded: after any number of epochs, the
-    number of synthetic
-samples is the exact number, rounded up.
+of it is rounded up too. Otherwise exact shares, which are fractions, are added up over the epochs
+and only the sum is rounded: after any number of epochs, the number of synthetic samples is the
+exact number, rounded up.
 
 Several sources of a kind divide its samples by their weights in the same way. The sources are the
 leaves of a binary tree, and each node sends ``round(m * share)`` of its first m samples to the left

@@ -22,8 +22,7 @@ class MixedStream(IterableDataset[Any]):
     ranks and workers every sample is yielded once.
 
     ``set_epoch`` takes effect with the next pass: a pass stays in the epoch in which it began. If
-        persistent workers
-    cannot determine that epoch, an error is raised.
+    persistent workers cannot determine that epoch, an error is raised.
 
     The state (state.py) holds the position after the batches yielded so far. The state of a worker,
     which torchdata's ``StatefulDataLoader`` saves, adds the number of samples that the worker has

@@ -77,8 +77,7 @@ def work(
     """Read the cases ``numbers`` and send, for each, its number before and its ``Outcome`` behind.
 
     First the valid dataset is read: that imports and compiles all that reading needs, and tells
-        what "equal" is. None
-    is sent when that has been done.
+    what "equal" is. None is sent when that has been done.
     """
     quiet(folder / "output.txt")
     torch.set_num_threads(1)

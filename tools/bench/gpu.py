@@ -4,11 +4,10 @@
     [--device cuda]
 
 From noise to the tensors of labelled scans: the flow's steps and the decoder, eager and compiled,
-    in turns. The network
-of R2Flow's size is this package's HDiT with random weights in 4 steps, as ``networks.py`` measures
-it. The last column is the share of the rate of a large matrix product; it is left out for models
-whose operations are not counted. ``--device cpu`` tries the script without a GPU, and leaves that
-network out.
+in turns. The network of R2Flow's size is this package's HDiT with random weights in 4 steps, as
+``networks.py`` measures it. The last column is the share of the rate of a large matrix product; it
+is left out for models whose operations are not counted. ``--device cpu`` tries the script without a
+GPU, and leaves that network out.
 """
 
 import argparse

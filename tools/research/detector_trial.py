@@ -7,10 +7,8 @@ two others.
 
 All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half
 of each batch of an arm with synthetic scans is synthetic, unless its row says otherwise. Each seed
-has its own 30 scans of the town, the
-same in every arm. Scans and finished trainings are kept in WORK: the same command resumes.
-    docs/research/detectors.md
-has the protocol.
+has its own 30 scans of the town, the same in every arm. Scans and finished trainings are kept in
+WORK: the same command resumes. docs/research/detectors.md has the protocol.
 """
 
 import argparse

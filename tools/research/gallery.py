@@ -11,7 +11,7 @@
     sensors   one street as three sensors see it
 
 All scans are the first ones of their seed: none is selected. Each picture takes less than a minute
-    on one core.
+on one core.
 """
 
 import argparse

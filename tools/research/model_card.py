@@ -16,9 +16,8 @@ encoded and decoded by the model's autoencoder: the lower bound for its flow. Wi
 a WEAKER model the flow is autoguided from t = HIGH to LOW, as the teacher of a student is.
 
 The measures are those that need no published weights: R2Flow's, LiDM's, the package's own of ranges
-    and classes, and
-those of the features of the town segmenter. 95 % intervals follow in brackets; the Fréchet distance
-gets one from 256 scans on.
+and classes, and those of the features of the town segmenter. 95 % intervals follow in brackets; the
+Fréchet distance gets one from 256 scans on.
 
 tools/research/condition_card.py is for conditional models.
 """

@@ -7,10 +7,9 @@ configurations.
 BANK is a bank, a folder of labelled scans or a model's name. For each share and order, OUT gets a
 mixed list, and one of real scans alone in which every scan occurs often enough for as many
 iterations. The commands of both trainings are printed. ``uniform`` takes evenly spread scans, as
-LaserMix does; ``sequential`` the first ones of each sequence:
-most places are never seen. The generator must not know more labels than the trainer: use the town,
-    or a model
-that was adapted to the same labelled scans.
+LaserMix does; ``sequential`` the first ones of each sequence: most places are never seen. The
+generator must not know more labels than the trainer: use the town, or a model that was adapted to
+the same labelled scans.
 """
 
 import argparse

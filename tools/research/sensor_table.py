@@ -4,10 +4,9 @@ beside what is known.
     python tools/research/sensor_table.py REAL_SCANS LABELLED_SCANS
 
 The folders are laid out as LIDAR_SYNTH_REAL_SCANS and LIDAR_SYNTH_LABELLED_SCANS of the tests.
-"error" is the largest
-difference of an elevation from a table: Hesai's for the Pandar64, that of the casting sensor for
-    the town; for two
-disjoint halves of the frames, it is the difference between both fits.
+"error" is the largest difference of an elevation from a table: Hesai's for the Pandar64, that of
+the casting sensor for the town; for two disjoint halves of the frames, it is the difference between
+both fits.
 """
 
 import argparse

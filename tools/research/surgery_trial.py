@@ -2,13 +2,12 @@
 
 Cars are removed from scans of the town and, with --labelled and --boxed, from real scans of KITTI.
 For each there is a control. In the town it is the same place in the scan that the town casts
-without these cars, which also shows how true
-the filled hole is. In a real scan it is another place of the unedited scan: the same box, turned
-    about the sensor to a
-free place on ground, so at the same distance and of the same size; of the free places, the one
-whose surroundings have the most similar classes. A small convolutional network sees both places in
-the range image (range relative to the object's, reflectance, lost returns, number of points), is
-trained on some scans and tested on others.
+without these cars, which also shows how true the filled hole is. In a real scan it is another place
+of the unedited scan: the same box, turned about the sensor to a free place on ground, so at the
+same distance and of the same size; of the free places, the one whose surroundings have the most
+similar classes. A small convolutional network sees both places in the range image (range relative
+to the object's, reflectance, lost returns, number of points), is trained on some scans and tested
+on others.
 
     python tools/research/surgery_trial.py --town 40 --labelled $LIDAR_SYNTH_LABELLED_SCANS/semantic_kitti
 """

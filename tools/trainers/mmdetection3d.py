@@ -2,10 +2,9 @@
 SemanticKITTI and nuScenes.
 
 MMCV_WHEEL names a wheel of mmcv 2.1.0 with its operators; without it they are compiled. FRNet, the
-network for
-SemanticKITTI, runs if FRNET_ROOT names a clone of its repository: it needs torch-scatter, which is
-    compiled. MinkUNet
-cannot run on a CPU, because its voxelisation sends tensors to CUDA.
+network for SemanticKITTI, runs if FRNET_ROOT names a clone of its repository: it needs
+torch-scatter, which is compiled. MinkUNet cannot run on a CPU, because its voxelisation sends
+tensors to CUDA.
 """
 
 import os

@@ -1,9 +1,9 @@
 """Distillation of a few-step student from a rectified-flow teacher.
 
 Every strategy is one function that gives the supervision of a batch: states, times, and the
-    velocities that the student
-is trained to predict there. The strategies differ in the times of training and in the part of the
-teacher's trajectory that the student approximates by a straight line::
+velocities that the student is trained to predict there. The strategies differ in the times of
+training and in the part of the teacher's trajectory that the student approximates by a straight
+line::
 
     strategy               time of training                                straightened part
     source adaptive_piecewise     starts of the intervals of the selected grid    interval's start

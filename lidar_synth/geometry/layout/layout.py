@@ -2,8 +2,7 @@
 and fences.
 
 A layout is in the sensor frame, metres: x forward, y left, z up. It is the condition of a model
-    that generates the scan
-of it, and its boxes are the boxes of that scan.
+that generates the scan of it, and its boxes are the boxes of that scan.
 """
 
 from collections.abc import Sequence

@@ -16,7 +16,7 @@ def layout_image(layout: Layout, sensor: Sensor) -> NDArray[np.uint8]:
     """Cast the rays through the centres of a sensor's cells, from where they start.
 
     The image does not depend on the direction of x: turning a layout rolls it, mirroring a layout
-        flips it.
+    flips it.
 
     Args:
         layout: what stands where. A box is never hidden by the ground, whose estimate may be too

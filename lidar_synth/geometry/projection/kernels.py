@@ -9,8 +9,7 @@ have no branches, so that the compiler can vectorise them, and use only IEEE +, 
 that numba on a CPU and torch on any device (batch.py) give the same bits.
 
 Everything that is compiled for ``project`` is in this one file: numba's cache on disk detects a
-    change of the file
-that defines a function, but not of a file whose functions were inlined into it.
+change of the file that defines a function, but not of a file whose functions were inlined into it.
 """
 
 from functools import lru_cache

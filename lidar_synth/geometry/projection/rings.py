@@ -3,10 +3,9 @@ are plausible.
 
 Lasers rotate counter-clockwise, so the azimuth (from straight ahead) increases within a ring, and a
 decrease marks the start of the next ring. The decrease is a full turn in a complete scan, and less
-in a scan cropped to a sector. Two
-other cases look like the start of a ring: a stray point, and a step back caused by motion
-    compensation, which changes
-the azimuth of near points more than that of distant ones.
+in a scan cropped to a sector. Two other cases look like the start of a ring: a stray point, and a
+step back caused by motion compensation, which changes the azimuth of near points more than that of
+distant ones.
 """
 
 import numpy as np

@@ -67,7 +67,7 @@ def first_hits(
     """Cast rays at the surfaces of a scan.
 
     Returns at the rim of a surface stand for a patch of their own: level where the surface is
-        level, else vertical.
+    level, else vertical.
 
     Args:
         surfaces: of N returns.

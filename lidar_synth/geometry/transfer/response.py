@@ -56,8 +56,7 @@ class Response:
         quantiles.
 
         Neither needs labels, but both should show scenes of the same kind: the curve cannot tell a
-            brighter street
-        from a brighter sensor.
+        brighter street from a brighter sensor.
 
         Raises:
             DataError: on scans without returns between 4 and 40 m.

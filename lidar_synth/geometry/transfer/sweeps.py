@@ -23,8 +23,7 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
     Returns in a box of the sweep move with the box to the one of the same ``instance`` in the scan.
     Returns of other
     vehicles and people are left out, because they may have moved: those in a box that the scan does
-        not have, and
-    those labelled as movable in no box.
+    not have, and those labelled as movable in no box.
 
     Args:
         sweep: N returns, with a pose.

@@ -45,11 +45,10 @@ class Transfer:
     """Turns scans of one sensor into scans of another.
 
     Surfaces are estimated from the returns: neighbours are joined unless the step between them or
-        their labels say
-    that they belong to different surfaces. The target's rays are cast at these surfaces from the
-    target's mount. A return with no neighbour of its surface stands for the patch between it and
-    the neighbouring rays, so that leaves and poles keep their share of returns. Where the recording
-    sensor saw nothing, there is no return.
+    their labels say that they belong to different surfaces. The target's rays are cast at these
+    surfaces from the target's mount. A return with no neighbour of its surface stands for the patch
+    between it and the neighbouring rays, so that leaves and poles keep their share of returns.
+    Where the recording sensor saw nothing, there is no return.
 
     Label, raw label, instance, confidence and time are those of the nearest return; reflectance is
     interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's

@@ -75,10 +75,10 @@ def evaluate(
     both sets: accuracy, IoU by class, the most frequent confusions and feature distances.
 
     Papers define metrics of the same name differently: scores of two protocols are not comparable.
-        Fewer scans than the
-    protocol's paper compares, and other sensors than its own, are refused. A reference that shares
-    frames with the model's training data is refused, because it flatters the model; the training
-    data of its teacher and autoencoder count too, and the names of the splits do not matter.
+    Fewer scans than the protocol's paper compares, and other sensors than its own, are refused. A
+    reference that shares frames with the model's training data is refused, because it flatters the
+    model; the training data of its teacher and autoencoder count too, and the names of the splits
+    do not matter.
 
     \b
     Examples:

@@ -8,8 +8,8 @@ for nearest neighbor search", 2011); of these, the ``CANDIDATES`` nearest sketch
 their full signatures. Exact copies are always found, by their hash.
 
 All steps before the full signatures compute with integers that float32 represents exactly: the
-    result does not depend
-on the machine, the number of threads or the block size. The time grows with N^1.5.
+result does not depend on the machine, the number of threads or the block size. The time grows with
+N^1.5.
 """
 
 import hashlib

@@ -1,9 +1,8 @@
 """Scores of all scans of a bank, and their file.
 
 The file is a numpy ``.npz`` without pickled objects: ``bank``, the identity of its bank;
-    ``reference``, the scans that
-the histograms were compared with ("" = the bank's own mean); ``twin``; and one array (N,) per
-score.
+``reference``, the scans that the histograms were compared with ("" = the bank's own mean);
+``twin``; and one array (N,) per score.
 """
 
 from collections.abc import Iterable

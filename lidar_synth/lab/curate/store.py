@@ -1,7 +1,7 @@
 """The features of a bank's scans on disk, so that the bank may be larger than the memory.
 
 A file holds ``BLOCK`` scans, 2.4 kB each, and is written atomically: a killed run resumes after the
-    existing files.
+existing files.
 """
 
 import shutil

@@ -1,8 +1,7 @@
 """Agreement of generated scans with the conditions that they were generated for.
 
 Both scans of a pair show the same place: the generated one, and the real one whose label map or
-    camera image was the
-condition.
+camera image was the condition.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,9 +1,8 @@
 """Metrics for a training loop: ``update`` with scans of both sets, ``compute``, ``reset``.
 
 They behave as those of torchmetrics: ``update(scans, real=True)`` collects, ``compute`` merges over
-    the processes of
-torch.distributed where it is initialised, ``reset(real=False)`` keeps the real scans for the next
-epoch.
+the processes of torch.distributed where it is initialised, ``reset(real=False)`` keeps the real
+scans for the next epoch.
 """
 
 import random

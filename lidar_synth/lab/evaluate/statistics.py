@@ -64,7 +64,7 @@ def sparse_histogram_distance(
     not empty.
 
     Only the bins that some histogram uses are compared: of the 4 million cells of LiDM's grid, the
-        fewest.
+    fewest.
     """
     filled = np.zeros(size, bool)
     for one in (*real, *fake):

@@ -3,9 +3,8 @@
 the state dictionaries ``backbone``, ``segmentation_decoder`` and ``segmentation_head``.
 
 Where such a network recognises the classes of a synthetic scan as well as those of real ones, the
-scan is realistic to
-it. No archive ships with the package: those of lidar-bonnetal have the terms of SemanticKITTI
-    (non-commercial).
+scan is realistic to it. No archive ships with the package: those of lidar-bonnetal have the terms
+of SemanticKITTI (non-commercial).
 """
 
 from collections.abc import Iterable, Sequence

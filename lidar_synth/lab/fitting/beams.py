@@ -401,8 +401,8 @@ def with_lost_beams(model: Model, points: Floats) -> Model:
     that see the sky.
 
     A beam is found among the points beyond ``STRAY`` of all others: where they lie close together,
-        with a valley
-    between them and the next beam on either side, so that the tail of a strong beam is none.
+    with a valley between them and the next beam on either side, so that the tail of a strong beam
+    is none.
 
     Args:
         model: with beams in any order.

@@ -1,12 +1,11 @@
 """Labels of KITTI-360's scans, recovered from the accumulated clouds of one window.
 
 A point of a scan takes the label on which its nearest neighbours agree: in the static clouds of the
-    window and of the
-ones before and after it, or among the moving objects of that very frame, whichever is nearer. A
-scan that lies up to ``FARTHEST`` off the clouds, because its pose is wrong, is laid onto them first
-(kitti360_registration.py). Clouds of other windows are left out, because cars that are parked now
-may be gone when the drive comes by again. A point keeps no label (0) where no neighbour lies within
-``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
+window and of the ones before and after it, or among the moving objects of that very frame,
+whichever is nearer. A scan that lies up to ``FARTHEST`` off the clouds, because its pose is wrong,
+is laid onto them first (kitti360_registration.py). Clouds of other windows are left out, because
+cars that are parked now may be gone when the drive comes by again. A point keeps no label (0) where
+no neighbour lies within ``RADIUS``, or where less than ``AGREEMENT`` of their weight agrees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -39,7 +39,7 @@ class _CastShape(NamedTuple):
     """A prototype as an Embree scene, with its bounding sphere.
 
     It holds a reference to its mesh: ``_SHAPES`` is keyed by ``id(mesh)``, which must not be
-        reused.
+    reused.
     """
 
     mesh: Mesh

@@ -2,9 +2,8 @@
 triangles.
 
 Rays pass between the leaves as in a real crown: some hit outer leaves, some a branch, and some an
-    object behind the
-tree. Each prototype is sampled once per process with a fixed key; a scene rotates, scales and tints
-it.
+object behind the tree. Each prototype is sampled once per process with a fixed key; a scene
+rotates, scales and tints it.
 """
 
 from functools import cache

@@ -1,9 +1,8 @@
 """The reference trainer: a small range-view segmenter on real scans with synthetic ones among them.
 
 All that a training with mixed data takes, in one file: ``endless_batches`` is the data loading,
-    ``train_segmenter`` the
-loop. ``tools/research/train_segmenter.py`` calls it from the command line, on the town or on your own
-dataset.
+``train_segmenter`` the loop. ``tools/research/train_segmenter.py`` calls it from the command line,
+on the town or on your own dataset.
 """
 
 from collections.abc import Callable, Iterable, Iterator

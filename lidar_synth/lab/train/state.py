@@ -1,9 +1,8 @@
 """The state of a training run, and how it is saved for resumption.
 
 The file is safetensors like a checkpoint, but serves to resume, not to sample: it holds the
-    network, the averaged
-weights, the optimiser's moments, the step, the seconds of training and a checksum. Everything else
-is a function of the configuration and the step.
+network, the averaged weights, the optimiser's moments, the step, the seconds of training and a
+checksum. Everything else is a function of the configuration and the step.
 """
 
 import copy

@@ -2,8 +2,8 @@
 overwritten.
 
 An outlook assigns every scan a *use*: the position of its next request, or ``NEVER``. The scan with
-    the nearest use is
-made first, and the scan with the farthest use is overwritten (Belady's rule, which is optimal).
+the nearest use is made first, and the scan with the farthest use is overwritten (Belady's rule,
+which is optimal).
 """
 
 import math

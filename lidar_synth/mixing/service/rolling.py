@@ -37,10 +37,8 @@ class RollingBank:
     """Scans by number from a generator process.
 
     Scan ``number`` is ``generator.scans(seed, [number])`` after a bank's encoding, for any process
-    and any order of
-    access. Two settings trade this for speed: ``starved="reuse"``, and ``refresh``, with which the
-        scan is a function
-    of number and epoch.
+    and any order of access. Two settings trade this for speed: ``starved="reuse"``, and
+    ``refresh``, with which the scan is a function of number and epoch.
 
     Workers inherit the bank when they start, forked or spawned. The generator process ends with
     ``close()``, at the end of a ``with`` block, or with the process that made the bank; in each

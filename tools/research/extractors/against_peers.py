@@ -258,7 +258,7 @@ def _bonnetal(
     and the image.
 
     Its projection takes the cell of the first point for empty: a point that another one hides is
-        put first.
+    put first.
     """
     import importlib
 

@@ -5,10 +5,9 @@
 
 spconv is the one from the package index. OpenPCDet's functions for a CPU are compiled from its
 sources (``openpcdet_cpu.cpp``), and numba's simulator runs the kernels of KITTI's evaluation. Two
-functions that OpenPCDet has
-for GPUs only are written here from its overlaps of boxes for a CPU: non-maximum suppression, and
-    the overlaps of its
-recall. Everything else that it compiles with nvcc can be imported and not called.
+functions that OpenPCDet has for GPUs only are written here from its overlaps of boxes for a CPU:
+non-maximum suppression, and the overlaps of its recall. Everything else that it compiles with nvcc
+can be imported and not called.
 
 Prints the scans of each batch.
 """

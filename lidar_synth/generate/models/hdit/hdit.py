@@ -11,8 +11,7 @@ Hourglass Diffusion Transformers", ICML 2024::
     -> velocity (B, C, H, W)
 
 A condition is given in one of two forms: maps on the grid of the state, which are added to the
-    tokens
-(``condition_channels``), or tokens, to which those of the coarsest level attend
+tokens (``condition_channels``), or tokens, to which those of the coarsest level attend
 (``context_channels``). The layers of both are initialised to zero.
 """
 

@@ -9,8 +9,7 @@ vector per cell is added to the features after the first convolution and before 
 that every level and every skip connection has access to a cell's position.
 
 A condition is given in one of two forms: maps on the grid of the state, which are concatenated with
-    it
-(``condition_channels``), or tokens, to which every cell attends at every level with attention
+it (``condition_channels``), or tokens, to which every cell attends at every level with attention
 (``context_channels``).
 """
 

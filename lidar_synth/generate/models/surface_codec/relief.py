@@ -2,10 +2,10 @@
 therefore drawn.
 
 The error of a predicted range has two causes. On a wall it is doubt: the plane lies elsewhere, and
-    drawing that would
-bend the wall. On grass and leaves it is relief, correlated over several columns, and a surface
-without it is smoother than any real one. The relief of a cell is a sum of fields of standard normal
-values, each with its own correlation along the columns. Rows of one patch share their values.
+drawing that would bend the wall. On grass and leaves it is relief, correlated over several columns,
+and a surface without it is smoother than any real one. The relief of a cell is a sum of fields of
+standard normal values, each with its own correlation along the columns. Rows of one patch share
+their values.
 """
 
 import math

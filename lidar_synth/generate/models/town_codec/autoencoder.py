@@ -4,10 +4,9 @@ An image (C, H, W) in [-1, 1] becomes a latent (Z, H / 4, W / 8) in (-1, 1), the
 et al., "Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024).
 
 No latent can hold what is random about a sensor: whether a ray returns, the speckle of a
-    reflectance. The decoder
-therefore predicts distributions, and an image is sampled from them: the mean would be smoother than
-    any real scan, and
-a network trained on such means would take the noise of real scans for something new.
+reflectance. The decoder therefore predicts distributions, and an image is sampled from them: the
+mean would be smoother than any real scan, and a network trained on such means would take the noise
+of real scans for something new.
 """
 
 from collections.abc import Callable, Sequence

@@ -80,9 +80,8 @@ def _lidm_image(scan: Scan, generated: bool) -> NDArray[np.float32]:
     unknown.
 
     A corner is the edge of four cells, so that rounding decides which of them a point meets: about
-        7 % of the returns
-    are lost. The operations are therefore those of LiDM's ``pcd2range`` in float32, and not
-    ``locate``.
+    7 % of the returns are lost. The operations are therefore those of LiDM's ``pcd2range`` in
+    float32, and not ``locate``.
     """
     points = _lidm_cloud(scan, generated)
     distance = np.linalg.norm(points, axis=1)
