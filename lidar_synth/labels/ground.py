@@ -54,6 +54,13 @@ class Ground(NamedTuple):
         )
         return heights
 
+    def standing(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> int:
+        """Number of points (N, 3) above the ground in or beside a box (7,)."""
+        local = np.abs(box_frame(points, box)[:, :2])
+        near = (local <= box[3:5] / 2 + CLEARANCE).all(1)
+        height = self.above(points[near], box)
+        return int(((height > FLOOR) & (height <= box[5])).sum())
+
 
 def ground_under(scan: Scan, box: NDArray[np.float32]) -> Ground | None:
     """The ground under a box, found by the labels around it, or by the lowest returns if there are

@@ -3,9 +3,11 @@
 A ring is continued over the hole from both sides. If both are one surface, its horizontal distance
 rho is interpolated: on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a
 cos(azimuth) + b sin(azimuth). Otherwise each side is continued to the middle. Deviations from it,
-lost returns, reflectance and labels are copied from the rays beside the hole, mirrored at its edge.
-Nothing but ground can be where the object stood; an estimate there is moved to where the ray leaves
-that place.
+lost returns, reflectance and labels are copied from the rays
+beside the hole, mirrored at its edge. Nothing but ground can be where the object stood: an estimate
+    just inside is
+moved to where the ray leaves that place; in place of another, the next surface beside the hole that
+is farther away is copied, and without one there is no return.
 """
 
 import numba
@@ -29,6 +31,10 @@ SAME = 0.2
 
 WIDE = 1.5
 """Radians from which on a hole is too wide for a wall that only one of its sides shows."""
+
+INSIDE = 0.5
+"""Metres by which an estimate may lie inside the place of the object to be moved to where the ray
+leaves it."""
 
 _BASE = 12  # rays between the two places that give the direction of a wall
 _SMOOTH = 2  # rays to either side over which a distance is averaged
@@ -117,7 +123,9 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             if not known[source]:
                 continue
             base = edge
-            if same:
+            if same and not (
+                mixed and ground[source]
+            ):  # ground continued towards a wall would rise
                 of_a = 1 - share
                 of_b = share
                 if not flat and turn < 3:
@@ -131,8 +139,23 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
                 abs(smooth - edge) > SAME * edge
             )  # the source is of another surface than the edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
-            if mixed or not ground[source]:  # ground continued towards a wall rises
-                out[j] = max(out[j], far[j])
+            if not ground[source] and far[j] - INSIDE < out[j] < far[j]:
+                out[j] = far[j]
+            elif not ground[source] and out[j] < far[j]:
+                beyond = _first_beyond(known, rho, side[:size], far[j])
+                if beyond < 0:
+                    beyond = _first_beyond(known, rho, right[:m] if use_left else left[:n], far[j])
+                donor[j] = beyond if beyond >= 0 else source
+                out[j] = rho[beyond] if beyond >= 0 else np.inf
+
+
+@numba.njit(cache=True)
+def _first_beyond(known, rho, side, limit):  # type: ignore[no-untyped-def]
+    """The first ray of a side whose return is farther away than a limit, metres; -1 = none."""
+    for i in side:
+        if known[i] and rho[i] > limit:
+            return i
+    return -1
 
 
 @numba.njit(cache=True)

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND
+from lidar_synth.datasets.classes import GROUND, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
-from lidar_synth.labels.boxes import grown, joined, overlapping
+from lidar_synth.labels.boxes import grown, joined, overlapping, turned_points
 from lidar_synth.labels.edit.compose import composed, next_instance
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.removal import remove, selected
@@ -41,6 +41,9 @@ that it lacks."""
 BESIDE = 0.05
 """Metres outside its box at which an object may still be hit: patches at its rim reach beyond the
 returns."""
+
+STRAYS = 2
+"""Maximum number of other returns above the ground in the place of an object."""
 
 GRAZE = 0.05
 """Metres by which the object has to be in front of a return to replace it."""
@@ -189,8 +192,22 @@ def move(
     cut = cut_out(scan, box)
     emptied = remove(scan, box, model=model, seed=seed)
     recorded = _shared(emptied, scan)
-    sure = recorded if emptied.label is None else recorded | GROUND[emptied.label]
-    return _set(emptied, cut, _place(emptied[sure], cut, pose), least, ~recorded)
+    ground = recorded if emptied.label is None else recorded | GROUND[emptied.label]
+    placed = _place(emptied[recorded], cut, pose, _with_foot(emptied[ground], cut), gone=box)
+    return _set(emptied, cut, placed, least, ~recorded)
+
+
+def _with_foot(scan: Scan, item: Object) -> Scan:
+    """The points and labels of a scan, and ground where an object of it stood, which it hid."""
+    along, across = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 3))
+    _, _, _, length, width, _, yaw = item.box.astype(np.float64)
+    local = np.stack([along.ravel() * length, across.ravel() * width], 1)
+    foot = np.full((len(local), 3), item.ground)
+    foot[:, :2] = turned_points(local, yaw) + item.box[:2]
+    points = np.concatenate([scan.points, foot.astype(np.float32)])
+    road = np.full(len(foot), TRAIN_ID["road"], np.uint8)
+    label = None if scan.label is None else np.concatenate([scan.label, road])
+    return Scan(points, np.zeros(len(points), np.float32), scan.sensor, label=label)
 
 
 def cut_out(scan: Scan, box: int) -> Object:
@@ -212,8 +229,21 @@ def cut_out(scan: Scan, box: int) -> Object:
     return found[box]
 
 
-def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
-    """The object at its pose on the ground."""
+def _place(
+    scan: Scan,
+    item: Object,
+    pose: Pose | None,
+    ground_of: Scan | None = None,
+    gone: int | None = None,
+) -> Placed:
+    """The object at its pose on the ground.
+
+    Args:
+        scan: what must not stand in its way.
+        item, pose: see ``insert``.
+        ground_of: shows the ground; by default the scan.
+        gone: number of a box that was taken out of the scan; later ones have one less.
+    """
     old = item.box.astype(np.float64)
     x, y, yaw = _complete(old, pose)
     distance = float(np.hypot(x, y))
@@ -232,24 +262,27 @@ def _place(scan: Scan, item: Object, pose: Pose | None) -> Placed:
         )
     if scan.boxes is not None and (taken := overlapping(box, scan.boxes.values)).any():
         number = int(np.flatnonzero(taken)[0])
+        name = scan.boxes.names[number]
+        number += gone is not None and number >= gone
         raise DataError(
-            f"an object at {_place_text(box)}, which overlaps box {number} "
-            f"({scan.boxes.names[number]})",
+            f"an object at {_place_text(box)}, which overlaps box {number} ({name})",
             "a free place",
             "Remove that object first, or choose another place.",
         )
     if _recorded_here(scan, item, box):
         box[2] = old[2]
         return Placed(old, box, False)
-    ground = ground_under(scan, box)
+    ground = ground_under(ground_of or scan, box)
     if ground is None or not ground.encloses:
         raise DataError(
             f"an object at {_place_text(box)}, where the scan has no level ground",
             "ground around the box",
         )
-    if not ground.free:
+    count = ground.standing(scan.points, box)
+    if count > STRAYS:
         raise DataError(
-            f"an object at {_place_text(box)}, where the scan has other returns", "a free place"
+            f"an object at {_place_text(box)}, where the scan has {count} other returns",
+            "a free place",
         )
     box[2] = ground.height + old[2] - item.ground
     return Placed(old, box, _mirrored(old, x, y, yaw))
