@@ -123,9 +123,8 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             if not known[source]:
                 continue
             base = edge
-            if same and not (
-                mixed and ground[source]
-            ):  # ground continued towards a wall would rise
+            # Ground that is continued towards a wall would rise.
+            if same and not (mixed and ground[source]):
                 of_a = 1 - share
                 of_b = share
                 if not flat and turn < 3:
