@@ -46,7 +46,7 @@ SCANS = 20
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("embreex")
     out = tmp_path_factory.mktemp("k360") / "town"
-    sensor = replace(load_sensor("hdl64e_kitti360"), name="coarse", columns=512)
+    sensor = replace(load_sensor("hdl64e_kitti360"), name="coarse", columns=256)
     export_town(
         Town(3, sensor, SCANS), out, "kitti360", camera=False, accumulate=True, progress=False
     )
