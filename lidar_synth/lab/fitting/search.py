@@ -80,8 +80,6 @@ def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
         if sharp > best:
             best = sharp
             place = found
-        if best > SHARP:
-            break
     return place[:3], tilt_of(place[3:])
 
 
