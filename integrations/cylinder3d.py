@@ -19,7 +19,7 @@ from lidar_synth.integrations.mixture import (
     EpochLoader,
     class_ids,
     id_table,
-    mix,
+    mix_for_trainer,
     points_of,
     read_settings,
     refuse_unlabelled,
@@ -65,7 +65,7 @@ def register() -> Any:
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
                 self._ids = trainer_ids(self.learning_map, take_classes(settings), _IDS)
-                self.mixed = mix(len(self.im_idx), settings, lambda scan, rng: scan)
+                self.mixed = mix_for_trainer(len(self.im_idx), settings, lambda scan, rng: scan)
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""

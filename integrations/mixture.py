@@ -23,9 +23,22 @@ from lidar_synth.datasets.classes import (
 )
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.mixing.settings import OPTIONS, VARIABLE, mix, open_synthetic, read_settings
+from lidar_synth.mixing.settings import (
+    OPTIONS,
+    VARIABLE,
+    mix_for_trainer,
+    open_synthetic,
+    read_settings,
+)
 
-__all__ = ["OPTIONS", "VARIABLE", "EpochLoader", "mix", "open_synthetic", "read_settings"]
+__all__ = [
+    "OPTIONS",
+    "VARIABLE",
+    "EpochLoader",
+    "mix_for_trainer",
+    "open_synthetic",
+    "read_settings",
+]
 
 
 def take_classes(settings: dict[str, Any]) -> Taxonomy:

@@ -15,7 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from lidar_synth.integrations.detection import in_view
-from lidar_synth.integrations.mixture import class_ids, id_table, mix, open_synthetic, points_of
+from lidar_synth.integrations.mixture import (
+    class_ids,
+    id_table,
+    mix_for_trainer,
+    open_synthetic,
+    points_of,
+)
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
 from lidar_synth.integrations.nuscenes import CLASSES as NUSCENES_CLASSES
 from lidar_synth.integrations.nuscenes import as_nuscenes, five_values
@@ -87,7 +93,7 @@ class Folder:
                 "ratio": {int(epoch): share for epoch, share in ratio.items()}
             }
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
-        self.mixed = mix(self.real, self.settings, lambda scan, rng: scan)
+        self.mixed = mix_for_trainer(self.real, self.settings, lambda scan, rng: scan)
         self.slots = self.mixed.mixture.laps[0]
         self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
         self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()

@@ -21,7 +21,7 @@ from lidar_synth.integrations.mixture import (
     EpochLoader,
     class_ids,
     id_table,
-    mix,
+    mix_for_trainer,
     points_of,
     read_settings,
     refuse_unlabelled,
@@ -92,7 +92,7 @@ def _split_class(stock: Any) -> Any:
 
         def __init__(self, dataset: Any, split: str = "training") -> None:
             # First, because the base class makes a sampler, which reads the length.
-            self.mixed = mix(
+            self.mixed = mix_for_trainer(
                 len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan
             )
             super().__init__(dataset, split=split)

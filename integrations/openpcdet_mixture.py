@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.mixture import mix, read_settings
+from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
@@ -37,7 +37,7 @@ class Mixed:
         """Make the mixture and check its first synthetic scans; ``known`` are the class names that
         a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
-        self.mixed = mix(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
+        self.mixed = mix_for_trainer(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
         self._check_boxes({*self.class_names, *known})
 
     def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:

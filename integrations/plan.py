@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.mixture import mix, read_settings
+from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 from lidar_synth.integrations.reader import PLAN_FORMAT
 
 from lidar_synth.bank import is_bank
@@ -75,7 +75,7 @@ def write_plan(
         raise ConfigError(
             f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one."
         )
-    mixed = mix(real, settings, lambda scan, rng: scan)
+    mixed = mix_for_trainer(real, settings, lambda scan, rng: scan)
     if (
         "boxes" in mixed.synthetic[0].fields
         and labels != "none"

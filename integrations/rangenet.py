@@ -23,7 +23,7 @@ from lidar_synth.integrations.launcher import prepare_script, run
 from lidar_synth.integrations.mixture import (
     class_ids,
     id_table,
-    mix,
+    mix_for_trainer,
     points_of,
     read_settings,
     refuse_unlabelled,
@@ -87,7 +87,7 @@ def dataset_class(stock: Any) -> Any:
             settings = dict(settings)
             self.taxonomy = take_classes(settings)
             _check_classes(self.learning_map, self.learning_map_inv, self.taxonomy)
-            self.mixed = mix(len(self.scan_files), settings, lambda scan, rng: scan)
+            self.mixed = mix_for_trainer(len(self.scan_files), settings, lambda scan, rng: scan)
             check_stripes(self)
 
         def set_epoch(self, epoch: int) -> None:

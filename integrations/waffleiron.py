@@ -21,7 +21,7 @@ from lidar_synth.integrations.launcher import CPU, plain_errors, prepare_script
 from lidar_synth.integrations.mixture import (
     class_ids,
     id_table,
-    mix,
+    mix_for_trainer,
     points_of,
     read_settings,
     refuse_unlabelled,
@@ -57,7 +57,7 @@ def dataset_class(stock: Any) -> Any:
                 refuse_unlabelled(settings, "WaffleIron")
                 require_ids(self.learning_map, _FILE_IDS)
                 self.real = copy(self)
-                self.mixed = mix(len(self.real), settings, lambda scan, rng: scan)
+                self.mixed = mix_for_trainer(len(self.real), settings, lambda scan, rng: scan)
                 self.set_epoch(0)
 
         def set_epoch(self, epoch: int) -> None:

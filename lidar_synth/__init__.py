@@ -56,6 +56,7 @@ _HOME = {
     "load_sensor": "geometry.sensor",
     "load_skin": "lab.town",
     "make_policy": "labels",
+    "mix": "mixing.settings",
     "open_scans": "formats",
     "project": "geometry.projection",
     "prove": "lab.proof",
@@ -111,9 +112,14 @@ if TYPE_CHECKING:
     from lidar_synth.mixing import Sources as Sources
     from lidar_synth.mixing.service import BatchMixer as BatchMixer
     from lidar_synth.mixing.service import RollingBank as RollingBank
+    from lidar_synth.mixing.settings import mix as mix
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}")
     return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -10,7 +10,6 @@ import pytest
 import yaml
 from banks import write_bank
 from blocks import record
-from lidar_synth.integrations.mixture import mix
 from test_transfer_mixing import OURS, THEIRS
 
 from lidar_synth.bake.as_sensor import turn_bank
@@ -23,6 +22,7 @@ from lidar_synth.formats.as_sensor import read_transfer
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer import Measurement, Mount, Transfer
+from lidar_synth.mixing.settings import mix_for_trainer
 from lidar_synth.noise import keyed_rng
 
 TRANSFER = Transfer(THEIRS, Mount(0.1), Measurement(range_noise=0.02, loss=0.1))
@@ -115,7 +115,7 @@ def test_settings_name_sensor_mount_and_scans_to_match(tmp_path: Path, bank: Ban
     for wrong in ({"mount": [0, 0]}, given | {"mount": "high"}, given | {"noise": 1}):
         with pytest.raises(ConfigError, match="as_sensor: .*expected sensor: a preset's name"):
             read_transfer(wrong, bank)
-    plain = mix(
+    plain = mix_for_trainer(
         3,
         {"synthetic": bank, "as_sensor": {"sensor": "os1_128", "mount": [0.1, 0]}},
         lambda scan, rng: scan,

@@ -26,7 +26,7 @@ from lidar_synth.integrations.mixture import (
     EpochLoader,
     class_ids,
     id_table,
-    mix,
+    mix_for_trainer,
     open_synthetic,
     points_of,
     read_settings,
@@ -64,7 +64,7 @@ def test_synthetic_scans_by_name(tmp_path: Path) -> None:
 
 
 def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
-    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4, "seed": 1}, as_is)
+    mixed = mix_for_trainer(6, {"synthetic": Endless(), "ratio": 0.4, "seed": 1}, as_is)
     samples = [mixed[i] for i in range(len(mixed))]
     assert sorted(s for s in samples if isinstance(s, int)) == list(range(6))
     assert sum(isinstance(s, Scan) for s in samples) == 4
@@ -81,7 +81,7 @@ def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
 )
 def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        mix(4, settings, as_is)
+        mix_for_trainer(4, settings, as_is)
 
 
 def test_settings_come_from_a_file_or_the_environment(
@@ -171,7 +171,7 @@ class Wrapped(Dataset[Any]):
 @pytest.mark.parametrize("persistent", [False, True])
 def test_the_loader_tells_the_epoch(persistent: bool) -> None:
     """Trap: an attribute set in the main process never reaches workers that persist."""
-    mixed = mix(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
+    mixed = mix_for_trainer(6, {"synthetic": Endless(), "ratio": 0.4}, as_is)
     loader = EpochLoader(
         Wrapped(mixed),
         batch_size=2,
@@ -194,7 +194,7 @@ def test_the_loader_tells_the_epoch(persistent: bool) -> None:
 def test_trainers_generators_do_not_decide_on_scans() -> None:
     """Trap: some seed their workers the same in every epoch."""
     settings = {"synthetic": Endless(), "ratio": 0.4}
-    mixed = mix(6, settings, lambda scan, rng: (scan.id, int(rng.integers(1 << 60))))
+    mixed = mix_for_trainer(6, settings, lambda scan, rng: (scan.id, int(rng.integers(1 << 60))))
     given = []
     for seed in (0, 1):
         np.random.seed(seed)

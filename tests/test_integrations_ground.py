@@ -13,7 +13,7 @@ from lidar_synth.integrations.detection import (
     write_gt_database,
 )
 from lidar_synth.integrations.mixture import (
-    mix,
+    mix_for_trainer,
 )
 from mixtures import as_is
 from streets import CAMERA, held, street, synthetic
@@ -100,7 +100,7 @@ def test_a_detectors_mixture_has_boxes_by_the_mix_policy(tmp_path: Path) -> None
         "labels": "mix",
         "label_options": {"objects": str(tmp_path / "objects.npz"), "count": 4},
     }
-    given = mix(4, settings, as_is)
+    given = mix_for_trainer(4, settings, as_is)
     scans = [s for s in (given[i] for i in range(len(given))) if isinstance(s, Scan)]
     assert len(scans) == 4
     found = [boxes for s in scans if (boxes := s.boxes) is not None]

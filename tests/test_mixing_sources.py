@@ -244,7 +244,11 @@ def wrong_labels() -> Any:
             r"seed, epoch and position",
         ),
         (
-            lambda: mixed().batches(2).load_state_dict({"seed": 1, "epoch": 0, "position": 0}),
+            lambda: (
+                mixed()
+                .batches(2)
+                .load_state_dict({"seed": 1, "epoch": 0, "position": 0, "plan": ""})
+            ),
             ConfigError,
             r"seed 1 for a mixture of seed 0",
         ),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from banks import some_image, write_bank
-from lidar_synth.integrations.mixture import mix, read_settings
+from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 from mixtures import Endless, Scans, as_is
 
 from lidar_synth.bank import Bank
@@ -41,7 +41,7 @@ def test_wrong_settings_are_named(case: str, tmp_path: Path) -> None:
     start = "" if text.startswith("[") else f"synthetic: {tmp_path / 'bank'}\n"
     path.write_text(start + text)
     with pytest.raises(ConfigError, match=message):
-        mix(4, read_settings(path), as_is)
+        mix_for_trainer(4, read_settings(path), as_is)
 
 
 def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("synthetic", [{"threshold": 1}, "a" * 5000])
 def test_what_is_no_source_is_refused(synthetic: object) -> None:
     with pytest.raises(ConfigError, match="as a source of synthetic scans|model 'aaa"):
-        mix(4, {"synthetic": synthetic}, as_is)
+        mix_for_trainer(4, {"synthetic": synthetic}, as_is)
 
 
 @pytest.mark.parametrize("epoch", [1.5, "1", None, True])

@@ -2,12 +2,15 @@
 
 import ast
 import graphlib
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from sizes import size_of
 
 import lidar_synth
+from lidar_synth.labels import KINDS, POLICIES
 
 ORDER = """
 errors files datasets noise geometry generate.models generate.flow generate labels bank formats mixing bake viz cli
@@ -128,6 +131,9 @@ def test_every_module_is_imported_by_something() -> None:
     used |= {
         name for name in known if name.startswith("lidar_synth.lab.cli.")
     }  # loaded by name, with the command
+    used |= {
+        f"lidar_synth.labels.{home.split('.')[0]}" for home in (*POLICIES.values(), *KINDS.values())
+    }
     packages = {name for name, path in known.items() if path.name == "__init__.py"}
     assert known.keys() - used - packages == PUBLIC
 
@@ -196,3 +202,11 @@ def test_open3d_is_imported_by_nothing_at_import_time() -> None:
 def test_what_the_package_offers_can_be_imported() -> None:
     for name in lidar_synth.__all__:
         assert getattr(lidar_synth, name) is not None
+
+
+def test_a_mixture_loads_few_modules_and_no_network() -> None:
+    code = "import sys; from lidar_synth import MixedScans; print(*sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = {name for name in out.stdout.split() if name.startswith("lidar_synth")}
+    assert len(loaded) <= 50
+    assert not [n for n in loaded if n.startswith(("lidar_synth.lab.", "lidar_synth.generate"))]

@@ -8,7 +8,6 @@ import pytest
 import torch
 import yaml
 from blocks import record
-from lidar_synth.integrations.mixture import mix
 from torch.utils.data import DataLoader
 
 from lidar_synth.errors import ConfigError
@@ -16,6 +15,7 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import Measurement, Mount, Transfer
 from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing.settings import mix_for_trainer
 
 THEIRS = Sensor("theirs", 512, 1.0, 100.0, rows=16, fov_up=2.0, fov_down=-14.0)
 OURS = replace(load_sensor("hdl64e_kitti360"), firings=512)
@@ -56,7 +56,7 @@ def test_the_settings_of_an_adapter_name_the_sensor(
     values = THEIRS.to_dict()
     path = tmp_path / "theirs.yaml"
     path.write_text(yaml.safe_dump({values.pop("name"): values}))
-    mixed = mix(
+    mixed = mix_for_trainer(
         3, {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)}, lambda scan, rng: scan
     )
     made = [

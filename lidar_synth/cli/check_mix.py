@@ -46,7 +46,7 @@ def check_mix(
         spread,
         table_of,
     )
-    from lidar_synth.mixing.settings import mix as make_mixture
+    from lidar_synth.mixing.settings import mix_for_trainer as make_mixture
     from lidar_synth.mixing.settings import read_settings
     from lidar_synth.viz import view_suffix, write_view
 

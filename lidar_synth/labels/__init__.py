@@ -1,24 +1,44 @@
-"""Label policies of synthetic scans by name, and objects that are pasted into scans."""
+"""Label policies of synthetic scans by name, and objects that are pasted into scans.
 
-from lidar_synth.labels import edit
-from lidar_synth.labels.bank import ObjectBank
-from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
-from lidar_synth.labels.objects import Object, instances_of, objects_of
-from lidar_synth.labels.pasting import paste
-from lidar_synth.labels.policies import KINDS, POLICIES, LabelPolicy, make_policy
+Each name is imported when it is first used: editing loads networks, which a mixture does not need.
+"""
 
-__all__ = [
-    "KINDS",
-    "POLICIES",
-    "LabelPolicy",
-    "Object",
-    "ObjectBank",
-    "edit",
-    "instances_of",
-    "make_policy",
-    "objects_of",
-    "paste",
-    "swap_bands",
-    "swap_sector",
-    "thinned",
-]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+_HOME = {
+    "KINDS": "policies",
+    "POLICIES": "policies",
+    "LabelPolicy": "policies",
+    "Object": "objects",
+    "ObjectBank": "bank",
+    "instances_of": "objects",
+    "make_policy": "policies",
+    "objects_of": "objects",
+    "paste": "pasting",
+    "swap_bands": "exchange",
+    "swap_sector": "exchange",
+    "thinned": "exchange",
+}
+
+__all__ = list(_HOME)
+
+if TYPE_CHECKING:
+    from lidar_synth.labels.bank import ObjectBank as ObjectBank
+    from lidar_synth.labels.exchange import swap_bands as swap_bands
+    from lidar_synth.labels.exchange import swap_sector as swap_sector
+    from lidar_synth.labels.exchange import thinned as thinned
+    from lidar_synth.labels.objects import Object as Object
+    from lidar_synth.labels.objects import instances_of as instances_of
+    from lidar_synth.labels.objects import objects_of as objects_of
+    from lidar_synth.labels.pasting import paste as paste
+    from lidar_synth.labels.policies import KINDS as KINDS
+    from lidar_synth.labels.policies import POLICIES as POLICIES
+    from lidar_synth.labels.policies import LabelPolicy as LabelPolicy
+    from lidar_synth.labels.policies import make_policy as make_policy
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'lidar_synth.labels' has no attribute {name!r}")
+    return getattr(import_module(f"lidar_synth.labels.{_HOME[name]}"), name)

@@ -2,6 +2,7 @@
 alone."""
 
 from collections.abc import Callable
+from importlib import import_module
 from inspect import signature
 from typing import Any
 
@@ -9,20 +10,17 @@ import numpy as np
 
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.labels.mix import exchange, laser, objects, polar
-from lidar_synth.labels.own import boxes, condition, generated, ignored, unlabelled
-from lidar_synth.labels.pseudo import pseudo
 
 LabelPolicy = Callable[[Scan, np.random.Generator], Scan]
 """Sets the labels of a synthetic scan; it returns a new scan and never changes its input."""
 
-KINDS: dict[str, Callable[..., LabelPolicy]] = {
-    "objects": objects,
-    "polar": polar,
-    "laser": laser,
-    "exchange": exchange,
+KINDS = {
+    "objects": "mix.objects",
+    "polar": "mix.polar",
+    "laser": "mix.laser",
+    "exchange": "mix.exchange",
 }
-"""Builders of the kinds of ``mix``: ``(real, fields, **options) -> LabelPolicy``."""
+"""Where to find the builders of the kinds of ``mix``, in ``lidar_synth.labels``."""
 
 
 def mix(
@@ -38,16 +36,17 @@ def mix(
     return _build(KINDS[kind], f"labels='mix', kind={kind!r}", real, fields, options)
 
 
-POLICIES: dict[str, Callable[..., LabelPolicy]] = {
-    "none": unlabelled,
-    "ignore": ignored,
-    "generated": generated,
-    "condition": condition,
-    "pseudo": pseudo,
-    "mix": mix,
-    "boxes": boxes,
+POLICIES = {
+    "none": "own.unlabelled",
+    "ignore": "own.ignored",
+    "generated": "own.generated",
+    "condition": "own.condition",
+    "pseudo": "pseudo.pseudo",
+    "mix": "policies.mix",
+    "boxes": "own.boxes",
 }
-"""Builders by name: ``(real, fields, **options) -> LabelPolicy``."""
+"""Where to find the builder of each policy, in ``lidar_synth.labels``; builders are
+``(real, fields, **options) -> LabelPolicy`` and are imported when they are used."""
 
 
 def make_policy(
@@ -91,12 +90,14 @@ def make_policy(
 
 
 def _build(
-    build: Callable[..., LabelPolicy],
+    home: str,
     where: str,
     real: Source | None,
     fields: frozenset[str],
     options: dict[str, Any],
 ) -> LabelPolicy:
+    module, name = home.split(".")
+    build: Callable[..., LabelPolicy] = getattr(import_module(f"lidar_synth.labels.{module}"), name)
     try:
         signature(build).bind(real, fields, **options)
     except TypeError as error:

@@ -4,7 +4,6 @@ The plan of an epoch (plan.py) is a pure function of seed and epoch; datasets, b
 stream follow it.
 """
 
-from lidar_synth.generate.generator import Generated
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate
 from lidar_synth.mixing.items import Item, to_item
@@ -18,7 +17,6 @@ from lidar_synth.mixing.synthetic import Held, Synthetic, make_synthetic
 
 __all__ = [
     "Collate",
-    "Generated",
     "Held",
     "Item",
     "Linear",

@@ -11,7 +11,6 @@ from torch.utils.data import get_worker_info
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.labels.edit import measure
 from lidar_synth.mixing.meaning import OTHER_SIZE
 from lidar_synth.mixing.plan import MixingPlan
 
@@ -122,11 +121,14 @@ class Notices:
                 "background. For a detector, use labels='mix' with objects, or labels='boxes' if "
                 "the scans have boxes."
             )
-        elif (found := measure([given])).objects:
+            return
+        from lidar_synth.labels.edit import measure  # loads networks
+
+        found = measure([given])
+        if found.objects:
             log.warning(
                 "synthetic scan %r: %s, which unboxed='close' removes; only their number is "
-                "reported with "
-                "unboxed='keep'",
+                "reported with unboxed='keep'",
                 given.id,
                 found,
             )

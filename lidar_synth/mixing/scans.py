@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -14,14 +14,13 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import LabelPolicy, make_policy
-from lidar_synth.labels.edit.unboxed import make_handling
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
 from lidar_synth.mixing.items import copy_scan, to_item
+from lidar_synth.mixing.loader import MixedLoader
 from lidar_synth.mixing.notices import Notices, report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
@@ -29,6 +28,9 @@ from lidar_synth.mixing.schedules import Schedule, make_schedule, to_integer
 from lidar_synth.mixing.sources import check_together, each
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
+
+if TYPE_CHECKING:
+    from lidar_synth.geometry.transfer import Transfer
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +133,7 @@ class MixedScans(Dataset[Any]):
         collate: Form | Callable[[Any], Any] = "offsets",
         unlabelled: Unlabelled = "error",
         unboxed: str | Callable[[Scan], Scan] = "close",
-        as_sensor: Transfer | Sensor | str | Path | None = None,
+        as_sensor: "Transfer | Sensor | str | Path | None" = None,
         real_as_is: bool = False,
         compare: bool = True,
     ) -> None:
@@ -147,11 +149,7 @@ class MixedScans(Dataset[Any]):
         synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
-        self._transfer = (
-            as_sensor
-            if isinstance(as_sensor, Transfer | None)
-            else Transfer(load_sensor(as_sensor))
-        )
+        self._transfer = _make_transfer(as_sensor)
         suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
         self.mixture = Mixture(
             tuple(
@@ -179,7 +177,7 @@ class MixedScans(Dataset[Any]):
             make_policy(labels, real=scans, fields=s.fields | rings, **options)
             for s in self.synthetic
         ]
-        self._without_unboxed = make_handling(unboxed) if isinstance(unboxed, str) else unboxed
+        self._without_unboxed = _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
         self._notices = Notices(images=collate == "range")
         self._augment = augment
         self._augment_real = augment_real
@@ -444,3 +442,37 @@ class MixedScans(Dataset[Any]):
             [[0, 1], [0, 1], [0, 1]]
         """
         return MixedBatches(self, batch_size, rank=rank, world_size=world_size, drop_last=drop_last)
+
+    def loader(self, batch_size: int, num_workers: int = 0, **options: Any) -> MixedLoader:
+        """Make a ``DataLoader`` that sets its own epoch and can resume; see ``MixedLoader``.
+
+        Args:
+            batch_size: number of samples in a batch, on each rank.
+            num_workers: number of worker processes.
+            options: further arguments of ``DataLoader``.
+
+        Example:
+            >>> from lidar_synth import Bank, MixedScans, open_scans
+            >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.25)
+            >>> loader = train.loader(batch_size=2)
+            >>> for epoch in range(2):
+            ...     for batch in loader:
+            ...         state = loader.state_dict()
+            >>> state["epoch"], state["position"]  # after the last batch of epoch 1
+            (2, 0)
+        """
+        return MixedLoader(self, batch_size, num_workers, **options)
+
+
+def _make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
+    from lidar_synth.geometry.transfer import Transfer  # only where a mixture turns its scans
+
+    if given is None or isinstance(given, Transfer):
+        return given
+    return Transfer(load_sensor(given))
+
+
+def _make_handling(name: str) -> Callable[[Scan], Scan]:
+    from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
+
+    return make_handling(name)

@@ -13,8 +13,11 @@ from lidar_synth.errors import ConfigError, shorten
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import read_transfer
+from lidar_synth.formats.description import same_grid
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.mixing.scans import MixedScans
+from lidar_synth.labels.policies import LabelPolicy
+from lidar_synth.mixing.scans import MixedScans, Ratio
+from lidar_synth.mixing.sources import each, sensor_of
 
 VARIABLE = "LIDAR_SYNTH_MIX"
 """Environment variable with the YAML file of settings, for trainers whose configuration allows no
@@ -51,9 +54,8 @@ def open_synthetic(where: Any) -> Any:
     if is_url(where):
         return Bank(where)
     if not os.path.isdir(where):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
-        from lidar_synth.generate.loading import (
-            load_generator,
-        )  # loads networks: only where a model is named
+        # It loads networks: only where a model is named.
+        from lidar_synth.generate.loading import load_generator
 
         return load_generator(where)
     if is_bank(where):
@@ -95,6 +97,54 @@ def read_settings(given: Any = None) -> dict[str, Any]:
 
 
 def mix(
+    real: Any,
+    synth: Any,
+    ratio: Ratio = 0.25,
+    labels: str | LabelPolicy = "generated",
+    *,
+    as_sensor: Any = "auto",
+    **options: Any,
+) -> MixedScans:
+    """Mix real and synthetic scans; ``mix(...).loader(...)`` makes batches of them.
+
+    Args:
+        real: a folder or URL of scans or of a bank, or any source of scans.
+        synth: a folder or URL of scans or of a bank, a checkpoint, the name of a shipped model, or
+            any source of synthetic scans.
+        ratio, labels: as for ``MixedScans``.
+        as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
+            is another; None leaves them as they are; otherwise as for ``MixedScans``, or
+            ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``.
+        options: further arguments of ``MixedScans``.
+
+    Raises:
+        ConfigError, FileError, DataError: if a source cannot be opened; as ``MixedScans``.
+
+    Example:
+        >>> import lidar_synth
+        >>> train = lidar_synth.mix("demo_out/town", "demo_out/bank", ratio=0.25)
+        >>> for batch in train.loader(batch_size=4):
+        ...     print(sorted(batch["domain"].tolist()))
+        [0, 0, 0, 1]
+    """
+    reals = _open_real(real)
+    synthetics = open_synthetic(synth)
+    if as_sensor == "auto":
+        target = sensor_of(reals)
+        alike = all(same_grid(target, sensor_of(source)) for source, _ in each(synthetics))
+        as_sensor = None if alike else target
+    as_sensor = read_transfer(as_sensor, synthetics)
+    return MixedScans(reals, synthetics, ratio, labels, as_sensor=as_sensor, **options)
+
+
+def _open_real(where: Any) -> Any:
+    """Open real scans by their path or URL; any other object is returned unchanged."""
+    if not isinstance(where, str | Path):
+        return where
+    return Bank(where) if is_url(where) or is_bank(where) else open_scans(where)
+
+
+def mix_for_trainer(
     real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]
 ) -> MixedScans:
     """Make a mixture from settings, for a trainer that loads real samples itself.

@@ -15,7 +15,7 @@ import torch
 import yaml
 from banks import SENSOR, some_image, write_bank
 from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
-from lidar_synth.integrations.mixture import mix, read_settings
+from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 from ouster_files import ouster_metadata
 from pandaset_files import write_pandaset
 
@@ -255,7 +255,7 @@ def read_mixture(root: Path) -> list[Any]:
     settings = read_settings(root / "mix.yaml")
     if settings.get("synthetic") == "bank":
         settings["synthetic"] = root / "bank"
-    mixed = mix(4, settings, lambda scan, rng: scan)
+    mixed = mix_for_trainer(4, settings, lambda scan, rng: scan)
     found: list[Any] = []
     for epoch in range(4):
         mixed.set_epoch(epoch)

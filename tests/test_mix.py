@@ -1,0 +1,102 @@
+"""The one door: two sources to batches, epochs that follow one another, resumption."""
+
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+from banks import SENSOR, some_image, write_bank
+from mixtures import Endless, Scans
+
+import lidar_synth
+from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.formats import WRITERS
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.mixing import Linear, MixedScans
+
+THEIRS = Sensor("theirs", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+WORKERS = pytest.mark.parametrize(
+    "workers", [0, pytest.param(2, marks=pytest.mark.slow)], ids=["0 workers", "2 workers"]
+)
+
+
+def mixture() -> MixedScans:
+    return lidar_synth.mix(Scans("r", 9), Endless(), ratio=Linear(0.5, 0.1, 4), seed=3)
+
+
+def ids(batches: Any) -> list[str]:
+    return [name for batch in batches for name in batch["id"]]
+
+
+def in_order(epoch: int) -> list[str]:
+    train = mixture()
+    train.set_epoch(epoch)
+    return [train[i]["id"] for i in range(len(train))]
+
+
+def test_two_folders_are_mixed_by_their_paths(tmp_path: Path) -> None:
+    writer = WRITERS["npz"](tmp_path / "real")
+    for number, scan in enumerate(Scans("r", 3)):
+        writer.write(scan, number)
+    writer.finish()
+    write_bank(tmp_path / "bank", [some_image(i) for i in range(4)])
+    train = lidar_synth.mix(tmp_path / "real", str(tmp_path / "bank"), ratio=0.25)
+    [batch] = train.loader(batch_size=4)
+    assert sorted(batch["domain"].tolist()) == [0, 0, 0, 1]
+    with pytest.raises(FileError, match="no/such"):
+        lidar_synth.mix("no/such", tmp_path / "bank")
+    with pytest.raises(ConfigError, match="model 'tow'.*town"):
+        lidar_synth.mix(tmp_path / "real", "tow")
+
+
+def test_synthetic_scans_come_out_on_the_sensor_of_the_real_ones() -> None:
+    real = Scans("r", 4, sensor=THEIRS)
+    town = lidar_synth.Town(seed=0, scans=2, sensor=SENSOR)
+    train = lidar_synth.mix(real, town, ratio=0.5, to_sample=lambda scan, rng: scan.sensor.shape)
+    assert [train[i] for i in range(len(train))] == [THEIRS.shape] * 8
+    with pytest.raises(ConfigError, match="8 x 64"):
+        lidar_synth.mix(real, town, ratio=0.5, as_sensor=None)
+    same = lidar_synth.mix(Scans("r", 4), Endless(), ratio=0.5)
+    assert same.mixture == MixedScans(Scans("r", 4), Endless(), ratio=0.5).mixture
+
+
+@WORKERS
+def test_each_pass_of_a_loader_is_the_next_epoch(workers: int) -> None:
+    loader = mixture().loader(batch_size=4, num_workers=workers)
+    for epoch in range(3):
+        assert loader.epoch == epoch
+        assert ids(loader) == in_order(epoch)
+    loader.set_epoch(7)
+    assert ids(loader) == in_order(7)
+
+
+@WORKERS
+@pytest.mark.parametrize("done", [1, 3, None], ids=["early", "late", "whole"])
+def test_a_loader_resumes_after_the_latest_batch(workers: int, done: int | None) -> None:
+    loader = mixture().loader(batch_size=4, num_workers=workers, drop_last=False)
+    loader.set_epoch(2)
+    seen = ids(islice(loader, done))
+    state = loader.state_dict()
+    resumed = mixture().loader(batch_size=2, num_workers=workers)
+    resumed.load_state_dict(state)
+    whole = in_order(2)
+    assert seen == whole[: len(seen)]
+    assert ids(resumed) == (whole[len(seen) :] or in_order(3))
+    assert resumed.epoch == (3 if done else 4)
+    assert ids(resumed) == in_order(resumed.epoch - 1)
+
+
+def test_a_pass_that_is_left_early_is_begun_again() -> None:
+    loader = mixture().loader(batch_size=4)
+    first = ids(islice(loader, 2))
+    assert ids(loader)[: len(first)] == first
+    assert loader.epoch == 1
+
+
+def test_bad_sizes_are_refused() -> None:
+    with pytest.raises(ConfigError, match="batch_size=0"):
+        mixture().loader(batch_size=0)
+
+
+def test_the_names_of_the_package_are_shown() -> None:
+    assert set(lidar_synth.__all__) == set(dir(lidar_synth))
