@@ -1,8 +1,8 @@
 """Lightning: a ``LightningDataModule`` for mixtures, optionally with synthesis on the GPU after the
 batch transfer::
 
-    data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8,
-    num_workers=4) trainer.fit(model, data)
+    data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
+    trainer.fit(model, data)
 
 Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among
 ranks itself. Training begins in the epoch that is set on the mixture. A checkpoint within an epoch

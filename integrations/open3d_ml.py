@@ -2,8 +2,8 @@
 
     import open3d.ml.torch as ml3d
     from lidar_synth.integrations.open3d_ml import dataset_class
-    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/",
-    "ratio": 0.25}) pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
+    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
+    pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
 Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever:
     ``use_cache`` is refused.

@@ -1,9 +1,9 @@
 """Pointcept: SemanticKITTI mixed with synthetic scans, registered when a configuration imports this
 module::
 
-    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"],
-    allow_failed_imports=False) hooks = [dict(type="SynthEpoch"), ...] data["train"] |=
-    dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
+    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
+    hooks = [dict(type="SynthEpoch"), ...]
+    data["train"] |= dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
 
 For segmentation, a synthetic scan always brings its labels: Pointcept reads a missing ``.label`` as
 zeros, which mean "car". Self-supervised pretraining reads no labels, so that its mixture may have

@@ -2,8 +2,7 @@
 on a mixture::
 
     cd train/tasks/semantic    # CENet: its root
-    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET
-    -ac ARCH.yaml ...
+    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET -ac ARCH.yaml ...
 
 The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in
 memory (``/dev/shm`` on Linux). Validation, and scripts other than ``train.py``, see only real

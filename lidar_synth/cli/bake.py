@@ -62,9 +62,9 @@ def bake(
       lidar-synth bake bank --count 20000 --seed 1 --engine processes
       lidar-synth bake bank --config bake_town --dry-run
       lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
-      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split
-      train lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4 torchrun
-      --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
+      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
+      lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
+      torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
     """
     from lidar_synth.bake import Share, make_plan
     from lidar_synth.bake import bake as run

@@ -7,8 +7,7 @@ banks. For all others it stands in ``scans.json`` in the root of their folder::
     {"format": "lidar-synth-scans/1",
      "sensor": {"name": "os1_128", "rows": 128, ...},            the keys of sensors.yaml
      "grid": [128, 1024],                                        rows and columns of the sensor
-     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...",
-     "seed": 7}]}
+     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...", "seed": 7}]}
 
 An origin is the domain of some of the scans (``real`` or ``synthetic``) with their
 ``Scan.provenance``. A folder has several if scans of several were written into it; then it does not

@@ -2,12 +2,11 @@
 
 A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provides it::
 
-    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor
-    (``RangeImage.label``) camera     (3, h, w) uint8 red, green, blue, of the size that the model's
-    encoder takes; or the image at
+    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
+    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the image at
                ``Scan.image_path``, which is resized
-    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``);
-               a scan with boxes provides its own layout
+    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``); a scan with boxes
+               provides its own layout
 
 An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of
 that network. A model that was also trained with blank conditions (``dropout``) can be guided: see

@@ -5,11 +5,10 @@ sensor. Firmware before 3 and the SDK's "legacy" form have all keys in one objec
 groups them::
 
     beam_intrinsics.beam_altitude_angles     degrees, one per row of the image, highest first
-    beam_intrinsics.beam_azimuth_angles      degrees, clockwise seen from above, away from the
-    direction of the firing lidar_intrinsics.lidar_to_sensor_transform   4 x 4, millimetres, row by
-    row: the lasers above the sensor's base lidar_data_format.columns_per_frame      firings of a
-    turn ("data_format" in the legacy form) lidar_data_format.udp_profile_lidar      resolution of
-    range and reflectance
+    beam_intrinsics.beam_azimuth_angles      degrees, clockwise seen from above, away from the direction of the firing
+    lidar_intrinsics.lidar_to_sensor_transform   4 x 4, millimetres, row by row: the lasers above the sensor's base
+    lidar_data_format.columns_per_frame      firings of a turn ("data_format" in the legacy form)
+    lidar_data_format.udp_profile_lidar      resolution of range and reflectance
     config_params.lidar_mode                 1024x10: firings of a turn, turns a second
     sensor_info.prod_line                    OS-1-128
 

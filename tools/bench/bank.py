@@ -1,7 +1,6 @@
 """How large a bank of town scans is, and how fast it is written and read, on one core.
 
-    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N] [--tree
-    SHARDS]
+    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N] [--tree SHARDS]
 
 Reading is compared with SCAN.bin, a KITTI-360 scan, or by default with a random scan of 120,000
 points. The figures are processor time, so that they hardly change on a busy machine. Scans of the

@@ -1,8 +1,7 @@
 """Compare distillation strategies in 4, 2 and 1 steps (the paper's Table 4), each with several
 seeds.
 
-    python tools/research/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072]
-    [--count 64]
+    python tools/research/ablation.py TEACHER LATENTS WORK [--seeds 3] [--iterations 1000] [--pairs 3072] [--count 64]
 
 TEACHER is the checkpoint of a latent flow, LATENTS the file ``latents-*.npy`` that its training has
 left in its cache. Parts of the teacher's trajectories are computed once, as in R2Flow, in Euler

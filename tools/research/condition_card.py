@@ -2,10 +2,10 @@
 docs/research/conditions.md.
 
     python tools/research/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64]
-    [--picture OUT.png]
+        [--picture OUT.png]
 
-    python tools/research/condition_card.py "student, 4 steps=town-semantic" "teacher, 50
-    steps=RUN/teacher.safetensors:50"
+    python tools/research/condition_card.py "student, 4 steps=town-semantic" \\
+        "teacher, 50 steps=RUN/teacher.safetensors:50"
 
 Every model gets the same noise and the conditions of the same real scans, from an unseen town or
 from ROOT. The first table measures how close the generated scans are as a set. The second one

@@ -1,7 +1,8 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
     python tools/research/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
-                                   [--picture OUT.png] [--dump OUT.json] [--intervals 200]
+                                   [--picture OUT.png]
+                                   [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of
 road. The first row is the town's own scans: boxes are larger than objects, so that some of their

@@ -5,10 +5,8 @@
     ground: -1.73                     # metres; 0 is the height of the sensor
     reach: 15                         # metres up to which the ground is known
     objects:
-      - {class: Van, at: [12, 0]}     # x forward, y left, metres; default: the size of its class,
-        on the ground
-      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}  # degrees
-        counter-clockwise from x
+      - {class: Van, at: [12, 0]}     # x forward, y left, metres; default: the size of its class, on the ground
+      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}  # degrees counter-clockwise from x
     outlines:
       - {kind: building, line: [[-10, 9], [40, 9]], height: 8}
       - {kind: vegetation, line: [[5, -7], [12, -7]], from: 2, height: 6}  # metres above the ground

@@ -42,8 +42,7 @@ def adapt(
     \b
     Examples:
       lidar-synth adapt town-dense --scans my_scans --out mine.safetensors
-      lidar-synth adapt town-dense --scans PandaSet/002 --out mine.safetensors --minutes 60
-      --dry-run
+      lidar-synth adapt town-dense --scans PandaSet/002 --out mine.safetensors --minutes 60 --dry-run
     """
     from lidar_synth.lab.train.adaptation import adapt as run
     from lidar_synth.lab.train.adaptation import plan_adaptation

@@ -65,8 +65,7 @@ def curate(
       lidar-synth curate bank --plot scores.png
       lidar-synth curate bank --sort -confidence --limit 20
       lidar-synth curate bank --drop "confidence < 0.5" --drop "duplicate > 0.99" --out good
-      lidar-synth curate bank --reference KITTI-360 --split r2flow/train --drop "range > 0.3 and
-      empty > 0.4"
+      lidar-synth curate bank --reference KITTI-360 --split r2flow/train --drop "range > 0.3 and empty > 0.4"
     """
     import numpy as np
 

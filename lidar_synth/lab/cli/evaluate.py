@@ -82,10 +82,9 @@ def evaluate(
 
     \b
     Examples:
-      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics
-      --beside lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples
-      --protocol town --json lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns
-      1024
+      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics --beside
+      lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
+      lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
     """
     from lidar_synth.errors import suggest
     from lidar_synth.formats import layout_of, open_scans

@@ -25,8 +25,7 @@ def import_(
 
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
 
-      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside
-      model.ckpt)
+      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
     """
     from lidar_synth.generate.checkpoint import save_checkpoint
     from lidar_synth.lab.importers import IMPORTERS

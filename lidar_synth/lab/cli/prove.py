@@ -68,8 +68,7 @@ def prove(
     \b
     Examples:
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
-      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio
-      0.5 --dry-run
+      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
     """
     import os
 

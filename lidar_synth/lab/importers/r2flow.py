@@ -4,8 +4,8 @@ R2Flow's network predicts u(s, x) = data - noise at s = 1 - t, so that ours is v
 y). Both changes are linear and are folded into the weights::
 
     sign   the last layer is negated
-    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise
-           the sine: the layer after the Fourier features of time absorbs this rotation
+    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise the sine:
+           the layer after the Fourier features of time absorbs this rotation
 
 R2Flow stores the rotary harmonics in every block; here they are stored once per level.
 """

@@ -2,18 +2,16 @@
 
 An autoencoder trains in the same loop as a flow: one network, one optimiser, one loss::
 
-    reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by
-    cross-entropy
-    codebook         squared distance of latents to their codes: ``commitment`` moves the encoder,
-                     ``codebook`` a "gradient" codebook; an "ema" codebook follows by moving
-                     averages
+    reconstruction   the recipe's metric per channel, with the recipe's weights; label bits by cross-entropy
+    codebook         squared distance of latents to their codes: ``commitment`` moves the encoder, ``codebook`` a
+                     "gradient" codebook; an "ema" codebook follows by moving averages
     mask             distance of the decoder's mask, where it has one, to 1 = return and -1 = none
-    geometric        squared distance of points, each the mean of four neighbours in a row, in units
-                     of the maximum range: preserves the curves that the beams trace
-    adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming
-                     Transformers for High-Resolution Image Synthesis", CVPR 2021). Both networks
-                     are trained in every step: the autoencoder's term uses the discriminator with
-                     frozen weights, the discriminator's term uses detached reconstructions
+    geometric        squared distance of points, each the mean of four neighbours in a row, in units of the
+                     maximum range: preserves the curves that the beams trace
+    adversarial      a discriminator of patches, with the hinge loss (Esser et al., "Taming Transformers for
+                     High-Resolution Image Synthesis", CVPR 2021). Both networks are trained in every step:
+                     the autoencoder's term uses the discriminator with frozen weights, the discriminator's term
+                     uses detached reconstructions
 
 The architectures "autoencoder" and "surfaces" predict distributions. Their loss is the negative
 log-likelihood of the

@@ -7,8 +7,8 @@ The folder holds::
     selection.npz            a student's timesteps and how they were selected
     state.safetensors        the state from which an interrupted run resumes
     held_out.json            losses on held-out scans, if there are any
-    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are
-    held-out scans samples/, logs/          pictures; scalars for TensorBoard
+    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are held-out scans
+    samples/, logs/          pictures; scalars for TensorBoard
 """
 
 import math

@@ -1,8 +1,7 @@
 """Every extractor beside the peers' own code, with the same random weights of the published shapes,
 on real scans.
 
-    python tools/research/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden
-    FILE]
+    python tools/research/extractors/against_peers.py CLONES SCANS [--only NAME ...] [--scans N] [--golden FILE]
 
 CLONES holds clones of the peers' repositories: LiDAR-Diffusion, r2flow, R3DPA, SpareNet,
 lidar-bonnetal. SCANS holds ``.bin`` files of KITTI-360. Needs torchsparse 1.4.0 (a CPU build will
