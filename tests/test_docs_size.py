@@ -12,7 +12,7 @@ LIMITS = {
     "docs/index.md": 130,
     "docs/start/install.md": 160,
     "docs/start/tutorial.md": 460,
-    "docs/how-to/mix.md": 550,
+    "docs/how-to/mix.md": 570,
     "docs/how-to/trainers/index.md": 280,
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,
