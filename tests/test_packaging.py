@@ -156,6 +156,19 @@ def test_the_versions_agree() -> None:
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
 
 
+def test_the_workflow_runs_the_command_of_the_readme_on_every_python() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text())
+    job = workflow["jobs"]["tests"]
+    named = PYPROJECT["project"]["classifiers"]
+    pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(named))
+    assert job["strategy"]["matrix"]["python"] == pythons
+    systems = {name.split("-")[0] for name in job["strategy"]["matrix"]["os"]}
+    assert systems == {"ubuntu", "macos", "windows"}
+    [command] = [step["run"] for step in job["steps"] if step.get("run", "").startswith("make")]
+    assert command == "make test PYTHON=python"
+    assert "\nmake test " in (ROOT / "README.md").read_text()
+
+
 def test_the_lock_file_has_the_pinned_versions_and_a_hash_for_each_package() -> None:
     """``make lock`` writes it."""
     text = (ROOT / "requirements-dev.txt").read_text()
