@@ -75,7 +75,7 @@ def short() -> Iterator[None]:
 
 
 def tiny_model(path: Path, semantic: bool = False) -> Path:
-    """A latent model of the tiny sensor with random weights: the architectures of ``town-dense``,
+    """A latent model of the tiny sensor with random weights: the architectures of ``town``,
     ``town-semantic``."""
     torch.manual_seed(0)
     size = sum(CHANNELS.values())
@@ -476,7 +476,7 @@ def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(model: Pa
 
 
 def test_the_shipped_dense_model_can_be_moved() -> None:
-    header = read_header(find_model("town-dense"))[0]
+    header = read_header(find_model("town"))[0]
     assert all(part.architecture in PLACED for part in header.networks.values())
     assert fitting(load_sensor("pandar64"), header).shape == (64, 1792)
 

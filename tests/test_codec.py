@@ -10,10 +10,11 @@ from conftest import random_scan
 from torch import Tensor
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.generate.codec import Identity, Latent, expected, make_codec
+from lidar_synth.generate.codec import Identity, Latent, make_codec
 from lidar_synth.generate.flow.path import METRICS
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.lidm.vqvae import VQVAE
+from lidar_synth.generate.models.objective import expected
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import Sensor
@@ -109,7 +110,7 @@ def test_the_adversarial_weight_balances_two_gradients() -> None:
     balanced.load_state_dict(plain.state_dict())
     last = balanced.network.decoder.head.weight
     output = balanced.network(x).output
-    rec = balanced.reconstruction(output, x)
+    rec = balanced.objective.reconstruction(output, x)
     judge = balanced.discriminator
     assert judge is not None
     fooled = -judge(expected(output, TENSORS)).mean()
@@ -169,12 +170,12 @@ def test_the_loss_is_the_sum_of_its_terms() -> None:
     x = tensors()
     trained = autoencoding(commitment=0.0)
     output = trained.network(x).output.detach()
-    assert trained.eval().reconstruction(logits_of(x), x) < 1e-3
-    plain = trained.reconstruction(output, x)
+    assert trained.eval().objective.reconstruction(logits_of(x), x) < 1e-3
+    plain = trained.objective.reconstruction(output, x)
     bits = torch.nn.functional.binary_cross_entropy_with_logits(output[:, 2:], (x[:, 2:] + 1) / 2)
     by_hand = (output[:, 0] - x[:, 0]).abs().mean() + (output[:, 1] - x[:, 1]).abs().mean() + bits
     assert plain.item() == pytest.approx(by_hand.item(), rel=1e-5)
-    heavy = autoencoding(commitment=0.0, weights={"label": 3.0}).reconstruction(output, x)
+    heavy = autoencoding(commitment=0.0, weights={"label": 3.0}).objective.reconstruction(output, x)
     assert heavy.item() == pytest.approx((by_hand + 2 * bits).item(), rel=1e-5)
     values = [
         float(autoencoding(**term).eval()(x))
@@ -194,7 +195,7 @@ def test_geometry_is_in_metres_along_the_rays() -> None:
     image = project(SCANS[0], SENSOR)
     points = image.range[..., None] * SENSOR.ray_directions()
     means = points.reshape(8, 8, 4, 3).mean(2) / SENSOR.range_max
-    assert np.allclose(trained._points(x)[0].movedim(0, -1).numpy(), means, atol=1e-5)
+    assert np.allclose(trained.objective.points(x)[0].movedim(0, -1).numpy(), means, atol=1e-5)
 
 
 def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
@@ -202,7 +203,9 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
     x = tensors()
     assert trained.discriminator is not None
     output = torch.zeros_like(x).requires_grad_()
-    trained._adversarial(trained.discriminator, output, x).backward()
+    trained.network._adversarial(
+        trained.discriminator, output, x, torch.zeros(()), trained.objective
+    ).backward()
     by_both = {
         n: p.grad.clone() for n, p in trained.discriminator.named_parameters() if p.grad is not None
     }

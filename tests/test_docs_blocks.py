@@ -47,7 +47,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _town(layout: str) -> Callable[[Path], object]:
-    return lambda out: export_town(Town(0, scans=SCANS), out, layout, camera=False, progress=False)
+    """The town on the grid of the shipped models."""
+    town = Town(0, "hdl64e_lasers", SCANS)
+    return lambda out: export_town(town, out, layout, camera=False, progress=False)
 
 
 def _semantic_kitti(out: Path) -> None:

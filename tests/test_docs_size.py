@@ -48,7 +48,6 @@ LIMITS = {
     "docs/explanation/determinism.md": 200,
     "docs/town.md": 290,
     "docs/models/town.md": 200,
-    "docs/models/town-dense.md": 130,
     "docs/models/town-semantic.md": 190,
     "docs/models/town-camera.md": 190,
     "docs/models/town-layout.md": 160,

@@ -47,7 +47,7 @@ WRONG_COMMANDS = {
     "lidar-synth town": "OUT",
     "lidar-synth train town_huge": "town_huge",
     "lidar-synth train town_tiny recipe.batches=4": "batches",
-    "lidar-synth train town-dense --until weaker": "weaker",
+    "lidar-synth train town --until weaker": "weaker",
     "lidar-synth bake bank --engine spark": "spark",
     "lidar-synth bake bank --count 0": "count",
     "lidar-synth convert IN OUT --to laz": "laz",

@@ -327,7 +327,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "sensor": (
         lambda: edit.remove(cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"),
         DataError,
-        "a scan of sensor 'os1_128' .* for a model of 'town'.*model=None",
+        "a scan of sensor 'os1_128' .* for a model of 'hdl64e_lasers'.*model=None",
     ),
     "overlap": (
         lambda: edit.insert(SCAN, ITEM, (8, 7)),

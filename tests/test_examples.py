@@ -98,7 +98,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
         "kitti360": "KITTI-360",
         "kitti": "KITTI",
     }.items():
-        export_town(Town(0, scans=3), root / out, layout, camera=False, progress=False)
+        export_town(Town(0, "hdl64e_lasers", 3), root / out, layout, camera=False, progress=False)
     write_kitti_raw(root / "KITTI-raw")
     write_nuscenes(root / "nuScenes")
     write_pandaset(root / "PandaSet")

@@ -236,20 +236,15 @@ SURFACES = {
     "architecture": "surfaces",
     "arguments": {"encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
 }
-PLANES = {
-    "architecture": "autoencoder",
-    "arguments": {"widths": [8, 8], "depth": 2, "fine": 8, "window": [3, 3]},
-}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", [PLANES, SURFACES], ids=lambda n: n["architecture"])
 def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(
-    network: dict[str, Any], scans: Path, tmp_path: Path
+    scans: Path, tmp_path: Path
 ) -> None:
     call(
         "train",
-        write_config(scans, tmp_path, "codec", network=network, samples={"every": 8, "count": 2}),
+        write_config(scans, tmp_path, "codec", network=SURFACES, samples={"every": 8, "count": 2}),
     )
     hdit = {
         "architecture": "hdit",
@@ -273,14 +268,13 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", [PLANES, SURFACES], ids=lambda n: n["architecture"])
 @pytest.mark.parametrize(
     "condition", [None, SEMANTIC | {"arguments": {"channels": 8, "method": "patches"}}]
 )
 def test_a_decoder_goes_on_alone(
-    condition: dict[str, Any] | None, network: dict[str, Any], scans: Path, tmp_path: Path
+    condition: dict[str, Any] | None, scans: Path, tmp_path: Path
 ) -> None:
-    call("train", write_config(scans, tmp_path, "codec", network=network))
+    call("train", write_config(scans, tmp_path, "codec", network=SURFACES))
     hdit = {
         "architecture": "hdit",
         "arguments": {"width": 16, "depths": [1], "heads": [2], "patch": [1, 1]},
@@ -311,8 +305,7 @@ def test_a_decoder_goes_on_alone(
         }
     assert moved and all(name.startswith(f"{CODEC}.") for name in moved)
     assert not [name for name in moved if any(part in name for part in STILL)]
-    last = "head.weight" if network is SURFACES else "planes.consensus.strict"
-    assert {f"{CODEC}.from_latent.weight", f"{CODEC}.{last}"} <= moved
+    assert {f"{CODEC}.from_latent.weight", f"{CODEC}.head.weight"} <= moved
     cond = np.zeros((8, 32), np.uint8) if condition else None
     assert len(load_generator(tmp_path / "more" / "more.safetensors").scans(0, [3], cond)[0])
 

@@ -61,9 +61,9 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
 
 
 def test_generators_that_differ_have_different_plans() -> None:
-    same = [load_generator("town-dense", **options) for options in ({}, {"columns": 2048})]
+    same = [load_generator("town", **options) for options in ({}, {"columns": 2048})]
     others = [
-        load_generator("town-dense", **options)
+        load_generator("town", **options)
         for options in ({"columns": 1024}, {"dtype": torch.bfloat16})
     ]
     assert len({Generated(generator).identity for generator in same}) == 1

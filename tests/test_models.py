@@ -86,10 +86,7 @@ def test_a_shipped_model_has_stages_and_says_how_it_was_made(name: str) -> None:
 def test_models_are_listed_and_printed_as_recipes_are() -> None:
     listed = call("recipes")
     assert all(f"{name} " in listed for name in [*MODELS, *RECIPES])
-    assert (
-        yaml.safe_load(call("recipes", "town-dense"))["stages"]["codec"]["recipe"]
-        == "town_dense_codec"
-    )
+    assert yaml.safe_load(call("recipes", "town"))["stages"]["codec"]["recipe"] == "town_codec"
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +282,7 @@ def test_a_given_checkpoint_replaces_the_stages_that_made_it(tiny: Path) -> None
 
 def test_overrides_reach_one_stage_or_all() -> None:
     plan = plan_model(
-        "town-dense",
+        "town",
         ["seed=7", "teacher.recipe.batch=16", "teacher.seed=8", "student.recipe.iterations=9"],
     )
     assert {name: stage.config.seed for name, stage in plan.stages.items()} == {
@@ -297,7 +294,7 @@ def test_overrides_reach_one_stage_or_all() -> None:
     batches = {name: stage.config.recipe.batch for name, stage in plan.stages.items()}
     assert (
         batches["teacher"] == 16
-        and batches["codec"] == load_config(TrainConfig, "town_dense_codec").recipe.batch
+        and batches["codec"] == load_config(TrainConfig, "town_codec").recipe.batch
     )
     assert list(plan.runs.shares) == ["codec", "teacher", "decoder"]
     assert isinstance(plan.stages["student"].config, DistillConfig)
@@ -313,41 +310,41 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         r"--until codec for the recipe town_codec; expected a model",
     ),
     "a stage": (
-        ["town-dense", "--until", "weaker"],
-        r"--until 'weaker'; expected a stage of town-dense: codec, teacher, student, decoder",
+        ["town", "--until", "weaker"],
+        r"--until 'weaker'; expected a stage of town: codec, teacher, student, decoder",
     ),
     "a stage of an override": (
-        ["town-dense", "techer.recipe.batch=4"],
-        r"override 'techer.recipe.batch=4'; expected STAGE.KEY=VALUE for a stage of town-dense \(codec, teacher, "
+        ["town", "techer.recipe.batch=4"],
+        r"override 'techer.recipe.batch=4'; expected STAGE.KEY=VALUE for a stage of town \(codec, teacher, "
         r"student, decoder\), output=FOLDER, or a key of all its recipes \(licence, data, .*Such as codec.recipe.batch",
     ),
     "a key": (
-        ["town-dense", "teacher.recipe.batches=4"],
+        ["town", "teacher.recipe.batches=4"],
         r"unknown key 'recipe.batches'; known there: iterations",
     ),
-    "no value": (["town-dense", "teacher.recipe"], r"override 'recipe'; expected key=value"),
+    "no value": (["town", "teacher.recipe"], r"override 'recipe'; expected key=value"),
     "the folder of a stage": (
-        ["town-dense", "codec.output=here"],
+        ["town", "codec.output=here"],
         r"override 'codec.output=here'; expected STAGE.KEY",
     ),
     "too few minutes": (
-        ["town-dense", "--minutes", "0.01"],
-        r"--minutes 0.01 for the stages codec, teacher, student, decoder of town-dense; expected at least 0.12. "
-        r"lidar-synth train town-dense --dry-run prints",
+        ["town", "--minutes", "0.01"],
+        r"--minutes 0.01 for the stages codec, teacher, student, decoder of town; expected at least 0.12. "
+        r"lidar-synth train town --dry-run prints",
     ),
     "a schedule": (
-        ["town-dense", "codec.recipe.schedule=cosine"],
+        ["town", "codec.recipe.schedule=cosine"],
         r"codec.recipe.schedule=cosine with a limit of time; expected trapezoid. Or give codec.recipe.iterations=N",
     ),
     "a start": (
         ["town-layout", "output=elsewhere/town-layout"],
-        r"teacher.init=elsewhere/town-dense/teacher/teacher.safetensors, which does not exist; expected the checkpoint "
-        r"of the stage teacher of town-dense. Type `lidar-synth train town-dense --until teacher "
-        r"output=elsewhere/town-dense` first, or give teacher.init=FILE.safetensors",
+        r"teacher.init=elsewhere/town/teacher/teacher.safetensors, which does not exist; expected the checkpoint "
+        r"of the stage teacher of town. Type `lidar-synth train town --until teacher "
+        r"output=elsewhere/town` first, or give teacher.init=FILE.safetensors",
     ),
     "a start in runs": (
         ["town-camera"],
-        r"Type `lidar-synth train town-dense --until teacher` first, or give teacher",
+        r"Type `lidar-synth train town --until teacher` first, or give teacher",
     ),
 }
 
@@ -398,7 +395,7 @@ def test_a_missing_file_and_a_recipe_are_no_models(tmp_path: Path) -> None:
         call("train", tmp_path / "nowhere.yaml")
     with pytest.raises(
         ConfigError,
-        match=r"model 'town_codec'; expected a YAML file .* one of town, town-camera, town-d",
+        match=r"model 'town_codec'; expected a YAML file .* one of town, town-camera, town-l",
     ):
         plan_model("town_codec")
 

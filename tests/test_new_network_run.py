@@ -14,8 +14,8 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models import NETWORKS, encoders_of, network_class
-from lidar_synth.generate.models.lidm.vqvae import Reconstruction
-from lidar_synth.generate.models.network import Encoder, Network
+from lidar_synth.generate.models.network import Autoencoder, Encoder, Network
+from lidar_synth.generate.models.objective import Objective
 
 
 class PointwiseFlow(Network):
@@ -44,12 +44,11 @@ class PointwiseFlow(Network):
         return self.mix(torch.cat([y, elevation] + ([] if cond is None else [cond]), 1))
 
 
-class PointwiseCodec(Network):
+class PointwiseCodec(Autoencoder):
     """An autoencoder whose latents are the image's own cells, mixed; it takes the name of the
     normalisation."""
 
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
-    is_autoencoder: ClassVar[bool] = True
 
     def __init__(self, resolution: Sequence[int], channels: int, normalisation: str) -> None:
         super().__init__()
@@ -67,9 +66,8 @@ class PointwiseCodec(Network):
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         return self.decoder(z)
 
-    def forward(self, x: Tensor) -> Reconstruction:
-        gap = x.new_zeros(len(x))
-        return Reconstruction(self.decode(self.encode(x)), gap, gap)
+    def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
+        return objective.reconstruction(self.decode(self.encode(x)), x)
 
 
 class ClassPresence(Encoder):

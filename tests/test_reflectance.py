@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.generate.models.town_codec.reflectance import BLANK, ZeroInflatedLogistic
+from lidar_synth.generate.models.surface_codec.reflectance import BLANK, ZeroInflatedLogistic
 
 CASES = [(0.1, 0.15, 0.2), (-0.9, 0.2, 0.001), (0.8, 0.05, 0.9)]
 """Medians, scales, shares of a 0."""
@@ -43,37 +43,6 @@ def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> No
     x = torch.linspace(low, high, 1001, dtype=torch.float64)
     between = torch.trapezoid(torch.exp(-predicted.nll(column(x))).flatten(), x)
     assert between.item() == pytest.approx(0.2 * len(numbers) / count, rel=0.01)
-
-
-@pytest.mark.parametrize("case", [CASES[0], CASES[2]])
-def test_what_was_said_is_not_unexpected(case: tuple[float, float, float]) -> None:
-    """Draws are 0 as often as expected, and around the median."""
-    count = 100_000
-    predicted = readings(*case, cells=count)
-    nothing, off = predicted.residual(
-        predicted.sample(column((torch.arange(count) + 0.5) / count))
-    ).unbind(1)
-    assert nothing.mean().item() == pytest.approx(0, abs=0.002)
-    assert off.median().item() == pytest.approx(0, abs=0.01)
-
-
-def test_the_unexpected_is_in_scales_and_has_an_end() -> None:
-    predicted = readings(0.1, 0.15, 0.2, cells=4)
-    nothing, off = (
-        predicted.residual(column(torch.tensor([0.1, 0.25, 90.0, BLANK])))
-        .flatten(2)
-        .squeeze(2)
-        .unbind(1)
-    )
-    assert torch.allclose(off, torch.tensor([0, 0.5, 4, 0], dtype=off.dtype), atol=1e-6)
-    assert torch.allclose(
-        nothing, torch.tensor([-0.2, -0.2, -0.2, 0.8], dtype=off.dtype), atol=1e-6
-    )
-
-
-def test_the_likeliest_is_0_or_the_median() -> None:
-    assert readings(0.1, 0.15, 0.6).mode().item() == BLANK
-    assert readings(0.1, 0.15, 0.4).mode().item() == pytest.approx(0.1)
 
 
 def test_numbers_at_the_ends_of_chance_are_finite() -> None:

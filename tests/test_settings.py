@@ -85,5 +85,5 @@ def test_sources_say_what_they_are_in_two_lines(tmp_path: Path) -> None:
         text = repr(make())
         assert text.startswith(start) and text.count("\n") == 1 and len(text) < 300
         assert (
-            "(64 x 1024" in text or "(8 x 32" in text or "real: Scans; synthetic: Endless" in text
+            "(64 x 2048" in text or "(8 x 32" in text or "real: Scans; synthetic: Endless" in text
         )

@@ -94,11 +94,12 @@ def sources(
 @pytest.fixture(scope="module", params=["the town", "SemanticKITTI"])
 def real(request: pytest.FixtureRequest) -> Source:
     if request.param == "the town":
-        return [Town(5, scans=SCANS)[i] for i in range(SCANS)]
+        town = Town(5, "hdl64e_lasers", SCANS)
+        return [town[i] for i in range(SCANS)]
     root = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
     if not root:
         pytest.skip("LIDAR_SYNTH_REAL_SCANS is not set")
-    source = SemanticKITTI(Path(root) / "semantic_kitti", split="train")
+    source = SemanticKITTI(Path(root) / "semantic_kitti", sensor="hdl64e_lasers", split="train")
     return [source[i] for i in range(SCANS)]
 
 

@@ -10,10 +10,10 @@ from lidar_synth.errors import suggest
 from lidar_synth.formats.description import Description
 
 CALLS = {
-    "train town-dence": "'town-dense'",
+    "train twon": "'town'",
     "train town_tiny recipe.itterations=3": "'iterations'",
     "distill town_studnt": "'town_student'",
-    "sample OUT --model town-dence": "'town-dense'",
+    "sample OUT --model twon": "'town'",
     "sample OUT --to kiti": "'kitti'",
     "bake OUT --engine locl": "'local'",
     "town OUT --layout kiti360": "'kitti360'",

@@ -15,9 +15,11 @@ from lidar_synth.generate.checkpoint import CODEC, VELOCITY
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.flow.path import METRICS
 from lidar_synth.generate.loading import _compile
+from lidar_synth.generate.models.objective import Losses
 from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
-from lidar_synth.generate.models.surface_codec.measure_noise import PLANTS, measure_noise
+from lidar_synth.generate.models.surface_codec.measure_noise import PLANTS
+from lidar_synth.generate.models.surface_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, relief_fields
 from lidar_synth.generate.models.surface_codec.surfaces import (
     DRAWS,
@@ -27,14 +29,13 @@ from lidar_synth.generate.models.surface_codec.surfaces import (
     Surfaces,
     surfaces_of,
 )
-from lidar_synth.generate.models.town_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.geometry.layout.layout import CHORD_STEP, CODES, DEPTH_STEP
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.town import Town
-from lidar_synth.lab.train.autoencoder import Autoencoding, Losses
+from lidar_synth.lab.train.autoencoder import Autoencoding
 from lidar_synth.noise import uniform
 
 K = 3
@@ -353,11 +354,10 @@ def test_the_noise_of_scans_is_measured() -> None:
     z = torch.randn(6, *network.latent_shape, generator=torch.Generator().manual_seed(1))
     images = []
     for i in range(6):
-        x = network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape)))
-        images.append((x, _codes(x)))
+        images.append(network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape))))
     latents = iter(network.bounded(z).split(1))
     network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
-    measure_noise(network, images, noise=0.0)
+    network.measure_noise(images, noise=0.0)
     assert network.roughness.mean() == pytest.approx(0.3, abs=0.06)
     assert network.alike.mean() == pytest.approx(0.6, abs=0.12)
 
@@ -401,13 +401,9 @@ def test_the_relief_of_plants_is_measured() -> None:
     ]
     latents = iter(network.bounded(z).split(1))
     network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
-    measure_noise(network, ((x, _codes(x)) for x in images), noise=0.0)
+    network.measure_noise(images, noise=0.0)
     assert torch.allclose(network.relief[list(PLANTS)], relief[list(PLANTS)], atol=0.25)
     assert not network.relief[[c for c in range(LABELS) if c not in PLANTS]].any()
-
-
-def _codes(x: Tensor) -> Tensor:
-    return sum(((x[:, -1 - b] > 0).long() << b for b in range(5)), torch.zeros_like(x[:, 0]).long())
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from lidar_synth import MixedScans, Scan
+from lidar_synth.formats.description import same_grid
 from lidar_synth.lab.evaluate.segmentation import class_ious, confusion, mean_iou
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
 from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
@@ -57,7 +58,11 @@ class Protocol:
     seeds: int = 3
 
     def mixture(self, ratio: float, seed: int, **options: Any) -> MixedScans:
-        """The training set of an arm; ``options`` are further arguments of ``MixedScans``."""
+        """The training set of an arm, on the real scans' sensor; ``options`` are further arguments
+        of ``MixedScans``."""
+        sensor = self.real[0].sensor
+        if not same_grid(sensor, self.synthetic[0].sensor):
+            options["as_sensor"] = sensor
         return MixedScans(self.real, self.synthetic if ratio else None, ratio, seed=seed, **options)
 
     def train(self, ratio: float, seed: int) -> NDArray[np.int64]:

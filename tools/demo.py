@@ -103,6 +103,8 @@ def town(out: Path, scans: int, seed: int) -> Data:
             str(number),
             "--interval",
             "1",
+            "--sensor",
+            "hdl64e_lasers",
             "--layout",
             "semantic_kitti",
             *more,

@@ -4,7 +4,7 @@ header.
 The header is stored in the file's metadata under ``lidar_synth`` and contains everything that
 generation needs::
 
-    format          "lidar-synth-checkpoint/2"; "/1" can be read too, other versions are refused
+    format          "lidar-synth-checkpoint/2"; others are refused
     convention      "t=1 noise, t=0 data, v=noise-data": the convention of times and velocities
     networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
                     model (the only part of an autoencoder's checkpoint), "condition" the encoder of a condition
@@ -21,9 +21,7 @@ generation needs::
     checksum        sha256 of all other keys, as JSON with sorted keys
 
 A tensor's name is its part, a dot, and its name in the network. The hash of a checkpoint is its
-checksum, which covers the header and, through ``weights``, the tensors. Version 1 has no checksum:
-its hash is the sha256 of the header's text, so that damage to its header can go unnoticed. Nothing
-is ever unpickled.
+checksum, which covers the header and, through ``weights``, the tensors. Nothing is ever unpickled.
 """
 
 import hashlib
@@ -49,9 +47,6 @@ from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorForm
 from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-checkpoint/2"
-WITHOUT_CHECKSUM = "lidar-synth-checkpoint/1"
-"""The older format, which has no checksum of the header. It can be read, but is no longer
-written."""
 CONVENTION = "t=1 noise, t=0 data, v=noise-data"
 LABEL_ENCODING = f"{LABEL_BITS} analog bits, most significant first, code 19 = no label"
 VELOCITY = "velocity"
@@ -160,7 +155,7 @@ class Header:
             ConfigError: on another format, or on unknown, missing or invalid keys and values.
         """
         values = dict(values)
-        if (given := values.pop("format", None)) not in (FORMAT, WITHOUT_CHECKSUM):
+        if (given := values.pop("format", None)) != FORMAT:
             raise ConfigError(
                 f"format {given!r}",
                 repr(FORMAT),
@@ -283,7 +278,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
             whose weights do not match its header.
     """
     device = checked_device(device)
-    _, header, digest, weights, tensors = _read(Path(path))
+    header, digest, weights, tensors = _read(Path(path))
     if weights != weights_hash(tensors):
         raise DataError(
             f"{path}: the weights do not match their checksum in the header",
@@ -315,19 +310,10 @@ def read_header(path: Path) -> tuple[Header, str]:
     return content.header, content.hash
 
 
-def has_checksum(path: Path) -> bool:
-    """Whether a checksum covers the header of this checkpoint.
-
-    Raises the errors of ``load_checkpoint``.
-    """
-    return _read(Path(path), tensors=False).format == FORMAT
-
-
 class _Content(NamedTuple):
     """The content of a checkpoint file; ``weights`` is the checksum of the tensors by the
     header."""
 
-    format: str
     header: Header
     hash: str
     weights: Any
@@ -365,10 +351,9 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         raise DataError(f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}")
     try:
         values = json.loads(text)
-        version = values.get("format")
-        digest = _hash(text) if version == WITHOUT_CHECKSUM else _verified(values)
+        digest = _verified(values)
         weights = values.pop("weights", None)
-        return _Content(version, Header.from_dict(values), digest, weights, stored)
+        return _Content(Header.from_dict(values), digest, weights, stored)
     except (ValueError, AttributeError, RecursionError) as error:  # a ConfigError is a ValueError
         raise DataError(f"{path}: {error}") from error
 

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
+from lidar_synth.generate.models.network import Autoencoder
+from lidar_synth.generate.models.objective import expected
+from lidar_synth.geometry.normalize import TensorFormat
 
 
 class Codec(Protocol):
@@ -45,33 +47,6 @@ class Codec(Protocol):
         """States (B, *shape) to tensors (B, C, H, W), sampled with (B, draws, H, W) numbers in (0,
         1); None = the mode. With {name of a condition: values (B, ...)}, autoencoders that can
         follow them exactly."""
-        ...
-
-
-class Autoencoder(Protocol):
-    """The interface of an autoencoder (such as ``VQVAE``) that a latent codec needs.
-
-    Attributes:
-        channels: number of channels of an image.
-        resolution: rows and columns of an image.
-        latent_shape: channels, rows and columns of a latent.
-        draws: number of random numbers per cell for sampling an image; 0 if decoding is
-            deterministic.
-        decodes_given: the conditions that ``decode`` takes, see ``models.network.Network``.
-    """
-
-    channels: int
-    resolution: tuple[int, int]
-    latent_shape: tuple[int, int, int]
-    draws: int
-    decodes_given: ClassVar[frozenset[str]]
-
-    def encode(self, x: Tensor) -> Tensor:
-        """Images (B, C, H, W) to latents of approximate mean 0 and variance 1."""
-        ...
-
-    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
-        """Latents to images; label bits as logits."""
         ...
 
 
@@ -157,19 +132,6 @@ class Latent:
             if name in self.network.decodes_given
         }
         return expected(decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors)
-
-
-def expected(output: Tensor, tensors: TensorFormat) -> Tensor:
-    """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits,
-    become tanh(x / 2) in (-1, 1); other channels are unchanged."""
-    parts = torch.split(output, [CHANNELS[name] for name in tensors.channels], 1)
-    return torch.cat(
-        [
-            (p / 2).tanh() if n == "label" else p
-            for n, p in zip(tensors.channels, parts, strict=True)
-        ],
-        1,
-    )
 
 
 def make_codec(

@@ -67,10 +67,10 @@ class Generator:
         >>> from lidar_synth import Generator, load_generator
         >>> generator = load_generator("town")
         >>> isinstance(generator, Generator), generator.sensor.shape
-        (True, (64, 1024))
+        (True, (64, 2048))
         >>> [image] = generator.range_images(seed=0, indices=[3], steps=2)
         >>> image.range.shape, sorted(image.channels)
-        ((64, 1024), ['confidence', 'label', 'reflectance'])
+        ((64, 2048), ['confidence', 'label', 'reflectance'])
     """
 
     name: str

@@ -129,7 +129,7 @@ def check_movable(header: Header) -> None:
         raise ConfigError(
             f"a model with the architecture {', '.join(unknown)}",
             f"architectures among {', '.join(PLACED)}: those that can be moved to another sensor",
-            "The shipped models 'town-dense' and 'town-semantic' can.",
+            "The shipped models 'town' and 'town-semantic' can.",
         )
 
 

@@ -86,7 +86,7 @@ class Notices:
                 self._warn(
                     "a real scan has %d points, a synthetic one %d, on the same nominal grid: the "
                     "density tells them "
-                    "apart. Use a model of that density (town-dense), as_sensor=, or "
+                    "apart. Give load_generator columns= of that density, or use as_sensor= or "
                     "collate='range'.",
                     theirs,
                     ours,

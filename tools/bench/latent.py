@@ -49,7 +49,7 @@ def main() -> None:
     a = torch.randn(4096, 4096)
     image = torch.randn(1, 1, 64, 1024)
     latent = torch.randn(1, 8, 16, 128)
-    town_image = torch.randn(1, 7, 64, 1024)
+    town_image = torch.randn(1, 7, *town.resolution)
     town_latent = torch.randn(1, *town.latent_shape)
     calls = {
         "product of 4096 x 4096 (137 GFLOP)": lambda: a @ a,

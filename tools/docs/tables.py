@@ -16,7 +16,7 @@ from typer.main import get_command
 
 import lidar_synth
 from lidar_synth.cli import COMMANDS, app
-from lidar_synth.lab.train.autoencoder import Losses
+from lidar_synth.generate.models.objective import Losses
 from lidar_synth.lab.train.config import (
     Condition,
     Data,

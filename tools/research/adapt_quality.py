@@ -2,9 +2,9 @@
 from.
 
     python tools/research/adapt_quality.py pandaset FRAMES OUT
-    lidar-synth adapt town-dense --scans OUT/adapt --out mine.safetensors
+    lidar-synth adapt town --scans OUT/adapt --out mine.safetensors
     python tools/research/adapt_quality.py measure mine.safetensors --train OUT/adapt --test OUT/test
-        [--before town-dense] [--judge FOLDER] [--count 60]
+        [--before town] [--judge FOLDER] [--count 60]
 
 FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring,
 label) in the sensor's frame; the first command writes frames 00 to 30 to OUT/adapt and frames from
@@ -68,7 +68,7 @@ def main() -> None:
     of.add_argument("checkpoint", type=Path)
     of.add_argument("--train", type=Path, required=True, help="the scans that it was adapted to")
     of.add_argument("--test", type=Path, required=True, help="scans that it has not seen")
-    of.add_argument("--before", default="town-dense", help="the model that it was adapted from")
+    of.add_argument("--before", default="town", help="the model that it was adapted from")
     of.add_argument("--judge", type=Path, help="an archive of lidar-bonnetal")
     of.add_argument(
         "--columns", type=int, help="width at which the judge looks [the archive's own]"

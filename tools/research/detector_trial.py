@@ -41,7 +41,7 @@ TESTED = 40
 TEST_TOWNS = (8, 9)
 """Tested scans of each town."""
 LAYOUT_TOWNS = (20, 21)
-UNBOXED_MODEL = "town-dense"
+UNBOXED_MODEL = "town"
 BATCH = 2
 RATE = 3e-3
 PHASES = 4

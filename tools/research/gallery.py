@@ -60,7 +60,7 @@ def pairs() -> list[list[tuple[str, Picture]]]:
     return [
         [
             (f"generated, 4 steps: town/0/{i}", near(scan)),
-            (f"the town, street {i}", near(street(i))),
+            (f"the town, street {i}", near(street(i, sensor="hdl64e_lasers", motion=False))),
         ]
         for i, scan in enumerate(made)
     ]
@@ -120,7 +120,7 @@ def pasted() -> list[list[tuple[str, Picture]]]:
     """A generated scan, and the same with objects of the town in place of its own (the label policy
     ``mix``)."""
     generator = load_generator("town")
-    scans = Town(0, scans=5 * STRETCH_FRAMES)
+    scans = Town(0, "hdl64e_lasers", 5 * STRETCH_FRAMES, motion=False)
     bank = ObjectBank.from_scans([scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)])
     policy = make_policy("mix", fields=generator.fields, objects=bank, count=12, clear=True)
     [scan] = generator.scans(0, [0])

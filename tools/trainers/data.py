@@ -108,17 +108,18 @@ class Data:
 
     @cached_property
     def bank(self) -> Path:
-        """A bank of eight scans of the shipped generator ``town``, on 64 x 1024 cells."""
-        return self._bank("bank", "town")
+        """A bank of eight scans of ``town``, on 64 x 1024 cells."""
+        return self._bank("bank", 1024)
 
     @cached_property
     def dense_bank(self) -> Path:
-        """A bank of eight scans of ``town-dense``, on 64 x 2048 cells."""
-        return self._bank("dense_bank", "town-dense")
+        """A bank of eight scans of ``town``, on 64 x 2048 cells."""
+        return self._bank("dense_bank", 2048)
 
-    def _bank(self, name: str, model: str) -> Path:
+    def _bank(self, name: str, columns: int) -> Path:
         out = self.folder / name
-        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--model", model, "--count", "8"]
+        bake = [sys.executable, "-m", "lidar_synth", "bake", out, "--count", "8"]
+        bake += ["--columns", str(columns)]
         subprocess.run(bake, check=True, stdout=subprocess.DEVNULL)
         return out
 

@@ -28,7 +28,6 @@ from lidar_synth.generate.models.lidm.unet import UNet
 from lidar_synth.generate.models.lidm.vqvae import VQVAE
 from lidar_synth.generate.models.network import Encoder, Network
 from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
-from lidar_synth.generate.models.town_codec.autoencoder import Autoencoder
 
 NETWORKS: dict[str, type[Network]] = {
     "hdit": HDiT,
@@ -36,7 +35,6 @@ NETWORKS: dict[str, type[Network]] = {
     "unet": UNet,
     "diffusion_unet": DiffusionUNet,
     "vqvae": VQVAE,
-    "autoencoder": Autoencoder,
     "surfaces": SurfaceAutoencoder,
     "semantic_map": SemanticMapEncoder,
     "layout": LayoutEncoder,

@@ -1,37 +1,35 @@
-"""What the autoencoders of the town have in common: an encoder on patches, and latents that are
-bounded.
+"""An encoder on patches whose latents are bounded, and how it is trained.
 
 The latent lies in (-1, 1) in place of a codebook, and the decoder is trained on noisy latents, so
 that it tolerates the errors of a flow. Every norm is over the channels of one cell, so that crops
 (in training) and full turns (in use) give the same result.
 """
 
-from abc import ABC, abstractmethod
+import math
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.generate.models.codebook import follow
 from lidar_synth.generate.models.convolution import WrapConv, check_shape
 from lidar_synth.generate.models.layers import rms_norm
-from lidar_synth.generate.models.network import Network
+from lidar_synth.generate.models.network import Autoencoder
+from lidar_synth.generate.models.objective import Objective
+from lidar_synth.geometry.normalize import encode_labels
 
 
 class NormedResidual(nn.Module):
-    """x + conv(silu(conv(norm(x)))).
+    """x + conv(silu(conv(norm(x)))) on C channels."""
 
-    Args:
-        channels: C.
-        reach: dilation of the second convolution, in columns.
-    """
-
-    def __init__(self, channels: int, reach: int = 1) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         self.first = WrapConv(channels, channels)
-        self.second = WrapConv(channels, channels, dilation=(1, reach))
+        self.second = WrapConv(channels, channels)
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -41,14 +39,15 @@ class NormedResidual(nn.Module):
         return out
 
 
-class BoundedAutoencoder(Network, ABC):
-    """Images (B, C, H, W) to latents and back. A subclass calls ``add_encoder``, and has ``embed``
-    and ``expand``."""
+class BoundedAutoencoder(Autoencoder):
+    """Images (B, C, H, W) to latents and back. A subclass calls ``add_encoder``, and has ``embed``,
+    ``expand`` and ``nll``.
 
-    is_autoencoder: ClassVar[bool] = True
+    Attributes:
+        bits: channels of the image that are an analog code of the label, the last ones.
+    """
 
-    channels: int
-    resolution: tuple[int, int]
+    bits: int
     shift: Tensor
     scale: Tensor
 
@@ -83,9 +82,13 @@ class BoundedAutoencoder(Network, ABC):
         columns)."""
 
     @abstractmethod
-    def expand(self, z: Tensor, image: Tensor) -> Any:
-        """Bounded latents (B, *latent_shape) to the distributions of the cells; a decoder may
-        predict some of them from other cells of the image (B, C, H, W)."""
+    def expand(self, z: Tensor) -> Any:
+        """Bounded latents (B, *latent_shape) to the distributions of the cells."""
+
+    @abstractmethod
+    def nll(self, predicted: Any, x: Tensor, objective: Objective) -> Tensor:
+        """The negative log-likelihood of images (B, C, H, W) under the predicted distributions, a
+        scalar."""
 
     def forward(self, x: Tensor, noise: Tensor) -> Any:
         """Encodes images (B, C, H, W) and expands them with ``noise`` (B, *latent_shape) added to
@@ -93,7 +96,25 @@ class BoundedAutoencoder(Network, ABC):
         z = self.squeeze(x)
         if self.training:
             follow(z.detach(), self.shift, self.scale)
-        return self.expand(z + noise, x)
+        return self.expand(z + noise)
+
+    def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
+        """The negative log-likelihood of images (B, C, H, W) from their latents with noise; some
+        images are encoded without their labels."""
+        shape = self.latent_shape
+        some = noise.flatten(1)[:, : math.prod(shape)].reshape(-1, *shape)
+        shown = x
+        if objective.losses.unlabelled:
+            blank = encode_labels(torch.full_like(x[:, 0], IGNORE, dtype=torch.uint8))
+            hidden = torch.cat([x[:, : -self.bits], blank.to(x)], 1)
+            chosen = torch.special.ndtr(noise[:, -1, -1, -1]) < objective.losses.unlabelled
+            shown = torch.where(chosen.view(-1, 1, 1, 1), hidden, x)
+        return self.nll(self(shown, objective.losses.noise * some), x, objective)
+
+    def decoder_loss(self, z: Tensor, x: Tensor, objective: Objective) -> Tensor:
+        """The negative log-likelihood of images (B, C, H, W) from given latents (B, *latent_shape),
+        a scalar."""
+        return self.nll(self.expand(self.bounded(z)), x, objective)
 
     def encoder(self) -> list[nn.Parameter]:
         """The weights of the encoder; all others belong to the decoder."""

@@ -1,9 +1,13 @@
 """Base classes of all networks that a checkpoint can hold. Class attributes state what a training
 run provides."""
 
+from abc import abstractmethod
+from collections.abc import Iterable
 from typing import ClassVar
 
-from torch import nn
+from torch import Tensor, nn
+
+from lidar_synth.generate.models.objective import Objective
 
 
 class Network(nn.Module):
@@ -18,15 +22,45 @@ class Network(nn.Module):
         needs_ray_angles: whether a network with fresh weights takes ``angles``, (2, H, W) elevation
             and azimuth of the cells of the state in radians; a checkpoint stores them among the
             weights.
-        is_autoencoder: whether the network maps range images to latents and back.
         decodes_given: the conditions that its ``decode`` takes and follows exactly: "layout"
             (objects in their boxes only) and "semantic" (the labels of the map).
     """
 
     derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels")
     needs_ray_angles: ClassVar[bool] = False
-    is_autoencoder: ClassVar[bool] = False
     decodes_given: ClassVar[frozenset[str]] = frozenset()
+
+
+class Autoencoder(Network):
+    """Range images (B, C, H, W) to latents (B, *latent_shape) and back.
+
+    Attributes:
+        channels: number of channels of an image.
+        resolution: rows and columns of an image.
+        latent_shape: channels, rows and columns of a latent.
+        draws: number of random numbers per cell for sampling an image; 0 if decoding is
+            deterministic.
+    """
+
+    channels: int
+    resolution: tuple[int, int]
+    latent_shape: tuple[int, int, int]
+    draws: int
+
+    @abstractmethod
+    def encode(self, x: Tensor) -> Tensor:
+        """Images to latents of approximate mean 0 and variance 1."""
+
+    @abstractmethod
+    def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
+        """Latents to images; label bits as logits."""
+
+    @abstractmethod
+    def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
+        """The training loss of images, a scalar; ``noise`` is standard normal, of their shape."""
+
+    def measure(self, images: Iterable[Tensor], objective: Objective) -> None:
+        """Set what is not trained but measured, on some images (1, C, H, W)."""
 
 
 class Encoder(Network):

@@ -8,7 +8,7 @@ import typer
 
 def adapt(
     model: Annotated[
-        str, typer.Argument(metavar="MODEL", help="a shipped model such as town-dense, or a file")
+        str, typer.Argument(metavar="MODEL", help="a shipped model such as town, or a file")
     ],
     scans: Annotated[
         Path,
@@ -41,8 +41,8 @@ def adapt(
 
     \b
     Examples:
-      lidar-synth adapt town-dense --scans my_scans --out mine.safetensors
-      lidar-synth adapt town-dense --scans PandaSet/002 --out mine.safetensors --minutes 60 --dry-run
+      lidar-synth adapt town --scans my_scans --out mine.safetensors
+      lidar-synth adapt town --scans PandaSet/002 --out mine.safetensors --minutes 60 --dry-run
     """
     from lidar_synth.lab.train.adaptation import adapt as run
     from lidar_synth.lab.train.adaptation import plan_adaptation

@@ -33,7 +33,7 @@ def prove(
     ] = "auto",
     model: Annotated[
         str, typer.Option(help="of the arms with a generator: a name or a file")
-    ] = "town-dense",
+    ] = "town",
     synthetic: Annotated[int, typer.Option(min=1, help="synthetic scans of each kind")] = 150,
     classes: Annotated[
         str,

@@ -20,7 +20,7 @@ def recipes(
     Examples:
       lidar-synth recipes
       lidar-synth recipes town_teacher > mine.yaml
-      lidar-synth recipes town-dense
+      lidar-synth recipes town
       lidar-synth train town_teacher data.path=scans data.town=null output=runs/mine
     """
     from lidar_synth.lab.train.config import (

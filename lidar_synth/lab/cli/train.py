@@ -57,16 +57,16 @@ def train(
     interrupted run resumes with the same losses; logs for TensorBoard; and images of samples.
     torchrun runs it on several GPUs.
 
-    A model such as town-dense has several stages: autoencoder, teacher, student, decoder. Each gets
+    A model such as town has several stages: autoencoder, teacher, student, decoder. Each gets
     its share of the minutes. The same command resumes. STAGE.KEY=VALUE changes the recipe of a
     stage, KEY=VALUE all of them.
 
     \b
     Examples:
-      lidar-synth train town-dense --dry-run
-      lidar-synth train town-dense --minutes 600 teacher.recipe.batch=16
-      lidar-synth train town-dense --until teacher output=runs/town-dense
-      lidar-synth train town-layout teacher.init=tools/stages/town_dense_teacher.safetensors
+      lidar-synth train town --dry-run
+      lidar-synth train town --minutes 600 teacher.recipe.batch=16
+      lidar-synth train town --until teacher output=runs/town
+      lidar-synth train town-layout teacher.init=tools/stages/town_teacher.safetensors
       lidar-synth train town_codec
       lidar-synth train town_teacher
       lidar-synth train town_teacher --resume recipe.iterations=20000
@@ -87,7 +87,7 @@ def train(
     if until is not None or dry_run:
         given = "--dry-run" if dry_run else f"--until {until}"
         raise ConfigError(
-            f"{given} for the recipe {recipe}", "a model of several stages, such as town-dense"
+            f"{given} for the recipe {recipe}", "a model of several stages, such as town"
         )
     _print_once(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 

@@ -178,7 +178,7 @@ def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> 
     if generator.condition == "camera":
         raise ConfigError(
             f"generator {model!r}, which needs camera images",
-            "one that needs none, such as town-dense",
+            "one that needs none, such as town",
         )
     seen = seen_by(generator.header.provenance)
     if any(dataset == CONTENT for dataset, _ in seen.drives):

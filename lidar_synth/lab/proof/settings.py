@@ -51,7 +51,7 @@ class ProofSettings:
     places: str = "auto"
     tested: int = 20
     synthetic: int = 150
-    model: str = "town-dense"
+    model: str = "town"
     columns: int | None = 512
     widths: tuple[int, ...] = (16, 32, 64, 96)
     classes: str = "auto"

@@ -5,9 +5,9 @@
 loop as a generator) serve trainings of your own. Running needs Accelerate (extra ``train``).
 """
 
+from lidar_synth.generate.models.objective import Losses
 from lidar_synth.lab.train.autoencoder import (
     Autoencoding,
-    Losses,
     autoencoder_loss,
     reconstruct,
     reconstruction_figures,

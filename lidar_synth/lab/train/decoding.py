@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.generate.flow.path import Example, Metric, Velocity, interpolate
-from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
-from lidar_synth.generate.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
 from lidar_synth.lab.train.autoencoder import Autoencoding
 from lidar_synth.lab.train.data import Batch
 from lidar_synth.lab.train.loop import Task
@@ -25,11 +24,11 @@ class Decoding(Autoencoding):
     """The trained module: a decoder; the encoder is frozen. Takes the arguments of
     ``Autoencoding``."""
 
-    network: Autoencoder | SurfaceAutoencoder
+    network: BoundedAutoencoder
 
     def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
         """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
-        return self.nll(self.network.expand(self.network.bounded(z), x), x)
+        return self.network.decoder_loss(z, x, self.objective)
 
 
 def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tensor:
@@ -39,7 +38,7 @@ def decoding_loss(network: nn.Module, example: Example, metric: Metric) -> Tenso
 
 
 def decoding_task(
-    autoencoder: Autoencoder | SurfaceAutoencoder, velocity: Velocity, time: float, noise: float
+    autoencoder: BoundedAutoencoder, velocity: Velocity, time: float, noise: float
 ) -> Task:
     """Latents as a flow leaves them; the answer is the image.
 

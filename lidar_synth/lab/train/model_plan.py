@@ -114,7 +114,7 @@ def plan_model(
     """The plan of a model.
 
     Args:
-        model: the name of a published model of stages, such as ``town-dense``, or a YAML file like
+        model: the name of a published model of stages, such as ``town``, or a YAML file like
             those in ``configs/models``.
         overrides: ``STAGE.KEY=VALUE`` for the recipe of one stage, ``KEY=VALUE`` for those of all
             stages, and ``output=FOLDER`` for the folder of the model, ``runs/NAME`` by default. A
@@ -135,11 +135,11 @@ def plan_model(
 
     Example:
         >>> from lidar_synth.lab.train import plan_model
-        >>> plan = plan_model("town-dense", ["teacher.recipe.batch=16"], minutes=155, until="teacher")
+        >>> plan = plan_model("town", ["teacher.recipe.batch=16"], minutes=155, until="teacher")
         >>> print(plan)
-        town-dense -> runs/town-dense/teacher/teacher.safetensors
-          codec      town_dense_codec         38.8 minutes
-          teacher    town_dense_teacher       116.2 minutes
+        town -> runs/town/teacher/teacher.safetensors
+          codec      town_codec         38.8 minutes
+          teacher    town_teacher       116.2 minutes
         The minutes are those of training; ...
     """
     path = find_model_file(model)

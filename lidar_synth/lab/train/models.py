@@ -48,7 +48,7 @@ def train_model(plan: ModelPlan) -> Path:
         ...     train_model(plan_model("town-layout", ["output=runs/elsewhere/town-layout"]))
         ... except ValueError as error:
         ...     print(str(error).split(";")[0])
-        teacher.init=runs/elsewhere/town-dense/teacher/teacher.safetensors, which does not exist
+        teacher.init=runs/elsewhere/town/teacher/teacher.safetensors, which does not exist
     """
     runs = plan.runs
     for name in plan.stages:

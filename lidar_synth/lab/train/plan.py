@@ -29,8 +29,7 @@ from lidar_synth.generate.flow.path import METRICS, balanced_velocity_loss, velo
 from lidar_synth.generate.flow.solvers import towards, uniform_grid
 from lidar_synth.generate.flow.timesteps import Selection, select_timesteps
 from lidar_synth.generate.models import build_network
-from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
-from lidar_synth.generate.models.town_codec.autoencoder import Autoencoder
+from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.town.town import Town
@@ -134,7 +133,7 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
     """The decoder of a latent model, on latents that its flow generates."""
     networks, header = start_networks(config)
     network = networks[CODEC]
-    if not isinstance(network, Autoencoder | SurfaceAutoencoder):
+    if not isinstance(network, BoundedAutoencoder):
         raise ConfigError(
             f"decoder with init {config.init}", "a model whose autoencoder predicts distributions"
         )

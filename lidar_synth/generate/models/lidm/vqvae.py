@@ -11,7 +11,7 @@ channel that predicts returns: a cell is empty where it is below 0.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -34,7 +34,8 @@ from lidar_synth.generate.models.convolution import (
     run,
     unfold,
 )
-from lidar_synth.generate.models.network import Network
+from lidar_synth.generate.models.network import Autoencoder
+from lidar_synth.generate.models.objective import Objective, expected
 
 CURVE = (1, 4)
 """Kernel of the decoder's levels that have as many rows as the image."""
@@ -72,7 +73,7 @@ class Reconstruction(NamedTuple):
     code_gap: Tensor
 
 
-class VQVAE(Network):
+class VQVAE(Autoencoder):
     """Autoencoder of range images. The defaults are LiDM's, which encode 64 x 1024 cells to 8 x 16
     x 128.
 
@@ -96,8 +97,6 @@ class VQVAE(Network):
     Raises:
         ConfigError: on values that do not fit together.
     """
-
-    is_autoencoder: ClassVar[bool] = True
 
     shift: Tensor
     scale: Tensor
@@ -198,6 +197,65 @@ class VQVAE(Network):
         return Reconstruction(
             self._decode(through), gap, (quantised - z.detach()).float().square().flatten(1).mean(1)
         )
+
+    def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
+        """The loss of images (B, C, H, W), a scalar; ``noise`` is not used.
+
+        ::
+
+            reconstruction   the metric per channel, with the weights; label bits by cross-entropy
+            codebook         squared distance of latents to their codes: ``commitment`` moves the
+                             encoder, ``codebook`` a "gradient" codebook; an "ema" codebook follows
+                             by moving averages
+            mask             distance of the mask, where there is one, to 1 = return and -1 = none
+            geometric        squared distance of points, each the mean of four neighbours in a row,
+                             in units of the maximum range: preserves the curves that beams trace
+            adversarial      the discriminator's hinge loss
+        """
+        losses = objective.losses
+        result = self(x)
+        output, mask = result.output.float().tensor_split([self.channels], 1)
+        loss = objective.reconstruction(output, x)
+        if self.mask:
+            loss = loss + losses.mask * objective.metric(mask, objective.returned(x)).mean()
+        if losses.geometric:
+            off = objective.points(output) - objective.points(x)
+            loss = loss + losses.geometric * off.square().sum(1).mean()
+        if objective.discriminator is not None:
+            image = expected(output, objective.tensors)
+            loss = loss + self._adversarial(objective.discriminator, image, x, loss, objective)
+        loss = loss + losses.commitment * result.gap.mean()
+        total: Tensor = loss + losses.codebook * result.code_gap.mean()
+        return total
+
+    def _adversarial(
+        self,
+        judge: nn.Module,
+        output: Tensor,
+        x: Tensor,
+        reconstruction: Tensor,
+        objective: Objective,
+    ) -> Tensor:
+        """The terms of autoencoder and discriminator: the first uses the discriminator with frozen
+        weights, the second uses detached reconstructions."""
+        frozen = {name: p.detach() for name, p in judge.named_parameters()}
+        fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
+        verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
+        losses = objective.losses
+        balance = self._balance(reconstruction, fooled) if losses.adaptive else 1.0
+        return losses.adversarial * balance * fooled + verdict / 2
+
+    def _balance(self, reconstruction: Tensor, fooled: Tensor) -> Tensor:
+        """Ratio of the gradient norms of both terms at the decoder's last layer, at most 10^4."""
+        last = self.decoder.head.weight
+        if not (torch.is_grad_enabled() and last.requires_grad):
+            return fooled.new_zeros(())
+        one, other = (
+            torch.autograd.grad(x, last, retain_graph=True)[0].norm()
+            for x in (reconstruction, fooled)
+        )
+        balance: Tensor = (one / (other + 1e-4)).clamp(max=1e4)
+        return balance
 
     def _encode(self, x: Tensor) -> Tensor:
         check_shape(x, (self.channels, *self.resolution), "an image")

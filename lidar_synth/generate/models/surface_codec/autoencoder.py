@@ -5,7 +5,7 @@ patches of 2 x 8 cells and predicts what the cells of a patch can show (``surfac
 linear layer knows single cells, which makes it cheap.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder, row_bias
 from lidar_synth.generate.models.convolution import check_shape, pair, reduced
+from lidar_synth.generate.models.objective import Objective
 from lidar_synth.generate.models.surface_codec.blocks import (
     PATCH,
     Block,
@@ -23,6 +24,7 @@ from lidar_synth.generate.models.surface_codec.blocks import (
     to_patches,
 )
 from lidar_synth.generate.models.surface_codec.bounds import bounds_of, codes_of
+from lidar_synth.generate.models.surface_codec.measure_noise import Seen, measure_noise
 from lidar_synth.generate.models.surface_codec.relief import SPANS, relief_fields
 from lidar_synth.generate.models.surface_codec.surfaces import (
     DRAWS,
@@ -143,11 +145,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         patches: Tensor = self.stem(to_patches(x, PATCH).flatten(1))
         return patches.view(len(x), rows, columns, -1).movedim(-1, 1)
 
-    def expand(self, z: Tensor, image: Tensor) -> Surfaces:
-        """The surfaces of bounded latents (B, *latent_shape); they do not depend on the image."""
-        return self.describe(z)
-
-    def describe(self, z: Tensor, merged: int = 1) -> Surfaces:
+    def expand(self, z: Tensor, merged: int = 1) -> Surfaces:
         """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by
         row; ``merged`` columns become one."""
         z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
@@ -155,6 +153,41 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         h = self.decode_outer(split(self.split(h), (2, 2)) + self.place_outer)
         numbers = self.head(cell_norm(h).movedim(1, -1).flatten(0, 2))
         return surfaces_of(numbers, self.surfaces, self.codes, PATCH, merged)
+
+    def nll(self, predicted: Surfaces, x: Tensor, objective: Objective) -> Tensor:
+        """The mean over cells, weighted by class (``Losses.rare``), of the negative log-likelihood
+        of return, class, range and reflectance together; the weights of channels are exponents of
+        the likelihoods of range and reflectance."""
+        code = _codes_of(x)
+        share = torch.bincount(code.flatten(), minlength=self.codes).float() / code.numel()
+        rarity = share.pow(-objective.losses.rare)[code]
+        cells = to_patches(torch.cat([x[:, :2], rarity[:, None]], 1), PATCH)
+        distance, value, weight = cells.unbind(1)
+        codes = to_patches(code[:, None], PATCH)[:, 0]
+        weights = objective.weights
+        temper = weights.get("range", 1.0), weights.get("reflectance", 1.0)
+        likely = predicted.log_likelihood(distance, value, codes, self.normalisation, temper)
+        return -(weight * likely).sum() / weight.sum()
+
+    def measure(self, images: Iterable[Tensor], objective: Objective) -> None:
+        """Measure the noise of cells."""
+        self.measure_noise(images, objective.losses.noise)
+
+    @torch.no_grad()
+    def measure_noise(self, images: Iterable[Tensor], noise: float) -> None:
+        """Set the noise of cells from images (1, C, H, W), whose latents get ``noise`` of this
+        standard deviation, as in training."""
+        generator = torch.Generator().manual_seed(0)
+
+        def measured(x: Tensor) -> Seen:
+            z = self.squeeze(x)
+            z = z + noise * torch.randn(z.shape, generator=generator)
+            return Seen(x, _codes_of(x), self.expand(z))
+
+        found = measure_noise(map(measured, images), self.codes, self.normalisation, generator)
+        self.roughness.copy_(found.roughness)
+        self.relief.copy_(found.relief)
+        self.alike.copy_(found.reflectance)
 
     def decode(
         self,
@@ -186,7 +219,7 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             )
         merged = self.resolution[1] // columns
         patch = PATCH[0], PATCH[1] // merged
-        surfaces = self.describe(self.bounded(z), merged)
+        surfaces = self.expand(self.bounded(z), merged)
         relief = relief_fields(uniform_noise[:, -1], merged)
         drawn = to_patches(uniform_noise, patch), to_patches(relief, patch)
         given = given or {}
@@ -204,3 +237,12 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             [(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1
         )
         return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)
+
+
+def _codes_of(x: Tensor) -> Tensor:
+    """The codes (B, H, W) of images (B, C, H, W): bits after range and reflectance, highest
+    first."""
+    code = torch.zeros_like(x[:, 0], dtype=torch.long)
+    for bit in x[:, 2:].unbind(1):
+        code = 2 * code + (bit > 0)
+    return code

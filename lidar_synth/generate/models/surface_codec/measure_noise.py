@@ -12,15 +12,16 @@ distances along a row: at the longer one, only the wider field is correlated.
 """
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lidar_synth.datasets.classes import TRAIN_ID
-from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, to_patches
 from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, to_normal
-from lidar_synth.generate.models.surface_codec.surfaces import Surfaces, normalised
+from lidar_synth.generate.models.surface_codec.surfaces import Noise, Surfaces, normalised
+from lidar_synth.geometry.normalize import Normalisation
 
 LEAST = 200
 """Pairs of cells that a class needs; others keep the mean of all classes."""
@@ -32,29 +33,39 @@ _LARGEST = 4.0  # error of a range in scales: beyond it, the cell shows another 
 _SURE = 1e-4
 
 
-@torch.no_grad()
-def measure_noise(
-    network: SurfaceAutoencoder, images: Iterable[tuple[Tensor, Tensor]], noise: float = 0.03
-) -> None:
-    """Set the noise of a codec from images.
+class Seen(NamedTuple):
+    """An image and what a decoder says of it.
 
     Args:
-        network: the codec; its buffers are changed.
-        images: (1, C, H, W) tensors and their codes (1, H, W), int64.
-        noise: standard deviation of the noise on latents, as in training.
+        image: (1, C, H, W).
+        codes: (1, H, W) classes, int64.
+        surfaces: of its patches.
     """
-    codes = len(network.roughness)
+
+    image: Tensor
+    codes: Tensor
+    surfaces: Surfaces
+
+
+def measure_noise(
+    images: Iterable[Seen], codes: int, normalisation: Normalisation, generator: torch.Generator
+) -> Noise:
+    """The noise of cells in images.
+
+    Args:
+        images: the images.
+        codes: number of classes.
+        normalisation: of the ranges.
+        generator: random numbers for reflectances of 0, whose score is not known.
+    """
     sums = torch.zeros(
         codes, 4, dtype=torch.float64
     )  # pairs, |e1 - e2|, products and squares of scores
     relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    for x, code in images:
-        z = network.squeeze(x)
-        surfaces = network.describe(z + noise * torch.randn(z.shape, generator=generator))
+    for x, code, surfaces in images:
         distance, value = to_patches(x[:, :2], PATCH).unbind(1)
         kinds = to_patches(code[:, None], PATCH)[:, 0]
-        error, score, surface = _scores(surfaces, distance, value, kinds, network, generator)
+        error, score, surface = _scores(surfaces, distance, value, kinds, normalisation, generator)
         left, right = (
             [part.view(-1, *PATCH)[..., some] for part in (error, score, surface, kinds, distance)]
             for some in (slice(0, -1), slice(1, None))
@@ -68,17 +79,14 @@ def measure_noise(
         ]
         for column, term in enumerate(terms):
             sums[:, column] += torch.bincount(left[3][same], term[same].double(), codes)
-        whole = from_patches(
-            torch.stack([error, kinds.float(), distance], 1), PATCH, network.resolution
-        )
+        cells = torch.stack([error, kinds.float(), distance], 1)
+        whole = from_patches(cells, PATCH, (x.shape[2], x.shape[3]))
         relief += _products(whole[:, 0], whole[:, 1], whole[:, 2], codes)
     total = sums.sum(0)
     known = sums[:, 0] >= LEAST
-    network.roughness.copy_(torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5)
-    network.alike.copy_(
-        torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95)
-    )
-    network.relief.copy_(_relief(relief))
+    roughness = torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5
+    alike = torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95)
+    return Noise(roughness, _relief(relief), alike)
 
 
 def _scores(
@@ -86,12 +94,12 @@ def _scores(
     distance: Tensor,
     value: Tensor,
     kinds: Tensor,
-    network: SurfaceAutoencoder,
+    normalisation: Normalisation,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each
     cell shows."""
-    far = normalised(surfaces.inverse, network.normalisation)
+    far = normalised(surfaces.inverse, normalisation)
     fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
     fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
     shown = fit.argmax(1)

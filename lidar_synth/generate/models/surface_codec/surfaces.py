@@ -19,9 +19,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lidar_synth.generate.models.surface_codec.bounds import Bounds
+from lidar_synth.generate.models.surface_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.generate.models.surface_codec.relief import to_normal
-from lidar_synth.generate.models.town_codec.planes import laplace_noise
-from lidar_synth.generate.models.town_codec.reflectance import ZeroInflatedLogistic
 from lidar_synth.geometry.normalize import Normalisation
 
 SLOPES = 0.3, 0.05
@@ -181,6 +180,12 @@ class Surfaces(NamedTuple):
     def _given(self, codes: Tensor) -> Tensor:
         """(N, K, P) probabilities of the surfaces of cells whose classes (N, P) are given."""
         return (self.weights + self._of(codes)).softmax(1)
+
+
+def laplace_noise(uniform_noise: Tensor) -> Tensor:
+    """Uniform numbers in (0, 1) to samples of the Laplace distribution of scale 1."""
+    off = uniform_noise - 0.5
+    return -off.sign() * torch.log1p(-2 * off.abs())
 
 
 def _allowed(shares: Tensor, object_: Tensor, bounds: Bounds) -> Tensor:

@@ -121,7 +121,7 @@ def plan_adaptation(
             f"scans without labels, such as {first.id!r}, for a model with labels",
             "scans with labels; or a model with an autoencoder and scans of the town, on which "
             "it learns to label",
-            "lidar-synth adapt town-dense",
+            "lidar-synth adapt town",
         )
     stages = stages_for(header, labelled, town)
     grid = fitting(source.sensor, header)
@@ -161,7 +161,7 @@ def adapt(
     an interrupted adaptation.
 
     Args:
-        model: ``"town-dense"``, or ``"town-semantic"``, which then takes anyone's label maps; or
+        model: ``"town"``, or ``"town-semantic"``, which then takes anyone's label maps; or
             the path of a checkpoint.
         scans: scans of one sensor, in any layout that is read. Labelled scans teach the model their
             labels. Without labels it keeps guesses, which it learns on the town.
@@ -188,7 +188,7 @@ def adapt(
     Example:
         >>> from lidar_synth import adapt
         >>> try:
-        ...     adapt("town-dense", "demo_out/town", "mine.safetensors", minutes=120)
+        ...     adapt("town", "demo_out/town", "mine.safetensors", minutes=120)
         ... except ValueError as error:
         ...     print(str(error).split(";")[0])
         3 scans

@@ -55,7 +55,7 @@ def find_model_file(given: str | Path) -> Path | None:
     """The file of a model of stages; None for a recipe.
 
     Args:
-        given: the name of a published model, such as ``town-dense``, or a YAML file, which is a
+        given: the name of a published model, such as ``town``, or a YAML file, which is a
             model's if it has the key ``stages``.
     """
     path = Path(given)

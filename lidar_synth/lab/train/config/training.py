@@ -9,9 +9,9 @@ from torch import nn
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
 from lidar_synth.generate.models import build_network, network_class
-from lidar_synth.generate.models.network import Encoder
+from lidar_synth.generate.models.network import Autoencoder, Encoder
+from lidar_synth.generate.models.objective import Losses
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.lab.train.autoencoder import Losses
 from lidar_synth.lab.train.config.sections import Condition, Count, Network, Run, Section
 
 
@@ -59,7 +59,7 @@ class TrainConfig(Run):
     @property
     def autoencodes(self) -> bool:
         """Whether an autoencoder is trained, and no flow."""
-        return network_class(self.network.architecture).is_autoencoder
+        return issubclass(network_class(self.network.architecture), Autoencoder)
 
     def tensors(self) -> TensorFormat:
         """Layout of the network's tensors.

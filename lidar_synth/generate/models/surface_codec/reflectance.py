@@ -12,7 +12,6 @@ from torch import Tensor
 
 BLANK = -1.0
 """The normalised value of 0."""
-_FAR = 8.0  # largest residual, in scales
 _SURE = 1e-6  # distance from 0 and 1 that keeps a logit finite
 
 
@@ -37,19 +36,6 @@ class ZeroInflatedLogistic(NamedTuple):
         below = torch.logaddexp(F.logsigmoid(self.blank), number + F.logsigmoid(off))
         density = number + F.logsigmoid(off) + F.logsigmoid(-off) - self.spreads
         return -torch.where(x > BLANK, density, below)
-
-    def residual(self, x: Tensor) -> Tensor:
-        """(B, 2 V, H, W) of values (B, V, H, W): whether 0 minus its probability, and the distance
-        to the median in scales."""
-        nothing = x <= BLANK
-        off = ((x - self.middles) * torch.exp(-self.spreads)).clamp(-_FAR, _FAR) / 2
-        return torch.cat(
-            [nothing.float() - torch.sigmoid(self.blank), torch.where(nothing, 0.0, off)], 1
-        )
-
-    def mode(self) -> Tensor:
-        """(B, V, H, W) 0 where that is more likely than not, else the median."""
-        return torch.where(self.blank > 0, BLANK, self.middles)
 
     def sample(self, uniform_noise: Tensor) -> Tensor:
         """(B, V, H, W) values from uniform numbers (B, V, H, W) in (0, 1), by the inverse

@@ -1,0 +1,121 @@
+"""What a training run wants of an autoencoder: the weights of its loss, and the terms that several
+architectures share."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
+
+CURVE_LENGTH = 4
+"""Number of neighbouring cells in a row whose points are averaged, as in LiDM."""
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights of the terms; 0 = left out.
+
+    Args:
+        commitment: of the distance between latents and their codes, as a loss of the encoder.
+        codebook: of the same distance, as a loss of a "gradient" codebook.
+        geometric: of the distance between points.
+        mask: of the decoder's mask.
+        adversarial: of the discriminator's output.
+        adaptive: multiply ``adversarial`` by the ratio of two gradient norms at the decoder's last
+            layer: of all reconstruction terms, and of the adversarial term (Esser et al., Eq. 7).
+        discriminator_width: channels of the discriminator.
+        noise: standard deviation of the noise added to the latents of "surfaces", which lie in
+            (-1, 1).
+        rare: exponent of the class weights of "surfaces": the weight of a cell is the share of its
+            class in the batch to the power of -rare. Poles cover one per cent of a scan, but
+            matter more than that.
+        unlabelled: share of the images whose labels "surfaces" decodes without having seen them.
+
+    Raises:
+        ConfigError: on a negative weight.
+    """
+
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
+
+    commitment: float = 0.25
+    codebook: float = 1.0
+    geometric: float = 0.0
+    mask: float = 1.0
+    adversarial: float = 0.0
+    adaptive: bool = False
+    discriminator_width: int = 32
+    noise: float = 0.07
+    rare: float = 0.0
+    unlabelled: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(value for value in vars(self).values()) < 0:
+            raise ConfigError(f"{self}", "weights of at least 0")
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What an autoencoder is trained for.
+
+    Args:
+        tensors: layout of its images.
+        rays: (3, H, W) directions of the cells, in units of 1 / maximum range.
+        losses: weights of the terms.
+        metric: of the reconstruction.
+        weights: {channel: weight}, 1 by default.
+        discriminator: judges images, with an adversarial term.
+    """
+
+    tensors: TensorFormat
+    rays: Tensor
+    losses: Losses
+    metric: Callable[[Tensor, Tensor], Tensor]
+    weights: Mapping[str, float]
+    discriminator: nn.Module | None = None
+
+    def reconstruction(self, output: Tensor, x: Tensor) -> Tensor:
+        """The weighted sum over channels, a scalar: the metric, or cross-entropy of label bits."""
+        sizes = [CHANNELS[name] for name in self.tensors.channels]
+        loss = output.new_zeros(())
+        parts = zip(self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True)  # type: ignore[no-untyped-call]
+        for name, a, b in parts:
+            error = _cross_entropy if name == "label" else self.metric
+            part = error(a, b).mean()
+            loss = loss + self.weights.get(name, 1.0) * part
+        return loss
+
+    def points(self, x: Tensor) -> Tensor:
+        """(B, 3, H, W / 4) mean points of neighbouring cells, in units of the maximum range."""
+        return F.avg_pool2d(self._metres(x) * self.rays, (1, CURVE_LENGTH))
+
+    def returned(self, x: Tensor) -> Tensor:
+        """(B, 1, H, W) 1 where there is a return, -1 elsewhere."""
+        return 2 * (self._metres(x) > 0).to(x.dtype) - 1
+
+    def _metres(self, x: Tensor) -> Tensor:
+        """(B, 1, H, W) ranges."""
+        before = self.tensors.channels[: self.tensors.channels.index("range")]
+        first = sum(CHANNELS[name] for name in before)
+        return self.tensors.normalisation.decode(x[:, first : first + 1])
+
+
+def _cross_entropy(logits: Tensor, bits: Tensor) -> Tensor:
+    """Mean cross-entropy of label bits, -1 and 1, under their logits."""
+    return F.binary_cross_entropy_with_logits(logits, (bits + 1) / 2)
+
+
+def expected(output: Tensor, tensors: TensorFormat) -> Tensor:
+    """The expected values of a decoder's output (B, C, H, W): label bits x, which are logits,
+    become tanh(x / 2) in (-1, 1); other channels are unchanged."""
+    parts = torch.split(output, [CHANNELS[name] for name in tensors.channels], 1)
+    return torch.cat(
+        [
+            (p / 2).tanh() if n == "label" else p
+            for n, p in zip(tensors.channels, parts, strict=True)
+        ],
+        1,
+    )
