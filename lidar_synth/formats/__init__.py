@@ -6,13 +6,12 @@ module and add its classes to ``READERS`` and ``WRITERS``; ``open_scans``, the c
 parametrised tests then include it.
 """
 
-from collections.abc import Callable
+import inspect
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.bank import is_bank, is_url
+from lidar_synth.bank import is_url
 from lidar_synth.errors import ConfigError, DataError, FileError, choose
-from lidar_synth.files.parsing import read_arrays
 from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import (
@@ -25,14 +24,13 @@ from lidar_synth.formats.folder import (
 )
 from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
-from lidar_synth.formats.kitti_raw import DRIVES, KITTIRaw
-from lidar_synth.formats.nuscenes import SUFFIX, NuScenes
-from lidar_synth.formats.pandaset import FRAMES, PandaSet
+from lidar_synth.formats.kitti_raw import KITTIRaw
+from lidar_synth.formats.nuscenes import NuScenes
+from lidar_synth.formats.pandaset import PandaSet
 from lidar_synth.formats.png import PNGWriter, RangePNG
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.webdataset import SUFFIX as TAR
 from lidar_synth.formats.webdataset import WebDataset, WebDatasetWriter
 from lidar_synth.formats.writer import Writer
 from lidar_synth.geometry.sensor import Sensor
@@ -63,16 +61,16 @@ READERS: dict[str, type[ScanFiles]] = {
     "kitti360": KITTI360,
     "semantic_kitti": SemanticKITTI,
     "kitti_object": KITTIObject,
-    "kitti_raw": KITTIRaw,
     "nuscenes": NuScenes,
     "pandaset": PandaSet,
+    "kitti_raw": KITTIRaw,
     "bank": BankScans,
     "webdataset": WebDataset,
-    "range": RangeImages,
     "png": RangePNG,
+    "range": RangeImages,
     "folder": Folder,
 }
-"""{layout: reader}."""
+"""{layout: reader}, in the order in which readers are asked whether they recognise a path."""
 
 WRITERS: dict[str, type[Writer]] = {
     "kitti": KITTIWriter,
@@ -87,29 +85,6 @@ WRITERS: dict[str, type[Writer]] = {
     "webdataset": WebDatasetWriter,
 }
 """{format: writer}."""
-
-SIGNS: dict[str, Callable[[Path], bool]] = {
-    "kitti360": lambda root: (root / "data_3d_raw").is_dir(),
-    "semantic_kitti": lambda root: any(root.glob("sequences/*/velodyne")),
-    "kitti_object": lambda root: any(root.glob("t[er]*ing/velodyne*")),
-    "nuscenes": lambda root: (
-        root.name.endswith(SUFFIX)
-        or any(any(root.glob(p)) for p in (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}"))
-    ),
-    "pandaset": lambda root: any(any(root.glob(p)) for p in (FRAMES, f"*/{FRAMES}")),
-    "kitti_raw": lambda root: any(
-        any(root.glob(p)) for p in ("velodyne_points/data", DRIVES, f"*/{DRIVES}")
-    ),
-    "bank": is_bank,
-    "webdataset": lambda root: root.suffix == TAR or any(root.glob(f"*{TAR}")),
-    "png": lambda root: root.suffix == ".png" or any(root.glob("range/*.png")),
-    "range": lambda root: _holds_range_images(root),
-    "folder": lambda root: (
-        root.suffix.lower() in SUFFIXES
-        or any(p.suffix.lower() in SUFFIXES for p in root.rglob("*"))
-    ),
-}
-"""{layout: test of a path} by which layouts are recognised, in this order."""
 
 
 def open_scans(
@@ -158,11 +133,12 @@ def open_scans(
         path = Path(path)
     name = layout_of(Path(path)) if layout is None else layout
     reader = choose("layout", name, READERS)
+    taken = inspect.signature(reader).parameters
     options: dict[str, Any] = {"sensor": sensor, "split": split}
-    if split is not None and reader not in (KITTI360, SemanticKITTI, KITTIObject):
+    if split is not None and "split" not in taken:
         raise ConfigError(f"split {split!r} of {path}", f"no split: layout {name!r} has none")
     plain = {"fields": fields, "reflectance_max": reflectance_max}
-    if reader is not Folder and any(v is not None for v in plain.values()):
+    if "fields" not in taken and any(v is not None for v in plain.values()):
         wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
         raise ConfigError(
             f"{wrong} for {path}", f"neither: layout {name!r} has a fixed file format", _AS_FOLDER
@@ -185,7 +161,7 @@ def layout_of(path: Path) -> str:
         raise FileError(
             f"{path} does not exist", "a dataset's root, a folder of scans, or one file"
         )
-    layout = next((name for name, sign in SIGNS.items() if sign(path)), None)
+    layout = next((name for name, reader in READERS.items() if reader.recognises(path)), None)
     if layout is None:
         raise DataError(
             f"{path} holds no scan in a layout that is known",
@@ -194,22 +170,3 @@ def layout_of(path: Path) -> str:
             "training or samples.",
         )
     return layout
-
-
-def _holds_range_images(root: Path) -> bool:
-    """Whether the first array file is an image and not a list of points."""
-    paths = (
-        [root]
-        if root.is_file()
-        else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
-    )
-    if not paths or paths[0].suffix not in (".npz", ".npy"):
-        return False
-    try:
-        arrays = read_arrays(paths[0])
-    except DataError:
-        return False
-    if "array" in arrays:
-        shape = arrays["array"].shape
-        return len(shape) == 3 or (len(shape) == 2 and shape[1] > 8)
-    return "range" in arrays or "image" in arrays

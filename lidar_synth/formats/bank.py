@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lidar_synth.bank import Bank
+from lidar_synth.bank import Bank, is_bank
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.scan import Scan
@@ -23,6 +23,11 @@ class BankScans(ScanFiles):
         ConfigError: if the bank has another sensor.
         LibraryError: on a URL whose file system is not installed.
     """
+
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return is_bank(root)
 
     def __init__(
         self,

@@ -69,6 +69,11 @@ class Folder(ScanFiles):
 
     plain = True
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return any(path.suffix.lower() in SUFFIXES for path in (root, *root.rglob("*")))
+
     def __init__(
         self,
         root: str | Path,

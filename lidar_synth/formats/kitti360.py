@@ -103,6 +103,11 @@ class KITTI360(ScanFiles):
 
     default_sensor = "hdl64e_kitti360"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return (root / "data_3d_raw").is_dir()
+
     def __init__(
         self,
         root: str | Path,

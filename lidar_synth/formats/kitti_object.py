@@ -83,6 +83,11 @@ class KITTIObject(ScanFiles):
 
     default_sensor = "hdl64e_kitti"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return any(root.glob("t[er]*ing/velodyne*"))
+
     def __init__(
         self,
         root: str | Path,

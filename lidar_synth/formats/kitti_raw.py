@@ -57,6 +57,12 @@ class KITTIRaw(ScanFiles):
 
     default_sensor = "hdl64e_kitti"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        patterns = ("velodyne_points/data", DRIVES, f"*/{DRIVES}")
+        return any(any(root.glob(p)) for p in patterns)
+
     def __init__(
         self,
         root: str | Path,

@@ -62,6 +62,12 @@ class NuScenes(ScanFiles):
 
     default_sensor = "hdl32e_nuscenes"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        patterns = (f"*{SUFFIX}", f"samples/LIDAR_TOP/*{SUFFIX}")
+        return root.name.endswith(SUFFIX) or any(any(root.glob(p)) for p in patterns)
+
     def __init__(
         self,
         root: str | Path,

@@ -91,6 +91,11 @@ class PandaSet(ScanFiles):
 
     default_sensor = "pandar64"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return any(any(root.glob(p)) for p in (FRAMES, f"*/{FRAMES}"))
+
     def __init__(
         self,
         root: str | Path,

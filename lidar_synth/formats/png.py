@@ -56,6 +56,11 @@ class RangePNG(ScanFiles):
         DataError: if it holds no image.
     """
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return root.suffix == ".png" or any(root.glob("range/*.png"))
+
     def __init__(
         self,
         root: str | Path,

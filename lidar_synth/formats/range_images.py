@@ -79,6 +79,25 @@ class RangeImages(ScanFiles):
         DataError: if there is no file.
     """
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """Whether the first array file is an image and not a list of points."""
+        paths = (
+            [root]
+            if root.is_file()
+            else sorted(p for p in root.rglob("*") if p.suffix in (".npz", ".npy"))
+        )
+        if not paths or paths[0].suffix not in (".npz", ".npy"):
+            return False
+        try:
+            arrays = read_arrays(paths[0])
+        except DataError:
+            return False
+        if "array" in arrays:
+            shape = arrays["array"].shape
+            return len(shape) == 3 or (len(shape) == 2 and shape[1] > 8)
+        return "range" in arrays or "image" in arrays
+
     def __init__(
         self,
         root: str | Path,

@@ -95,6 +95,11 @@ class SemanticKITTI(ScanFiles):
 
     default_sensor = "hdl64e_semantic_kitti"
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return any(root.glob("sequences/*/velodyne"))
+
     def __init__(
         self,
         root: str | Path,

@@ -63,6 +63,11 @@ class ScanFiles(ABC):
     default_sensor: ClassVar[str] = "hdl64e_kitti"
     plain: ClassVar[bool] = False
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """Whether a path looks like this layout."""
+        return False
+
     def __init__(
         self,
         root: Path,

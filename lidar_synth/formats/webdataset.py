@@ -61,6 +61,11 @@ class WebDataset(ScanFiles):
         DataError: if there is no scan, or a file is not a tar file.
     """
 
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return root.suffix == SUFFIX or any(root.glob(f"*{SUFFIX}"))
+
     def __init__(
         self,
         root: str | Path,
