@@ -12,98 +12,20 @@ import pytest
 import torch
 from conftest import Golden
 from fuzzing.text import edit
+from releases import CFG, DEPTHS, peer_weights, write_r2flow
 from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
 
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
-from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.hdit.hdit import HDiT
-from lidar_synth.lab.importers.r2flow import (
-    HARMONICS,
-    block_names,
-    convert,
-    peer_names,
-    read_r2flow,
-)
-
-DEPTHS = (1, 1, 1, 1)
-CFG: dict[str, Any] = {
-    "data": {
-        "dataset": "kitti_360",
-        "data_format": "logscale",
-        "train_reflectance": True,
-        "projection": "spherical-1024",
-        "resolution": [64, 64],
-        "min_depth": 1.45,
-        "max_depth": 80.0,
-    },
-    "model": {
-        "architecture": "nat_hdit",
-        "base_channels": 16,
-        "temb_channels": 16,
-        "num_residual_blocks": list(DEPTHS),
-        "coords_encoding": "learnable_embedding",
-    },
-    "flow": {"num_sampling_steps": 32, "solver": "dopri5"},
-    "training": {"lr": 1e-4},
-    "finetuning": {"init_ckpt": None, "k_distil": None},
-}
-
-
-def peer_weights(position: str = "learned") -> dict[str, Tensor]:
-    """Random weights with R2Flow's names and shapes."""
-    torch.manual_seed(0)
-    net = build_network(
-        "hdit",
-        {
-            "resolution": (64, 64),
-            "width": 16,
-            "time_width": 16,
-            "depths": DEPTHS,
-            "position": position,
-            "angles": torch.rand(2, 64, 64),
-        },
-    )
-    state = net.state_dict()
-    weights = {
-        theirs: torch.randn_like(state[ours])
-        for ours, theirs in peer_names(DEPTHS, position).items()
-    }
-    weights["coords"] = state["angles.cells"][None]
-    weights["tokenizer.0.weight"] = torch.randn(16, 2, 1, 4)
-    if position == "learned":
-        weights["spatial_pe.embedding"] = torch.randn(1, 64, 16, 16)
-    for ours, theirs in block_names(DEPTHS).items():
-        level = len(DEPTHS) - 1 if ours.startswith("middle") else int(ours.split(".")[1])
-        for i, name in enumerate(HARMONICS):
-            weights[f"{theirs}.{name}"] = state[f"rotary.{level}.harmonics"][i].clone()
-    return weights
-
-
-def write(path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG) -> Path:
-    """Write a file like R2Flow's training, including values that sampling does not need."""
-    optimizer = {
-        "state": {0: {"step": 1, "exp_avg": torch.zeros(3)}},
-        "param_groups": [{"lr": 1e-4}],
-    }
-    torch.save(
-        {
-            "cfg": cfg,
-            "weights": weights,
-            "optimizer": optimizer,
-            "lr_scheduler": {},
-            "num_images": 96,
-        },
-        path,
-    )
-    return path
+from lidar_synth.lab.importers.r2flow import convert, read_r2flow
 
 
 @pytest.fixture
 def released(tmp_path: Path) -> Path:
-    return write(tmp_path / "r2flow-kitti360-1rf.pth", peer_weights())
+    return write_r2flow(tmp_path / "r2flow-kitti360-1rf.pth", peer_weights())
 
 
 def change(**groups: dict[str, Any]) -> dict[str, Any]:
@@ -152,7 +74,7 @@ def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
 def test_other_configurations_are_imported(
     tmp_path: Path, cfg: dict[str, Any], expected: dict[str, Any]
 ) -> None:
-    header, _ = read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
+    header, _ = read_r2flow(write_r2flow(tmp_path / "other.pth", peer_weights(), cfg))
     for name, value in expected.items():
         found: Any = header
         for part in name.split("."):
@@ -178,7 +100,7 @@ def test_all_keys_of_the_released_network_are_imported(golden: Golden, tmp_path:
     stays small."""
     published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
     weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
-    path = write(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
+    path = write_r2flow(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
     assert path.stat().st_size < 1 << 20
     header, networks = read_r2flow(path)
     assert sum(p.numel() for p in networks[VELOCITY].parameters()) == published["parameters"]
@@ -199,7 +121,7 @@ def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Golden, tmp_
         key: config[key]
         for key in ("base_channels", "temb_channels", "num_residual_blocks", "coords_encoding")
     }
-    path = write(
+    path = write_r2flow(
         tmp_path / "tiny.pth",
         weights,
         change(data={"resolution": config["resolution"]}, model=model),
@@ -267,7 +189,7 @@ def test_weights_that_do_not_fit_are_refused(
 ) -> None:
     weights = peer_weights()
     spoil(weights)
-    path = write(tmp_path / "other.pth", weights)
+    path = write_r2flow(tmp_path / "other.pth", weights)
     with pytest.raises(DataError, match=message) as caught:
         read_r2flow(path)
     assert str(path) in str(caught.value)
@@ -290,7 +212,7 @@ def test_configurations_that_do_not_fit_are_refused(
     tmp_path: Path, cfg: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
-        read_r2flow(write(tmp_path / "other.pth", peer_weights(), cfg))
+        read_r2flow(write_r2flow(tmp_path / "other.pth", peer_weights(), cfg))
 
 
 def test_fourier_features_other_than_octaves_are_refused() -> None:
@@ -352,7 +274,7 @@ def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
         cfg = copy.deepcopy(CFG)
         edit(cfg, rng)
         try:
-            read_r2flow(write(tmp_path / "a.pth", weights, cfg))
+            read_r2flow(write_r2flow(tmp_path / "a.pth", weights, cfg))
         except LidarSynthError:
             refused += 1
     assert refused > 10
@@ -361,4 +283,4 @@ def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
 def test_a_hostile_number_of_blocks_is_refused_soon(tmp_path: Path) -> None:
     cfg = change(model={"num_residual_blocks": [2**31 - 1, 1, 1, 1]})
     with pytest.raises(DataError, match="blocks in"):
-        read_r2flow(write(tmp_path / "a.pth", peer_weights(), cfg))
+        read_r2flow(write_r2flow(tmp_path / "a.pth", peer_weights(), cfg))

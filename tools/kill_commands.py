@@ -1,22 +1,25 @@
-"""Kill commands that write (SIGKILL) at random moments, run them again, and compare with runs
-without a kill.
+"""Disturb commands that write, run them again, and compare with runs that nothing disturbed.
 
     python tools/kill_commands.py --kills 50 [--command convert ...]
 
-Every command is run twice without a kill, to see whether it gives the same bytes at all and how
-long it takes after its imports. Then it runs in a forked process that is killed after a random part
-of that time and started again, until it ends by itself. The table has the kills and the files that
-differ from those of the uninterrupted run.
+Every command is run twice undisturbed, to see whether it gives the same bytes at all and how long
+it takes after its imports. Then it runs in a forked process that is killed (SIGKILL) after a random
+part of that time and started again, until it ends by itself. Likewise it runs with a limit of the
+size of files (a full disk), as a user who may not write into the folder, and twice at once. A run
+that cannot end has to say so by one of the package's errors; the next one has to give the bytes of
+an undisturbed run.
 """
 
 import argparse
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from bench.untrained import write_untrained
@@ -24,6 +27,7 @@ from tqdm import tqdm
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
+from lidar_synth.errors import LidarSynthError
 
 COMMANDS = {
     "town": "town OUT --scans 6 --layout semantic_kitti --no-camera",
@@ -38,44 +42,70 @@ COMMANDS = {
     "bank split": "bank split BANK OUT/a=0.5 OUT/b=0.5",
     "bank as-sensor": "bank as-sensor BANK OUT --sensor hdl32e",
     "curate": "curate BANK --drop range<0.0125 --out OUT",
+    "edit remove": "edit remove TOWN OUT --name Car",
+    "repair": "repair OUT",
+    "label kitti360": "label kitti360 KITTI360 OUT",
 }
-"""Commands by name. OUT is the output; TOWN, MODEL, BANK and OTHER are made beforehand."""
+"""Commands by name. OUT is the output; the other places are made beforehand."""
+
+STARTS = {"repair": "DAMAGED"}
+"""Commands that change a folder which exists already: the place that they begin with."""
+
+DONE, FAILED, REFUSED = range(3)
+"""How a run ended: well, with an exception, or with one of the package's errors."""
+
+NOBODY = 65534
+"""A user who may write nowhere."""
 
 
 def run(words: list[str]) -> None:
     """Run a command in this process.
 
     Raises:
-        RuntimeError: if it fails.
+        LidarSynthError: if it is refused.
+        RuntimeError: if it fails in another way.
     """
     result = CliRunner().invoke(app, words)
+    if isinstance(result.exception, LidarSynthError):
+        raise result.exception
     if result.exit_code != 0:
         raise RuntimeError(f"lidar-synth {' '.join(words)}: {result.exception or result.output}")
 
 
-def run_and_kill(words: list[str], seconds: float) -> bool:
-    """Run a command in a child process and kill it after some seconds; returns whether it was still
-    running."""
+def start(words: list[str], limit: Callable[[], object] = lambda: None) -> int:
+    """Run a command in a child process, which ``limit`` limits before; the process."""
     child = os.fork()
     if child == 0:
-        os.setpgid(0, 0)
+        ended = DONE
         try:
+            os.setpgid(0, 0)
+            limit()
             run(words)
+        except LidarSynthError:
+            ended = REFUSED
         except BaseException as error:
-            print(error, file=sys.stderr)
-            os._exit(1)
-        os._exit(0)
+            print(f"{type(error).__name__}: {error}", file=sys.stderr)
+            ended = FAILED
+        os._exit(ended)
+    return child
+
+
+def wait(child: int) -> int:
+    """How a child ended."""
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def kill(child: int, seconds: float) -> int | None:
+    """Kill a child after some seconds; None, or how it ended before."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
-            if status != 0:
-                raise RuntimeError(f"lidar-synth {' '.join(words)} failed after a kill")
-            return False
+            return os.waitstatus_to_exitcode(status)
         time.sleep(0.002)
-    os.kill(child, signal.SIGKILL)
+    os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    return True
+    return None
 
 
 def read_files(root: Path) -> dict[str, bytes]:
@@ -87,45 +117,129 @@ def read_files(root: Path) -> dict[str, bytes]:
     }
 
 
-def try_command(
-    name: str, places: dict[str, str], out: Path, kills: int, rng: random.Random
-) -> tuple[int, int, str]:
-    """Kill one command repeatedly.
+class Trial:
+    """A command and its undisturbed result.
 
-    Returns:
-        The kills, the runs that were completed after kills, and what differed or failed ("" if
-        nothing).
+    Args:
+        name: a key of ``COMMANDS``.
+        places: {name of a place: path}.
+        out: the output.
+
+    Raises:
+        RuntimeError: if two undisturbed runs fail or differ.
     """
-    words = COMMANDS[name]
-    for place, path in {**places, "OUT": str(out)}.items():
-        words = words.replace(place, path)
-    given = words.split()
-    expected = []
-    for _ in range(2):
-        shutil.rmtree(out, ignore_errors=True)
+
+    def __init__(self, name: str, places: dict[str, str], out: Path) -> None:
+        words = COMMANDS[name]
+        for place, path in {**places, "OUT": str(out)}.items():
+            words = words.replace(place, path)
+        self.words = words.split()
+        self.out = out
+        self.begins_with = places.get(STARTS.get(name, ""))
+        self.expected: dict[str, bytes] = {}
+        self.clear()
         begin = time.monotonic()
-        run_and_kill(given, 1e6)
-        seconds = time.monotonic() - begin
-        expected.append(read_files(out))
-    if expected[0] != expected[1]:
-        return 0, 0, "two runs without a kill differ"
-    shutil.rmtree(out)
-    done = completed = 0
-    while done < kills or out.exists():
-        moment = rng.uniform(0, seconds) if done < kills else 1e6
-        try:
-            if run_and_kill(given, moment):
-                done += 1
-                continue
-        except RuntimeError as error:
-            return done, completed, str(error)
-        found = read_files(out)
-        differing = sorted(n for n in expected[0] | found if expected[0].get(n) != found.get(n))
+        if wait(start(self.words)) != DONE:
+            raise RuntimeError("an undisturbed run fails")
+        self.seconds = time.monotonic() - begin
+        self.expected = read_files(out)
+        self.clear()
+        self.complete("an undisturbed run")
+
+    def clear(self) -> None:
+        """Put the output back into the state before the command."""
+        shutil.rmtree(self.out, ignore_errors=True)
+        if self.begins_with is not None:
+            shutil.copytree(self.begins_with, self.out)
+
+    def complete(self, after: str) -> None:
+        """Run the command to its end, compare, and clear.
+
+        Raises:
+            RuntimeError: if it fails, or a file differs.
+        """
+        if wait(start(self.words)) != DONE:
+            raise RuntimeError(f"fails after {after}")
+        found = read_files(self.out)
+        names = sorted(self.expected.keys() | found.keys())
+        differing = [n for n in names if self.expected.get(n) != found.get(n)]
         if differing:
-            return done, completed, f"differs: {', '.join(differing[:4])}"
-        completed += 1
-        shutil.rmtree(out)
-    return done, completed, ""
+            raise RuntimeError(f"differs after {after}: {', '.join(differing[:4])}")
+        self.clear()
+
+
+def kill_often(trial: Trial, kills: int, rng: random.Random) -> None:
+    """Kill a command at random moments; a run that ends before is compared."""
+    done = 0
+    while done < kills:
+        ended = kill(start(trial.words), rng.uniform(0, trial.seconds))
+        if ended is None:
+            done += 1
+            continue
+        if ended != DONE:
+            raise RuntimeError("fails after a kill")
+        trial.complete("a kill")
+    trial.complete("a kill")
+
+
+def fill_disk(trial: Trial, times: int, rng: random.Random) -> None:
+    """Run a command where no file may be larger than a part of the largest one."""
+    largest = max(map(len, trial.expected.values()))
+    for _ in range(times):
+        size = int(largest * rng.random())
+        limited = start(
+            trial.words, lambda size=size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        )
+        if wait(limited) == FAILED:
+            raise RuntimeError("a foreign error on a full disk")
+        trial.complete("a full disk")
+
+
+def forbid_writing(trial: Trial, times: int, rng: random.Random) -> None:
+    """Run a command as a user who may not write into the folder, from the beginning or midway."""
+    for i in range(times):
+        if i % 2:
+            kill(start(trial.words), rng.uniform(0, trial.seconds))
+        if wait(start(trial.words, lambda: os.setuid(NOBODY))) == FAILED:
+            raise RuntimeError("a foreign error in a read-only folder")
+        trial.complete("a read-only folder")
+
+
+def run_twice(trial: Trial, times: int, rng: random.Random) -> None:
+    """Run a command twice at once, the second a moment later."""
+    for _ in range(times):
+        first = start(trial.words)
+        time.sleep(rng.uniform(0, trial.seconds / 2))
+        second = start(trial.words)
+        if FAILED in (wait(first), wait(second)):
+            raise RuntimeError("a foreign error of one of two writers")
+        trial.complete("two writers at once")
+
+
+DISTURBANCES: dict[str, Callable[[Trial, int, random.Random], None]] = {
+    "kills": kill_often,
+    "full disk": fill_disk,
+    "read-only": forbid_writing,
+    "two writers": run_twice,
+}
+
+
+def make_places(root: Path) -> dict[str, str]:
+    """What the commands read, by name; of every user, for those who may not write."""
+    root.chmod(0o755)
+    names = ("TOWN", "KITTI360", "BANK", "OTHER", "DAMAGED")
+    places = {name: str(root / name.lower()) for name in names}
+    places["MODEL"] = str(write_untrained(root / "untrained.safetensors"))
+    town = ["--no-camera", "--scans"]
+    run(["town", places["TOWN"], "--layout", "semantic_kitti", *town, "12"])
+    run(["town", places["KITTI360"], "--layout", "kitti360", *town, "6"])
+    for name, first in (("BANK", "0"), ("OTHER", "24")):
+        sizes = ["--count", "24", "--shard-size", "5", "--first", first]
+        run(["bake", places[name], "--model", places["MODEL"], *sizes])
+    shutil.copytree(places["BANK"], places["DAMAGED"])
+    for shard in sorted(Path(places["DAMAGED"]).glob("*.h5"))[1:4]:
+        shard.unlink()
+    return places
 
 
 def main() -> None:
@@ -134,24 +248,26 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--times", type=int, default=4, help="of each other disturbance")
     parser.add_argument("--command", action="append", choices=COMMANDS, help="repeatable [all]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
     given = parser.parse_args()
     rng = random.Random(given.seed)
     failed = False
-    print("| command | kills | completed runs | differs |\n|---|---:|---:|---|")
+    print(f"| command | {' | '.join(DISTURBANCES)} |\n|---|{'---:|' * len(DISTURBANCES)}")
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        places = {name: str(root / name.lower()) for name in ("TOWN", "BANK", "OTHER")}
-        places["MODEL"] = str(write_untrained(root / "untrained.safetensors"))
-        run(["town", places["TOWN"], "--scans", "12", "--layout", "semantic_kitti", "--no-camera"])
-        for name, first in (("BANK", "0"), ("OTHER", "24")):
-            sizes = ["--count", "24", "--shard-size", "5", "--first", first]
-            run(["bake", places[name], "--model", places["MODEL"], *sizes])
+        places = make_places(Path(folder))
         for name in tqdm(given.command or COMMANDS, unit="command"):
-            kills, completed, fault = try_command(name, places, root / "out", given.kills, rng)
-            tqdm.write(f"| {name} | {kills} | {completed} | {fault or 'no'} |")
-            failed |= bool(fault)
+            cells = []
+            for disturbance, disturb in DISTURBANCES.items():
+                times = given.kills if disturbance == "kills" else given.times
+                try:
+                    disturb(Trial(name, places, Path(folder) / "out"), times, rng)
+                    cells.append(f"{times}")
+                except RuntimeError as error:
+                    cells.append(str(error))
+                    failed = True
+            tqdm.write(f"| {name} | {' | '.join(cells)} |")
     sys.exit(failed)
 
 

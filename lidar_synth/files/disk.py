@@ -118,7 +118,9 @@ def read_file(
     """
     try:
         with path.open("rb") as file:
-            content = file.read(-1 if at_most is None else at_most + 1)
+            # read(n) takes n bytes of memory before it reads: no more than the file has.
+            size = os.fstat(file.fileno()).st_size
+            content = file.read(-1 if at_most is None else min(at_most, size) + 1)
     except OSError as error:
         raise unreadable(path, error, expected) from error
     if at_most is not None and len(content) > at_most:

@@ -37,6 +37,9 @@ FORMAT = "lidar-synth-objects/1"
 MOST_BYTES = 1 << 32
 """Maximum size of a bank in memory: a hundred thousand objects of 2,500 points each."""
 
+MOST_PACKED = 64 << 20, 20
+"""How much a bank may unpack into: these bytes, and so many times the size of its file."""
+
 
 @dataclass(frozen=True, repr=False)
 class ObjectBank:
@@ -176,7 +179,10 @@ class ObjectBank:
         """
         path = Path(path)
         try:
-            arrays: dict[str, Any] = read_arrays(path, most=MOST_BYTES)
+            size = path.stat().st_size if path.is_file() else 0
+            least, factor = MOST_PACKED
+            most = min(least + factor * size, MOST_BYTES)
+            arrays: dict[str, Any] = read_arrays(path, most=most)
             if str(arrays.pop("format")) != FORMAT:
                 raise ValueError("another format")
             sensor = Sensor.from_dict(parse_json(str(arrays.pop("sensor")), "its sensor"))

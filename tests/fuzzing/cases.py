@@ -72,6 +72,9 @@ class Cases:
         """Put a case into the folder, beside the files that it shares with the valid dataset; the
         folder."""
         rng = Random(f"{self.seed}/{self.name}/{number}")
+        if self.target.change is not None:
+            self.target.change(self.root, rng)
+            return self.root
         for name, content in mutated(self.target, self.files, rng).items():
             self._put(name, content)
         if self.target.mend is not None and rng.random() < 0.5:
@@ -82,6 +85,9 @@ class Cases:
 
     def restore(self) -> Path:
         """Put the valid dataset into the folder; the folder."""
+        if self.target.writes or self.target.change is not None:
+            shutil.rmtree(self.root, ignore_errors=True)
+            self._changed = set(self.files)
         for name in sorted(self._changed):
             self._put(name, self.files[name])
         self._changed.clear()

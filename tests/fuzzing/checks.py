@@ -8,13 +8,14 @@ from functools import singledispatch
 from typing import Any
 
 import numpy as np
-import torch
+from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.formats import Calibration
 from lidar_synth.generate.checkpoint import Checkpoint, Header
 from lidar_synth.geometry.scan import FARTHEST, REAL, SYNTHETIC, Boxes, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.town.skin.skin import SOFT, Dressed
 
 FIELD_TYPES = {
     "reflectance": "f4",
@@ -43,13 +44,44 @@ def flaws(value: Any) -> Iterator[str]:
     yield f"a {type(value).__name__}, of which nothing is known"
 
 
-@flaws.register
-def _(value: None) -> Iterator[str]:
+@flaws.register(str)
+@flaws.register(int)
+@flaws.register(float)
+@flaws.register(type(None))
+def _(value: object) -> Iterator[str]:
     yield from ()
 
 
+@flaws.register(dict)
+def _(values: dict[Any, Any]) -> Iterator[str]:
+    yield from flaws(list(values.values()))
+
+
+@flaws.register(np.ndarray)
+@flaws.register(Tensor)
+def _(values: Any) -> Iterator[str]:
+    array = np.asarray(values)
+    if array.dtype.kind in "fc" and not np.isfinite(array).all():
+        yield f"{array.dtype} of shape {array.shape} that are not finite"
+
+
+@flaws.register
+def _(network: nn.Module) -> Iterator[str]:
+    yield from flaws(list(network.state_dict().values()))
+
+
+@flaws.register
+def _(dressed: Dressed) -> Iterator[str]:
+    if (
+        not (np.abs(dressed.shift) <= SOFT).all()
+        or not ((dressed.reflectance >= 0) & (dressed.reflectance <= 1)).all()
+    ):
+        yield "returns with a skin that move too far, or of a reflectance outside [0, 1]"
+
+
 @flaws.register(list)
-def _(values: list[Any]) -> Iterator[str]:
+@flaws.register(tuple)
+def _(values: list[Any] | tuple[Any, ...]) -> Iterator[str]:
     for value in values:
         yield from flaws(value)
 
@@ -128,7 +160,7 @@ def _(checkpoint: Checkpoint) -> Iterator[str]:
     yield from flaws(checkpoint.header)
     for name, network in checkpoint.networks.items():
         for key, tensor in network.state_dict().items():
-            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
                 yield f"{name}.{key} is not finite"
 
 
@@ -174,8 +206,10 @@ def _add(digest: Any, value: Any) -> None:
         digest.update(
             f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes()
         )
-    elif isinstance(value, torch.nn.Module):
-        _add(digest, {key: tensor.numpy() for key, tensor in value.state_dict().items()})
+    elif isinstance(value, Tensor):
+        _add(digest, value.numpy())
+    elif isinstance(value, nn.Module):
+        _add(digest, dict(value.state_dict()))
     elif is_dataclass(value):
         _add(digest, {field.name: getattr(value, field.name) for field in fields(value)})
     elif isinstance(value, Mapping):

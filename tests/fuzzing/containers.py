@@ -1,6 +1,7 @@
-"""Mutators of containers of files: ``.npz`` (zip) and ``.tar``. A member is mutated as a file of
-its own suffix."""
+"""Mutators of containers of files: zips (``.npz``; ``.pth`` and ``.ckpt`` of PyTorch) and tars
+(``.tar``, ``.tgz``). A member is mutated as a file of its own suffix."""
 
+import gzip
 import tarfile
 import zipfile
 import zlib
@@ -30,6 +31,9 @@ NAMES = (
     "pose.npy",
     "image.npy",
     "json",
+    "a/data.pkl",
+    "model/data/0",
+    "model/byteorder",
 )
 """What a member may be called."""
 
@@ -75,7 +79,7 @@ def edit_members(members: Members, rng: Random) -> Members:
     return members
 
 
-@mutates(".npz")
+@mutates(".npz", ".pth", ".ckpt")
 def edit_zip(content: bytes, rng: Random) -> bytes:
     """The members of the zip change."""
     members = edit_members(unzip(content), rng)
@@ -89,7 +93,7 @@ def edit_zip(content: bytes, rng: Random) -> bytes:
     )
 
 
-@mutates(".npz")
+@mutates(".npz", ".pth", ".ckpt")
 def lie_in_zip(content: bytes, rng: Random) -> bytes:
     """Headers of the zip say another size, method, flag, checksum or place."""
     values = bytearray(content)
@@ -111,7 +115,7 @@ def zeros(megabytes: int) -> bytes:
     return b"".join(packer.compress(bytes(1_000_000)) for _ in range(megabytes)) + packer.flush()
 
 
-@mutates(".npz")
+@mutates(".npz", ".pth", ".ckpt")
 def bomb_zip(content: bytes, rng: Random) -> bytes:
     """A member that unpacks into far more than the file is long."""
     members = unzip(content)
@@ -231,3 +235,29 @@ def lie_in_tar(content: bytes, rng: Random) -> bytes:
     header[148:156] = b" " * 8
     header[148:156] = b"%06o\x00 " % sum(header)
     return content[:start] + bytes(header) + content[start + 512 :]
+
+
+@mutates(".tgz")
+def edit_packed_tar(content: bytes, rng: Random) -> bytes:
+    """The tar inside changes."""
+    change = rng.choice((edit_tar, edit_tar, change_kinds, lie_in_tar))
+    return gzip.compress(change(gzip.decompress(content), rng), 1, mtime=0)
+
+
+@mutates(".tgz")
+def bomb_tar(content: bytes, rng: Random) -> bytes:
+    """A member unpacks into far more than the file is long."""
+    members = untar(gzip.decompress(content))
+    name = rng.choice([name for name, _ in members])
+    megabytes = rng.choice((1, 1, 700))
+    info = tarfile.TarInfo(name)
+    info.size = megabytes * 1_000_000
+    return gzip.compress(info.tobuf(), 1, mtime=0) + gzipped_zeros(megabytes) + content
+
+
+@cache
+def gzipped_zeros(megabytes: int) -> bytes:
+    """That many megabytes of zeros and the rest of a tar's last block, as gzip writes them."""
+    packer = zlib.compressobj(9, wbits=31)
+    body = b"".join(packer.compress(bytes(1_000_000)) for _ in range(megabytes))
+    return body + packer.compress(bytes(-megabytes * 1_000_000 % 512)) + packer.flush()

@@ -1,5 +1,6 @@
-"""Mutators of pickled tables, compressed with gzip (``.gz``): opcodes, and the tree of values and
-calls."""
+"""Mutators of pickles: opcodes, and the tree of values and calls. A ``.gz`` is a table
+that gzip compressed; a ``.pkl`` a pickle inside an archive of PyTorch; a ``.pt`` a row of pickles
+and the storages, as PyTorch before 1.6 wrote it."""
 
 import gzip
 import pickletools
@@ -7,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from io import BytesIO
 from random import Random
 from typing import Any
 
@@ -43,11 +45,15 @@ def packed(content: bytes) -> bytes:
 
 
 @mutates(".gz")
+def edit_packed_opcodes(content: bytes, rng: Random) -> bytes:
+    """Opcodes of a compressed pickle change."""
+    return packed(edit_opcodes(unpacked(content), rng))
+
+
+@mutates(".pkl", ".pt")
 def edit_opcodes(content: bytes, rng: Random) -> bytes:
     """Opcodes are dropped, repeated, swapped, or others."""
-    plain = unpacked(content)
-    starts = [position for _, _, position in pickletools.genops(plain)]
-    parts = [plain[a:b] for a, b in zip(starts, [*starts[1:], len(plain)], strict=True)]
+    parts, rest = opcodes(content)
     for _ in range(rng.choice((1, 1, 2, 5))):
         i = rng.randrange(len(parts))
         change = rng.randrange(6)
@@ -61,7 +67,34 @@ def edit_opcodes(content: bytes, rng: Random) -> bytes:
             parts[i] = parts[i][:1] + rng.randbytes(len(parts[i]) - 1)
         else:
             parts.insert(i, rng.choice(HOSTILE))
-    return packed(b"".join(parts))
+    return b"".join(parts) + rest
+
+
+@mutates(".pkl", ".pt")
+def set_argument(content: bytes, rng: Random) -> bytes:
+    """A number of a pickle (a size, a stride, a length) becomes one at the limit of a type."""
+    parts, rest = opcodes(content)
+    i = rng.choice([i for i, part in enumerate(parts) if part[:1] in (b"K", b"M", b"J", b"\x8a")])
+    number = rng.choice((*INTEGERS, 2**40, -(2**31), 2**62))
+    packed_number = number.to_bytes(9, "little", signed=True)
+    parts[i] = b"\x8a\x09" + packed_number
+    return b"".join(parts) + rest
+
+
+def opcodes(content: bytes) -> tuple[list[bytes], bytes]:
+    """The opcodes of all pickles that stand one behind the other at the beginning, and what follows them."""
+    parts: list[bytes] = []
+    stream = BytesIO(content)
+    end = 0
+    try:
+        while end < len(content):
+            starts = [end + position for _, _, position in pickletools.genops(stream.read())]
+            end = starts[-1] + 1
+            parts += [content[a:b] for a, b in zip(starts, [*starts[1:], end], strict=True)]
+            stream.seek(end)
+    except (ValueError, IndexError):  # the storages, which are no pickle
+        pass
+    return parts, content[end:]
 
 
 @mutates(".gz")

@@ -1,5 +1,8 @@
 """The readers that are fuzzed, one line each in ``TARGETS``: how to write a small valid dataset,
-and how to read it."""
+and how to read it.
+
+Those of scans and banks are written here, all others in ``saved``.
+"""
 
 import hashlib
 import json
@@ -7,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -19,9 +23,10 @@ from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
 from ouster_files import ouster_metadata
 from pandaset_files import write_pandaset
 
+from fuzzing import saved, trees
 from lidar_synth.bank import ShardReader
 from lidar_synth.files.disk import write_named_matrices
-from lidar_synth.formats import READERS, WRITERS, layout_of
+from lidar_synth.formats import READERS, WRITERS, layout_of, open_scans
 from lidar_synth.generate.checkpoint import (
     VELOCITY,
     Header,
@@ -50,12 +55,16 @@ class Target:
         files: patterns of the names of the files that are mutated.
         mend: makes checksums of the folder fit again after a mutation, where they can be; done for
             half of the cases.
+        change: changes files and folders as such, in the place of the content of one file.
+        writes: whether reading writes into the folder, which is then made anew for every case.
     """
 
     make: Callable[[Path], object]
     read: Callable[[Path], Any]
     files: tuple[str, ...] = ("*",)
     mend: Callable[[Path], object] | None = None
+    change: Callable[[Path, Random], object] | None = None
+    writes: bool = False
 
 
 def scans(**fields: bool) -> list[Scan]:
@@ -263,6 +272,37 @@ def read_mixture(root: Path) -> list[Any]:
     return found
 
 
+def make_described(root: Path) -> None:
+    """Folders with a description of their scans: a full one, a short one, and two of earlier versions."""
+    for name in ("full", "short", "town", "mark"):
+        write("kitti", root / name)
+        if name != "full":
+            (root / name / "scans.json").unlink()
+    (root / "short" / "scans.json").write_text(
+        json.dumps({"format": "lidar-synth-scans/1", "sensor": "os1_128"})
+    )
+    (root / "town" / "town.json").write_text(
+        json.dumps({"seed": 3, "interval": 0.1, "sensor": SENSOR.to_dict()})
+    )
+    (root / "mark" / "synthetic.json").write_text("{}")
+
+
+def make_folders(root: Path) -> None:
+    """A small dataset of each layout."""
+    for name in FOLDERS:
+        TARGETS[name].make(root / name)
+
+
+def read_all(root: Path) -> list[Any]:
+    """The scans of all datasets in a folder."""
+    found: list[Any] = []
+    for folder in sorted(root.iterdir()):
+        source: Any = open_scans(folder)
+        for index in range(min(len(source), SCANS)):
+            found += [source[index], source.calibration(index)]
+    return found
+
+
 def read(layout: str, root: Path, **options: Any) -> list[Any]:
     """Scans, images and cameras of a dataset, through the reader and through what recognises its
     layout."""
@@ -349,6 +389,34 @@ TARGETS: dict[str, Target] = {
     "sensor": Target(make_sensors, read_sensors),
     "mixture": Target(make_mixture, read_mixture, files=("mix.yaml",)),
     "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
+    "archives": Target(
+        saved.make_archives, saved.read_archives, files=("*.pth", "*.pt", "*.tar", "*.tgz")
+    ),
+    "judges": Target(saved.make_judges, saved.read_judges, files=("*.yaml",)),
+    "importers": Target(saved.make_importers, saved.read_importers, writes=True),
+    "states": Target(saved.make_states, saved.read_states, mend=saved.mend_states, writes=True),
+    "objects": Target(saved.make_objects, saved.read_objects),
+    "layouts": Target(saved.make_layouts, saved.read_layouts),
+    "recipes": Target(saved.make_recipes, saved.read_recipes),
+    "skins": Target(saved.make_skins, saved.read_skins, mend=saved.mend_skin),
+    "scans_json": Target(make_described, read_all, files=("*.json",)),
+    "folders": Target(make_folders, read_all, change=trees.rearrange),
 }
 """By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is
 left out."""
+
+FOLDERS = (
+    "bin",
+    "npz",
+    "range",
+    "png",
+    "webdataset",
+    "semantic_kitti",
+    "kitti_object",
+    "kitti_raw",
+    "kitti360",
+    "nuscenes",
+    "pandaset",
+    "bank",
+)
+"""Targets of which ``folders`` has a dataset."""

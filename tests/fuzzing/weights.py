@@ -1,4 +1,4 @@
-"""Mutators of ``.safetensors`` files."""
+"""Mutators of ``.safetensors`` files, of which a skin is one."""
 
 import json
 from random import Random
@@ -22,16 +22,19 @@ def join(text: str, body: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + body
 
 
-@mutates(".safetensors")
+@mutates(".safetensors", ".skin")
 def edit_header(content: bytes, rng: Random) -> bytes:
     """The package's own header says something else."""
     outer, body = parts(content)
     metadata = outer["__metadata__"]
-    metadata["lidar_synth"] = edit_json_text(metadata["lidar_synth"], rng)
+    if "lidar_synth" in metadata:
+        metadata["lidar_synth"] = edit_json_text(metadata["lidar_synth"], rng)
+    else:
+        edit(metadata, rng)
     return join(json.dumps(outer), body)
 
 
-@mutates(".safetensors")
+@mutates(".safetensors", ".skin")
 def edit_layout(content: bytes, rng: Random) -> bytes:
     """Types, shapes, places or names of the tensors are others than those of the bytes."""
     outer, body = parts(content)
@@ -39,7 +42,7 @@ def edit_layout(content: bytes, rng: Random) -> bytes:
     return join(written(json.dumps(outer)), body)
 
 
-@mutates(".safetensors")
+@mutates(".safetensors", ".skin")
 def edit_tensors(content: bytes, rng: Random) -> bytes:
     """Tensors hold other values, types or shapes, in a file that is whole."""
     metadata = parts(content)[0]["__metadata__"]
