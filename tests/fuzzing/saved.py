@@ -1,6 +1,8 @@
 """What is fuzzed beside scans and banks: files of weights, states of runs, and settings that people
 write."""
 
+import gzip
+import io
 import json
 import tarfile
 from dataclasses import asdict
@@ -18,6 +20,7 @@ from layouts import some_scan
 from releases import UNCONDITIONAL, config_of, peer_weights, random_weights, release, write_r2flow
 from torch import Tensor, nn
 
+from fuzzing.weights import in_order
 from lidar_synth import ObjectBank, Town, load_layout, load_skin
 from lidar_synth.files.parsing import seal
 from lidar_synth.files.torch_files import load_pickle, state_of
@@ -58,21 +61,28 @@ def make_archives(root: Path) -> None:
     """Weights in both formats of PyTorch, and a judge's archive as a tar and as a compressed one."""
     folder = root / "judge"
     folder.mkdir(parents=True)
-    torch.manual_seed(0)
-    state = nn.Linear(4, 3).state_dict()
+    flat = torch.randn(15, generator=torch.Generator().manual_seed(0))
+    state = {"weight": flat[:12].view(3, 4), "bias": flat[12:]}
     content = {
         "state_dict": state,
         "epoch": 3,
         "optimizer": {"state": {0: {"step": 1}}, "betas": (0.9, 0.99)},
     }
     torch.save(content, root / "new.pth")
-    torch.save(content, root / "old.pt", _use_new_zipfile_serialization=False)
+    old = io.BytesIO()
+    torch.save(content, old, _use_new_zipfile_serialization=False)
+    address = str(flat.untyped_storage()._cdata).encode()  # the old format's name of the storage
+    (root / "old.pt").write_bytes(old.getvalue().replace(address, b"1" * len(address)))
     torch.save(state, folder / "weights")
     (folder / "arch_cfg.yaml").write_text(yaml.safe_dump({"backbone": {"name": "x", "OS": 32}}))
-    for name in ("judge.tar", "judge.tgz"):
-        with tarfile.open(root / name, "w:gz" if name.endswith("z") else "w") as tar:
-            for path in sorted(folder.iterdir()):
-                tar.add(path, f"judge/{path.name}", filter=without_owner)
+    with tarfile.open(root / "judge.tar", "w") as tar:
+        for path in sorted(folder.iterdir()):
+            tar.add(path, f"judge/{path.name}", filter=without_owner)
+    content = (root / "judge.tar").read_bytes().rstrip(b"\0")  # without the record of zeros
+    content += bytes(-len(content) % 512 + 1024)
+    (root / "judge.tar").write_bytes(content)
+    packed = gzip.compress(content, mtime=0)
+    (root / "judge.tgz").write_bytes(packed)
 
 
 def without_owner(member: tarfile.TarInfo) -> tarfile.TarInfo:
@@ -186,6 +196,7 @@ def make_states(root: Path) -> None:
     run = some_training()
     run.earlier = -(run.seconds - 1.0)
     run.save(root / STATE)
+    (root / STATE).write_bytes(in_order((root / STATE).read_bytes()))
     cached(root)
     outcome = Outcome(np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0)
     (root / "outcome.json").write_bytes(seal(to_values(outcome)))
@@ -240,7 +251,8 @@ def mend_metadata(path: Path) -> None:
     with safetensors.safe_open(path, "pt") as file:
         facts = dict(file.metadata())
     facts.pop("checksum", None)
-    safetensors.torch.save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
+    whole = safetensors.torch.save(tensors, facts | {"checksum": _checksum(facts, tensors)})
+    path.write_bytes(in_order(whole))
 
 
 @cache

@@ -399,8 +399,8 @@ TARGETS: dict[str, Target] = {
     "layouts": Target(saved.make_layouts, saved.read_layouts),
     "recipes": Target(saved.make_recipes, saved.read_recipes),
     "skins": Target(saved.make_skins, saved.read_skins, mend=saved.mend_skin),
-    "scans_json": Target(make_described, read_all, files=("*.json",)),
-    "folders": Target(make_folders, read_all, change=trees.rearrange),
+    "scans_json": Target(make_described, read_all, files=("scans.json",)),
+    "folders": Target(make_folders, read_all, files=(), change=trees.rearrange),
 }
 """By name. A reader of ``READERS`` is read by ``partial(read, LAYOUT)``; a test sees that none is
 left out."""

@@ -22,6 +22,12 @@ def join(text: str, body: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + body
 
 
+def in_order(content: bytes) -> bytes:
+    """The same file with the keys of its header sorted, which safetensors writes in any order."""
+    outer, body = parts(content)
+    return join(json.dumps(outer, sort_keys=True), body)
+
+
 @mutates(".safetensors", ".skin")
 def edit_header(content: bytes, rng: Random) -> bytes:
     """The package's own header says something else."""
@@ -64,4 +70,4 @@ def edit_tensors(content: bytes, rng: Random) -> bytes:
         lambda: {rng.choice(("x", f"x.{name}", name + "x", "velocity", "codec.x", "")): tensor},
     )
     tensors |= {key: value.contiguous() for key, value in (rng.choice(changed)() or {}).items()}
-    return safetensors.torch.save(tensors, metadata)
+    return in_order(safetensors.torch.save(tensors, metadata))
