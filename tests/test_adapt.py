@@ -38,7 +38,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
-from lidar_synth.generate.regrid import PLACED, fitting, regrid
+from lidar_synth.generate.regrid import PLACED, check_movable, fitting, regrid
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
@@ -408,7 +408,6 @@ def test_a_folder_without_scans_is_refused(model: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     {
-        "town": "architecture autoencoder; expected architectures among surfaces, hdit",
         "town-layout": "the condition layout; expected an unconditional model, or the condition semantic",
         "nothing": "model 'nothing'; expected a shipped one",
     }.items(),
@@ -418,6 +417,13 @@ def test_models_that_cannot_be_adapted_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         adapt(name, scans, tmp_path / "mine.safetensors")
+
+
+def test_a_model_of_another_architecture_is_refused() -> None:
+    header = read_header(find_model("town"))[0]
+    other = header.networks["velocity"]._replace(architecture="unet")
+    with pytest.raises(ConfigError, match="architecture unet; expected architectures among surf"):
+        check_movable(replace(header, networks=header.networks | {"velocity": other}))
 
 
 def test_a_resumed_adaptation_has_the_same_scans_and_model(
