@@ -20,7 +20,7 @@ from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import Source
 from lidar_synth.mixing import Collate, MixedBatches, MixedScans, to_item
 from lidar_synth.mixing.batches import CutSteps, cut_steps
-from lidar_synth.mixing.state import after_epoch, checked_state, make_state
+from lidar_synth.mixing.state import after_epoch, check_state, make_state
 from lidar_synth.noise import keyed_rng
 
 try:
@@ -195,7 +195,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             ConfigError: on a checkpoint of another mixture; or from the middle of an epoch with
                 another batch size, which Lightning would miscount.
         """
-        checked_state(state_dict, self.train.mixture)
+        check_state(state_dict, self.train.mixture)
         self._resume = state_dict
         if self._batches is not None:
             self._batches.load_state_dict(state_dict)

@@ -13,7 +13,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.formats.nuscenes import INTENSITY_MAX
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import moved
+from lidar_synth.labels.boxes import move_boxes
 
 CLASSES = (
     "car",
@@ -86,7 +86,7 @@ def turned_boxes(boxes: Boxes) -> Boxes:
     values = boxes.values.copy()
     values[:, :3] = turned_points(boxes.values[:, :3])
     values[:, 6] += np.float32(np.pi / 2)
-    return moved(boxes, values)
+    return move_boxes(boxes, values)
 
 
 def five_values(scan: Scan) -> NDArray[np.float32]:

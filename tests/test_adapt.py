@@ -38,7 +38,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
-from lidar_synth.generate.regrid import PLACED, check_movable, fitting, regrid
+from lidar_synth.generate.regrid import PLACED, check_movable, fit_grid, regrid
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
@@ -450,7 +450,7 @@ def test_sensors_that_the_networks_cannot_have_are_refused(
     changed: Any, message: str, model: Path
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        fitting(replace(OWN, **changed), read_header(model)[0])
+        fit_grid(replace(OWN, **changed), read_header(model)[0])
 
 
 def test_a_model_that_is_moved_to_its_own_sensor_stays_the_same(model: Path) -> None:
@@ -484,7 +484,7 @@ def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(model: Pa
 def test_the_shipped_dense_model_can_be_moved() -> None:
     header = read_header(find_model("town"))[0]
     assert all(part.architecture in PLACED for part in header.networks.values())
-    assert fitting(load_sensor("pandar64"), header).shape == (64, 1792)
+    assert fit_grid(load_sensor("pandar64"), header).shape == (64, 1792)
 
 
 def test_a_sensor_file_is_taken(model: Path, scans: Path, tmp_path: Path) -> None:

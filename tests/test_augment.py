@@ -16,7 +16,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import augment
-from lidar_synth.labels.augment import Augmentation, compose, mirrored, rotated, scaled
+from lidar_synth.labels.augment import Augmentation, compose, mirror_scan, rotate_scan, scale_scan
 from lidar_synth.noise import keyed_rng
 
 STEPS: dict[str, Augmentation] = {
@@ -124,11 +124,11 @@ def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
 def test_augmentations_can_be_inverted(seed: int, angle: float, factor: float) -> None:
     scan = scan_with_boxes(seed % 50, 300)
     for changed in (
-        rotated(rotated(scan, angle), -angle),
-        mirrored(mirrored(scan, "x"), "x"),
-        mirrored(mirrored(scan, "y"), "y"),
-        scaled(scaled(scan, factor), 1 / factor),
-        rotated(mirrored(mirrored(scan, "x"), "y"), np.pi),  # both flips are half a turn
+        rotate_scan(rotate_scan(scan, angle), -angle),
+        mirror_scan(mirror_scan(scan, "x"), "x"),
+        mirror_scan(mirror_scan(scan, "y"), "y"),
+        scale_scan(scale_scan(scan, factor), 1 / factor),
+        rotate_scan(mirror_scan(mirror_scan(scan, "x"), "y"), np.pi),  # both flips are half a turn
     ):
         assert np.allclose(changed.points, scan.points, atol=1e-4)
         assert changed.boxes is not None and scan.boxes is not None
@@ -140,20 +140,20 @@ def test_augmentations_can_be_inverted(seed: int, angle: float, factor: float) -
 def test_yaws_turn_and_flip_with_their_boxes() -> None:
     scan = cast([car(10, 5, 0.5)])
     for changed, expected in (
-        (rotated(scan, np.pi / 2), [-5, 10, 0.5 + np.pi / 2]),
-        (rotated(scan, np.pi), [-10, -5, 0.5 - np.pi]),
-        (mirrored(scan, "y"), [10, -5, -0.5]),
-        (mirrored(scan, "x"), [-10, 5, np.pi - 0.5]),
-        (scaled(scan, 2), [20, 10, 0.5]),
+        (rotate_scan(scan, np.pi / 2), [-5, 10, 0.5 + np.pi / 2]),
+        (rotate_scan(scan, np.pi), [-10, -5, 0.5 - np.pi]),
+        (mirror_scan(scan, "y"), [10, -5, -0.5]),
+        (mirror_scan(scan, "x"), [-10, 5, np.pi - 0.5]),
+        (scale_scan(scan, 2), [20, 10, 0.5]),
     ):
         assert changed.boxes is not None
         assert np.allclose(changed.boxes.values[0, [0, 1, 6]], expected, atol=1e-5)
-    assert np.allclose(scaled(scan, 2).boxes.values[0, 3:6], 2 * scan.boxes.values[0, 3:6])
+    assert np.allclose(scale_scan(scan, 2).boxes.values[0, 3:6], 2 * scan.boxes.values[0, 3:6])
 
 
 def test_moving_a_scan_removes_its_camera_image() -> None:
     scan = scan_with_boxes(0)
-    for changed in (rotated(scan, 1), mirrored(scan, "x"), scaled(scan, 1.1)):
+    for changed in (rotate_scan(scan, 1), mirror_scan(scan, "x"), scale_scan(scan, 1.1)):
         assert changed.pose is None and changed.image_path is None and changed.boxes is not None
         assert (changed.boxes.truncation == -1).all() and (changed.boxes.alpha == -10).all()
     kept = augment.range_drop(scan, keyed_rng(0))
@@ -242,7 +242,7 @@ def test_far_returns_are_lost_more_often() -> None:
         (partial(augment.beam_drop, share=1.5), "share 1.5"),
         (partial(augment.range_drop, share=-0.1), "share -0.1"),
         (partial(augment.range_drop, power=-1), "power=-1"),
-        (lambda scan, rng: mirrored(scan, "z"), "axis='z'"),
+        (lambda scan, rng: mirror_scan(scan, "z"), "axis='z'"),
     ],
 )
 def test_values_out_of_range_are_refused(step: Augmentation, message: str) -> None:

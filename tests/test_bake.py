@@ -35,7 +35,7 @@ from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, NetworkSp
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
-from lidar_synth.lab.train.config import read_values, validated
+from lidar_synth.lab.train.config import read_values, validate
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -409,7 +409,7 @@ def test_options_override_a_configuration_file(
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem)
 def test_published_configurations_load(path: Path) -> None:
-    assert validated(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
+    assert validate(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from lidar_synth.bake.edit import drop, head, merge, split
 from lidar_synth.bake.making import NOTE
 from lidar_synth.bank import INDEX, Bank
 from lidar_synth.errors import ConfigError
-from lidar_synth.files.lock import shared
+from lidar_synth.files.lock import lock_shared
 
 CALLS: dict[str, Callable[[Bank, Path], object]] = {
     "merge": lambda bank, out: merge([bank], out / "one", progress=False),
@@ -91,7 +91,10 @@ def test_two_calls_do_not_write_one_folder(bank: Bank, tmp_path: Path) -> None:
     out = tmp_path / "out"
     head(bank, 3, out, progress=False)
     (out / INDEX).unlink()
-    with shared(out / NOTE), pytest.raises(ConfigError, match="in which another process works"):
+    with (
+        lock_shared(out / NOTE),
+        pytest.raises(ConfigError, match="in which another process works"),
+    ):
         head(bank, 3, out, progress=False)
     assert edit.head(bank, 3, out, progress=False).scans == 3
 

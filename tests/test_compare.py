@@ -19,7 +19,7 @@ from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.scan import POINT_FIELDS, Scan
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.mixing import MixedScans
-from lidar_synth.mixing.compare import made_up
+from lidar_synth.mixing.compare import make_up_scan
 
 
 class Theirs:
@@ -255,7 +255,7 @@ def test_without_real_or_synthetic_samples_there_is_nothing_to_compare() -> None
 @pytest.mark.parametrize("name", ["hdl64e_kitti360", "hdl32e_nuscenes", "os1_128"])
 def test_a_made_up_scan_has_the_fields_of_its_source(name: str) -> None:
     sensor = presets()[name]
-    scan = made_up(sensor, frozenset(POINT_FIELDS))
+    scan = make_up_scan(sensor, frozenset(POINT_FIELDS))
     assert set(scan.fields()) == set(POINT_FIELDS) and len(scan) == np.prod(sensor.shape)
     assert set(np.unique(scan.label)) == {*range(19), IGNORE}
-    assert set(made_up(sensor, frozenset({"label"})).fields()) == {"reflectance", "label"}
+    assert set(make_up_scan(sensor, frozenset({"label"})).fields()) == {"reflectance", "label"}

@@ -17,12 +17,16 @@ from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, bridged, one_view
-from lidar_synth.generate.flow.path import guided
+from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, bridge_gaps, one_view
+from lidar_synth.generate.flow.path import guide
 from lidar_synth.generate.models import NETWORKS, build_network, encoders_of
 from lidar_synth.generate.models.encoders.calibrated_camera import SightEncoder
 from lidar_synth.generate.models.encoders.camera_views import split_views
-from lidar_synth.generate.models.encoders.clip_views import CLIP_VARIABLE, CLIP_WIDTH, frozen_clip
+from lidar_synth.generate.models.encoders.clip_views import (
+    CLIP_VARIABLE,
+    CLIP_WIDTH,
+    load_frozen_clip,
+)
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
@@ -88,7 +92,7 @@ def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> 
     other = replace(SENSOR, name="other", columns=64, rows=16)
     scan = random_scan(other, 3000)
     labels = CONDITIONS["semantic"].read(scan, SENSOR, SENSOR.shape, {})
-    assert np.array_equal(labels, bridged(project(scan, SENSOR, ["label"]).channels["label"]))
+    assert np.array_equal(labels, bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"]))
 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
@@ -390,10 +394,10 @@ def test_guidance_extrapolates_from_the_blank_condition() -> None:
     without = velocity(y, t, nothing.expand(3, 2))
     calls.clear()
     for scale in (0.0, 1.5, 4.0):
-        out = guided(velocity, scale, nothing)(y, t, cond)
+        out = guide(velocity, scale, nothing)(y, t, cond)
         assert torch.allclose(out, without + scale * (with_condition - without), atol=1e-5)
     assert calls == [6, 6, 6]
-    assert guided(velocity, 1.0, nothing) is velocity
+    assert guide(velocity, 1.0, nothing) is velocity
 
 
 # --- CLIP
@@ -434,9 +438,9 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     )
     monkeypatch.setitem(sys.modules, "transformers", holder)
     monkeypatch.setitem(sys.modules, "open_clip", SimpleNamespace(create_model=create_model))
-    frozen_clip.cache_clear()
+    load_frozen_clip.cache_clear()
     yield asked
-    frozen_clip.cache_clear()
+    load_frozen_clip.cache_clear()
 
 
 @pytest.mark.parametrize("form", ["folder", "file"])
@@ -457,15 +461,15 @@ def test_frozen_clip_encodes_each_view_and_only_other_layers_are_trained(
     assert tokens.shape == (3, 2, 6)
     tokens.square().mean().backward()
     assert all(p.grad is not None and p.grad.any() for p in net.parameters())
-    assert frozen_clip(str(place), "cpu").training is False
-    assert not any(p.requires_grad for p in frozen_clip(str(place), "cpu").parameters())
+    assert load_frozen_clip(str(place), "cpu").training is False
+    assert not any(p.requires_grad for p in load_frozen_clip(str(place), "cpu").parameters())
     assert len(clip_libraries) == 1  # loaded once
 
 
 def test_missing_clip_weights_or_libraries_are_reported_with_a_hint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frozen_clip.cache_clear()
+    load_frozen_clip.cache_clear()
     net = build_network("clip_views", {"views": 2})
     image = torch.zeros(1, 3, 224, 448, dtype=torch.uint8)
     monkeypatch.delenv(CLIP_VARIABLE, raising=False)

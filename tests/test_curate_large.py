@@ -27,7 +27,7 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Entry
 from lidar_synth.errors import DataError
 from lidar_synth.lab.cli.curate import curate
-from lidar_synth.lab.curate import FILE, kept_in, read_scores, score
+from lidar_synth.lab.curate import FILE, keep_features_in, read_scores, score
 from lidar_synth.lab.curate.duplicates import compare_all, most_similar
 from lidar_synth.lab.curate.features import SIGNATURE
 from lidar_synth.lab.curate.neighbours import find_similar
@@ -284,7 +284,7 @@ def test_features_of_another_bank_are_not_reused(bank: Bank, tmp_path: Path) -> 
 
 def test_the_command_removes_its_features(bank: Bank) -> None:
     root = Path(bank.root)
-    with kept_in(root) as other:  # another run is at work
+    with keep_features_in(root) as other:  # another run is at work
         curate(root, as_json=True)
         assert other.is_dir() and (root / FILE).is_file()
     assert not (root / FOLDER).exists()

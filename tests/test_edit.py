@@ -25,7 +25,7 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import edit, objects_of
 from lidar_synth.labels.edit.insertion import cut_out
 from lidar_synth.labels.edit.rays import rays_of_scan
-from lidar_synth.labels.edit.removal import returns_of, without
+from lidar_synth.labels.edit.removal import remove_returns, returns_of
 from lidar_synth.labels.ground import FLOOR
 
 BEHIND = wall(24, 0, np.pi / 2, length=80)
@@ -384,9 +384,9 @@ def test_the_flow_draws_the_hole_and_nothing_else() -> None:
     [scan] = generator.scans(seed=5, indices=[1])
     scan = replace(scan, boxes=Boxes(np.zeros((0, 7), np.float32), ()))
     assert edit.measure([scan]).objects > 0
-    by_geometry = edit.closed(scan)
-    drawn = edit.closed(scan, generator)
-    again = edit.closed(scan, generator)
+    by_geometry = edit.remove_unboxed(scan)
+    drawn = edit.remove_unboxed(scan, generator)
+    again = edit.remove_unboxed(scan, generator)
     assert np.array_equal(drawn.points, again.points)
     before, filled, new = (
         {tuple(p) for p in s.points.tolist()} for s in (scan, by_geometry, drawn)
@@ -408,7 +408,9 @@ def test_a_drawn_road_is_level_where_rays_start_above_the_origin(
     x, y, _ = scan.points.T
     removed = GROUND[scan.label] & (x > 6) & (x < 20) & (np.abs(y) < 0.15 * x)
     box = np.array([13, 0, -1, 10, 3, 2, 0], np.float32)
-    result = without(scan, [(removed, box)], SimpleNamespace(condition=None, sensor=sensor), 0)
+    result = remove_returns(
+        scan, [(removed, box)], SimpleNamespace(condition=None, sensor=sensor), 0
+    )
     assert removed.sum() > 500 and np.allclose(result.points, scan.points, atol=1e-3)
 
 

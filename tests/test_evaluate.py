@@ -21,9 +21,9 @@ from lidar_synth.datasets.recordings import (
     KITTI360_SPLITS,
     NOTE,
     Recordings,
+    all_frames,
     frames_of,
     seen_by,
-    whole,
 )
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, open_scans
@@ -167,7 +167,7 @@ def test_training_data_is_refused_as_reference(
     real, fake = (shutil.copytree(folder, tmp_path / folder.name) for folder in folders)
     call = ["evaluate", str(real), str(fake), "--protocol", "town", "--json"]
     path = f"{real.parent}/../{tmp_path.name}/real"
-    trained_on(fake, whole(FILES, [path if same else f"{path}#train"]))
+    trained_on(fake, all_frames(FILES, [path if same else f"{path}#train"]))
     by_path = CliRunner().invoke(app, call)
     trained_on(fake, town(5))
     (real / SETTINGS).write_text(json.dumps({"seed": 5 if same else 6}))

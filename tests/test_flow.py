@@ -16,7 +16,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.generate.flow.path import (
     METRICS,
     TIMESTEPS,
-    autoguided,
+    autoguide,
     flow_matching,
     interpolate,
     logit_normal,
@@ -79,11 +79,11 @@ def test_autoguidance_reduces_the_error_that_both_models_share() -> None:
     grid = uniform_grid(50)
 
     def spread(scale: float) -> float:
-        y = solve(autoguided(model, weaker, scale), noise, grid)
+        y = solve(autoguide(model, weaker, scale), noise, grid)
         assert float(y.mean()) == pytest.approx(MEAN, abs=0.01)
         return float(y.std())
 
-    assert autoguided(model, weaker, 1.0) is model
+    assert autoguide(model, weaker, 1.0) is model
     assert spread(0.0) == pytest.approx(2 * STD, rel=0.05)
     assert spread(1.0) == pytest.approx(1.5 * STD, rel=0.05)
     assert spread(2.0) == pytest.approx(STD, rel=0.15)
@@ -93,19 +93,19 @@ def test_autoguidance_passes_the_condition_on() -> None:
     y = torch.randn(3, 2)
     t = torch.rand(3)
     cond = torch.randn(3, 2)
-    out = autoguided(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
+    out = autoguide(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
     assert torch.allclose(out, y + 5 * cond, atol=1e-5)
     halves = (
         lambda y, t, c: (y + c).bfloat16(),
         lambda y, t, c: (y - c).bfloat16(),
     )  # dtype under autocast
-    assert torch.allclose(autoguided(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
+    assert torch.allclose(autoguide(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
 
 
 def test_autoguidance_is_limited_to_its_time_interval() -> None:
     y = torch.ones(5, 2)
     t = torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
-    out = autoguided(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
+    out = autoguide(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
     assert out[:, 0].tolist() == [3, 5, 5, 5, 3] and torch.equal(out[:, 0], out[:, 1])
 
 

@@ -28,7 +28,7 @@ from lidar_synth.generate.checkpoint import (
     NetworkSpec,
     save_checkpoint,
 )
-from lidar_synth.generate.conditions import GAP, bridged
+from lidar_synth.generate.conditions import GAP, bridge_gaps
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.loading import load_generator, shipped_models
@@ -185,7 +185,9 @@ def test_a_label_map_also_labels_the_generated_scan(tmp_path: Path, generator: G
 def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
     conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
     scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
-    maps = np.stack([bridged(project(scan, SENSOR, ["label"]).channels["label"]) for scan in scans])
+    maps = np.stack(
+        [bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"]) for scan in scans]
+    )
     for a, b in zip(
         conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True
     ):
@@ -201,7 +203,7 @@ def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
         np.uint8
     )
     given = labels.copy()
-    made = bridged(labels)
+    made = bridge_gaps(labels)
     assert np.array_equal(labels, given)
     for row, out in zip(labels, made, strict=True):
         known = np.flatnonzero(row != IGNORE)

@@ -24,7 +24,7 @@ from lidar_synth.labels import (
     make_policy,
     swap_bands,
     swap_sector,
-    thinned,
+    thin_scan,
 )
 from lidar_synth.noise import keyed_rng
 
@@ -284,19 +284,19 @@ def test_bands_alternate_from_top_to_bottom() -> None:
 
 def test_a_partner_is_thinned_to_the_grid() -> None:
     scan = Town(1, scans=1)[0]
-    thin = thinned(scan, SENSOR)
+    thin = thin_scan(scan, SENSOR)
     assert len(thin) == project(scan).mask.sum() < len(scan)
     assert np.array_equal(project(thin).range, project(scan).range)
     with pytest.raises(DataError, match="returns of sensor 'town' for a scan of 'os1_128'"):
-        thinned(scan, presets()["os1_128"])
+        thin_scan(scan, presets()["os1_128"])
 
 
 def test_a_partner_of_other_lasers_lends_no_rings() -> None:
     host = Town(1, scans=1)[0]
     other = Town(1, "os1_128", scans=1)[0]
-    assert thinned(other, host.sensor).ring is None
-    assert thinned(host, replace(host.sensor, name="fewer", columns=512)).ring is not None
-    mixed = swap_sector(host, thinned(other, host.sensor), 0, 512)
+    assert thin_scan(other, host.sensor).ring is None
+    assert thin_scan(host, replace(host.sensor, name="fewer", columns=512)).ring is not None
+    mixed = swap_sector(host, thin_scan(other, host.sensor), 0, 512)
     assert mixed.ring.max() < 64
 
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
 from lidar_synth.datasets.classes import BOXED, LABELS
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.layout import CODES, Outline, known_boxes, layout_image
+from lidar_synth.geometry.layout import CODES, Outline, layout_image, select_known_boxes
 from lidar_synth.geometry.layout.layout import overlaps
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.layouts import layout_agreement, rays_of_boxes
-from lidar_synth.labels.boxes import turned, widened
+from lidar_synth.labels.boxes import turn_boxes, widen_boxes
 
 SMALL = Sensor("small", 64, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
 LASERS = Sensor(
@@ -54,7 +54,7 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         boxes = Boxes(more, ("Car",) * len(more))
         if (
             not overlaps(boxes, 0.0)
-            and not Boxes(widened(more, 1.0), boxes.names).contain(np.zeros((1, 3), "f4")).any()
+            and not Boxes(widen_boxes(more, 1.0), boxes.names).contain(np.zeros((1, 3), "f4")).any()
         ):
             rows = more
     outlines = [
@@ -196,7 +196,7 @@ def test_turning_rolls_and_mirroring_flips() -> None:
     image = layout_image(layout, sensor)
     columns = 300
     rolled = layout_image(
-        replace(layout, boxes=turned(layout.boxes, 2 * np.pi * columns / 2048)), sensor
+        replace(layout, boxes=turn_boxes(layout.boxes, 2 * np.pi * columns / 2048)), sensor
     )
     assert (np.roll(rolled, columns, -1) == image).all(
         0
@@ -248,7 +248,7 @@ def test_only_boxes_that_overlap_a_kept_one_are_dropped(town: Any) -> None:
     row = Boxes(
         np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32), ("Car",) * 3
     )
-    assert known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [10, 16]
+    assert select_known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [10, 16]
 
 
 def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
@@ -270,7 +270,7 @@ def test_a_scan_agrees_with_its_own_layout_and_not_with_another(town: Any) -> No
     found = layout_agreement([town], [layout], [town])
     assert found.inside_share > 0.99 and found.kept_share == 1 and found.points > 100
     assert 0.5 < found.filled_share <= 1 and 0 < found.seen <= found.boxes <= len(layout.boxes)
-    turned_away = replace(layout, boxes=turned(layout.boxes, np.pi / 2))
+    turned_away = replace(layout, boxes=turn_boxes(layout.boxes, np.pi / 2))
     other = layout_agreement([town], [turned_away], [town])
     assert other.inside_share < 0.5 and other.points == found.points
     with pytest.raises(DataError, match="has no labels"):

@@ -34,7 +34,7 @@ from lidar_synth.bank.boxes import SHAPE, check_boxes, decode_boxes, encode_boxe
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.generate.boxed import with_boxes
+from lidar_synth.generate.boxed import add_boxes
 from lidar_synth.generate.conditions import CONDITIONS, batch_of
 from lidar_synth.generate.generator import Generated
 from lidar_synth.geometry.layout import CODES, Outline, layout_image
@@ -327,7 +327,7 @@ def test_ground_in_a_box_belongs_to_no_object() -> None:
         .astype(np.uint8)
     )
     image = RangeImage(distance, SENSOR, {"label": label})
-    made = with_boxes(
+    made = add_boxes(
         image, Boxes(np.float32([[10, 0, 0, 4, 4, 4, 0], [-30, 0, 0, 1, 1, 1, 0]]), ("Car", "Car"))
     )
     scan = unproject(made)

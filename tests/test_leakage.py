@@ -11,7 +11,7 @@ from layouts import write_all
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
-from lidar_synth.datasets.recordings import MODELS, NOTE, whole
+from lidar_synth.datasets.recordings import MODELS, NOTE, all_frames
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import WRITERS, layout_of, open_scans
 from lidar_synth.formats.convert import convert
@@ -52,7 +52,7 @@ def test_scans_are_not_read_for_a_model_without_hashes(
         "lidar_synth.lab.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed")
     )
     measured(
-        open_scans(tmp_path), "semantic_kitti", tmp_path, None, whole("KITTI-360", ["a drive"])
+        open_scans(tmp_path), "semantic_kitti", tmp_path, None, all_frames("KITTI-360", ["a drive"])
     )
 
 

@@ -19,7 +19,7 @@ from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
 from lidar_synth.lab.evaluate.cache import Cached, extract_all, scan_hash, weights_hash
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS
-from lidar_synth.lab.evaluate.leaderboard import beside, leaderboard
+from lidar_synth.lab.evaluate.leaderboard import compare_published, leaderboard
 from lidar_synth.lab.evaluate.measures import KINDS
 from lidar_synth.lab.evaluate.protocols import FEATURES, alike, parse_protocol
 
@@ -359,7 +359,7 @@ def test_own_figures_stand_in_the_scale_of_the_table() -> None:
     scores = [
         Score("BEV minimum matching distance", 8.72e-5, "r3dpa", 1000, 2000, "MMD", 1e5, 8e-5, 9e-5)
     ]
-    shown = beside(scores)
+    shown = compare_published(scores)
     assert (
         shown.splitlines()[-1]
         == "| **these scans** (1000 real, 2000 generated) | |  |  |  |  |  | 8.72 [8, 9] |"
@@ -368,4 +368,4 @@ def test_own_figures_stand_in_the_scale_of_the_table() -> None:
         "| R3DPA |  | 8.46 | 6.34 | 9.83 | 11.0 | 5.67 | 8.72 |" in shown
         and "LiDAR-Flow" not in shown
     )
-    assert "No published figures" in beside([Score("x", 1.0, "town", 2, 2)])
+    assert "No published figures" in compare_published([Score("x", 1.0, "town", 2, 2)])

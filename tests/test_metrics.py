@@ -90,12 +90,14 @@ def test_r2flow_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> 
 
 def test_lidm_cells(vectors: Vectors) -> None:
     counts = sum(
-        np.bincount(lidm.occupied(c, lidm.FINE), minlength=2000**2) for c in clouds(vectors, "real")
+        np.bincount(lidm.find_occupied(c, lidm.FINE), minlength=2000**2)
+        for c in clouds(vectors, "real")
     )
     assert np.array_equal(np.argwhere(counts.reshape(2000, 2000)), vectors["lidm/bev_sum_nonzero"])
     assert np.array_equal(counts[counts > 0], vectors["lidm/bev_sum_values"])
     coarse = (
-        np.stack(np.divmod(lidm.occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1) / 200
+        np.stack(np.divmod(lidm.find_occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1)
+        / 200
     )
     assert {tuple(c) for c in coarse.astype(np.float32)} == {
         tuple(c) for c in vectors["lidm/bev_bin_real0"]
@@ -191,7 +193,7 @@ def test_minimum_matching_distance_by_nearest_neighbours(
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
     side = lidm.cells_along(cell)
     grids = [
-        [np.stack(np.divmod(lidm.occupied(p, cell), side), 1) / side for p in points]
+        [np.stack(np.divmod(lidm.find_occupied(p, cell), side), 1) / side for p in points]
         for points in (real, fake)
     ]
 

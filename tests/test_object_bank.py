@@ -18,7 +18,7 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank, instances_of, objects_of, paste
-from lidar_synth.labels.boxes import box_frame, grown, joined, overlapping, turned
+from lidar_synth.labels.boxes import box_frame, find_overlapping, grow_box, join_boxes, turn_boxes
 from lidar_synth.labels.ground import ground_under
 
 
@@ -220,22 +220,22 @@ def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
         np.c_[grid, np.zeros(len(grid))].astype(np.float32)
     )
     both = (inside[0] & inside[1:]).any(1)
-    found = overlapping(values[0], values[1:])
+    found = find_overlapping(values[0], values[1:])
     assert (both <= found).all()
     smaller = values[1:] - np.array([0, 0, 0, 0.4, 0.4, 0, 0], np.float32)
     assert (
-        overlapping(values[0], smaller) <= both
+        find_overlapping(values[0], smaller) <= both
     ).all()  # a corner may lie between the grid's points
 
 
 def test_boxes_grow_no_more_than_they_have_to() -> None:
     box = car(5, 5, 0.5)
     corners = Boxes(box, ("Car",)).corners()[0]
-    assert np.allclose(grown(box, corners[:0]), box)
+    assert np.allclose(grow_box(box, corners[:0]), box)
     out = box[:3] + (corners - box[:3]) * np.float32(1.02)
-    larger = grown(box, out)
+    larger = grow_box(box, out)
     assert Boxes(larger, ("Car",)).contain(out).all()
     assert np.allclose(larger[3:6], 1.02 * box[3:6] + 0.002, atol=1e-4)
     assert np.allclose(np.abs(box_frame(corners, box)), box[3:6] / 2, atol=1e-5)
-    two = joined([Boxes(box, ("Car",)), turned(Boxes(box, ("Van",)), 0.3)])
+    two = join_boxes([Boxes(box, ("Car",)), turn_boxes(Boxes(box, ("Van",)), 0.3)])
     assert two.names == ("Car", "Van") and two.values[1, 6] == pytest.approx(0.8)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from layouts import WRITTEN_AS, some_scan, write_tars
 
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.files.disk import inside, write_file
+from lidar_synth.files.disk import join_inside, write_file
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import Report, convert
 from lidar_synth.formats.source import ScanFiles
@@ -172,7 +172,7 @@ def test_names_stay_inside_and_apart(names: list[str]) -> None:
     found = {}
     for name in names:
         try:
-            found[name] = inside(root, name)
+            found[name] = join_inside(root, name)
         except DataError:
             continue
         assert (

@@ -17,7 +17,7 @@ from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import Object, objects_of, paste
-from lidar_synth.labels.merge import merged
+from lidar_synth.labels.merge import merge_scans
 from lidar_synth.labels.pasting import LIFT
 
 places = st.tuples(st.floats(5, 30), st.floats(-180, 180), st.floats(-3.1, 3.1))
@@ -263,7 +263,7 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
 @pytest.mark.parametrize("name", ["town", "hdl64e_lasers"])
 def test_points_without_rings_get_those_of_their_lasers(name: str) -> None:
     host, other = (Town(seed, name, scans=1, motion=False)[0] for seed in (0, 3))
-    both = merged(host, [replace(other, ring=None)])
+    both = merge_scans(host, [replace(other, ring=None)])
     assert (both.ring[len(host) :] == other.ring).mean() > 0.999
 
 
@@ -279,7 +279,7 @@ def test_objects_with_tracks_are_still_there_where_points_have_no_instance() -> 
     """As in PandaSet and KITTI raw, whose boxes have the numbers of their tracks."""
     town = replace(Town(0, scans=1)[0], instance=None, raw_label=None)
     before = objects_of(town)
-    after = objects_of(merged(town, []))
+    after = objects_of(merge_scans(town, []))
     assert len(before) >= 8 and before.keys() == after.keys()
     for number, item in before.items():
         assert np.array_equal(after[number].scan.points, item.scan.points)

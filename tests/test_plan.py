@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.mixing import Linear, MixingPlan, Mixture, PlannedSource, make_schedule, plan
 from lidar_synth.mixing.batches import cut_steps, rank_share
-from lidar_synth.mixing.quotas import deal, exact_synthetic, quotas, running_counts, split
+from lidar_synth.mixing.quotas import count_before, deal, exact_synthetic, quotas, split
 from lidar_synth.mixing.schedules import Schedule, share_of
 
 ENDLESS = PlannedSource(None, identity="model")
@@ -86,7 +86,7 @@ def test_counts_are_exact_over_epochs(
         assert len(made) == (real if size == "replace" else size)
         exact = len(made) * share
     assert abs(made.synthetics - exact) < 1
-    assert sum(running_counts(mixed, epoch)[1:]) == ceil(epoch * exact)
+    assert sum(count_before(mixed, epoch)[1:]) == ceil(epoch * exact)
 
 
 WEIGHTS = st.lists(st.sampled_from([None, 1, 9, 2.5, 100]), min_size=1, max_size=4)
@@ -136,10 +136,10 @@ def test_rare_sources_and_small_ratios_get_their_turn() -> None:
         (PlannedSource(None, 9.0), PlannedSource(None, 1.0)),
         make_schedule(0.5),
     )
-    assert running_counts(mixed, 50) == (200, 180, 20)
+    assert count_before(mixed, 50) == (200, 180, 20)
     turns = [quotas(mixture(4, 0.1, epoch_size="replace"), epoch) for epoch in range(5)]
     assert turns == [(3, 1), (4, 0), (3, 1), (4, 0), (4, 0)]
-    assert running_counts(mixture(4, 0.1, epoch_size="replace"), 900) == (3240, 360)
+    assert count_before(mixture(4, 0.1, epoch_size="replace"), 900) == (3240, 360)
 
 
 @pytest.mark.parametrize("size", ["add", "replace", 17])
@@ -227,7 +227,7 @@ def test_reuse_is_spread_over_epochs(
         counts.update(here)
     assert max(counts.values(), default=0) <= reuse
     for source, lap in enumerate(mixed.laps, 1):
-        whole = running_counts(mixed, 4 * reuse)[source] // (reuse * lap) * lap
+        whole = count_before(mixed, 4 * reuse)[source] // (reuse * lap) * lap
         assert all(counts[source, scan] == reuse for scan in range(whole))
 
 
@@ -249,14 +249,14 @@ def test_weights_are_kept() -> None:
         (PlannedSource(None, 1.0), PlannedSource(None, 2.0), PlannedSource(5, 1.0)),
     )
     weighted = Mixture(*parts, make_schedule(0.4), epoch_size=50)
-    assert running_counts(weighted, 4) == (30, 90, 20, 40, 20)
+    assert count_before(weighted, 4) == (30, 90, 20, 40, 20)
     unweighted = Mixture(
         (PlannedSource(10), PlannedSource(30)),
         (ENDLESS, PlannedSource(5)),
         make_schedule(0.4),
         epoch_size=50,
     )
-    assert running_counts(unweighted, 4) == (30, 90, 40, 40)
+    assert count_before(unweighted, 4) == (30, 90, 40, 40)
 
 
 @settings(max_examples=60)
@@ -319,7 +319,7 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
     mixed = mixture(7, ratio)
     before = (0, 0)
     for epoch in range(5):
-        assert running_counts(mixed, epoch) == before
+        assert count_before(mixed, epoch) == before
         before = tuple(np.add(before, quotas(mixed, epoch)).tolist())  # type: ignore[assignment]
         assert before[1] == ceil(
             sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1))
@@ -336,13 +336,13 @@ def test_a_late_epoch_costs_no_more_than_the_first() -> None:
 
     mixed = mixture(3, Counted(0.0, 0.5, 4))
     # 0, 1 and 2 synthetic samples of 6, then 3 in every epoch
-    assert running_counts(mixed, 10**9) == (15 + 3 * (10**9 - 3), 3 + 3 * (10**9 - 3))
+    assert count_before(mixed, 10**9) == (15 + 3 * (10**9 - 3), 3 + 3 * (10**9 - 3))
     assert len(calls) < 20
 
 
 def test_a_tenth_is_a_tenth() -> None:
     assert share_of(make_schedule(0.1), 0) == Fraction(1, 10)
-    assert running_counts(mixture(1, 0.1, epoch_size=5), 20) == (90, 10)
+    assert count_before(mixture(1, 0.1, epoch_size=5), 20) == (90, 10)
 
 
 def test_the_hash_tells_plans_apart() -> None:

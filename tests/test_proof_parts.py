@@ -24,7 +24,7 @@ from lidar_synth.lab.evaluate.segmentation import class_ious
 from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
 from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings
 from lidar_synth.lab.proof.arms import rows
-from lidar_synth.lab.proof.budget import expected_minutes, within
+from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
 from lidar_synth.lab.proof.places import APART, SPLITS, choose, clusters, find_places
@@ -38,9 +38,9 @@ from lidar_synth.lab.proof.scores import (
     require_labels,
     t_quantile,
 )
-from lidar_synth.lab.proof.trial import pretrain, pretraining_seconds, reference, turned
+from lidar_synth.lab.proof.trial import pretrain, pretraining_seconds, reference, turn_scan
 from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.exchange import thinned
+from lidar_synth.labels.exchange import thin_scan
 
 
 def test_wrapped_padding_is_circular_padding() -> None:
@@ -152,10 +152,10 @@ def equal(some: dict[str, torch.Tensor], others: dict[str, torch.Tensor]) -> boo
 
 
 def test_turning_keeps_every_return_in_a_cell() -> None:
-    scan = thinned(random_scan(SENSOR, 20_000), SENSOR)
+    scan = thin_scan(random_scan(SENSOR, 20_000), SENSOR)
     cells = np.count_nonzero(project(scan).range)
     for seed in range(5):
-        kept = np.count_nonzero(project(turned(scan, np.random.default_rng(seed))).range)
+        kept = np.count_nonzero(project(turn_scan(scan, np.random.default_rng(seed))).range)
         assert abs(kept - cells) <= 0.001 * cells
 
 
@@ -240,11 +240,11 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
 def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> None:
     whole, _ = make_plan(drives(4, 5), replace(SMALL, iterations=100), None, 1)
     plan = replace(whole, step=6.0)
-    minutes = expected_minutes(plan, plan.pairs[:3]) + 0.01
+    minutes = estimate_minutes(plan, plan.pairs[:3]) + 0.01
     short = within(plan, minutes)
     assert short.pairs == plan.pairs[:3] and short.minutes <= minutes
     assert {seed for _, seed in plan.pairs[:4]} == {0}
-    few = expected_minutes(plan, plan.pairs[:1]) + 0.01
+    few = estimate_minutes(plan, plan.pairs[:1]) + 0.01
     fewer = within(plan, few)
     assert fewer.pairs == plan.pairs[:2] and fewer.minutes <= few
     assert 10 <= fewer.settings.iterations < plan.settings.iterations

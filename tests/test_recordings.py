@@ -14,8 +14,8 @@ from lidar_synth.datasets.recordings import (
     ODOMETRY,
     PLACES,
     Recordings,
+    all_frames,
     frames_of,
-    whole,
 )
 from lidar_synth.errors import DataError
 from lidar_synth.formats import semantic_kitti
@@ -68,7 +68,7 @@ def test_they_are_sets(some: Held, others: Held) -> None:
 
 def test_splits_of_kitti360_leak_into_each_other() -> None:
     sets = {
-        name: whole(KITTI360, drives)
+        name: all_frames(KITTI360, drives)
         for name, drives in KITTI360_SPLITS.items()
         if drives is not None
     }
@@ -114,12 +114,14 @@ def test_many_holes_are_kept_as_one_run() -> None:
 def test_all_of_lidms_models_know_both_datasets() -> None:
     """Their autoencoder is trained on KITTI-360 and the odometry benchmark; validation is on drive
     03, sequence 08."""
-    val = frames_of("semantic_kitti", ["08"]) | whole(KITTI360, KITTI360_SPLITS["lidm/val"] or ())
+    val = frames_of("semantic_kitti", ["08"]) | all_frames(
+        KITTI360, KITTI360_SPLITS["lidm/val"] or ()
+    )
     for data in ("KITTI-360", "SemanticKITTI", lidm.IMAGES):
         seen = lidm.seen(data, generates=True)
         assert not seen & val
         assert seen & frames_of("semantic_kitti", ["00", "19"])
-        assert seen & whole(KITTI360, KITTI360_SPLITS["r2flow/test"] or ())
+        assert seen & all_frames(KITTI360, KITTI360_SPLITS["r2flow/test"] or ())
 
 
 @pytest.mark.parametrize(
@@ -146,4 +148,6 @@ def test_recordings_are_described_in_words() -> None:
         str(some)
         == "KITTI-360 a (3 frames from 1 to 5), KITTI-360 b (all frames), KITTI-360 c (frame 7)"
     )
-    assert str(whole(KITTI, map(str, range(8)))).endswith("KITTI 5 (all frames) and 2 more drives")
+    assert str(all_frames(KITTI, map(str, range(8)))).endswith(
+        "KITTI 5 (all frames) and 2 more drives"
+    )

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.flow.path import per_sample
-from lidar_synth.generate.flow.solvers import SOLVERS, solve, towards, trajectory, uniform_grid
+from lidar_synth.generate.flow.solvers import (
+    SOLVERS,
+    mean_velocity,
+    solve,
+    trajectory,
+    uniform_grid,
+)
 from lidar_synth.noise import gaussian
 
 NOISE = gaussian(0, range(4), (2, 5), dtype=torch.float64)
@@ -50,10 +56,10 @@ def test_a_network_is_told_where_its_step_ends() -> None:
             return (gaussian_flow(y, t, end) - y) / per_sample(end - t, y)
 
     for grid in ((1.0, 0.0), (1.0, 0.7, 0.0), (1.0, 0.86, 0.58, 0.22, 0.0)):
-        assert torch.allclose(solve(towards(Exact(), grid), NOISE, grid), DATA)
-    assert towards(gaussian_velocity, (1.0, 0.0)) is gaussian_velocity
+        assert torch.allclose(solve(mean_velocity(Exact(), grid), NOISE, grid), DATA)
+    assert mean_velocity(gaussian_velocity, (1.0, 0.0)) is gaussian_velocity
     with pytest.raises(ConfigError, match="time grid"):
-        towards(Exact(), (0.0, 1.0))
+        mean_velocity(Exact(), (0.0, 1.0))
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -10,7 +10,7 @@ sys.path.append(str(ROOT / "tools" / "research"))
 from surgery_trial import Emptied, fidelity, places_of
 
 from lidar_synth import Boxes, Scan, Town
-from lidar_synth.labels.edit.removal import without
+from lidar_synth.labels.edit.removal import remove_returns
 
 TOWN = Town(seed=977, scans=2)
 
@@ -30,6 +30,6 @@ def test_the_town_without_cars_is_what_an_edit_should_bring_about() -> None:
         return np.nanmean(fidelity(scan, places, result, truth), 0).tolist()
 
     before = agreement(scan)
-    after = agreement(without(scan, [(p.mine, p.box) for p in places], None, 0))
+    after = agreement(remove_returns(scan, [(p.mine, p.box) for p in places], None, 0))
     assert agreement(truth) == [1, 1, 1]
     assert after[0] > 0.8 and after[1] > before[1] + 0.2 and after[2] > before[2] + 0.2

@@ -60,7 +60,7 @@ def test_touching_cars_are_one_cluster_and_distant_ones_two() -> None:
 
 def test_behind_a_closed_object_is_what_was_there() -> None:
     truth = project(cast([car(12, 3)], [BEHIND]))
-    result = edit.closed(with_boxes(BOTH, [0]))
+    result = edit.remove_unboxed(with_boxes(BOTH, [0]))
     assert edit.measure([result]).objects == 0
     assert (np.abs(project(result).range - truth.range) < 0.3).mean() > 0.997
     assert (result.label == CAR).sum() == (BOTH.instance == 1).sum()

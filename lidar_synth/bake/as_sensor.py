@@ -13,7 +13,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import sync_folder, write_bank_files
-from lidar_synth.bake.making import making
+from lidar_synth.bake.making import claim_bank
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.files.disk import part_of, sha256
@@ -39,7 +39,7 @@ def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) 
         ConfigError: on a folder that holds something else, or in which another process works.
         DataError, FileError: if a scan cannot be read, cast or written.
     """
-    with making(out, {"bank": bank.identity, "as_sensor": transfer.identity}):
+    with claim_bank(out, {"bank": bank.identity, "as_sensor": transfer.identity}):
         sources = tuple(_facts(facts, transfer) for facts in bank.index.sources)
         entries = []
         with tqdm(total=len(bank), unit="scan", disable=not progress) as bar:

@@ -20,7 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from lidar_synth.bake.folder import write_bank_files
-from lidar_synth.bake.making import making
+from lidar_synth.bake.making import claim_bank
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import hash_of_names, part_of, sha256
@@ -231,7 +231,7 @@ def _making(out: Path, what: str, banks: Sequence[Bank], *more: Any) -> Iterator
         more: the operation's other arguments, plain values.
     """
     settings = {"made": what, "from": [bank.index.checksum for bank in banks], "arguments": more}
-    with making(out, settings):
+    with claim_bank(out, settings):
         complete = (out / INDEX).is_file()
         if not complete:
             for shard in out.glob("*.h5"):

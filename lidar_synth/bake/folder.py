@@ -25,7 +25,7 @@ from lidar_synth.bank.card import CARD, CROISSANT, card_files
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_file, sha256, write_file
-from lidar_synth.files.lock import alone, shared
+from lidar_synth.files.lock import lock_shared, try_lock
 from lidar_synth.formats.writer import NOTES
 
 SETTINGS = ".bake.json"
@@ -75,11 +75,11 @@ def at_work(plan: BakePlan) -> Iterator[None]:
         FileError: if the folder is not, or is no longer, the one that ``prepare`` claimed.
     """
     check_folder(plan)
-    with shared(plan.out / SETTINGS):
+    with lock_shared(plan.out / SETTINGS):
         yield
 
 
-def recorded(plan: BakePlan, number: int) -> Entry | None:
+def read_record(plan: BakePlan, number: int) -> Entry | None:
     """The recorded size and hash of a shard, from its own record or from the index."""
     wanted = plan.shards[number]
     with suppress(FileError, ValueError, TypeError):
@@ -91,9 +91,9 @@ def recorded(plan: BakePlan, number: int) -> Entry | None:
     return there if there is not None and replace(there, bytes=0, sha256="") == wanted else None
 
 
-def finished(plan: BakePlan, number: int) -> Entry | None:
+def find_finished(plan: BakePlan, number: int) -> Entry | None:
     """The shard, if its file exists and has the recorded hash."""
-    entry = recorded(plan, number)
+    entry = read_record(plan, number)
     if entry is None:
         return None
     path = plan.out / entry.file
@@ -134,7 +134,7 @@ def finish(plan: BakePlan) -> Index | None:
     with at_work(plan):
         entries = []
         for number in range(len(plan.shards)):
-            entry = recorded(plan, number)
+            entry = read_record(plan, number)
             if entry is None or not (plan.out / entry.file).is_file():
                 return None
             entries.append(entry)
@@ -224,7 +224,7 @@ def _clear_up(root: Path, finished: bool) -> None:
 
     While another process is at work in the folder, nothing is removed; that process does it later.
     """
-    with alone(root / SETTINGS) as exclusive:
+    with try_lock(root / SETTINGS) as exclusive:
         if not exclusive:
             return
         for part in root.glob(".*.part"):

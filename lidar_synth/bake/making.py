@@ -9,7 +9,7 @@ from typing import Any
 from lidar_synth.bake.folder import refuse_others
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.claims import claim
-from lidar_synth.files.lock import alone
+from lidar_synth.files.lock import try_lock
 
 NOTE = ".made.json"
 """File in the bank's folder with the settings of the call that makes it; a run holds a lock on
@@ -17,7 +17,7 @@ it."""
 
 
 @contextmanager
-def making(out: Path, settings: dict[str, Any]) -> Iterator[None]:
+def claim_bank(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """Claim a folder for a new bank, and keep other processes out of it until the block ends.
 
     The claim stays, so that the same call resumes after a kill. Temporary files of killed calls are
@@ -34,7 +34,7 @@ def making(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     if not (out / NOTE).is_file():
         refuse_others(out)
     claim(out / NOTE, settings)
-    with alone(out / NOTE) as exclusive:
+    with try_lock(out / NOTE) as exclusive:
         if not exclusive:
             raise ConfigError(f"{out}, in which another process works", "a folder for this process")
         for part in out.glob(".*.part"):

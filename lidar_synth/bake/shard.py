@@ -17,7 +17,7 @@ from lidar_synth.bake.conditions import (
     fingerprint,
     open_conditions,
 )
-from lidar_synth.bake.folder import at_work, finished, publish
+from lidar_synth.bake.folder import at_work, find_finished, publish
 from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
@@ -50,7 +50,7 @@ def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: N
         ConfigError: if the checkpoint has changed since the plan was made, or the device is not
             available.
     """
-    there = finished(plan, number)
+    there = find_finished(plan, number)
     if there is not None:
         progress(there.scans)
         return there

@@ -13,7 +13,7 @@ from lidar_synth.bank.shard import ShardReader
 from lidar_synth.bank.storage import RemoteFile, is_url, open_storage
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, made_by_model
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, model_provenance
 from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # files kept open at a time
@@ -226,7 +226,7 @@ def _provenance(index: Index, shard: int) -> dict[str, Any]:
     """What made the scans of a shard, as ``Scan.provenance``."""
     entry = index.shards[shard]
     facts = index.sources[entry.source]
-    return made_by_model(facts.model, facts.checkpoint, entry.seed)
+    return model_provenance(facts.model, facts.checkpoint, entry.seed)
 
 
 def _read_index(root: str | Path) -> bytes:

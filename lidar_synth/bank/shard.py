@@ -35,7 +35,7 @@ from lidar_synth.bank.index import FORMAT, REPAIR, Entry, Facts
 from lidar_synth.bank.layout import ShardLayout, read_attributes, read_layout, with_hdf5
 from lidar_synth.bank.storage import LocalFile, Storage
 from lidar_synth.errors import DataError, LidarSynthError
-from lidar_synth.files.disk import naming
+from lidar_synth.files.disk import name_errors
 
 _GAP = 16 << 10  # chunks closer together than this many bytes are read at once
 
@@ -185,7 +185,7 @@ class ShardReader:
                 raise ValueError("its CRC does not match")
             if (seed, index) != (self.entry.seed, self.entry.first + position):
                 raise ValueError(f"it is scan {index} of seed {seed}")
-        with naming(f"{self.name}: scan {position}"):
+        with name_errors(f"{self.name}: scan {position}"):
             self.encoding.check(arrays)
         return arrays, packed
 

@@ -68,12 +68,12 @@ def bake(
     """
     from lidar_synth.bake import Share, make_plan
     from lidar_synth.bake import bake as run
-    from lidar_synth.files.recipes import find_recipe, read_recipe, validated
+    from lidar_synth.files.recipes import find_recipe, read_recipe, validate
 
     values = {} if config is None else read_recipe(find_recipe(config))
     values |= {name: value for name, value in settings.items() if value is not None}
     share = Share(shard_index, num_shards)
-    plan = make_plan(out, validated(BakeJob, values, "bake" if config is None else str(config)))
+    plan = make_plan(out, validate(BakeJob, values, "bake" if config is None else str(config)))
     if dry_run:
         _describe(plan)
         return

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, only_given, options_from
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
@@ -107,7 +107,7 @@ def convert(
     from lidar_synth.formats.convert import convert as run
 
     writer = choose("--to", to, WRITERS)(out)
-    scans = open_scans(source, sensor=sensor, **only_given(reading))
+    scans = open_scans(source, sensor=sensor, **drop_missing(reading))
     change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
     how: dict[str, Any] = {"jobs": jobs, "on_bad": scans.on_bad, "unfold": unfold, "strict": strict}
     report = run(scans, writer, as_sensor=change, **how)

@@ -28,7 +28,7 @@ class Reading(BaseModel):
     )
 
 
-def only_given(values: dict[str, Any]) -> dict[str, Any]:
+def drop_missing(values: dict[str, Any]) -> dict[str, Any]:
     """The options that the user gave."""
     return {name: value for name, value in values.items() if value is not None}
 

@@ -78,7 +78,7 @@ def sample(
 
     from lidar_synth.bake.conditions import conditions, conditions_for
     from lidar_synth.errors import choose
-    from lidar_synth.files.claims import claimed
+    from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
     from lidar_synth.generate.loading import load_generator
 
@@ -101,7 +101,7 @@ def sample(
     }
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
-    with claimed(writer.root / NOTE, settings | trained):
+    with hold_claim(writer.root / NOTE, settings | trained):
         missing = [i for i in range(count) if not writer.complete(i)]
         with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
             for first in range(0, len(missing), generator.batch):

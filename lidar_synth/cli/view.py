@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, only_given, options_from
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 from lidar_synth.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def view(
 
     if out is not None:
         view_suffix(out)
-    scans = _read(open_scans(path, sensor=sensor, **only_given(reading)), index, count)
+    scans = _read(open_scans(path, sensor=sensor, **drop_missing(reading)), index, count)
     if out is None:
         if show(scans, title=str(path)):
             return

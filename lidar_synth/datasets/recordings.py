@@ -148,7 +148,7 @@ class Recordings:
             ) from error
 
 
-def whole(dataset: str, drives: Iterable[str]) -> Recordings:
+def all_frames(dataset: str, drives: Iterable[str]) -> Recordings:
     """All frames of some drives."""
     return Recordings({(dataset, drive): None for drive in drives})
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text, write_file
-from lidar_synth.files.lock import alone, shared
+from lidar_synth.files.lock import lock_shared, try_lock
 from lidar_synth.files.parsing import parse_json
 
 
@@ -51,7 +51,7 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
 
 
 @contextmanager
-def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
+def hold_claim(path: Path, settings: dict[str, Any]) -> Iterator[None]:
     """``claim`` a folder for the block, and take the claim back if the block has written nothing,
     so that the corrected call may use the folder.
 
@@ -64,7 +64,7 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
     first = not path.is_file()
     claim(path, settings)
     try:
-        with writing(path):
+        with hold_writing(path):
             yield
         if not _alone(path):
             claim(
@@ -76,16 +76,16 @@ def claimed(path: Path, settings: dict[str, Any]) -> Iterator[None]:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def hold_writing(path: Path) -> Iterator[None]:
     """Write into a claimed folder; the last of several runs removes the temporary files that killed
     ones left.
 
     Args:
         path: the file of the claim.
     """
-    with shared(path):
+    with lock_shared(path):
         yield
-    with alone(path) as exclusive:
+    with try_lock(path) as exclusive:
         for part in path.parent.rglob(".*.part") if exclusive else ():
             part.unlink(missing_ok=True)
 

@@ -181,7 +181,7 @@ def unreadable(path: Path, error: OSError, expected: str = "a file of the datase
     return FileError(f"{path} cannot be read ({error.strerror or error})", expected)
 
 
-def inside(folder: Path, name: str) -> Path:
+def join_inside(folder: Path, name: str) -> Path:
     """The path under a folder of an untrusted name, such as one from a bank, an archive or a table.
 
     Args:
@@ -302,7 +302,7 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
 
 
 @contextmanager
-def naming(where: str | Path) -> Iterator[None]:
+def name_errors(where: str | Path) -> Iterator[None]:
     """Prefix errors raised in this context with the name of a file."""
     try:
         yield

@@ -1,7 +1,7 @@
 """A lock on a file, which the system releases when its process ends or is killed.
 
-Processes that work in one folder hold the lock together (``shared``); only a process that holds it
-exclusively (``alone``) removes leftover files. The lock is flock; over NFS, a lock on the server.
+Processes that work in one folder hold the lock together (``lock_shared``); only a process that holds it
+exclusively (``try_lock``) removes leftover files. The lock is flock; over NFS, a lock on the server.
 On a file system without locks nothing is ever removed. On Windows every process counts as
 exclusive: an open file cannot be removed there.
 """
@@ -24,7 +24,7 @@ else:
     import fcntl
 
     def _lock(file: BinaryIO, alone: bool) -> bool:
-        """Take the lock: shared after waiting, or exclusive (``alone``) without waiting; False if
+        """Take the lock: shared after waiting, or exclusive (``try_lock``) without waiting; False if
         unavailable."""
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
@@ -55,7 +55,7 @@ def one_writer(path: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def shared(path: Path) -> Iterator[None]:
+def lock_shared(path: Path) -> Iterator[None]:
     """Hold a shared lock on a file; wait while another process holds it exclusively.
 
     Raises:
@@ -67,7 +67,7 @@ def shared(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[bool]:
+def try_lock(path: Path) -> Iterator[bool]:
     """Try to hold an exclusive lock on a file until the block ends; yields whether it was
     available."""
     try:

@@ -63,7 +63,7 @@ def _without_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def in_processes(
+def map_in_processes(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, chunk: int = 1
 ) -> Iterator[Iterator[Result]]:
     """Map ``work`` over items in several processes, with results in order.

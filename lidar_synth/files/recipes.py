@@ -100,12 +100,12 @@ def published() -> Iterator[Listed]:
         yield Listed(path.stem, command, data, size, time, head_of(path))
 
 
-def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """``above`` on top of ``below``, mapping by mapping."""
     result = dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(result.get(key), dict)
-        result[key] = merged(result[key], value) if both else value
+        result[key] = merge(result[key], value) if both else value
     return result
 
 
@@ -116,8 +116,8 @@ def _merged(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     bases = values.pop("base", [])
     result: dict[str, Any] = {}
     for base in [bases] if isinstance(bases, str) else bases:
-        result = merged(result, _merged(_base(path, base), (*above, path)))
-    return merged(result, values)
+        result = merge(result, _merged(_base(path, base), (*above, path)))
+    return merge(result, values)
 
 
 def _base(path: Path, name: Any) -> Path:
@@ -156,7 +156,7 @@ def head_of(path: Path) -> str:
     return " ".join(lines).split(". ")[0].rstrip(".") + "."
 
 
-def validated(kind: type[Model], values: dict[str, Any], where: str) -> Model:
+def validate(kind: type[Model], values: dict[str, Any], where: str) -> Model:
     """Values as the model ``kind`` checks them; ``where`` begins the message of the ConfigError."""
     try:
         return kind.model_validate(values)

@@ -78,7 +78,7 @@ class Field:
         return np.dtype(self.type).itemsize * self.count
 
 
-def cut(where: str, held: int, wanted: int, unit: str = "bytes") -> DataError:
+def size_error(where: str, held: int, wanted: int, unit: str = "bytes") -> DataError:
     """The error for a file whose size does not match its header."""
     given = "is truncated" if held < wanted else "holds more than its header declares"
     return DataError(
@@ -95,7 +95,7 @@ def check_size(body: bytes, size: int, where: str, *, more: bool = False) -> Non
         DataError: if it is too short or too long.
     """
     if len(body) < size or not (more or body[size:] in (b"", b"\n", b"\r\n")):
-        raise cut(where, len(body), size)
+        raise size_error(where, len(body), size)
 
 
 def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
@@ -151,7 +151,7 @@ def from_text(
     columns = sum(field.count for field in fields)
     lines = sum(1 for line in text.splitlines() if line.strip())
     if lines != count:
-        raise cut(where, lines, count, "lines")
+        raise size_error(where, lines, count, "lines")
     try:
         table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
     except ValueError as error:

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.claims import claimed
+from lidar_synth.files.claims import hold_claim
 from lidar_synth.files.disk import hash_of_names
-from lidar_synth.files.processes import in_processes
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import OnBad, ScanFiles, Writer
 from lidar_synth.formats.as_sensor import AsSensor
 from lidar_synth.formats.description import NAME, Origin, add_origin
@@ -130,7 +130,7 @@ def convert(
         target = source.sensor if change is None else change.transfer.target
         writer.require_grid(target.by_beams() if unfold else target)
     models = models_of(source.root) if isinstance(source, ScanFiles) else []
-    with claimed(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
+    with hold_claim(writer.root / SETTINGS, _settings(source, writer, change, unfold)):
         work = partial(convert_one, source, writer, change, unfold, on_bad, strict)
         report = _write_missing(source, writer, change, work, on_bad, jobs, progress)
         write_models(writer.root, models if report.written or report.kept else [])
@@ -155,7 +155,7 @@ def _write_missing(
             ]
     elif isinstance(source, ScanFiles):
         report.left_out = writer.carry(source)
-    with in_processes(work, missing, jobs, CHUNK) as results:
+    with map_in_processes(work, missing, jobs, CHUNK) as results:
         for done in tqdm(
             results, total=len(missing), unit="scan", disable=not (progress and missing)
         ):

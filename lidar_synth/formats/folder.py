@@ -26,7 +26,7 @@ from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import Description
-from lidar_synth.formats.npz import check_numbers, decode_scan, stored_sensor, write_scan
+from lidar_synth.formats.npz import check_numbers, decode_scan, read_stored_sensor, write_scan
 from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
 from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
@@ -125,7 +125,7 @@ class Folder(ScanFiles):
             scan = Scan(
                 sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays
             )
-            scan = said.origin.apply(scan) if said else without_empty_firings(scan)
+            scan = said.origin.apply(scan) if said else drop_empty_firings(scan)
             scan.boxes = read_boxes(path)
             is_log = said is None and scan.ring is not None
             if (
@@ -174,7 +174,7 @@ def write_boxes(path: Path, boxes: Boxes | None) -> None:
         write_file(path.with_suffix(BOXES), json.dumps(values).encode())
 
 
-def without_empty_firings(scan: Scan) -> Scan:
+def drop_empty_firings(scan: Scan) -> Scan:
     """The scan without points at the origin, as drivers write firings that had no return."""
     there = scan.points.any(axis=1)
     return scan if there.all() else scan[there]
@@ -232,7 +232,7 @@ def _named_sensor(path: Path) -> Sensor | None:
     """The sensor that a file names; None if it names none, or if reading the scan will raise an
     error."""
     if path.suffix.lower() == ".npz":
-        return stored_sensor(path)
+        return read_stored_sensor(path)
     try:
         said = _description(path)
     except (DataError, FileError):

@@ -21,7 +21,7 @@ import numpy as np
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import (
     list_files,
-    naming,
+    name_errors,
     png_size,
     read_named_matrices,
     read_text,
@@ -242,7 +242,7 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
             f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12"
         )
     camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
-    with naming(path):
+    with name_errors(path):
         return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import list_files, naming, png_size, read_file, read_named_matrices
+from lidar_synth.files.disk import list_files, name_errors, png_size, read_file, read_named_matrices
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -190,7 +190,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                 f"{path}: a box of frame {frame} with {values}",
                 f"metres within {FARTHEST:g}, and radians",
             )
-        with naming(path):
+        with name_errors(path):
             boxes[frame] = Boxes(
                 np.array(values, np.float32),
                 names,

@@ -48,7 +48,7 @@ TYPES = {
 """numpy types of a scan's fields."""
 
 
-def stored_sensor(path: Path) -> Sensor | None:
+def read_stored_sensor(path: Path) -> Sensor | None:
     """The sensor that is stored in an ``.npz`` file, without reading its other arrays; None if
     there is none."""
     try:
@@ -57,7 +57,7 @@ def stored_sensor(path: Path) -> Sensor | None:
         return None  # reading the scan will raise the error
 
 
-def stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, NDArray[Any]]:
+def to_stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, NDArray[Any]]:
     """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are
     float64.
 
@@ -88,10 +88,10 @@ def write_scan(path: Path, scan: Scan) -> None:
     """Write a scan as ``.npz``; ``decode_scan`` is the inverse.
 
     Raises:
-        DataError: as ``stored``.
+        DataError: as ``to_stored``.
         FileError: if it cannot be written.
     """
-    write_arrays(path, stored({"points": scan.points, **scan.fields()}, path) | _facts(scan))
+    write_arrays(path, to_stored({"points": scan.points, **scan.fields()}, path) | _facts(scan))
 
 
 def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None) -> Scan:
@@ -126,7 +126,11 @@ def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -
         if scan is None
         else _facts(scan, image.sensor)
     )
-    arrays = {"range": np.asarray(image.range, np.float32), **stored(image.channels, path), **facts}
+    arrays = {
+        "range": np.asarray(image.range, np.float32),
+        **to_stored(image.channels, path),
+        **facts,
+    }
     write_arrays(path, arrays, compressed=True)
 
 

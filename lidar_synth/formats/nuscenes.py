@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NUSCENES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, inside, list_files, read_text, read_values
+from lidar_synth.files.disk import SKIP_HINT, join_inside, list_files, read_text, read_values
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
@@ -141,7 +141,7 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
             )
             names = {row["token"]: row["filename"] for row in samples}
             for row in rows:
-                files[PurePosixPath(names[row["sample_data_token"]]).name] = inside(
+                files[PurePosixPath(names[row["sample_data_token"]]).name] = join_inside(
                     root, row["filename"]
                 )
         except (KeyError, TypeError, AttributeError) as error:

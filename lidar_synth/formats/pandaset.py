@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import list_files, naming
+from lidar_synth.files.disk import list_files, name_errors
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.pandas_table import read_table, require_numbers
 from lidar_synth.formats.pandaset_cuboids import read_cuboids
@@ -144,7 +144,7 @@ class PandaSet(ScanFiles):
         world = np.stack([table[axis][kept] for axis in "xyz"], axis=-1).astype(np.float64)
         time = table["t"][kept].astype(np.float64)
         pose = track.poses[number] @ self._mount
-        with naming(path):
+        with name_errors(path):
             measured = from_world(
                 world, interpolate_poses(track.times, track.poses, time) @ self._mount
             )
@@ -186,7 +186,7 @@ class PandaSet(ScanFiles):
             if self.motion_compensated
             else camera.times[number]
         )
-        with naming(source / "intrinsics.json"):
+        with name_errors(source / "intrinsics.json"):
             pose = interpolate_poses(track.times, track.poses, np.array([when]))[0] @ self._mount
             projection = read_intrinsics(source)
             return Calibration(projection, np.linalg.inv(camera.poses[number]) @ pose, IMAGE_SIZE)
@@ -221,7 +221,7 @@ class PandaSet(ScanFiles):
     def _boxes(self, path: Path, pose: NDArray[np.float64]) -> Boxes | None:
         if not path.is_file():
             return None
-        with naming(path):
+        with name_errors(path):
             boxes = read_cuboids(path, pose, other_sensor=1 - self._device)
         ahead = abs(np.arctan2(boxes.values[:, 1], boxes.values[:, 0])) < VIEW
         return boxes[ahead] if self._device else boxes

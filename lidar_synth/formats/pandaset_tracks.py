@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import naming, read_text
+from lidar_synth.files.disk import name_errors, read_text
 from lidar_synth.files.parsing import parse_json
 
 Matrix = NDArray[np.float64]
@@ -80,7 +80,7 @@ def read_track(folder: Path) -> Track:
         DataError: on anything but as many poses as increasing times.
     """
     times, poses = (_parse(folder / name) for name in ("timestamps.json", "poses.json"))
-    with naming(folder / "poses.json"):
+    with name_errors(folder / "poses.json"):
         if (
             not isinstance(times, list)
             or not isinstance(poses, list)

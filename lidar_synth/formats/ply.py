@@ -20,9 +20,9 @@ from lidar_synth.formats.cloud import (
     Field,
     check_fields,
     check_size,
-    cut,
     from_records,
     from_text,
+    size_error,
     to_arrays,
     to_records,
 )
@@ -116,7 +116,7 @@ def map_vertices(path: Path) -> NDArray[np.void]:
     fields = elements[0].fields
     count = elements[0].count
     if size - offset != elements[0].size:
-        raise cut(where, size - offset, elements[0].size)
+        raise size_error(where, size - offset, elements[0].size)
     if len({f.name for f in fields}) < len(fields):
         raise DataError(f"{where} has a property twice", "each property once", SKIP_HINT)
     kind = np.dtype([(f.name, f.type) for f in fields])
@@ -146,7 +146,7 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     if encoding == "ascii":
         lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
         if len(lines) != (wanted := sum(e.count for e in elements)):
-            raise cut(where, len(lines), wanted, "lines")
+            raise size_error(where, len(lines), wanted, "lines")
         start = sum(e.count for e in elements[:position])
         return to_arrays(
             from_text(

@@ -28,7 +28,7 @@ from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import Picture, Writer, projected
+from lidar_synth.formats.writer import Picture, Writer, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -159,7 +159,7 @@ class PNGWriter(Writer):
     def _put(
         self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
     ) -> None:
-        image = projected(scan)
+        image = project_scan(scan)
         scale = image.sensor.range_max / STEPS
         facts = {
             "scale": scale,

@@ -128,7 +128,7 @@ def finite(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> NDA
     return good
 
 
-def without_bad_points(scan: Scan) -> Scan:
+def drop_bad_points(scan: Scan) -> Scan:
     """Drop the points of a scan that are NaN or infinite, with their labels and other fields.
 
     Raises:

@@ -25,13 +25,13 @@ from lidar_synth.formats.npz import (
     check_numbers,
     decode_range_image,
     range_image,
-    stored_sensor,
+    read_stored_sensor,
     write_range_image,
 )
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, FileWriter, Picture, projected
+from lidar_synth.formats.writer import DETAILS, FileWriter, Picture, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -109,7 +109,7 @@ class RangeImages(ScanFiles):
         root = Path(root)
         self._base, paths = scan_paths(root, SUFFIXES)
         ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
-        stored = stored_sensor(paths[0])
+        stored = read_stored_sensor(paths[0])
         super().__init__(root, ids, sensor if stored is None else None, on_bad, stored=stored)
         self._suffix = paths[0].suffix
         self._given = None if sensor is None else load_sensor(sensor)
@@ -231,4 +231,4 @@ class RangeWriter(FileWriter):
     def _put(
         self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
     ) -> None:
-        write_range_image(path, projected(scan), scan)
+        write_range_image(path, project_scan(scan), scan)

@@ -22,7 +22,7 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI, Taxonomy
 from lidar_synth.errors import DataError, choose
 from lidar_synth.files.disk import (
     list_files,
-    naming,
+    name_errors,
     numbers,
     png_size,
     read_file,
@@ -251,7 +251,7 @@ def read_calibration(folder: Path) -> Calibration | None:
     if any(matrices.get(name, np.zeros(0)).size != 12 for name in ("P2", "Tr")):
         return None
     size = next((png_size(p) for p in sorted((folder / "image_2").glob("*.png"))), None)
-    with naming(folder / "calib.txt"):
+    with name_errors(folder / "calib.txt"):
         return Calibration(
             matrices["P2"].reshape(3, 4), homogeneous(matrices["Tr"]), size, matrices
         )

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, get_args
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
-from lidar_synth.formats.points import bad_points_kept, without_bad_points
+from lidar_synth.formats.points import bad_points_kept, drop_bad_points
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -130,7 +130,7 @@ class ScanFiles(ABC):
         if drop_points if drop_points is not None else self.on_bad == "drop-points":
             with bad_points_kept():
                 read = self.read(index)
-            scan = without_bad_points(read)
+            scan = drop_bad_points(read)
             if len(scan) < len(read):
                 self.dropped[self.ids[index]] = len(read) - len(scan)
         else:

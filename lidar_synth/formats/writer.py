@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
-    inside,
+    join_inside,
     list_files,
     read_file,
     read_text,
@@ -37,7 +37,7 @@ from lidar_synth.formats.description import (
     record,
     require_grid,
 )
-from lidar_synth.formats.npz import check_pose, stored
+from lidar_synth.formats.npz import check_pose, to_stored
 from lidar_synth.formats.points import check_scan, write_points
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.projection import project
@@ -100,7 +100,7 @@ class Writer(ABC):
         if not self._without_links:
             refuse_links(self.root)
             self._without_links = True
-        return inside(self._base, self._place(index, name))
+        return join_inside(self._base, self._place(index, name))
 
     @abstractmethod
     def _place(self, index: int, name: str | None) -> str:
@@ -131,7 +131,7 @@ class Writer(ABC):
         self.require_grid(scan.sensor)
         where = f"scan {scan.id!r}"
         check_facts(scan, where)
-        typed: dict[str, Any] = stored({"points": scan.points, **scan.fields()}, where)
+        typed: dict[str, Any] = to_stored({"points": scan.points, **scan.fields()}, where)
         scan = replace(scan, **typed)
         check_scan(scan, where)
         picture = scan.image_path if image is None else image
@@ -217,7 +217,7 @@ def check_facts(scan: Scan, where: str) -> None:
         raise DataError(f"{where}: {error}", "what files can hold") from error
 
 
-def projected(scan: Scan) -> RangeImage:
+def project_scan(scan: Scan) -> RangeImage:
     """The scan on its sensor's grid.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.datasets.classes import GROUND
-from lidar_synth.geometry.layout import Layout, known_boxes
+from lidar_synth.geometry.layout import Layout, select_known_boxes
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 
@@ -32,10 +32,10 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
     each = list(given) if isinstance(given, Sequence) else [given] * count
     if not all(isinstance(one, Scan | Layout) and one.boxes is not None for one in each):
         return None
-    return [one.boxes if isinstance(one, Layout) else known_boxes(one) for one in each]
+    return [one.boxes if isinstance(one, Layout) else select_known_boxes(one) for one in each]
 
 
-def with_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
+def add_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
     """An image with those boxes that hold a return, and the channel ``instance``: 1 for the returns
     in the first of them, and so on; 0 = none. Returns of the ground belong to no box."""
     scan = unproject(image)

@@ -40,7 +40,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
-from lidar_synth.generate.devices import checked_device
+from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.geometry.normalize import LABEL_BITS, Normalisation, TensorFormat
@@ -277,7 +277,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
         DataError: on a file that is not a checkpoint of this version, is truncated or damaged, or
             whose weights do not match its header.
     """
-    device = checked_device(device)
+    device = check_device(device)
     header, digest, weights, tensors = _read(Path(path))
     if weights != weights_hash(tensors):
         raise DataError(

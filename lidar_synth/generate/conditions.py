@@ -10,7 +10,7 @@ A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provi
 
 An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of
 that network. A model that was also trained with blank conditions (``dropout``) can be guided: see
-``flow.path.guided``.
+``flow.path.guide``.
 
 To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in
     ``models.NETWORKS``.
@@ -79,7 +79,7 @@ class Condition(Protocol):
         ...
 
 
-def bridged(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def bridge_gaps(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A label map without narrow gaps: up to ``GAP`` unknown cells between two known ones of a row
     take the nearer one.
 
@@ -116,14 +116,14 @@ class SemanticMap:
         self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
     ) -> NDArray[np.uint8]:
         """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see
-        ``bridged``.
+        ``bridge_gaps``.
 
         Raises:
             DataError: on a scan without labels.
         """
         if scan.label is None:
             raise DataError(f"scan {scan.id!r} has no labels", "a labelled scan, to condition on")
-        return bridged(project(scan, sensor, ["label"]).channels["label"])
+        return bridge_gaps(project(scan, sensor, ["label"]).channels["label"])
 
     def check(self, values: Tensor) -> None:
         """Check that all values are train ids or 255.
@@ -160,7 +160,7 @@ class CameraImage:
     def read(
         self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
     ) -> NDArray[np.uint8]:
-        """The image taken with the scan, see ``resized``.
+        """The image taken with the scan, see ``resize_image``.
 
         Raises:
             DataError: on a scan without an image, one that cannot be read, or of another size.
@@ -176,7 +176,7 @@ class CameraImage:
             raise DataError(
                 f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG"
             ) from error
-        return resized(image, shape, options, f"the image {scan.image_path}")
+        return resize_image(image, shape, options, f"the image {scan.image_path}")
 
     def check(self, values: Tensor) -> None:
         """Accept all values, since every byte is a valid colour."""
@@ -186,7 +186,7 @@ class CameraImage:
         return one_view(values, views)
 
 
-def resized(
+def resize_image(
     image: "PILImage", shape: tuple[int, ...], options: Mapping[str, Any], what: str = "an image"
 ) -> NDArray[np.uint8]:
     """A camera image as a condition.

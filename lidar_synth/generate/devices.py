@@ -17,7 +17,7 @@ def available_devices() -> list[str]:
     return [*names, "mps"] if torch.backends.mps.is_available() else names
 
 
-def checked_device(device: str | torch.device) -> torch.device:
+def check_device(device: str | torch.device) -> torch.device:
     """The device with a name; a type without an index is the current device of that type.
 
     Raises:

@@ -21,11 +21,11 @@ from lidar_synth.generate.checkpoint import Header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
 from lidar_synth.generate.devices import refuse_worker
-from lidar_synth.generate.flow.path import Velocity, guided
-from lidar_synth.generate.flow.solvers import solve, towards
+from lidar_synth.generate.flow.path import Velocity, guide
+from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, identity_of, made_by_model
+from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, identity_of, model_provenance
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
@@ -199,7 +199,7 @@ class Generator:
         return (
             images
             if boxes is None
-            else [boxed.with_boxes(*pair) for pair in zip(images, boxes, strict=True)]
+            else [boxed.add_boxes(*pair) for pair in zip(images, boxes, strict=True)]
         )
 
     def scans(
@@ -215,7 +215,7 @@ class Generator:
         ``<checkpoint>/<seed>/<index>``, and its ``domain`` is ``SYNTHETIC``.
         """
         images = self.range_images(seed, indices, condition, **options)
-        made = made_by_model(self.name, self.hash, seed)
+        made = model_provenance(self.name, self.hash, seed)
         return [
             replace(
                 unproject(image),
@@ -278,12 +278,12 @@ class Generator:
                 "Train it with condition.dropout=0.1.",
             )
         if condition is None or not isinstance(self.network, Conditioned):
-            return towards(self.network, grid), condition
+            return mean_velocity(self.network, grid), condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
         unconditional = (
             encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
         )
-        return guided(towards(self.network.velocity, grid), guidance, unconditional), encode(
+        return guide(mean_velocity(self.network.velocity, grid), guidance, unconditional), encode(
             condition
         )
 

@@ -18,7 +18,7 @@ from torch.nn.functional import adaptive_max_pool2d
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.generate.flow.solvers import solve, towards
+from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.normalize import CHANNELS
 from lidar_synth.geometry.scan import RangeImage
@@ -148,7 +148,7 @@ def _sample(
             "a later time in it",
         )
     y = (1 - grid[0]) * known + grid[0] * noise
-    velocity = towards(generator.network, grid)
+    velocity = mean_velocity(generator.network, grid)
     for t, t_next in pairwise(grid):
         y = solve(velocity, y, (t, t_next))
         y = torch.where(inside, y, (1 - t_next) * known + t_next * noise)

@@ -14,7 +14,7 @@ from lidar_synth.generate.checkpoint import (
     join,
     load_checkpoint,
 )
-from lidar_synth.generate.devices import checked_device, refuse_worker
+from lidar_synth.generate.devices import check_device, refuse_worker
 from lidar_synth.generate.generator import BATCH, Generator
 
 
@@ -51,7 +51,7 @@ def load_generator(
         ('town/0/1', ['confidence', 'label', 'reflectance'])
     """
     refuse_worker(device)
-    device = checked_device(device)
+    device = check_device(device)
     path = find_model(model)
     checkpoint = load_checkpoint(path, device)
     if VELOCITY not in checkpoint.networks:

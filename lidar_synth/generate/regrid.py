@@ -54,7 +54,7 @@ CONDITIONS = ("semantic",)
 """Conditions of the models that are moved."""
 
 
-def fitting(sensor: Sensor, header: Header) -> Sensor:
+def fit_grid(sensor: Sensor, header: Header) -> Sensor:
     """The grid of a sensor on which a model can be trained: with as many columns as its networks
     can have, and within the model's range limits.
 
@@ -94,7 +94,7 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
 
     Args:
         model: an unconditional model, or one with a condition among ``CONDITIONS``.
-        sensor: as ``fitting`` gives it.
+        sensor: as ``fit_grid`` gives it.
 
     Raises:
         ConfigError: on an autoencoder alone, a model with another condition, or one of an
@@ -188,7 +188,7 @@ def _along(weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool) 
     return torch.lerp(one, other, share)
 
 
-def with_codec(
+def attach_codec(
     flow: Mapping[str, nn.Module], codec: Mapping[str, nn.Module]
 ) -> dict[str, nn.Module]:
     """The flow of one model, with what encodes its condition, and the autoencoder of another

@@ -242,7 +242,7 @@ POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confid
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
 
 
-def made_by_model(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
+def model_provenance(name: str, checkpoint: str, seed: int) -> dict[str, Any]:
     """The provenance of scans that a model generated.
 
     Args:

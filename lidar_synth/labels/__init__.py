@@ -18,7 +18,7 @@ _HOME = {
     "paste": "pasting",
     "swap_bands": "exchange",
     "swap_sector": "exchange",
-    "thinned": "exchange",
+    "thin_scan": "exchange",
 }
 
 __all__ = list(_HOME)
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lidar_synth.labels.bank import ObjectBank as ObjectBank
     from lidar_synth.labels.exchange import swap_bands as swap_bands
     from lidar_synth.labels.exchange import swap_sector as swap_sector
-    from lidar_synth.labels.exchange import thinned as thinned
+    from lidar_synth.labels.exchange import thin_scan as thin_scan
     from lidar_synth.labels.objects import Object as Object
     from lidar_synth.labels.objects import instances_of as instances_of
     from lidar_synth.labels.objects import objects_of as objects_of

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import moved, turned, turned_points
-from lidar_synth.labels.own import checked_share
+from lidar_synth.labels.boxes import move_boxes, turn_boxes, turn_points
+from lidar_synth.labels.own import check_share
 
 Augmentation = Callable[[Scan, np.random.Generator], Scan]
 
@@ -61,24 +61,24 @@ def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
     either side."""
     if not 0 <= limit <= 180:
         raise ConfigError(f"limit={limit}", "0..180 degrees")
-    return rotated(scan, float(np.radians(rng.uniform(-limit, limit))))
+    return rotate_scan(scan, float(np.radians(rng.uniform(-limit, limit))))
 
 
 def flip_x(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror front and back with probability ``chance``."""
-    return mirrored(scan, "x") if rng.random() < checked_share("chance", chance) else scan
+    return mirror_scan(scan, "x") if rng.random() < check_share("chance", chance) else scan
 
 
 def flip_y(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror left and right with probability ``chance``."""
-    return mirrored(scan, "y") if rng.random() < checked_share("chance", chance) else scan
+    return mirror_scan(scan, "y") if rng.random() < check_share("chance", chance) else scan
 
 
 def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float = 1.05) -> Scan:
     """Multiply all lengths by a random factor between ``low`` and ``high``."""
     if not 0 < low <= high < np.inf:
         raise ConfigError(f"low={low}, high={high}", "0 < low <= high")
-    return scaled(scan, float(rng.uniform(low, high)))
+    return scale_scan(scan, float(rng.uniform(low, high)))
 
 
 def jitter(
@@ -114,7 +114,7 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
     The ring of a point is ``scan.ring``, or its row in the sensor's range image if that is not set.
     """
     rows, columns = scan.sensor.shape
-    most = round(checked_share("share", share) * rows)
+    most = round(check_share("share", share) * rows)
     dropped = rng.choice(rows, rng.integers(most + 1), replace=False)
     row = locate(scan.points, scan.sensor).cell // columns if scan.ring is None else scan.ring
     return _subset(scan, ~np.isin(row, dropped))
@@ -134,16 +134,16 @@ def range_drop(
     if not power >= 0:
         raise ConfigError(f"power={power}", "0 or more")
     far = np.minimum(np.linalg.norm(scan.points, axis=1) / scan.sensor.range_max, 1)
-    return _subset(scan, rng.random(len(scan)) >= checked_share("share", share) * far**power)
+    return _subset(scan, rng.random(len(scan)) >= check_share("share", share) * far**power)
 
 
-def rotated(scan: Scan, angle: float) -> Scan:
+def rotate_scan(scan: Scan, angle: float) -> Scan:
     """Rotate the scan about the vertical axis, counter-clockwise, by an angle in radians."""
-    boxes = None if scan.boxes is None else turned(scan.boxes, angle)
-    return _placed(scan, turned_points(scan.points, angle), boxes)
+    boxes = None if scan.boxes is None else turn_boxes(scan.boxes, angle)
+    return _placed(scan, turn_points(scan.points, angle), boxes)
 
 
-def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
+def mirror_scan(scan: Scan, axis: Literal["x", "y"]) -> Scan:
     """Mirror the scan: change the sign of x (front and back) or of y (left and right)."""
     if axis not in ("x", "y"):
         raise ConfigError(f"axis={axis!r}", "'x' or 'y'")
@@ -155,17 +155,17 @@ def mirrored(scan: Scan, axis: Literal["x", "y"]) -> Scan:
         values = scan.boxes.values.copy()
         values[:, column] *= -1
         values[:, 6] = np.pi * (axis == "x") - values[:, 6]
-        boxes = moved(scan.boxes, values)
+        boxes = move_boxes(scan.boxes, values)
     return _placed(scan, points, boxes)
 
 
-def scaled(scan: Scan, factor: float) -> Scan:
+def scale_scan(scan: Scan, factor: float) -> Scan:
     """Multiply all lengths of the scan by a factor."""
     boxes = None
     if scan.boxes is not None:
         values = scan.boxes.values.copy()
         values[:, :6] *= factor
-        boxes = moved(scan.boxes, values)
+        boxes = move_boxes(scan.boxes, values)
     return _placed(scan, scan.points * np.float32(factor), boxes)
 
 

@@ -29,7 +29,7 @@ from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.labels.boxes import joined
+from lidar_synth.labels.boxes import join_boxes
 from lidar_synth.labels.objects import Object, objects_of
 
 FORMAT = "lidar-synth-objects/1"
@@ -157,7 +157,7 @@ class ObjectBank:
         parts = [o.scan for _, o in objects]
         return cls(
             sensor=parts[0].sensor,
-            boxes=joined([p.boxes for p in parts if p.boxes is not None]),
+            boxes=join_boxes([p.boxes for p in parts if p.boxes is not None]),
             scan=np.array([p.id for p in parts], np.str_),
             number=np.array([n for n, _ in objects], np.int32),
             ground=np.array([o.ground for _, o in objects], np.float32),

@@ -22,7 +22,7 @@ def box_frame(points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[
     )
 
 
-def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
+def grow_box(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Enlarge a box (7,) about its centre so that it contains points (N, 3).
 
     A margin of one millimetre ensures that it still contains them when both are moved in float32.
@@ -31,7 +31,7 @@ def grown(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.f
     return np.concatenate([box[:3], np.maximum(box[3:6], needed), box[6:]], dtype=np.float32)
 
 
-def moved(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
+def move_boxes(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
     """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in
     [-pi, pi)."""
     values = values.astype(np.float32)
@@ -41,15 +41,15 @@ def moved(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
     )
 
 
-def turned(boxes: Boxes, angle: float) -> Boxes:
+def turn_boxes(boxes: Boxes, angle: float) -> Boxes:
     """Boxes turned about the sensor, counter-clockwise by an angle in radians."""
     values = boxes.values.copy()
-    values[:, :2] = turned_points(values[:, :2], angle)
+    values[:, :2] = turn_points(values[:, :2], angle)
     values[:, 6] += angle
-    return moved(boxes, values)
+    return move_boxes(boxes, values)
 
 
-def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
+def turn_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32]:
     """(N, 2 or 3) points turned about the sensor, counter-clockwise by an angle in radians."""
     c = np.cos(angle)
     s = np.sin(angle)
@@ -58,7 +58,7 @@ def turned_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float
     return out
 
 
-def joined(several: Sequence[Boxes]) -> Boxes:
+def join_boxes(several: Sequence[Boxes]) -> Boxes:
     """Concatenate boxes, in this order."""
     names = tuple(name for boxes in several for name in boxes.names)
     arrays = {
@@ -69,7 +69,7 @@ def joined(several: Sequence[Boxes]) -> Boxes:
     return Boxes(names=names, **arrays)
 
 
-def overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
+def find_overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
 
     Separating axis theorem: two rectangles are disjoint if a side of one of them separates their
@@ -102,12 +102,12 @@ def _footprints(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.stack([x, y], -1) + values[:, None, :2], np.float32)
 
 
-def widened(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
+def widen_boxes(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
     """Boxes (..., 7) with a margin in metres on each of their four sides."""
     return values + np.array([0, 0, 0, 2 * margin, 2 * margin, 0, 0], np.float32)
 
 
-def unseen(boxes: Boxes) -> Boxes:
+def forget_images(boxes: Boxes) -> Boxes:
     """The boxes without their place in the camera image, which is unknown after they were raised or
     lowered."""
     return replace(

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.labels.boxes import overlapping
+from lidar_synth.labels.boxes import find_overlapping
 from lidar_synth.labels.ground import standing
-from lidar_synth.labels.merge import merged, same_lasers
-from lidar_synth.labels.objects import holding
+from lidar_synth.labels.merge import merge_scans, same_lasers
+from lidar_synth.labels.objects import enlarge_boxes
 from lidar_synth.labels.view import refuse_coarser
 
 
-def thinned(scan: Scan, sensor: Sensor) -> Scan:
+def thin_scan(scan: Scan, sensor: Sensor) -> Scan:
     """Thin a scan to the grid of another sensor: the nearest return in each of its cells.
 
     Ring numbers are kept only if both sensors have the same lasers.
@@ -48,15 +48,15 @@ def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
         start: first column of the sector.
         width: number of columns of the sector, 0..W; they wrap around.
     """
-    scan = holding(scan)
-    other = holding(other)
+    scan = enlarge_boxes(scan)
+    other = enlarge_boxes(other)
     columns = scan.sensor.columns
     cell, cell_other = (locate(s.points, scan.sensor).cell for s in (scan, other))
     first = _without_cut_objects(scan, (cell >= 0) & ((cell - start) % columns >= width))
     second = _without_cut_objects(
         other, (cell_other >= 0) & ((cell_other - start) % columns < width)
     )
-    return merged(*_separated(first, second))
+    return merge_scans(*_separated(first, second))
 
 
 def swap_bands(scan: Scan, other: Scan, bands: int, odd: bool) -> Scan:
@@ -75,7 +75,7 @@ def swap_bands(scan: Scan, other: Scan, bands: int, odd: bool) -> Scan:
     for part, mine in ((scan, ours), (other, ~ours)):
         cell = locate(part.points, scan.sensor).cell
         parts.append(replace(part[(cell >= 0) & mine[cell // columns]], boxes=None))
-    return merged(parts[0], parts[1:])
+    return merge_scans(parts[0], parts[1:])
 
 
 def _without_cut_objects(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
@@ -105,7 +105,7 @@ def _separated(first: Scan, second: Scan) -> tuple[Scan, list[Scan]]:
     a = first.boxes
     b = second.boxes
     if a is not None and b is not None and len(a) and len(b):
-        clash = np.array([overlapping(box, a.values).any() for box in b.values])
+        clash = np.array([find_overlapping(box, a.values).any() for box in b.values])
         second = _without(second, clash, standing(second, b))
     return _outside(first, second.boxes), [_outside(second, first.boxes)]
 

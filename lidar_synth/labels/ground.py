@@ -54,7 +54,7 @@ class Ground(NamedTuple):
         )
         return heights
 
-    def standing(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> int:
+    def find_standing(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> int:
         """Number of points (N, 3) above the ground in or beside a box (7,)."""
         local = np.abs(box_frame(points, box)[:, :2])
         near = (local <= box[3:5] / 2 + CLEARANCE).all(1)

@@ -11,11 +11,11 @@ from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.labels.boxes import joined
-from lidar_synth.labels.objects import belonging
+from lidar_synth.labels.boxes import join_boxes
+from lidar_synth.labels.objects import find_returns
 
 
-def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
+def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     """Append the points, labels and boxes of other scans to a scan.
 
     The ``domain`` of the result is always ``SYNTHETIC``; sensor, id, pose and image are those of
@@ -42,7 +42,7 @@ def merged(scan: Scan, others: Sequence[Scan]) -> Scan:
         **together,
         raw_label=None,
         time=None,
-        boxes=joined(boxes) if boxes else None,
+        boxes=join_boxes(boxes) if boxes else None,
         domain=SYNTHETIC,
     )
 
@@ -75,7 +75,7 @@ def _of_tracks(scan: Scan) -> NDArray[np.int32]:
     instance = np.zeros(len(scan), np.int32)
     if scan.boxes is not None:
         for number in np.flatnonzero(scan.boxes.instance > 0):
-            mine = belonging(scan, scan.boxes[[number]])
+            mine = find_returns(scan, scan.boxes[[number]])
             instance[mine & (instance == 0)] = scan.boxes.instance[number]
     return instance
 

@@ -17,8 +17,8 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.edit.redraw import open_model
-from lidar_synth.labels.edit.unboxed import closed
-from lidar_synth.labels.exchange import swap_bands, swap_sector, thinned
+from lidar_synth.labels.edit.unboxed import remove_unboxed
+from lidar_synth.labels.exchange import swap_bands, swap_sector, thin_scan
 from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
 from lidar_synth.labels.own import Ignored, Own, generated
 from lidar_synth.labels.pasting import paste
@@ -54,7 +54,7 @@ class Objects:
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if self.clear:  # before labels of low confidence are ignored
             things = {int(label) for label in np.unique(self.bank.label) if label < THINGS}
-            scan = closed(
+            scan = remove_unboxed(
                 scan, open_model(self.model), int(rng.integers(1 << 32)), {*BOXED, *things}
             )
         scan = self.own(scan, rng)
@@ -148,7 +148,7 @@ def _partner(real: Source, scan: Scan, rng: np.random.Generator) -> Scan:
     other = real[int(rng.integers(len(real)))]
     if other.label is None:
         raise DataError(f"scan {other.id!r} has no labels", "real scans with labels, all of them")
-    return thinned(other, scan.sensor)
+    return thin_scan(other, scan.sensor)
 
 
 def objects(

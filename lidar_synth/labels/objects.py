@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import grown, turned, turned_points
+from lidar_synth.labels.boxes import grow_box, turn_boxes, turn_points
 from lidar_synth.labels.ground import ground_under
 
 THINGS = len(
@@ -54,9 +54,9 @@ class Object(NamedTuple):
     def turned(self, angle: float) -> "Object":
         """The object turned about the sensor, counter-clockwise by an angle in radians."""
         assert self.scan.boxes is not None
-        points = turned_points(self.scan.points, angle)
+        points = turn_points(self.scan.points, angle)
         return self._replace(
-            scan=replace(self.scan, points=points, boxes=turned(self.scan.boxes, angle))
+            scan=replace(self.scan, points=points, boxes=turn_boxes(self.scan.boxes, angle))
         )
 
 
@@ -105,7 +105,7 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
         if len(part) >= least:
             low = scan.points[part].min(0)
             high = scan.points[part].max(0)
-            box = grown(
+            box = grow_box(
                 np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
                 scan.points[part],
             )
@@ -113,18 +113,20 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
     return objects
 
 
-def holding(scan: Scan) -> Scan:
+def enlarge_boxes(scan: Scan) -> Scan:
     """The scan with boxes enlarged by some centimetres, so that they contain all returns of their
     instance."""
     if scan.boxes is None or scan.instance is None:
         return scan
     values = scan.boxes.values.copy()
     for number in np.flatnonzero(scan.boxes.instance > 0):
-        values[number] = grown(values[number], scan.points[_instance(scan, scan.boxes[[number]])])
+        values[number] = grow_box(
+            values[number], scan.points[_instance(scan, scan.boxes[[number]])]
+        )
     return replace(scan, boxes=replace(scan.boxes, values=values))
 
 
-def belonging(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
+def find_returns(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for the returns of the object in one box: those of its instance, or those above the
     ground."""
     has_instance = scan.instance is not None and box.instance[0] > 0
@@ -141,9 +143,9 @@ def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 
 def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object in one box; None if it contains no points."""
-    mine = np.flatnonzero(belonging(scan, box))
+    mine = np.flatnonzero(find_returns(scan, box))
     return (
-        _object(scan, mine, replace(box, values=grown(box.values[0], scan.points[mine])[None]))
+        _object(scan, mine, replace(box, values=grow_box(box.values[0], scan.points[mine])[None]))
         if len(mine)
         else None
     )

@@ -140,7 +140,7 @@ def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.
         raise ConfigError(
             f"threshold {threshold} for synthetic scans without confidence", "threshold=0"
         )
-    return Own(checked_share("threshold", threshold))
+    return Own(check_share("threshold", threshold))
 
 
 def condition(real: Source | None, fields: frozenset[str]) -> Own:
@@ -153,7 +153,7 @@ def condition(real: Source | None, fields: frozenset[str]) -> Own:
     return Own(kept=False)
 
 
-def checked_share(name: str, value: float) -> float:
+def check_share(name: str, value: float) -> float:
     """Check that ``value`` is a number from 0 to 1, and return it.
 
     Raises:

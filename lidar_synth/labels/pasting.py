@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import overlapping, unseen, widened
+from lidar_synth.labels.boxes import find_overlapping, forget_images, widen_boxes
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
-from lidar_synth.labels.merge import merged
+from lidar_synth.labels.merge import merge_scans
 from lidar_synth.labels.objects import Object
 from lidar_synth.labels.view import Composition, VisibleReturns, refuse_coarser
 
@@ -63,14 +63,14 @@ def paste(
     shown = [o for o in placed if view.add(o, least)]
     own = _own(scan, view.parts[0].seen, least)
     pasted = [_as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)]
-    return merged(own, [p for p in pasted if len(p) >= least])
+    return merge_scans(own, [p for p in pasted if len(p) >= least])
 
 
 def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
     """The object placed on the ground of the scan; None if there is no suitable place."""
     box = candidate.box
     taken = [o.box for o in placed] + ([] if scan.boxes is None else list(scan.boxes.values))
-    if taken and overlapping(widened(box, CLEARANCE), np.array(taken)).any():
+    if taken and find_overlapping(widen_boxes(box, CLEARANCE), np.array(taken)).any():
         return None
     ground = ground_under(scan, box)
     if (
@@ -88,7 +88,7 @@ def _raised(candidate: Object, height: float) -> Object:
     lift = np.array([0, 0, height - candidate.ground], np.float32)
     values = candidate.scan.boxes.values.copy()
     values[:, :3] += lift
-    boxes = replace(unseen(candidate.scan.boxes), values=values)
+    boxes = replace(forget_images(candidate.scan.boxes), values=values)
     return Object(replace(candidate.scan, points=candidate.scan.points + lift, boxes=boxes), height)
 
 
@@ -96,7 +96,9 @@ def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
     """The visible returns of an object, as one instance, with its occlusion."""
     assert scan.boxes is not None
     visible = scan[part.seen]
-    boxes = replace(occluded(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32))
+    boxes = replace(
+        update_occlusion(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32)
+    )
     return replace(visible, instance=np.ones(len(visible), np.int32), boxes=boxes)
 
 
@@ -127,10 +129,10 @@ def still_visible(
     after = (inside & seen).sum(1)
     removed = (after < before) & (after < least)
     share = after / np.maximum(before, 1) + (before == 0)
-    return seen & ~inside[removed].any(0), occluded(scan.boxes, share)[~removed]
+    return seen & ~inside[removed].any(0), update_occlusion(scan.boxes, share)[~removed]
 
 
-def occluded(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
+def update_occlusion(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
     """The boxes with occlusion levels updated by the shares (M,) of their returns that are still
     visible."""
     level = np.select([share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION])

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.labels.own import checked_share, trusted
+from lidar_synth.labels.own import check_share, trusted
 
 Teacher = Callable[[Scan], Any]
 """``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with
@@ -79,4 +79,4 @@ def pseudo(
             f"labels='pseudo' with teacher={teacher!r}",
             "a function scan -> (labels, confidence), or scan -> scan",
         )
-    return Pseudo(teacher, checked_share("threshold", threshold))
+    return Pseudo(teacher, check_share("threshold", threshold))

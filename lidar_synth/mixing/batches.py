@@ -15,7 +15,7 @@ from torch.utils.data import Sampler
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
 from lidar_synth.mixing.quotas import Mixture
-from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
+from lidar_synth.mixing.state import after_epoch, check_state, check_unshared, make_state, place
 
 AHEAD = 1 << 20
 """Number of positions that are announced at a time to a source that works ahead."""
@@ -235,7 +235,7 @@ class MixedBatches(Sampler[list[int]]):
         Raises:
             ConfigError: on an invalid state, or one of another mixture.
         """
-        self._start = checked_state(state, self.dataset.mixture)
+        self._start = check_state(state, self.dataset.mixture)
         self._taken = (0, 0)
         self.dataset.current.forget_pass()
         go_to(self.dataset, *self._start)

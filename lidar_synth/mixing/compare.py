@@ -347,7 +347,7 @@ def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
 def _scan_of(source: Synthetic) -> Scan:
     """The first scan of a source, or a made-up one if the source generates scans on demand."""
     if _is_on_demand(source):
-        return made_up(source.sensor, source.fields)
+        return make_up_scan(source.sensor, source.fields)
     return source[0]
 
 
@@ -356,7 +356,7 @@ def _is_on_demand(source: Synthetic) -> bool:
     return getattr(source, "on_demand", False) or hasattr(source, "expect")
 
 
-def made_up(sensor: Sensor, fields: frozenset[str]) -> Scan:
+def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
     """A scan of level ground with random labels, for checks of a scan's form.
 
     Args:

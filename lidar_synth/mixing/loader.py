@@ -5,6 +5,8 @@ from typing import Any
 
 from torch.utils.data import DataLoader
 
+from lidar_synth.mixing.batches import MixedBatches
+
 
 class MixedLoader(DataLoader[Any]):
     """A ``DataLoader`` of a mixture that sets its own epoch and can resume.
@@ -33,8 +35,8 @@ class MixedLoader(DataLoader[Any]):
         **options: Any,
     ) -> None:
         self._mixed = dataset
-        self._batches = dataset.batches(batch_size, drop_last=drop_last)
-        self._epoch = dataset.epoch
+        self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
+        self._epoch: int = dataset.epoch
         self._done = 0
         options.setdefault("collate_fn", dataset.collate)
         super().__init__(dataset, batch_sampler=self._batches, num_workers=num_workers, **options)

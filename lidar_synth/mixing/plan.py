@@ -27,9 +27,9 @@ from lidar_synth.mixing.permutation import permute
 from lidar_synth.mixing.quotas import (
     Mixture,
     PlannedSource,
+    count_before,
     deal,
     quotas,
-    running_counts,
     synthetic_before,
 )
 from lidar_synth.mixing.schedules import share_of
@@ -71,7 +71,7 @@ class MixingPlan:
     @cached_property
     def before(self) -> tuple[int, ...]:
         """Number of samples from each source in all earlier epochs together."""
-        return running_counts(self.mixture, self.epoch)
+        return count_before(self.mixture, self.epoch)
 
     @property
     def reals(self) -> int:

@@ -213,7 +213,7 @@ def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
     )
 
 
-def running_counts(mixture: Mixture, epoch: int) -> tuple[int, ...]:
+def count_before(mixture: Mixture, epoch: int) -> tuple[int, ...]:
     """The number of samples from each source in all epochs before this one together, real sources
     first."""
     synthetic = ceil(synthetic_before(mixture, epoch))
@@ -230,8 +230,8 @@ def quotas(mixture: Mixture, epoch: int) -> tuple[int, ...]:
         DataError: if the ratio needs real scans and there are none.
     """
     exact_synthetic(mixture, epoch)  # raises if the schedule has no such epoch
-    before = running_counts(mixture, epoch)
-    after = running_counts(mixture, epoch + 1)
+    before = count_before(mixture, epoch)
+    after = count_before(mixture, epoch + 1)
     return tuple(b - a for a, b in zip(before, after, strict=True))
 
 

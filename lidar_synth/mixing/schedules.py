@@ -43,7 +43,7 @@ class Steps:
             _checked(value, epoch)
 
     @property
-    def settled(self) -> int:
+    def constant_from(self) -> int:
         """The epoch from which on the share is constant."""
         return self.shares[-1][0]
 

@@ -90,7 +90,7 @@ def after_epoch(mixture: Mixture, epoch: int) -> tuple[int, int]:
     return epoch + 1, 0
 
 
-def checked_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
+def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
     """The epoch and position of a state, after checking that it fits the mixture.
 
     Raises:

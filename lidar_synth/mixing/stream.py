@@ -11,7 +11,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
 from lidar_synth.mixing.epochs import check_pass, shared_integers
 from lidar_synth.mixing.scans import MixedScans
-from lidar_synth.mixing.state import after_epoch, check_unshared, checked_state, make_state, place
+from lidar_synth.mixing.state import after_epoch, check_state, check_unshared, make_state, place
 
 
 class MixedStream(IterableDataset[Any]):
@@ -176,7 +176,7 @@ class MixedStream(IterableDataset[Any]):
         Raises:
             ConfigError: on an invalid state, or one of another mixture.
         """
-        epoch, position = checked_state(state, self.scans.mixture)
+        epoch, position = check_state(state, self.scans.mixture)
         self._begun = None
         self._resume = {k: v for k, v in state.items() if k not in ("plan", "mixture")}
         self._loaded_by = os.getpid()

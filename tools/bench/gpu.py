@@ -20,7 +20,7 @@ from networks import EVALUATION, GRID, full_network
 from timing import machine
 from tqdm import tqdm
 
-from lidar_synth.generate.devices import checked_device
+from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import solve
 from lidar_synth.generate.loading import load_generator
 
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     given = parser.parse_args()
     torch.set_grad_enabled(False)
-    device = checked_device(given.device)
+    device = check_device(given.device)
     dtype = getattr(torch, given.dtype)
     size = 8192 if device.type == "cuda" else 2048
     a = torch.randn(size, size, device=device, dtype=dtype)

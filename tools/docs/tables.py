@@ -63,7 +63,7 @@ FURTHER = (
     "lidar_synth.labels.edit.insertion.insert",
     "lidar_synth.labels.edit.insertion.move",
     "lidar_synth.labels.edit.unboxed.measure",
-    "lidar_synth.labels.edit.unboxed.closed",
+    "lidar_synth.labels.edit.unboxed.remove_unboxed",
     "lidar_synth.datasets.classes.Taxonomy",
     "lidar_synth.lab.evaluate.metric.Metric",
     "lidar_synth.lab.evaluate.comparison.evaluate",

@@ -41,7 +41,7 @@ from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.flow.path import autoguided
+from lidar_synth.generate.flow.path import autoguide
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
@@ -79,7 +79,7 @@ class Autoguided(nn.Module):
 
     def forward(self, y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
         """Velocities."""
-        return autoguided(self.network, self.weaker, *self.how)(y, t, cond)
+        return autoguide(self.network, self.weaker, *self.how)(y, t, cond)
 
 
 def generate(model: str, steps: int | None, count: int, weaker: str = "", *how: str) -> list[Scan]:

@@ -30,8 +30,8 @@ from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.projection import locate, project
 from lidar_synth.lab.town.world import World
-from lidar_synth.labels.boxes import turned
-from lidar_synth.labels.edit.removal import returns_of, without
+from lidar_synth.labels.boxes import turn_boxes
+from lidar_synth.labels.edit.removal import remove_returns, returns_of
 from lidar_synth.labels.ground import ground_under
 from lidar_synth.labels.objects import instances_of
 from lidar_synth.noise import keyed_rng
@@ -73,7 +73,7 @@ def control(scan: Scan, box: Boxes, rng: np.random.Generator) -> NDArray[np.floa
     similar = -1.0
     here = surroundings(scan, box)
     for angle in rng.uniform(-np.pi, np.pi, TRIES):
-        there = turned(box, angle)
+        there = turn_boxes(box, angle)
         values = there.values[0]
         ground = ground_under(scan, values)
         if ground is not None and ground.free and ground.encloses:
@@ -207,7 +207,7 @@ def edits(model: Generator | None, starts: list[float]) -> dict[str, object]:
         return scan[~np.any([mine for mine, _ in parts], 0)]
 
     def filled(scan: Scan, parts: list, number: int, start: float | None = None) -> Scan:
-        return without(scan, parts, None if start is None else model, number, start)
+        return remove_returns(scan, parts, None if start is None else model, number, start)
 
     return {"hole left open": hole, "filled by geometry": filled} | {
         f"drawn by the flow from t = {start}": partial(filled, start=start) for start in starts

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.flow.path import Example, Velocity, interpolate, per_sample
-from lidar_synth.generate.flow.solvers import checked_grid, solve, uniform_grid
+from lidar_synth.generate.flow.solvers import check_grid, solve, uniform_grid
 
 Strategy = Callable[[Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any], Example]
 """``strategy(teacher, y0, y1, u, grid, steps, cond)``. All strategies have the same arguments and
@@ -170,7 +170,7 @@ def every_piece(
     """
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
-    pieces = [(a, b) for grid in grids for a, b in pairwise(checked_grid(grid).tolist())]
+    pieces = [(a, b) for grid in grids for a, b in pairwise(check_grid(grid).tolist())]
     evaluations = 0
     total = steps * (len(grids[0]) - 1)
 
@@ -225,7 +225,7 @@ def _bounds(interval: Tensor, grid: Sequence[float], like: Tensor) -> tuple[Tens
 
 def _times(grid: Sequence[float], like: Tensor) -> Tensor:
     """(N + 1,) times of the student's grid, with the device and dtype of ``like``."""
-    times = checked_grid(grid)
+    times = check_grid(grid)
     if times[0] != 1 or times[-1] != 0:
         raise ConfigError(f"time grid {times.tolist()}", "one from 1 down to 0")
     return times.to(like.device, like.dtype)
@@ -251,7 +251,7 @@ def _straight(teacher: Velocity, y1: Tensor, t: Tensor, steps: int, cond: Any) -
 
 
 def _check_uniform(grid: Sequence[float]) -> None:
-    uniform = uniform_grid(len(checked_grid(grid)) - 1)
+    uniform = uniform_grid(len(check_grid(grid)) - 1)
     if max(abs(a - b) for a, b in zip(grid, uniform, strict=True)) > 1e-6:
         raise ConfigError(
             f"time grid {tuple(grid)}", f"{uniform}, which is uniform", "Or use adaptive_piecewise."

@@ -101,7 +101,7 @@ def _errors(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
     return metric(velocity(example.y, example.t, *given), example.velocity)
 
 
-def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
+def guide(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
     """Classifier-free guidance (Ho and Salimans, 2022): v(y, t, blank) + scale (v(y, t, c) - v(y,
     t, blank)).
 
@@ -123,7 +123,7 @@ def guided(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
     return velocity if scale == 1 else guided_velocity
 
 
-def autoguided(
+def autoguide(
     velocity: Velocity, weaker: Velocity, scale: float, within: tuple[float, float] = (0.0, 1.0)
 ) -> Velocity:
     """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself",

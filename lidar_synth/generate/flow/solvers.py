@@ -129,7 +129,7 @@ def solve(
     return y
 
 
-def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
+def mean_velocity(velocity: Velocity, grid: Sequence[float]) -> Velocity:
     """A network with ``ends`` as a v(y, t, cond) for the steps of a grid: its mean velocity until
     the next time. Other velocities are returned as they are.
 
@@ -138,7 +138,7 @@ def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
     """
     if not getattr(velocity, "ends", False):
         return velocity
-    ascending = checked_grid(grid).flip(0)
+    ascending = check_grid(grid).flip(0)
 
     def mean_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
         times = ascending.to(t.device, t.dtype)
@@ -149,7 +149,7 @@ def towards(velocity: Velocity, grid: Sequence[float]) -> Velocity:
     return mean_velocity
 
 
-def checked_grid(grid: Sequence[float] | Tensor) -> Tensor:
+def check_grid(grid: Sequence[float] | Tensor) -> Tensor:
     """(S + 1,) float64 times on the CPU.
 
     Raises:
@@ -171,5 +171,5 @@ def _times(grid: Grid, y: Tensor) -> Tensor:
         isinstance(grid, Tensor) and grid.ndim == 2
     ):  # from distillation, already on the device; a check would synchronise
         return grid
-    times = checked_grid(grid).to(y.device, torch.promote_types(y.dtype, torch.float32))
+    times = check_grid(grid).to(y.device, torch.promote_types(y.dtype, torch.float32))
     return times[:, None].expand(-1, len(y))

@@ -88,7 +88,7 @@ def build_network(architecture: str, arguments: dict[str, Any]) -> Network:
 
 
 @contextmanager
-def bounded(most: int) -> Iterator[None]:
+def limit_modules(most: int) -> Iterator[None]:
     """Inside, building more than ``most`` modules fails: the arguments of a file may ask for 10^9
     layers.
 
@@ -132,7 +132,7 @@ def assemble(
     """
     try:
         # On "meta" there is neither time nor memory for weights that will be replaced.
-        with torch.device("meta"), bounded(64 + 16 * len(state)):
+        with torch.device("meta"), limit_modules(64 + 16 * len(state)):
             network = build_network(architecture, arguments)
     except ConfigError as error:
         raise DataError(f"{what}: {error}") from error

@@ -36,7 +36,7 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     Args:
         scan: N points and boxes. Ground and outlines are those of its labels; a scan without labels
             has the plane of its lowest returns, and outlines of what stands on it. Its boxes are
-            ``known_boxes``.
+            ``select_known_boxes``.
         reach: of the ground, metres; by default the sensor's range.
 
     Raises:
@@ -53,10 +53,12 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
     label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
     ground = _plane(_lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id)
     outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
-    return Layout(known_boxes(scan), ground, outlines, reach or scan.sensor.range_max, scan.id)
+    return Layout(
+        select_known_boxes(scan), ground, outlines, reach or scan.sensor.range_max, scan.id
+    )
 
 
-def known_boxes(scan: Scan) -> Boxes:
+def select_known_boxes(scan: Scan) -> Boxes:
     """The boxes of a scan with boxes that its layout has: of known classes, within the sensor's
     range, of overlapping ones the first, and none around the sensor."""
     assert scan.boxes is not None

@@ -123,7 +123,7 @@ def _scores(
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
-    from lidar_synth.lab.curate import FILE, kept_in, read_scores, score, write_scores
+    from lidar_synth.lab.curate import FILE, keep_features_in, read_scores, score, write_scores
     from lidar_synth.lab.evaluate.cache import scan_hash
 
     if split is not None and reference is None:
@@ -140,7 +140,7 @@ def _scores(
         saved = read_scores(path)
         if (saved.bank, saved.reference) == (opened.identity, name):
             return saved
-    with kept_in(bank) as folder:
+    with keep_features_in(bank) as folder:
         scores = score(opened, source, name=name, jobs=jobs, progress=progress, folder=folder)
         write_scores(path, scores)
     return scores

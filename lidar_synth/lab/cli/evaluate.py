@@ -92,7 +92,7 @@ def evaluate(
     from lidar_synth.lab.evaluate import evaluate as compare
     from lidar_synth.lab.evaluate.comparison import check_counts
     from lidar_synth.lab.evaluate.features import describe_missing
-    from lidar_synth.lab.evaluate.leaderboard import beside as published
+    from lidar_synth.lab.evaluate.leaderboard import compare_published as published
     from lidar_synth.lab.evaluate.leakage import measured, seen_by_model_of
     from lidar_synth.lab.evaluate.segmentation import load_judge
 

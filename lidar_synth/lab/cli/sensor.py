@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, only_given, options_from
+from lidar_synth.cli.options import Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.lab.fitting import SensorFit
@@ -56,7 +56,7 @@ def fit_from_scans(
         raise ConfigError(f"--out {out}", "a file that ends in .yaml")
     if picture is not None and picture.suffix != ".png":
         raise ConfigError(f"--picture {picture}", "a file that ends in .png")
-    source = open_scans(path, **only_given(reading))
+    source = open_scans(path, **drop_missing(reading))
     source.skip_sensor_check()
     chosen = np.unique(np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int))
     found = fit_sensor([source[int(index)] for index in chosen], name=out.stem, columns=columns)

@@ -11,13 +11,13 @@ bank, add a line to ``scores``.
 
 from lidar_synth.lab.curate.rules import matching
 from lidar_synth.lab.curate.scores import FILE, MEANINGS, Scores, read_scores, score, write_scores
-from lidar_synth.lab.curate.store import kept_in
+from lidar_synth.lab.curate.store import keep_features_in
 
 __all__ = [
     "FILE",
     "MEANINGS",
     "Scores",
-    "kept_in",
+    "keep_features_in",
     "matching",
     "read_scores",
     "score",

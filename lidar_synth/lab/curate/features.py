@@ -102,7 +102,7 @@ class ScanFeatures(NamedTuple):
     signature: NDArray[np.float16]
 
 
-def measured(fields: Collection[str]) -> tuple[str, ...]:
+def supported_measures(fields: Collection[str]) -> tuple[str, ...]:
     """The names in ``MEASURES`` that scans with these fields support."""
     return tuple(
         name
@@ -114,7 +114,7 @@ def measured(fields: Collection[str]) -> tuple[str, ...]:
 def features(image: RangeImage) -> ScanFeatures:
     """The features of a range image; measures of missing channels are left out."""
     scan = unproject(image)
-    numbers = {name: MEASURES[name].of(image, scan) for name in measured(image.channels)}
+    numbers = {name: MEASURES[name].of(image, scan) for name in supported_measures(image.channels)}
     ranges, _ = np.histogram(image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max))
     labels = np.zeros(0, np.uint8) if scan.label is None else scan.label
     classes = np.bincount(labels[labels != IGNORE], minlength=len(NAMES))

@@ -21,7 +21,7 @@ from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.files.parsing import read_arrays
-from lidar_synth.files.processes import in_processes
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Source
 from lidar_synth.geometry.sensor import Sensor
@@ -174,7 +174,7 @@ def _means(histograms: Iterable[Histograms]) -> Histograms:
 def _means_of(source: Source, sensor: Sensor, jobs: int, progress: bool) -> Histograms:
     work = partial(_of_source, source, sensor)
     count = len(source)
-    with in_processes(work, range(count), jobs, _CHUNK) as results:
+    with map_in_processes(work, range(count), jobs, _CHUNK) as results:
         return _means(
             tqdm(results, desc="reference", total=count, unit="scan", disable=not progress)
         )

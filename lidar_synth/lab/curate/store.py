@@ -20,9 +20,9 @@ from lidar_synth.bank import INDEX, Bank
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import write_file
-from lidar_synth.files.lock import alone, shared
-from lidar_synth.files.processes import in_processes
-from lidar_synth.lab.curate.features import RANGE_BINS, SIGNATURE, features, measured
+from lidar_synth.files.lock import lock_shared, try_lock
+from lidar_synth.files.processes import map_in_processes
+from lidar_synth.lab.curate.features import RANGE_BINS, SIGNATURE, features, supported_measures
 
 BLOCK = 4096
 """Scans per file."""
@@ -125,12 +125,12 @@ def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
         DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
     own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # not reused by others
-    store = Store(own, len(bank), measured(bank.fields))
+    store = Store(own, len(bank), supported_measures(bank.fields))
     start = store.stored()
     spans = [range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)]
     waiting: list[NDArray[Any]] = []
     with (
-        in_processes(partial(_rows, bank, store), spans, jobs) as results,
+        map_in_processes(partial(_rows, bank, store), spans, jobs) as results,
         tqdm(
             total=len(bank), initial=start, desc="scores", unit="scan", disable=not progress
         ) as bar,
@@ -159,11 +159,11 @@ def _rows(bank: Bank, store: Store, span: range) -> NDArray[Any]:
 
 
 @contextmanager
-def kept_in(root: Path) -> Iterator[Path]:
+def keep_features_in(root: Path) -> Iterator[Path]:
     """A folder in the bank's folder for its features; removed at the end, kept if the run is killed
     or fails."""
-    with shared(root / INDEX):
+    with lock_shared(root / INDEX):
         yield root / FOLDER
-    with alone(root / INDEX) as exclusive, suppress(OSError):
+    with try_lock(root / INDEX) as exclusive, suppress(OSError):
         if exclusive:
             shutil.rmtree(root / FOLDER)

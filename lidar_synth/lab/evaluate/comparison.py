@@ -9,7 +9,7 @@ from tqdm import tqdm
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.cache import extract_all
-from lidar_synth.lab.evaluate.features import Extractor, find_weights, published
+from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
 from lidar_synth.lab.evaluate.metric import Metric, Score, choice
 from lidar_synth.lab.evaluate.protocols import Protocol, find_protocol
 
@@ -120,7 +120,11 @@ def _fill(
         if path is not None:
             for source, generated in zip(sets, (False, True), strict=True):
                 extract_all(
-                    partial(published, measure, path, cache), source, processes, batch, (generated,)
+                    partial(load_published, measure, path, cache),
+                    source,
+                    processes,
+                    batch,
+                    (generated,),
                 )
 
 

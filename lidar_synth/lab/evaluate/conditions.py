@@ -35,7 +35,7 @@ def map_agreement(generated: Sequence[Scan], real: Sequence[Scan], judge: Judge)
     Raises:
         DataError: on sets of different lengths, or real scans without labels.
     """
-    return mean_iou(judge.agreement([relabelled(a, b) for a, b in _pairs(generated, real)]))
+    return mean_iou(judge.agreement([relabel(a, b) for a, b in _pairs(generated, real)]))
 
 
 def sight_agreement(generated: Sequence[Scan], real: Sequence[Scan]) -> Statistic:
@@ -51,7 +51,7 @@ def sight_agreement(generated: Sequence[Scan], real: Sequence[Scan]) -> Statisti
     )
 
 
-def relabelled(scan: Scan, other: Scan) -> Scan:
+def relabel(scan: Scan, other: Scan) -> Scan:
     """A scan on its sensor's grid; each return gets the label of the same cell in another scan."""
     image = project(scan, scan.sensor)
     labels = project(other, scan.sensor, ["label"]).channels["label"]

@@ -72,11 +72,11 @@ def load_extractors(
                 "them"
             )
         else:
-            loaded.extractors[name] = published(measure, path, cache)
+            loaded.extractors[name] = load_published(measure, path, cache)
     return loaded
 
 
-def published(measure: Measure, path: Path, cache: Path | None = None) -> Paired:
+def load_published(measure: Measure, path: Path, cache: Path | None = None) -> Paired:
     """The extractor of a measure, with what its option ``join`` names appended to the features;
     ``cache`` as in ``load_extractors``."""
     extract = _package().load_extractor(measure.extractor, path, measure.preparation)

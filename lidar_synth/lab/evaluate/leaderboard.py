@@ -44,7 +44,7 @@ def leaderboard() -> tuple[tuple[Table, ...], Mapping[str, str]]:
     return tuple(Table(**table) for table in values["tables"]), values["sources"]
 
 
-def beside(scores: Sequence[Score]) -> str:
+def compare_published(scores: Sequence[Score]) -> str:
     """The published figures of the scores' protocol as tables in Markdown, each with the scores as
     its last row, which says how many scans they are of."""
     named = {score.table: score for score in scores if score.table}

@@ -22,9 +22,9 @@ from lidar_synth.datasets.recordings import (
     PLACES,
     TOWN,
     Recordings,
+    all_frames,
     frames_of,
     seen_by,
-    whole,
 )
 from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats import BankScans
@@ -71,8 +71,8 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
     if made.get("made_by") == "town":  # converted to another format
         return town(made.get("seed", 0))
     if isinstance(source, BankScans):  # includes the training data of its model
-        return whole(FILES, [str(path)]) | _of_bank(source.bank)
-    return frames_of(layout, source.ids) if layout in PLACES else whole(FILES, [str(path)])
+        return all_frames(FILES, [str(path)]) | _of_bank(source.bank)
+    return frames_of(layout, source.ids) if layout in PLACES else all_frames(FILES, [str(path)])
 
 
 def measured(
@@ -85,7 +85,7 @@ def measured(
         these may lie in the
     layout of any dataset now.
     """
-    found = recordings_of(source, layout, path) | whole(
+    found = recordings_of(source, layout, path) | all_frames(
         FILES, [str(path)] + ([f"{path}#{split}"] if split else [])
     )
     hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
@@ -101,7 +101,7 @@ def content_of(scan: Scan) -> str:
 
 def contents(hashes: Iterable[str]) -> Recordings:
     """Scans that their hashes identify, see ``content_of``."""
-    return whole(CONTENT, hashes)
+    return all_frames(CONTENT, hashes)
 
 
 def overlap(seen: Recordings, reference: Recordings) -> Recordings:
@@ -119,7 +119,7 @@ def undecided(seen: Recordings, reference: Recordings) -> bool:
 
 def town(seed: int) -> Recordings:
     """The town of a seed; the streets of its scans are the same in every layout."""
-    return whole(TOWN, [f"seed {seed}"])
+    return all_frames(TOWN, [f"seed {seed}"])
 
 
 def _of_bank(bank: Bank) -> Recordings:

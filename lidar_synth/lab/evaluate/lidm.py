@@ -36,7 +36,7 @@ _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 m
 _MOST_CELLS = 1 << 16  # cells of a grid up to which the maps of a block are held and multiplied
 
 
-def occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
+def find_occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
     """The cells of ``size`` metres that hold a point, as row * cells per side + column, sorted: row
     along x.
 

@@ -79,7 +79,7 @@ def _bev(scan: Scan, options: Options) -> NDArray[np.uint32]:
 
 
 def _occupied(scan: Scan, options: Options) -> NDArray[np.int32]:
-    return lidm.occupied(scan.points, options["cell"])
+    return lidm.find_occupied(scan.points, options["cell"])
 
 
 def _classes(scan: Scan, options: Options) -> Sparse:

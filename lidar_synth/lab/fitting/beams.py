@@ -113,13 +113,13 @@ def turn_fraction(points: NDArray[np.float32]) -> Floats:
     The turn starts where the file does, if its points are in the order of time; otherwise behind
     the sensor.
     """
-    if in_order_of_time(points):
+    if follows_time(points):
         unwrapped = _unwrapped(points)
         return np.asarray(unwrapped - unwrapped.mean())
     return np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / (2 * np.pi)
 
 
-def in_order_of_time(points: NDArray[np.float32]) -> bool:
+def follows_time(points: NDArray[np.float32]) -> bool:
     """Whether the azimuth follows the order of the points around one turn."""
     if not len(points):
         return False
@@ -250,13 +250,13 @@ def _attempt(
     cloud: Cloud, still: Model, seed: int, parts: frozenset[str] = frozenset()
 ) -> tuple[tuple[Model, frozenset[str]] | None, float]:
     """The best model from one mounting, its parts, and its quality."""
-    model = _from_rings(cloud, still) if cloud.kept else with_peaks(cloud, still)
+    model = _from_rings(cloud, still) if cloud.kept else add_peaks(cloud, still)
     if model is None:
         return None, 0.0
     few = _some_points(cloud, POINTS // 3, seed)
     for _ in range(1 if cloud.kept else ROUNDS):
         model, parts = _choose_parts(few, model, parts)
-        again = None if cloud.kept else with_peaks(cloud, model)
+        again = None if cloud.kept else add_peaks(cloud, model)
         if again is None or len(again.tangents) == len(model.tangents):
             break
         model = again
@@ -363,7 +363,7 @@ def _from_rings(cloud: Cloud, still: Model) -> Model | None:
     return replace(still, tangents=tangents, heights=np.zeros(len(tangents)))
 
 
-def with_peaks(cloud: Cloud, model: Model) -> Model | None:
+def add_peaks(cloud: Cloud, model: Model) -> Model | None:
     """The model with its beams found anew, as peaks of the elevations; None without two beams."""
     points = model.aligned(cloud)
     ring = nearest_beams(points, model.tangents, model.heights)
@@ -396,7 +396,7 @@ def concentration(elevation: Floats, beams: Floats) -> float:
     return float((distance[near] < room[near] / 4).sum() / max(len(distance), 1))
 
 
-def with_lost_beams(model: Model, points: Floats) -> Model:
+def add_lost_beams(model: Model, points: Floats) -> Model:
     """The model with beams that have too few points to be peaks beside the others, such as those
     that see the sky.
 

@@ -15,10 +15,10 @@ from lidar_synth.lab.fitting.azimuths import Azimuths, fit_azimuths, turn_of
 from lidar_synth.lab.fitting.beams import (
     NEAREST,
     Beams,
+    add_lost_beams,
     fit_beams,
-    in_order_of_time,
+    follows_time,
     room_of,
-    with_lost_beams,
 )
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
@@ -171,7 +171,7 @@ def _described(
     beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, columns: int | None
 ) -> SensorFit:
     points = beams.model.aligned(cloud)
-    lost = beams.model if cloud.kept else with_lost_beams(beams.model, points)
+    lost = beams.model if cloud.kept else add_lost_beams(beams.model, points)
     model = _highest_first(lost)
     points = model.aligned(cloud)
     ring = nearest_beams(points, model.tangents, model.heights)
@@ -275,7 +275,7 @@ def _azimuths(
         time: Floats | None = None
         if scans[number].time is not None:
             time = cloud.time[use]
-        elif in_order_of_time(scans[number].points):
+        elif follows_time(scans[number].points):
             time = np.arange(len(use), dtype=np.float64)
         turns.append(turn_of(points[use], ring[use], time))
     return fit_azimuths(turns, rows)

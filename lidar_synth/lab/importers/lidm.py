@@ -27,7 +27,13 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, Recordings, frames_of, whole
+from lidar_synth.datasets.recordings import (
+    KITTI360,
+    KITTI360_SPLITS,
+    Recordings,
+    all_frames,
+    frames_of,
+)
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
@@ -49,8 +55,8 @@ IMAGES = "KITTI-360 and KITTI odometry"
 _LABELLED = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
 SEEN = {
     "SemanticKITTI": frames_of("semantic_kitti", _LABELLED),
-    "KITTI-360": whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ()),
-    IMAGES: whole(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
+    "KITTI-360": all_frames(KITTI360, KITTI360_SPLITS["lidm/train"] or ()),
+    IMAGES: all_frames(KITTI360, KITTI360_SPLITS["lidm/train"] or ())
     | frames_of("semantic_kitti", (*_LABELLED, *map(str, range(11, 22)))),
 }
 """LiDM's training data by the name under ``data`` of a provenance (from its lidm/data/kitti.py).

@@ -5,7 +5,7 @@ from collections.abc import Collection
 import torch
 
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
-from lidar_synth.generate.models import bounded, build_network
+from lidar_synth.generate.models import build_network, limit_modules
 
 UNET = "model.diffusion_model."
 UNET_EMA = "model_ema."
@@ -61,7 +61,7 @@ def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
         part: the network.
         nested: whether the file is that of a diffusion model, whose names have prefixes.
     """
-    with torch.device("meta"), bounded(MOST_MODULES):
+    with torch.device("meta"), limit_modules(MOST_MODULES):
         keys = list(build_network(*part).state_dict())
     if name == VELOCITY:
         attending = {key.partition(".attention.")[0] for key in keys if ".attention." in key}

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, whole
+from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, all_frames
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
@@ -156,7 +156,7 @@ def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
 def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     cfg = content["cfg"]
     # R2Flow's split of KITTI raw is not published.
-    known = whole(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
+    known = all_frames(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
     seen = {"seen": known.to_list()} if cfg["data"]["dataset"] == "kitti_360" else {}
     return {
         "data": DATA[cfg["data"]["dataset"]][0],

@@ -28,7 +28,7 @@ from lidar_synth.datasets.classes import KITTI360 as CLASSES
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import list_files, read_text, sha256, write_file
 from lidar_synth.files.parsing import parse_json
-from lidar_synth.files.processes import in_processes
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats.kitti360 import (
     boxes_path,
     confidence_path,
@@ -42,7 +42,7 @@ from lidar_synth.formats.kitti360_poses import fill_poses, read_calibration, rea
 from lidar_synth.formats.point_labels import write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.lab.kitti360.accumulated import Window, find_windows
-from lidar_synth.lab.kitti360.movers import inside
+from lidar_synth.lab.kitti360.movers import find_inside
 from lidar_synth.lab.kitti360.recovery import Recovery
 from lidar_synth.lab.kitti360.report import LabelCounts, LabelReport
 
@@ -192,7 +192,7 @@ def label_scans(
     report = LabelReport(plan.without_pose, plan.outside, plan.without_clouds)
     with (
         tqdm(total=plan.frames, unit="scan", disable=not progress) as bar,
-        in_processes(work, plan.jobs, jobs) as results,
+        map_in_processes(work, plan.jobs, jobs) as results,
     ):
         for job, record in zip(plan.jobs, results, strict=True):
             report.add(job.drive, record)
@@ -277,7 +277,7 @@ def _moving(
     placed = recovery.place(scan, frame)
     moving = np.zeros(len(scan), bool)
     for track in recovery.movers.present(frame):
-        moving[inside(track.boxes[frame], placed, 0.1)] = True
+        moving[find_inside(track.boxes[frame], placed, 0.1)] = True
     return moving & _OBJECTS[truth]
 
 

@@ -102,7 +102,7 @@ class Movers:
         return [track for track in self.tracks if frame in track.boxes]
 
 
-def inside(
+def find_inside(
     box: NDArray[np.float64], points: NDArray[np.float64], margin: float = 0.0, floor: float = 0.0
 ) -> NDArray[np.intp]:
     """The indices of the points in a box.
@@ -170,7 +170,7 @@ def _gather(
     own = [track.values]
     for moment, box in track.boxes.items():
         candidates = np.flatnonzero(free & (frame == moment))
-        taken = candidates[inside(box, points[candidates], MARGIN)]
+        taken = candidates[find_inside(box, points[candidates], MARGIN)]
         free[taken] = False
         local.append((points[taken] - box[:3, 3]) @ _rigid(box)[:3, :3])
         own.append(values[taken])

@@ -18,7 +18,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.formats.kitti360_boxes import WorldBoxes
 from lidar_synth.formats.kitti360_poses import ego_motion, undo_ego_motion
 from lidar_synth.lab.kitti360.accumulated import Window, cloud_values, read_cloud
-from lidar_synth.lab.kitti360.movers import FLOOR, MARGIN, Movers, inside
+from lidar_synth.lab.kitti360.movers import FLOOR, MARGIN, Movers, find_inside
 from lidar_synth.lab.kitti360.registration import apply, find_surfaces, register
 from lidar_synth.labels.nearest import Chunk, index_cloud
 
@@ -244,7 +244,7 @@ class Recovery:
         """
         boxed = np.zeros(len(placed), bool)
         for track in self.movers.present(frame):
-            own = inside(track.boxes[frame], placed, MARGIN / 2, FLOOR)
+            own = find_inside(track.boxes[frame], placed, MARGIN / 2, FLOOR)
             own = own[distance[own] > (RADIUS if len(track.points) else ON_SURFACE)]
             values[own] = track.semantic | track.instance << 16
             confidence[own] = BOX_CONFIDENCE

@@ -25,7 +25,7 @@ OVERHEAD = 1.3
 """Time of a training over that of its steps: loading, tests, a busy machine."""
 
 
-def expected_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
+def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     """The time that some pairs take, with the pools that they need."""
     settings = plan.settings
     pools = {pool for row in plan.rows for pool in row.arm.pools()}
@@ -59,7 +59,7 @@ def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> Pro
     """
     count = len(plan.pairs)
     if minutes is not None:
-        while count > 0 and expected_minutes(plan, plan.pairs[:count]) > minutes:
+        while count > 0 and estimate_minutes(plan, plan.pairs[:count]) > minutes:
             count -= 1
         least = min(2, len(plan.pairs))
         if count < least and not resumed:
@@ -67,7 +67,7 @@ def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> Pro
         count = max(count, least)
     pairs = plan.pairs[:count]
     labelled = {pair: plan.labelled[pair] for pair in pairs}
-    return replace(plan, pairs=pairs, labelled=labelled, minutes=expected_minutes(plan, pairs))
+    return replace(plan, pairs=pairs, labelled=labelled, minutes=estimate_minutes(plan, pairs))
 
 
 def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> ProofPlan:
@@ -75,7 +75,7 @@ def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> Proof
     if not few:
         raise ConfigError(
             f"{minutes:g} minutes, in which {least} places cannot be tested",
-            f"about {expected_minutes(plan, plan.pairs[:least]):.0f} or more",
+            f"about {estimate_minutes(plan, plan.pairs[:least]):.0f} or more",
             "Give more --minutes or fewer arms (--arm).",
         )
     return replace(plan, settings=replace(plan.settings, iterations=few))
@@ -85,12 +85,12 @@ def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> 
     """With how many iterations, a multiple of ten, some pairs fit into the time; 0 = none."""
     for count in range(plan.settings.iterations // 10 * 10, 0, -10):
         shorter = replace(plan, settings=replace(plan.settings, iterations=count))
-        if expected_minutes(shorter, pairs) <= minutes:
+        if estimate_minutes(shorter, pairs) <= minutes:
             return count
     return 0
 
 
-def measured_step(
+def measure_step(
     scans: list[Scan], settings: ProofSettings, half: bool | None
 ) -> tuple[bool, float]:
     """Whether bfloat16 is faster on this machine, and the seconds of an iteration."""

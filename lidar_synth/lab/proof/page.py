@@ -11,7 +11,7 @@ from typing import Any
 from lidar_synth.files.disk import write_file
 from lidar_synth.lab.proof.arms import BASE
 from lidar_synth.lab.proof.drawing import curves, differences
-from lidar_synth.lab.proof.summary import Proof, signed, span
+from lidar_synth.lab.proof.summary import Proof, format_signed, span
 
 Values = Mapping[str, Any]
 
@@ -128,7 +128,7 @@ def _table(values: Values) -> str:
         cells = [
             _cell(row["title"]),
             _cell(f"{row['miou']:.1f}"),
-            _cell(signed(row["difference"]), _sign(row)),
+            _cell(format_signed(row["difference"]), _sign(row)),
             _cell(span(row["interval"]) if row["arm"] != BASE else ""),
             _cell(row["better_in"]),
             _cell(str(row["iterations"])),
@@ -157,7 +157,7 @@ def _places(values: Values) -> str:
     for place in values["tested_places"]:
         miou = base["miou_by_place"][place]
         cells = [_cell(place), _cell("–" if miou is None else f"{miou:.1f}")]
-        cells += [_cell(signed(row["by_place"][place])) for row in arms]
+        cells += [_cell(format_signed(row["by_place"][place])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _grid(["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows)
 

@@ -17,12 +17,12 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import recordings_of
 from lidar_synth.lab.proof.arms import rows
-from lidar_synth.lab.proof.budget import measured_step, within
+from lidar_synth.lab.proof.budget import measure_step, within
 from lidar_synth.lab.proof.places import Places, choose, find_places, names_of, spread
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import GROUPS, groups_of, require_labels
 from lidar_synth.lab.proof.settings import MOST_LABELLED, ProofSettings
-from lidar_synth.labels.exchange import thinned
+from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.mixing.sources import sensor_of
 
 
@@ -65,7 +65,7 @@ def make_plan(
     scans = {i: _read(source, i, grid) for i in needed}
     absent = require_labels(_counts(scans), groups, settings.only)
     batch = [scans[i] for i in needed[: settings.batch]]
-    half, step = measured_step(batch, settings, earlier.get("half") if earlier else None)
+    half, step = measure_step(batch, settings, earlier.get("half") if earlier else None)
     if earlier and minutes is not None:
         settings = replace(settings, iterations=min(settings.iterations, earlier["iterations"]))
     names = tuple(names_of(source))
@@ -131,7 +131,7 @@ def _read(source: Source, index: int, grid: Sensor | None) -> Scan:
             f"train ids 0 to {len(NAMES) - 1}, or {IGNORE} = ignore",
             "They are of another table: map them when they are read (Taxonomy.decode).",
         )
-    return scan if grid is None else thinned(scan, grid)
+    return scan if grid is None else thin_scan(scan, grid)
 
 
 def _counts(scans: dict[int, Scan]) -> NDArray[np.int64]:

@@ -32,7 +32,7 @@ from lidar_synth.lab.proof.arms import RARE
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
 from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.exchange import thinned
+from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.noise import keyed_rng
 
 FRAMES = (4, 10, 16)
@@ -79,7 +79,7 @@ def raw_town(task: PoolTask) -> Iterator[Scan]:
     yield from _streets(task, None)
 
 
-def skinned_town(task: PoolTask) -> Iterator[Scan]:
+def make_skinned_town(task: PoolTask) -> Iterator[Scan]:
     """Scans of the town with a skin that is learnt from the unlabelled scans."""
     path = task.folder / SKIN
     if not path.is_file():
@@ -95,7 +95,7 @@ def skinned_town(task: PoolTask) -> Iterator[Scan]:
     yield from _streets(task, load_skin(path))
 
 
-def generated(task: PoolTask) -> Iterator[Scan]:
+def make_generated(task: PoolTask) -> Iterator[Scan]:
     """Scans of a generator, turned into scans of the user's sensor where theirs is another one.
     What a model with a condition needs, the town gives: label maps or layouts of its streets."""
     generator = load_generator(task.model)
@@ -112,8 +112,8 @@ def generated(task: PoolTask) -> Iterator[Scan]:
 
 POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
     "town": raw_town,
-    "skin": skinned_town,
-    "generator": generated,
+    "skin": make_skinned_town,
+    "generator": make_generated,
 }
 """Makers of pools by name."""
 
@@ -133,7 +133,7 @@ def make_pool(task: PoolTask) -> Path:
     made = 0
     boxed = []
     for scan in POOLS[task.kind](task):
-        kept = scan if task.grid is None else thinned(scan, task.grid)
+        kept = scan if task.grid is None else thin_scan(scan, task.grid)
         writer.write(kept, made, name=f"00/{made:06d}")
         made += 1
         boxed += [kept] if task.kind == "skin" and kept.boxes is not None else []

@@ -21,7 +21,7 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_sealed, seal
-from lidar_synth.files.processes import in_processes
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.arms import Row
@@ -242,7 +242,7 @@ def prove(
         if not _is_there(work.path(row, pair), read_outcome)
     ]
     _pretrain(work, tasks, progress)
-    with in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
+    with map_in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
         for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
             pass
     return report(work, named, seen)
@@ -349,7 +349,9 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
                 partial(_scans, source, indices),
                 tuple(plan.names[i] for i in indices),
             )
-    with in_processes(make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))) as done:
+    with map_in_processes(
+        make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))
+    ) as done:
         for _ in tqdm(
             done, total=len(tasks), desc="synthetic scans", unit="pool", disable=not progress
         ):
@@ -363,7 +365,7 @@ def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool
         for task in tasks
         if (path := work.start(*task)) is not None and not _is_there(path, pretraining_seconds)
     }
-    with in_processes(
+    with map_in_processes(
         work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))
     ) as done:
         for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):

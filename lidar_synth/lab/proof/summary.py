@@ -48,7 +48,7 @@ class Proof:
             cells = (
                 row["title"],
                 f"{row['miou']:.1f}",
-                signed(row["difference"]),
+                format_signed(row["difference"]),
                 span(row["interval"]),
                 row["better_in"],
                 row["budget"],
@@ -61,7 +61,7 @@ class Proof:
 _BUDGET = "what it uses"
 
 
-def signed(value: float | None) -> str:
+def format_signed(value: float | None) -> str:
     """A difference in percentage points."""
     return "" if value is None else f"{value:+.1f}"
 
@@ -293,9 +293,11 @@ def headline(values: Mapping[str, Any]) -> str:
             f"by {change}, from {base['miou']:.1f} %."
         )
     if over["real"] != base["title"]:
-        text += f" Against “{over['real']}”: {signed(over['difference'])} {span(over['interval'])}."
+        text += f" Against “{over['real']}”: {format_signed(over['difference'])} {span(over['interval'])}."
     if "longer" in arms:
-        text += f" More iterations alone: {signed(arms['longer']['difference'])} {span(arms['longer']['interval'])}."
+        longer = arms["longer"]
+        gain = format_signed(longer["difference"])
+        text += f" More iterations alone: {gain} {span(longer['interval'])}."
     swept = [
         row for row in values["arms"] if row["arm"] == best["arm"] and row["ratio"] is not None
     ]
@@ -325,7 +327,7 @@ def limits(values: Mapping[str, Any]) -> list[str]:
         found.append(
             "The best of several arms looks better than it is, because it was chosen on the "
             "places that it is "
-            f"measured on. Chosen on the other places each time: {signed(chosen['difference'])} "
+            f"measured on. Chosen on the other places each time: {format_signed(chosen['difference'])} "
             f"{span(chosen['interval'])}."
         )
     if values["trainer"] == "reference":

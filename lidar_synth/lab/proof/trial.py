@@ -32,7 +32,7 @@ from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
 from lidar_synth.lab.train.segmentation import RATE, endless_batches, train_segmenter
 from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.augment import mirrored, rotated
+from lidar_synth.labels.augment import mirror_scan, rotate_scan
 from lidar_synth.mixing import MixedScans
 
 LOOKS = 8
@@ -114,7 +114,7 @@ class Job:
                     seed=1000 * self.seed + number,
                     epoch_size=iterations * self.batch,
                     balanced=True,
-                    augment=turned,
+                    augment=turn_scan,
                     augment_real=True,
                     **options,
                 ),
@@ -146,14 +146,16 @@ Trainer = Callable[[Job], "Outcome | NDArray[np.int64]"]
 alone."""
 
 
-def turned(scan: Scan, rng: np.random.Generator) -> Scan:
+def turn_scan(scan: Scan, rng: np.random.Generator) -> Scan:
     """Turn a scan by a whole number of columns, and mirror it left and right with probability one
     half.
 
     Returns stay within their cells, so that the range image of a thinned scan loses none.
     """
-    scan = rotated(scan, 2 * np.pi / scan.sensor.columns * int(rng.integers(scan.sensor.columns)))
-    return mirrored(scan, "y") if rng.random() < 0.5 else scan
+    scan = rotate_scan(
+        scan, 2 * np.pi / scan.sensor.columns * int(rng.integers(scan.sensor.columns))
+    )
+    return mirror_scan(scan, "y") if rng.random() < 0.5 else scan
 
 
 def run_trainer(trainer: Trainer, job: Job) -> Outcome:
@@ -292,7 +294,7 @@ def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) ->
         ratio=0,
         seed=job.seed,
         epoch_size=SETTLING * job.batch,
-        augment=turned,
+        augment=turn_scan,
         augment_real=True,
         collate="range",
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidar_synth.lab.town import fences, furniture
 from lidar_synth.lab.town.boundaries import put_boundary, sample_kind
-from lidar_synth.lab.town.buildings import building
+from lidar_synth.lab.town.buildings import make_building
 from lidar_synth.lab.town.facades import BuildingPlan, finishes
 from lidar_synth.lab.town.furniture import StaticObject
 from lidar_synth.lab.town.lots import sample_house
@@ -28,7 +28,7 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
         while t < 40:
             width = rng.uniform(9, 16)
             plan = sample_house(str(rng.choice(["house", "house", "block"])), width, 9.0, rng)
-            house = StaticObject(building(plan, rng), finishes(rng), HOUSE)
+            house = StaticObject(make_building(plan, rng), finishes(rng), HOUSE)
             # The front faces back along the street; in a building's own frame it faces -y.
             at = t if direction < 0 else t + width
             scene.put(house, end + direction * rng.uniform(3, 6), at, -direction * np.pi / 2)
@@ -56,7 +56,7 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
                     style = str(rng.choice(["house", "house", "row", "block"]))
                     depth = rng.uniform(8, 10)
                     plan = sample_house(style, width, depth, rng)
-                    mesh = building(plan, rng) if near else _plain_house(int(rng.integers(12)))
+                    mesh = make_building(plan, rng) if near else _plain_house(int(rng.integers(12)))
                     low = t if side == LEFT else -t - width
                     at = low if direction < 0 else low + width
                     house = StaticObject(mesh, finishes(rng), HOUSE)
@@ -86,7 +86,7 @@ def _plain_house(variant: int) -> Mesh:
     """One of the house meshes without window recesses, for houses that are only seen from afar."""
     rng = np.random.Generator(np.random.Philox(key=variant))
     roof = ("gable", "cross", "hip")[variant % 3]
-    return building(
+    return make_building(
         BuildingPlan(
             rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False
         ),

@@ -114,7 +114,7 @@ def _skylights(
     return quads(np.array(corners).reshape(-1, 4, 3), GLASS)
 
 
-def building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
+def make_building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     """The mesh of a building; the slots are those of ``facades.finishes``."""
     w = plan.width
     d = plan.depth

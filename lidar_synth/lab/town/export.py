@@ -11,10 +11,10 @@ from pathlib import Path
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, suggest
-from lidar_synth.files.claims import claim, writing
+from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.markdown import escape_markdown
-from lidar_synth.files.processes import in_processes
+from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats.kitti360 import KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObjectWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
@@ -95,14 +95,14 @@ def export_town(
     if accumulate:
         check_accumulation(town, layout)
     _claim_folder(Path(out), town, layout, number, camera)
-    with writing(Path(out) / SETTINGS):
+    with hold_writing(Path(out) / SETTINGS):
         writer = LAYOUTS[layout](out, calibration=town.calibration)
         names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
         missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
         work = partial(_write_group, town, writer, names, camera)
         with (
             tqdm(total=len(missing), unit="scan", disable=not progress) as bar,
-            in_processes(work, _groups(missing, jobs), jobs) as done,
+            map_in_processes(work, _groups(missing, jobs), jobs) as done,
         ):
             for count in done:
                 bar.update(count)
@@ -167,6 +167,6 @@ def _write_group(
 def _write_windows(town: Town, out: Path, drive: str, jobs: int, progress: bool) -> None:
     missing = [w for w in windows_of(town) if not window_paths(out, drive, w)[0].is_file()]
     work = partial(write_window, town, out, drive)
-    with in_processes(work, missing, jobs) as done:
+    with map_in_processes(work, missing, jobs) as done:
         for _ in tqdm(done, total=len(missing), unit="window", disable=not progress):
             pass

@@ -5,7 +5,7 @@ import numpy as np
 from lidar_synth.lab.town import fences, furniture
 from lidar_synth.lab.town.bodywork import PAINTS
 from lidar_synth.lab.town.boundaries import put_boundary
-from lidar_synth.lab.town.buildings import building, garage
+from lidar_synth.lab.town.buildings import garage, make_building
 from lidar_synth.lab.town.facades import finishes
 from lidar_synth.lab.town.furniture import BUILDING, StaticObject
 from lidar_synth.lab.town.lots import Lot
@@ -24,7 +24,7 @@ def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
     if lot.plan is not None:
         _put_facing_street(
             scene,
-            StaticObject(building(lot.plan, rng), finishes(rng), HOUSE),
+            StaticObject(make_building(lot.plan, rng), finishes(rng), HOUSE),
             lot,
             lot.start + lot.house_offset,
             house,

@@ -14,7 +14,7 @@ from lidar_synth.files.parsing import parse_json
 from lidar_synth.generate.flow.path import METRICS
 from lidar_synth.lab.train.config import Run
 from lidar_synth.lab.train.data import Batches
-from lidar_synth.lab.train.loop import weighted
+from lidar_synth.lab.train.loop import weigh_metric
 from lidar_synth.lab.train.plan import TrainingPlan, open_data
 from lidar_synth.lab.train.schedules import ENDLESS, PLATEAU
 from lidar_synth.lab.train.state import Training
@@ -114,7 +114,7 @@ class Watch:
     def _loss(self, training: Training) -> float:
         assert self.config.held_out is not None
         recipe = training.recipe
-        metric = weighted(METRICS[recipe.metric], recipe.weights, self.data.tensors)
+        metric = weigh_metric(METRICS[recipe.metric], recipe.weights, self.data.tensors)
         total = 0.0
         count = self.config.held_out.samples
         for start in range(0, count, recipe.batch):

@@ -84,7 +84,7 @@ class Record(NamedTuple):
     teacher_evaluations: int
 
 
-def weighted(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat) -> Metric:
+def weigh_metric(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat) -> Metric:
     """A metric of tensors whose channels are multiplied by the roots of their weights."""
     if not weights:
         return metric
@@ -123,7 +123,7 @@ def steps(
             before that step.
     """
     recipe = training.recipe
-    metric = weighted(METRICS[recipe.metric], recipe.weights, batches.tensors)
+    metric = weigh_metric(METRICS[recipe.metric], recipe.weights, batches.tensors)
     schedule = SCHEDULES[recipe.schedule]
     network, *optimizers = accelerator.prepare(training.network, *training.optimizers)
     training.network.train()

@@ -20,7 +20,7 @@ from lidar_synth.generate.loading import find_model
 from lidar_synth.lab.train.model_plan import ModelPlan, is_missing
 from lidar_synth.lab.train.resume import check_resumed
 from lidar_synth.lab.train.runs import run
-from lidar_synth.lab.train.staged import iterations_of, train_for, with_iterations
+from lidar_synth.lab.train.staged import iterations_of, set_iterations, train_for
 
 LARGE = 14.4e6
 """Bytes of weights in float32 from which on a model is stored in half precision."""
@@ -91,7 +91,7 @@ def _still_done(plan: ModelPlan, name: str) -> bool:
     stage = plan.stages[name]
     folder = plan.runs.folder_of(name)
     done = iterations_of(stage.config)
-    config = stage.config if stage.minutes is None else with_iterations(stage.config, done)
+    config = stage.config if stage.minutes is None else set_iterations(stage.config, done)
     check_resumed(config)
     facts = read_header(plan.runs.checkpoint(name))[0].provenance
     for key, path in stage.starts.items():

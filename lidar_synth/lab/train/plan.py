@@ -24,9 +24,9 @@ from lidar_synth.generate.checkpoint import (
     split,
 )
 from lidar_synth.generate.codec import Codec, make_codec
-from lidar_synth.generate.conditions import CONDITIONS, resized
+from lidar_synth.generate.conditions import CONDITIONS, resize_image
 from lidar_synth.generate.flow.path import METRICS, balanced_velocity_loss, velocity_loss
-from lidar_synth.generate.flow.solvers import towards, uniform_grid
+from lidar_synth.generate.flow.solvers import mean_velocity, uniform_grid
 from lidar_synth.generate.flow.timesteps import Selection, select_timesteps
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
@@ -41,10 +41,10 @@ from lidar_synth.lab.train.decoding import Decoding, decoding_loss, decoding_tas
 from lidar_synth.lab.train.loop import Loss, Task, several_steps_task, student_task, teacher_task
 from lidar_synth.lab.train.selection import load_selection, save_selection, selection_settings
 from lidar_synth.lab.train.start import (
+    add_recordings,
     fresh_networks,
     provenance_of,
     start_networks,
-    with_recordings,
 )
 from lidar_synth.lab.train.teaching import target_flow
 
@@ -98,7 +98,7 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
         plan = plan_decoder(config, accelerator)
     else:
         plan = plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
-    return replace(plan, header=with_recordings(config, plan.header))
+    return replace(plan, header=add_recordings(config, plan.header))
 
 
 def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
@@ -153,7 +153,7 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
         METRICS[recipe.metric],
         recipe.weights,
     )
-    velocity = towards(join(frozen), header.time_grid)
+    velocity = mean_velocity(join(frozen), header.time_grid)
     task = decoding_task(network, velocity, header.time_grid[-2], config.losses.noise)
     return TrainingPlan(trained, task, header, decoding_loss, frozen)
 
@@ -291,7 +291,7 @@ def _reader(
     if name == "camera" and isinstance(source, Town):
         from PIL import Image
 
-        return lambda i, scan: resized(
+        return lambda i, scan: resize_image(
             Image.fromarray(source.image(i)), shape, options, "the town's image"
         )
     return lambda i, scan: CONDITIONS[name].read(scan, sensor, shape, options)

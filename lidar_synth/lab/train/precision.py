@@ -9,7 +9,7 @@ _SIDE = 512
 _ROUNDS = 3
 
 
-def computed(asked: str) -> str:
+def choose_precision(asked: str) -> str:
     """The precision for a configuration's: "bf16" only on a GPU, or a processor that is faster with
     it.
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import Header, read_header
-from lidar_synth.lab.train.config import PARENTS, Run, read_values, validated
+from lidar_synth.lab.train.config import PARENTS, Run, read_values, validate
 from lidar_synth.lab.train.config.load import Config
 from lidar_synth.lab.train.schedules import SCHEDULES
 from lidar_synth.lab.train.state import read_progress
@@ -54,7 +54,7 @@ def began_with(config: Config) -> Config:
         FileError: where it cannot be read.
     """
     path = config.output / "config.yaml"
-    return validated(type(config), read_values(path, type(config)), str(path))
+    return validate(type(config), read_values(path, type(config)), str(path))
 
 
 def _same_steps(config: Run, before: int) -> bool:

@@ -37,7 +37,7 @@ from lidar_synth.lab.train.data import Batches, InTurns
 from lidar_synth.lab.train.held_out import Watch, open_watch
 from lidar_synth.lab.train.loop import Record, steps
 from lidar_synth.lab.train.plan import TrainingPlan, make_plan, open_data
-from lidar_synth.lab.train.precision import computed
+from lidar_synth.lab.train.precision import choose_precision
 from lidar_synth.lab.train.resume import check_parents, check_resumed
 from lidar_synth.lab.train.state import STATE, Training, set_damaged_aside
 from lidar_synth.viz import write_view
@@ -129,7 +129,7 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
     from accelerate.state import AcceleratorState, is_initialized
 
     by_caller = is_initialized()
-    precision = computed(config.precision)
+    precision = choose_precision(config.precision)
     if by_caller and AcceleratorState().mixed_precision not in (config.precision, precision):
         given = f"precision={config.precision}, where this process has set up Accelerate with"
         raise ConfigError(

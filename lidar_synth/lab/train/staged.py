@@ -69,7 +69,7 @@ def iterations_of(config: Run) -> int:
     return began_with(config).recipe.iterations if (config.output / STATE).is_file() else ENDLESS
 
 
-def with_iterations(config: Config, iterations: int) -> Config:
+def set_iterations(config: Config, iterations: int) -> Config:
     """The same configuration with other iterations."""
     return config.model_copy(update={"recipe": replace(config.recipe, iterations=iterations)})
 
@@ -92,7 +92,7 @@ def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
     if iterations == ENDLESS:
         left = PLATEAU * minutes - read_progress(config.output).seconds / 60
         if left > 0:
-            run(with_iterations(config, ENDLESS), resume=True, minutes=left)
+            run(set_iterations(config, ENDLESS), resume=True, minutes=left)
         steps = read_progress(config.output).step
         warmup = config.recipe.warmup
         if steps < warmup:
@@ -103,5 +103,5 @@ def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
                 "Type more --minutes, or fewer steps (recipe.warmup=N) with another output=FOLDER.",
             )
         iterations = math.ceil(steps / PLATEAU)
-    run(with_iterations(config, iterations), resume=True)
+    run(set_iterations(config, iterations), resume=True)
     return checkpoint_path(config)

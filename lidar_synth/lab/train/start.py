@@ -228,7 +228,7 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
             )
 
 
-def with_recordings(config: Run, header: Header) -> Header:
+def add_recordings(config: Run, header: Header) -> Header:
     """The header with all recordings that the weights will know: of this run and of what it begins
     with.
 

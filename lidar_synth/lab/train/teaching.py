@@ -15,7 +15,7 @@ from lidar_synth.generate.checkpoint import (
     network_hash,
 )
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
-from lidar_synth.generate.flow.path import Velocity, autoguided, guided
+from lidar_synth.generate.flow.path import Velocity, autoguide, guide
 from lidar_synth.lab.train.config import DistillConfig
 
 
@@ -39,7 +39,7 @@ def target_flow(
         weaker = load_checkpoint(config.weaker, device)
         _check_weaker(config, teacher, weaker)
         made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
-        return autoguided(
+        return autoguide(
             velocity, _frozen_flow(weaker, config.compile), config.guidance, config.within
         ), made
     return velocity if config.guidance == 1 else _from_blank(config, teacher, velocity), made
@@ -67,7 +67,7 @@ def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module)
             "1",
         )
     empty = torch.zeros(CONDITIONS[name].shape(velocity.encoder), dtype=torch.uint8)
-    return guided(velocity, config.guidance, blank(name, empty))
+    return guide(velocity, config.guidance, blank(name, empty))
 
 
 def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint) -> None:

@@ -2,6 +2,6 @@
 
 from lidar_synth.labels.edit.insertion import insert, move
 from lidar_synth.labels.edit.removal import remove
-from lidar_synth.labels.edit.unboxed import Unboxed, closed, measure
+from lidar_synth.labels.edit.unboxed import Unboxed, measure, remove_unboxed
 
-__all__ = ["Unboxed", "closed", "insert", "measure", "move", "remove"]
+__all__ = ["Unboxed", "insert", "measure", "move", "remove", "remove_unboxed"]

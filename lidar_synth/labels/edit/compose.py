@@ -11,7 +11,7 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.labels.edit.rays import ScanRays
 
 
-def composed(
+def replace_returns(
     scan: Scan, removed: NDArray[np.bool_], rays: ScanRays, which: NDArray[np.intp], new: Scan
 ) -> Scan:
     """Replace returns of a scan.

@@ -40,7 +40,7 @@ _BASE = 12  # rays between the two places that give the direction of a wall
 _SMOOTH = 2  # rays to either side over which a distance is averaged
 
 
-def continued(
+def continue_surfaces(
     rays: ScanRays,
     hole: NDArray[np.bool_],
     near: NDArray[np.float64],

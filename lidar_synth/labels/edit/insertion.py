@@ -19,13 +19,13 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
-from lidar_synth.labels.boxes import grown, joined, overlapping, turned_points
-from lidar_synth.labels.edit.compose import composed, next_instance
+from lidar_synth.labels.boxes import find_overlapping, grow_box, join_boxes, turn_points
+from lidar_synth.labels.edit.compose import next_instance, replace_returns
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
-from lidar_synth.labels.edit.removal import remove, selected
+from lidar_synth.labels.edit.removal import remove, select_boxes
 from lidar_synth.labels.ground import FLOOR, ground_under
 from lidar_synth.labels.objects import Object, objects_of
-from lidar_synth.labels.pasting import occluded, still_visible
+from lidar_synth.labels.pasting import still_visible, update_occlusion
 
 if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
@@ -147,13 +147,13 @@ def _set(
     )
     assert item.scan.boxes is not None
     instance = np.array([next_instance(scan) if scan.instance is not None else -1], np.int32)
-    values = grown(placed.box, new.points)[None]
+    values = grow_box(placed.box, new.points)[None]
     own = Boxes(
         values, item.scan.boxes.names, occlusion=item.scan.boxes.occlusion.copy(), instance=instance
     )
-    own = occluded(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
-    result = composed(scan, ~remaining, rays, which, new)
-    return replace(result, boxes=joined([boxes, own]))
+    own = update_occlusion(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
+    result = replace_returns(scan, ~remaining, rays, which, new)
+    return replace(result, boxes=join_boxes([boxes, own]))
 
 
 def move(
@@ -203,7 +203,7 @@ def _with_foot(scan: Scan, item: Object) -> Scan:
     _, _, _, length, width, _, yaw = item.box.astype(np.float64)
     local = np.stack([along.ravel() * length, across.ravel() * width], 1)
     foot = np.full((len(local), 3), item.ground)
-    foot[:, :2] = turned_points(local, yaw) + item.box[:2]
+    foot[:, :2] = turn_points(local, yaw) + item.box[:2]
     points = np.concatenate([scan.points, foot.astype(np.float32)])
     road = np.full(len(foot), TRAIN_ID["road"], np.uint8)
     label = None if scan.label is None else np.concatenate([scan.label, road])
@@ -216,7 +216,7 @@ def cut_out(scan: Scan, box: int) -> Object:
     Raises:
         DataError: if there is no such box, or no return in it.
     """
-    selected(scan, box)
+    select_boxes(scan, box)
     if scan.ring is None:
         ring, on_grid = rings_of(scan)
         sensor = (
@@ -260,7 +260,7 @@ def _place(
             f"an object recorded at {recorded:.1f} m, to be seen at {distance:.1f} m",
             f"at least {NEARER * recorded:.1f} m, because it has too few returns for less",
         )
-    if scan.boxes is not None and (taken := overlapping(box, scan.boxes.values)).any():
+    if scan.boxes is not None and (taken := find_overlapping(box, scan.boxes.values)).any():
         number = int(np.flatnonzero(taken)[0])
         name = scan.boxes.names[number]
         number += gone is not None and number >= gone
@@ -278,7 +278,7 @@ def _place(
             f"an object at {_place_text(box)}, where the scan has no level ground",
             "ground around the box",
         )
-    count = ground.standing(scan.points, box)
+    count = ground.find_standing(scan.points, box)
     if count > STRAYS:
         raise DataError(
             f"an object at {_place_text(box)}, where the scan has {count} other returns",

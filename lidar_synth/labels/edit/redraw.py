@@ -43,7 +43,7 @@ def _load(model: str) -> "Generator":
     return load_generator(model)
 
 
-def redrawn(
+def redraw_hole(
     kept: Scan,
     filled: Scan,
     rays: ScanRays,

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, IGNORE
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import grown, widened
-from lidar_synth.labels.edit.compose import composed
-from lidar_synth.labels.edit.fill import continued
+from lidar_synth.labels.boxes import grow_box, widen_boxes
+from lidar_synth.labels.edit.compose import replace_returns
+from lidar_synth.labels.edit.fill import continue_surfaces
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
-from lidar_synth.labels.edit.redraw import Model, open_model, redrawn
+from lidar_synth.labels.edit.redraw import Model, open_model, redraw_hole
 from lidar_synth.labels.ground import CLEARANCE, FLOOR, ground_under, standing
-from lidar_synth.labels.objects import NOISE, THINGS, belonging
+from lidar_synth.labels.objects import NOISE, THINGS, find_returns
 
 if TYPE_CHECKING:
     from lidar_synth.generate.generator import Generator
@@ -67,7 +67,7 @@ def remove(
         >>> len(scan.boxes) - len(emptied.boxes)
         1
     """
-    boxes, numbers = selected(scan, box)
+    boxes, numbers = select_boxes(scan, box)
     if not len(boxes):
         return scan
     parts = [(returns_of(scan, boxes[[i]]), boxes.values[i]) for i in range(len(boxes))]
@@ -76,14 +76,14 @@ def remove(
             f"box {_text(boxes.values[0])} of scan {scan.id!r} without a return",
             "a box with an object",
         )
-    result = without(scan, parts, open_model(model), seed)
+    result = remove_returns(scan, parts, open_model(model), seed)
     if scan.boxes is None:
         return result
     gone = (scan.boxes.values[:, None] == boxes.values).all(2).any(1)
     return replace(result, boxes=scan.boxes[~gone])
 
 
-def selected(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
+def select_boxes(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
     """The boxes that an argument names, and their numbers in the scan, None for boxes of its own.
 
     Raises:
@@ -133,7 +133,7 @@ def _text(values: NDArray[np.float32]) -> str:
 def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) the returns of the object in one box, with those of its mirrors and aerials just
     outside."""
-    mine = belonging(scan, box)
+    mine = find_returns(scan, box)
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
     around = Boxes(wide, box.names).contain(scan.points)[0] & ~mine
     ground = ground_under(scan, box.values[0])
@@ -154,7 +154,7 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     return np.asarray(mine | around)
 
 
-def without(
+def remove_returns(
     scan: Scan,
     parts: Sequence[tuple[NDArray[np.bool_], NDArray[np.float32]]],
     model: Model,
@@ -191,15 +191,15 @@ def without(
             )
             near[absorbed] = np.minimum(near[absorbed], np.hypot(*scan.points[mine, :2].T).min())
             hole |= absorbed
-            place = widened(grown(box, scan.points[mine]), CLEARANCE + MARGIN)
+            place = widen_boxes(grow_box(box, scan.points[mine]), CLEARANCE + MARGIN)
             far = np.maximum(far, rays.leaving(place))
-    donor, rho = continued(rays, hole, near, far, _ground(scan, rays), _things(scan, rays))
+    donor, rho = continue_surfaces(rays, hole, near, far, _ground(scan, rays), _things(scan, rays))
     which = np.flatnonzero(hole & (donor >= 0))
     filled = _copies(scan, rays, which, donor[which], rho[which])
     if model is not None:
-        filled = redrawn(scan[~removed], filled, rays, which, model, seed, start)
+        filled = redraw_hole(scan[~removed], filled, rays, which, model, seed, start)
     seen = np.linalg.norm(filled.points, axis=1) > 0
-    return composed(scan, removed, rays, which[seen], filled[seen])
+    return replace_returns(scan, removed, rays, which[seen], filled[seen])
 
 
 def _ground(scan: Scan, rays: ScanRays) -> NDArray[np.bool_]:

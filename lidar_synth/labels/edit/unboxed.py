@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.labels.boxes import grown
+from lidar_synth.labels.boxes import grow_box
 from lidar_synth.labels.edit.redraw import Model
-from lidar_synth.labels.edit.removal import without
+from lidar_synth.labels.edit.removal import remove_returns
 from lidar_synth.labels.ground import FLOOR, standing
 
 LEAST = 20
@@ -105,7 +105,7 @@ def measure(scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = 
     return total
 
 
-def closed(
+def remove_unboxed(
     scan: Scan,
     model: Model = None,
     seed: int = 0,
@@ -122,7 +122,7 @@ def closed(
     """
     number = clusters(scan, classes, least)
     parts = [_with_rim(scan, number == k) for k in range(1, int(number.max(initial=0)) + 1)]
-    return without(scan, parts, model, seed) if parts else scan
+    return remove_returns(scan, parts, model, seed) if parts else scan
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,11 @@ def _kept(scan: Scan) -> Scan:
     return scan
 
 
-HANDLING: dict[str, Callable[[Scan], Scan]] = {"close": closed, "keep": _kept, "error": Refusal()}
+HANDLING: dict[str, Callable[[Scan], Scan]] = {
+    "close": remove_unboxed,
+    "keep": _kept,
+    "error": Refusal(),
+}
 """What is done to unboxed objects of scans with boxes, by name."""
 
 
@@ -153,14 +157,18 @@ def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
 
     Args:
         name: a key of ``HANDLING``.
-        model: for ``"close"``, see ``closed``.
+        model: for ``"close"``, see ``remove_unboxed``.
 
     Raises:
         ConfigError: on another name.
     """
     if name not in HANDLING:
         raise ConfigError(f"unboxed={name!r}", f"one of {', '.join(map(repr, HANDLING))}")
-    return partial(closed, model=model) if name == "close" and model is not None else HANDLING[name]
+    return (
+        partial(remove_unboxed, model=model)
+        if name == "close" and model is not None
+        else HANDLING[name]
+    )
 
 
 def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:
@@ -181,7 +189,7 @@ def _with_rim(scan: Scan, mine: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], N
     around it."""
     low = scan.points[mine].min(0)
     high = scan.points[mine].max(0)
-    box = grown(
+    box = grow_box(
         np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
         scan.points[mine],
     )

@@ -12,7 +12,7 @@ from detector.classes import CLASS_OF, LEAST
 from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.lab.town import STRETCH_FRAMES
-from lidar_synth.labels.edit import closed
+from lidar_synth.labels.edit import remove_unboxed
 
 SENSOR = "hdl64e_lasers"
 FRAMES = (4, 10, 16)
@@ -84,7 +84,7 @@ def unconditional(folder: Path, count: int, model: str) -> Source:
 def without_unboxed(folder: Path, scans: Source) -> Source:
     """The same scans, as the package's default makes them: objects without a box are removed, their
     holes filled."""
-    return make_pool(folder, len(scans), lambda i: closed(scans[i]))
+    return make_pool(folder, len(scans), lambda i: remove_unboxed(scans[i]))
 
 
 def laid_out(folder: Path, model: str, layouts: Source) -> Source:
@@ -94,7 +94,7 @@ def laid_out(folder: Path, model: str, layouts: Source) -> Source:
     return make_pool(
         folder,
         len(layouts),
-        lambda i: with_points(closed(generator.scans(0, [i], condition=layouts[i])[0])),
+        lambda i: with_points(remove_unboxed(generator.scans(0, [i], condition=layouts[i])[0])),
     )
 
 

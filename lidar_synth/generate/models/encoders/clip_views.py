@@ -53,7 +53,7 @@ class ClipViewEncoder(Encoder):
         with torch.no_grad():
             x = split_views(image, self.views).float() / 255
             mean, std = (x.new_tensor(v).view(3, 1, 1) for v in (_CLIP_MEAN, _CLIP_STD))
-            tower = frozen_clip(os.environ.get(CLIP_VARIABLE, ""), str(x.device))
+            tower = load_frozen_clip(os.environ.get(CLIP_VARIABLE, ""), str(x.device))
             features = tower((x - mean) / std).reshape(-1, self.views, CLIP_WIDTH)
         out: Tensor = self.project(features.to(self.project.weight.dtype) + self.view_embedding)
         return out
@@ -77,7 +77,7 @@ class _Tower(nn.Module):
 
 
 @lru_cache(maxsize=1)
-def frozen_clip(location: str, device: str) -> nn.Module:
+def load_frozen_clip(location: str, device: str) -> nn.Module:
     """Load CLIP's vision tower from local files; nothing is ever downloaded.
 
     Args:

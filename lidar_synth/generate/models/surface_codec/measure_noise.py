@@ -20,7 +20,7 @@ from torch import Tensor
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, to_patches
 from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, to_normal
-from lidar_synth.generate.models.surface_codec.surfaces import Noise, Surfaces, normalised
+from lidar_synth.generate.models.surface_codec.surfaces import Noise, Surfaces, normalise_inverse
 from lidar_synth.geometry.normalize import Normalisation
 
 LEAST = 200
@@ -99,7 +99,7 @@ def _scores(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each
     cell shows."""
-    far = normalised(surfaces.inverse, normalisation)
+    far = normalise_inverse(surfaces.inverse, normalisation)
     fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
     fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
     shown = fit.argmax(1)

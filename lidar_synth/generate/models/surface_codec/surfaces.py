@@ -97,7 +97,7 @@ class Surfaces(NamedTuple):
         """
         x = x[:, None]
         value = value[:, None]
-        far = normalised(self.inverse, normalisation)
+        far = normalise_inverse(self.inverse, normalisation)
         distance = -(x - far).abs() / self.scale - (2 * self.scale).log()
         shown = -self.reflectance.nll(value)
         seen = (
@@ -165,7 +165,7 @@ class Surfaces(NamedTuple):
         error = rough * laplace_noise(near) + sum(
             a * b for a, b in zip(bumps, relief.unbind(1), strict=True)
         )
-        distance = normalised(distance, normalisation) + scale * error
+        distance = normalise_inverse(distance, normalisation) + scale * error
         if bounds is not None:  # where no box is, far = -1: no return
             distance = torch.where(object_, distance.clamp(bounds.near, bounds.far), distance)
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
@@ -213,7 +213,7 @@ def _mixed(own: Tensor, correlation: Tensor, shared: Tensor) -> Tensor:
     return mixed.clamp(_SURE, 1 - _SURE)
 
 
-def normalised(inverse: Tensor, normalisation: Normalisation) -> Tensor:
+def normalise_inverse(inverse: Tensor, normalisation: Normalisation) -> Tensor:
     """Inverse ranges as normalised ranges, inside the limits of a return."""
     low = normalisation.range_min
     high = normalisation.range_max

@@ -24,7 +24,7 @@ from lidar_synth.lab.town.skin.features import (
 from lidar_synth.lab.town.skin.features import features as features_of
 from lidar_synth.lab.town.skin.features import strata as strata_of
 from lidar_synth.lab.town.skin.skin import PARTS
-from lidar_synth.lab.town.skin.tables import pooled
+from lidar_synth.lab.town.skin.tables import pool_quantiles
 
 _ANOTHER = np.radians(1.0)
 """Mean distance between the elevations of rings and lasers above which a scan is of another
@@ -110,7 +110,7 @@ class Domain:
             for name in ("cell", "roughness")
         )
         coarse = np.arange(CELLS) // (len(RANGES) + 1)
-        [table] = pooled(
+        [table] = pool_quantiles(
             [(rough, cell)], [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)], ROUGH + 1
         )
         cuts = np.ascontiguousarray(table[:, 1:-1])

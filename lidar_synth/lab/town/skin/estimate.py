@@ -20,7 +20,7 @@ from lidar_synth.lab.town.skin.features import (
     features,
 )
 from lidar_synth.lab.town.skin.skin import MEANS, RESIDUALS, Skin, part_of
-from lidar_synth.lab.town.skin.tables import FEWEST, pooled
+from lidar_synth.lab.town.skin.tables import FEWEST, pool_quantiles
 
 ROUNDS = 3
 SHARE = 0.6
@@ -80,7 +80,7 @@ def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> 
     distance = np.concatenate([s.found.residual for s in domain.scans])
     stratum = np.concatenate(domain.strata)
     if quantiles is None:
-        [quantiles] = pooled([(mean, BAND[stratum])], BAND_LEVELS, MEANS)
+        [quantiles] = pool_quantiles([(mean, BAND[stratum])], BAND_LEVELS, MEANS)
     measured = np.flatnonzero(~np.isnan(distance))
     return {
         "mean": (mean, BAND[stratum]),
@@ -92,7 +92,7 @@ def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> 
 def _both(name: str, town: Pair, real: Pair) -> tuple[Floats, Floats]:
     """The quantiles of the town and the real ones."""
     count = MEANS if name == "mean" else RESIDUALS
-    one, other = pooled([town, real], LEVELS[name], count)
+    one, other = pool_quantiles([town, real], LEVELS[name], count)
     return one, other
 
 
@@ -137,7 +137,7 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
         ring.append(scan.rows[pairs])
     value = np.concatenate(difference)
     upper = np.concatenate(ring)
-    [table] = pooled([(value, upper)], [np.arange(rows)], 3)
+    [table] = pool_quantiles([(value, upper)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
     return np.asarray(total - np.median(sliding_window_view(padded, _SMOOTH), axis=1), np.float32)

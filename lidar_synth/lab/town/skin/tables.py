@@ -49,7 +49,7 @@ def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
     return np.where(positive, low & np.uint32(0x7FFFFFFF), ~low).astype(np.uint32).view(np.float32)
 
 
-def pooled(
+def pool_quantiles(
     pairs: Sequence[tuple[Floats, NDArray[np.integer]]],
     levels: Sequence[NDArray[np.integer]],
     count: int,

@@ -18,7 +18,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
-from lidar_synth.generate.regrid import check_movable, fitting, regrid, with_codec
+from lidar_synth.generate.regrid import attach_codec, check_movable, fit_grid, regrid
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.lab.train.adaptation.scans import Split, label, prepare, split
@@ -124,7 +124,7 @@ def plan_adaptation(
             "lidar-synth adapt town",
         )
     stages = stages_for(header, labelled, town)
-    grid = fitting(source.sensor, header)
+    grid = fit_grid(source.sensor, header)
     return AdaptPlan(
         start,
         Path(str(model)).stem,
@@ -255,7 +255,7 @@ def _with_codec(work: Work, name: str, flow: Path, codec: Path) -> Path:
         save_checkpoint(
             path,
             replace(one.header, provenance=provenance),
-            with_codec(one.networks, other.networks),
+            attach_codec(one.networks, other.networks),
         )
     return path
 

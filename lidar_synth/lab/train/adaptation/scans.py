@@ -207,7 +207,7 @@ def _checked(scan: Scan, sensor: Sensor, usual: float) -> bool:
     return True
 
 
-def unlabelled(image: RangeImage) -> RangeImage:
+def drop_labels(image: RangeImage) -> RangeImage:
     """A range image whose cells have no label."""
     blank = np.full(image.sensor.shape, IGNORE, np.uint8)
     return RangeImage(image.range, image.sensor, {**image.channels, "label": blank})
@@ -235,7 +235,7 @@ def label(prepared: Prepared, codec: Latent, folder: Path) -> Prepared:
 
 def _labelled(image: RangeImage, codec: Latent) -> RangeImage:
     tensors: TensorFormat = codec.tensors
-    decoded = codec.decode(codec.encode(tensors.from_images([unlabelled(image)])))
+    decoded = codec.decode(codec.encode(tensors.from_images([drop_labels(image)])))
     [made] = tensors.to_images(decoded, image.sensor)
     given = np.where(image.mask & made.mask, made.channels["label"], IGNORE).astype(np.uint8)
     return RangeImage(image.range, image.sensor, {**image.channels, "label": given})

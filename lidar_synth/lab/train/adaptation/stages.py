@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidar_synth.files.recipes import merged
+from lidar_synth.files.recipes import merge
 from lidar_synth.generate.checkpoint import CODEC, Header
 from lidar_synth.lab.train.adaptation.scans import HELD, TRAIN, Prepared
 from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
@@ -146,7 +146,7 @@ class Work:
         kind: type[TrainConfig] | type[DistillConfig] = (
             DistillConfig if name == "student" else TrainConfig
         )
-        values = merged(self._own(name, start), dict(self.overrides.get(name, {})))
+        values = merge(self._own(name, start), dict(self.overrides.get(name, {})))
         return load_config(kind, self.stages[name].recipe, values=values)
 
     def _own(self, name: str, start: Path) -> dict[str, Any]:

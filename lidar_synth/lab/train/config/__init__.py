@@ -4,7 +4,7 @@ What a run needs is built from the checked values by the caller, so that nothing
 configurations.
 """
 
-from lidar_synth.files.recipes import Listed, command_of, find_recipe, published, validated
+from lidar_synth.files.recipes import Listed, command_of, find_recipe, published, validate
 from lidar_synth.lab.train.config.load import load_config, read_values
 from lidar_synth.lab.train.config.models import (
     PARENTS,
@@ -48,5 +48,5 @@ __all__ = [
     "published",
     "published_models",
     "read_values",
-    "validated",
+    "validate",
 ]

@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import parse_yaml
-from lidar_synth.files.recipes import find_recipe, merged, read_recipe, validated
+from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
 from lidar_synth.generate.conditions import CONDITIONS
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.config.sections import Run
@@ -46,10 +46,10 @@ def load_config(
         >>> config.recipe.batch, config.recipe.iterations, config.output.as_posix()
         (4, 200, 'runs/mine')
     """
-    given = merged(read_values(recipe, kind), dict(values or {}))
+    given = merge(read_values(recipe, kind), dict(values or {}))
     for override in overrides:
         _override(given, override)
-    config = validated(kind, given, str(recipe))
+    config = validate(kind, given, str(recipe))
     check(config)
     return config
 

@@ -18,7 +18,7 @@ from lidar_synth.files.recipes import (
     head_of,
     read_file,
     read_recipe,
-    validated,
+    validate,
 )
 from lidar_synth.lab.train.config.sections import Run, Section
 
@@ -72,7 +72,7 @@ def load_model(path: Path) -> ModelConfig:
         FileError: where the file cannot be read.
         ConfigError: on what is no model, or a stage that needs one that is not before it.
     """
-    model = validated(ModelConfig, read_recipe(path), str(path))
+    model = validate(ModelConfig, read_recipe(path), str(path))
     earlier: list[str] = []
     for name, stage in model.stages.items():
         if not name.isidentifier() or name in Run.model_fields:
