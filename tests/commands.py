@@ -25,7 +25,7 @@ from lidar_synth.cli import app
 from lidar_synth.formats import WRITERS
 from lidar_synth.lab.evaluate import PROTOCOLS
 from lidar_synth.lab.train import DistillConfig, TrainConfig, load_config, plan_model
-from lidar_synth.lab.train.config import published_models, read_values, validated
+from lidar_synth.lab.train.config import published_models, read_values, validate
 
 PLAIN = (
     ".",
@@ -147,7 +147,7 @@ def _bake(values: dict[str, Any], folder: Path | None) -> None:
         for key, value in values.items()
         if key in BakeJob.model_fields and value is not None
     }
-    validated(BakeJob, settings, "bake")
+    validate(BakeJob, settings, "bake")
     _one_of("engine", (*ENGINES,))(values, folder)
 
 
