@@ -2,12 +2,14 @@
 
 import io
 import struct
+import tarfile
 import zipfile
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzzing.worker import causes
 from hostile import HOSTILE_NPY, POINTS, described, npy, saved
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +19,7 @@ from limits import in_limits, needs_limits
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.parsing import parse_npy, read_arrays
 from lidar_synth.formats import open_scans
+from lidar_synth.lab.evaluate.extractors.archive import Archive
 from lidar_synth.labels.bank import ObjectBank
 
 
@@ -223,3 +226,38 @@ def test_invalid_ranges_are_not_dropped_silently(tmp_path: Path, value: float) -
     for file in (path, tmp_path / "alone.npy"):
         with pytest.raises(DataError, match="1 cells whose range is negative or not finite"):
             open_scans(file)[0]
+
+
+@pytest.mark.slow
+@needs_limits
+@pytest.mark.parametrize("kind", ["objects", "folder", "packed"])
+def test_small_files_take_little_memory(tmp_path: Path, kind: str) -> None:
+    """A bank and an archive that unpack into 700 MB; a file that may have 2 GB, but has few."""
+    path = tmp_path / kind
+    zeros = np.zeros(700_000_000 // 8)
+    if kind == "objects":
+        np.savez_compressed(path, points=zeros)
+        path = path.with_suffix(".npz")
+    elif kind == "packed":
+        with tarfile.open(path, "w:gz", compresslevel=1) as tar:
+            info = tarfile.TarInfo("a/weights")
+            info.size = zeros.nbytes
+            tar.addfile(info, io.BytesIO(zeros.data))
+    else:
+        path.mkdir()
+        (path / "weights").write_bytes(b"x")
+    assert in_limits(READ[kind], path, megabytes=300, seconds=20) == ""
+
+
+def refuse_objects(path: Path) -> None:
+    with pytest.raises(DataError, match="more than it can hold"):
+        ObjectBank.load(path)
+
+
+def refuse_weights(path: Path) -> None:
+    with pytest.raises(DataError) as refused:
+        Archive(path, "a peer").weights("weights")
+    assert not any(isinstance(c, MemoryError) for c in causes(refused.value))
+
+
+READ = {"objects": refuse_objects, "folder": refuse_weights, "packed": refuse_weights}

@@ -22,7 +22,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.proof.study import _is_there, read_outcome, to_values
 from lidar_synth.lab.proof.trial import Outcome
 from lidar_synth.lab.train import TrainConfig, cache_latents, cache_scans, load_config, run
-from lidar_synth.lab.train.state import STATE, Recipe, Training, read_progress
+from lidar_synth.lab.train.state import STATE, Recipe, Training, _checksum, read_progress
 
 SENSOR = Sensor("tiny", 32, 1.0, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 SCANS = [random_scan(SENSOR, 100, seed) for seed in range(130)]
@@ -203,3 +203,20 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path) -> None:
         assert free
         with pytest.raises(ConfigError, match=r"another run is training in"):
             run(tiny(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("change", ["name", "shape", "steps"])
+def test_moments_that_the_next_step_could_not_use_are_refused(tmp_path: Path, change: str) -> None:
+    path = tmp_path / STATE
+    training().save(path)
+    tensors = load_file(path)
+    weight = tensors.pop("optimizer.0.0.exp_avg")
+    tensors |= {
+        "name": {"optimizer.0.0.exp_avg2": weight},
+        "shape": {"optimizer.0.0.exp_avg": weight[:0]},
+        "steps": {"optimizer.0.0.exp_avg": weight, "optimizer.0.0.step": torch.ones(2)},
+    }[change]
+    facts = {"step": "1", "seconds": "0"}
+    save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
+    with pytest.raises(DataError, match="is the state of another network"):
+        training().load(path)

@@ -42,8 +42,8 @@ COMMANDS = {
     "bank split": "bank split BANK OUT/a=0.5 OUT/b=0.5",
     "bank as-sensor": "bank as-sensor BANK OUT --sensor hdl32e",
     "curate": "curate BANK --drop range<0.0125 --out OUT",
-    "edit remove": "edit remove TOWN OUT --name Car",
-    "repair": "repair OUT",
+    "edit remove": "edit remove KITTI360 OUT --name Car",
+    "repair": "repair OUT --model MODEL",
     "label kitti360": "label kitti360 KITTI360 OUT",
 }
 """Commands by name. OUT is the output; the other places are made beforehand."""
@@ -81,7 +81,8 @@ def start(words: list[str], limit: Callable[[], object] = lambda: None) -> int:
             os.setpgid(0, 0)
             limit()
             run(words)
-        except LidarSynthError:
+        except LidarSynthError as error:
+            print(error, file=sys.stderr)
             ended = REFUSED
         except BaseException as error:
             print(f"{type(error).__name__}: {error}", file=sys.stderr)

@@ -81,7 +81,8 @@ def move(path: Path, to: Path) -> None:
 
 
 def copy(path: Path, to: Path) -> None:
-    if to == path or path in to.parents or to in path.parents:
+    inside = to.parent.resolve()  # links may lead into the folder that is copied
+    if to == path or path.resolve() in (inside, *inside.parents) or to in path.parents:
         return
     remove(to)
     if path.is_dir():

@@ -32,6 +32,10 @@ STATE = "state.safetensors"
 """The file of the state in a run's folder."""
 
 
+MOMENTS = ({"step", "exp_avg", "exp_avg_sq"}, {"momentum_buffer"})
+"""What AdamW and Muon keep of a weight."""
+
+
 @dataclass(frozen=True)
 class Recipe:
     """The optimisation settings; the defaults are those of R2Flow's 1-RF.
@@ -169,12 +173,28 @@ class Training:
                 optimizer.load_state_dict(
                     {"state": state, "param_groups": optimizer.state_dict()["param_groups"]}
                 )
+                _check_moments(optimizer)
         except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise DataError(
                 f"{path} is the state of another network ({error})", "the same configuration"
             ) from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
+
+
+def _check_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Refuse what torch takes here and fails on in the next step.
+
+    Raises:
+        ValueError: on moments of other names or shapes than the optimizer's own.
+    """
+    for parameter, moments in optimizer.state.items():
+        if set(moments) not in MOMENTS:
+            raise ValueError(f"a weight with {', '.join(map(str, moments))}")
+        for name, value in moments.items():
+            expected = () if name == "step" else tuple(parameter.shape)
+            if tuple(value.shape) != expected:
+                raise ValueError(f"{name} of shape {tuple(value.shape)}, not {expected}")
 
 
 class Progress(NamedTuple):

@@ -21,6 +21,9 @@ from lidar_synth.files.torch_files import unpickle
 MOST_BYTES = 2 << 30
 """Maximum size of a file of an archive."""
 
+MOST_PACKED = 64 << 20, 20
+"""How much an archive may unpack into: these bytes, and so many times its size."""
+
 
 class Archive:
     """The files of a published archive.
@@ -80,7 +83,14 @@ class Archive:
             ) from error
 
     def _member(self, tar: tarfile.TarFile, name: str, at_most: int) -> bytes:
+        least, factor = MOST_PACKED
+        most = least + factor * self.path.stat().st_size
         for member in tar:
+            if member.offset_data + member.size > most:  # the next one would unpack all of it
+                raise DataError(
+                    f"{self.path}: {member.name[:100]} declares {member.size} bytes",
+                    f"an archive that unpacks into at most {most} bytes",
+                )
             parts = PurePosixPath(member.name).parts
             if parts[-1:] == (name,) and len(parts) <= 3 and member.isfile():
                 if member.size > at_most:
