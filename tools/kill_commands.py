@@ -42,7 +42,7 @@ COMMANDS = {
     "bank split": "bank split BANK OUT/a=0.5 OUT/b=0.5",
     "bank as-sensor": "bank as-sensor BANK OUT --sensor hdl32e",
     "curate": "curate BANK --drop range<0.0125 --out OUT",
-    "edit remove": "edit remove KITTI360 OUT --name Car",
+    "edit remove": "edit remove KITTI360 OUT --scan 0 --name Car",
     "repair": "repair OUT --model MODEL",
     "label kitti360": "label kitti360 KITTI360 OUT",
 }

@@ -1,5 +1,6 @@
 """Changes of files and folders as such: missing, moved, linked, empty, or of another kind."""
 
+import os
 import shutil
 from pathlib import Path
 from random import Random
@@ -81,8 +82,9 @@ def move(path: Path, to: Path) -> None:
 
 
 def copy(path: Path, to: Path) -> None:
-    inside = to.parent.resolve()  # links may lead into the folder that is copied
-    if to == path or path.resolve() in (inside, *inside.parents) or to in path.parents:
+    inside = Path(os.path.realpath(to.parent))  # links may lead into the folder that is copied
+    given = Path(os.path.realpath(path))
+    if to == path or given in (inside, *inside.parents) or to in path.parents:
         return
     remove(to)
     if path.is_dir():
