@@ -233,7 +233,7 @@ def make_places(root: Path) -> dict[str, str]:
     places["MODEL"] = str(write_untrained(root / "untrained.safetensors"))
     town = ["--no-camera", "--scans"]
     run(["town", places["TOWN"], "--layout", "semantic_kitti", *town, "12"])
-    run(["town", places["KITTI360"], "--layout", "kitti360", *town, "6"])
+    run(["town", places["KITTI360"], "--layout", "kitti360", "--accumulate", *town, "6"])
     for name, first in (("BANK", "0"), ("OTHER", "24")):
         sizes = ["--count", "24", "--shard-size", "5", "--first", first]
         run(["bake", places[name], "--model", places["MODEL"], *sizes])
