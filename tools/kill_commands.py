@@ -20,8 +20,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import numba
 from bench.untrained import write_untrained
 from tqdm import tqdm
 from typer.testing import CliRunner
@@ -188,20 +190,28 @@ def fill_disk(trial: Trial, times: int, rng: random.Random) -> None:
     largest = max(map(len, trial.expected.values()))
     for _ in range(times):
         size = int(largest * rng.random())
-        limited = start(
-            trial.words, lambda size=size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-        )
+        limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (size, size))
+        limited = start(trial.words, limit)
         if wait(limited) == FAILED:
             raise RuntimeError("a foreign error on a full disk")
         trial.complete("a full disk")
 
 
+def become_nobody(cache: Path) -> None:
+    """Give up the right to write anywhere but into ``cache``, where numba keeps what it compiles."""
+    setattr(numba.config, "CACHE_DIR", str(cache))  # noqa: B010 - no attribute for mypy
+    os.setuid(NOBODY)
+
+
 def forbid_writing(trial: Trial, times: int, rng: random.Random) -> None:
     """Run a command as a user who may not write into the folder, from the beginning or midway."""
+    cache = trial.out.with_name("numba")
+    cache.mkdir(exist_ok=True)
+    cache.chmod(0o777)
     for i in range(times):
         if i % 2:
             kill(start(trial.words), rng.uniform(0, trial.seconds))
-        if wait(start(trial.words, lambda: os.setuid(NOBODY))) == FAILED:
+        if wait(start(trial.words, partial(become_nobody, cache))) == FAILED:
             raise RuntimeError("a foreign error in a read-only folder")
         trial.complete("a read-only folder")
 
