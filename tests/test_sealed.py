@@ -137,7 +137,9 @@ def test_no_flipped_bit_of_a_state_is_resumed(tmp_path: Path) -> None:
 )
 def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / STATE
-    save_file({name: torch.ones(3)}, path, {"step": "1"})
+    tensors = {name: torch.ones(3)}
+    facts = {"step": "1", "seconds": "0"}
+    save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
     with pytest.raises(DataError, match=r"is the state of another network"):
         training().load(path)
     save_file({"network.weight": torch.ones(3)}, path)
