@@ -43,7 +43,7 @@ LIMITS = {
     "docs/reference/recipes.md": 80,
     "docs/bank-format.md": 350,
     "docs/reference/descriptions.md": 230,
-    "docs/reliability.md": 280,
+    "docs/reliability.md": 330,
     "docs/explanation/method.md": 320,
     "docs/explanation/determinism.md": 200,
     "docs/town.md": 290,
