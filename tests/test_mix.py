@@ -56,6 +56,8 @@ def test_synthetic_scans_come_out_on_the_sensor_of_the_real_ones() -> None:
     assert [train[i] for i in range(len(train))] == [THEIRS.shape] * 8
     with pytest.raises(ConfigError, match="8 x 64"):
         lidar_synth.mix(real, town, ratio=0.5, as_sensor=None)
+    alone = lidar_synth.mix(None, town, ratio=1.0, epoch_size=4)
+    assert len(alone) == 4 and alone[0]["domain"] == 1
     same = lidar_synth.mix(Scans("r", 4), Endless(), ratio=0.5)
     assert same.mixture == MixedScans(Scans("r", 4), Endless(), ratio=0.5).mixture
 

@@ -313,7 +313,7 @@ def test_invalid_options_and_states_of_a_stream_are_refused(
     with pytest.raises(ConfigError, match="5 batches done of 4"):
         stream.state_dict(5)
     with pytest.raises(ConfigError, match="the state of seed 3"):
-        stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0})
+        stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0, "plan": ""})
     next(iter(stream))
     after = stream.state_dict()
     monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=2))

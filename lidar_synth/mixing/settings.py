@@ -15,6 +15,7 @@ from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import read_transfer
 from lidar_synth.formats.description import same_grid
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.policies import LabelPolicy
 from lidar_synth.mixing.scans import MixedScans, Ratio
 from lidar_synth.mixing.sources import each, sensor_of
@@ -108,7 +109,7 @@ def mix(
     """Mix real and synthetic scans; ``mix(...).loader(...)`` makes batches of them.
 
     Args:
-        real: a folder or URL of scans or of a bank, or any source of scans.
+        real: a folder or URL of scans or of a bank, or any source of scans; None with ratio 1.
         synth: a folder or URL of scans or of a bank, a checkpoint, the name of a shipped model, or
             any source of synthetic scans.
         ratio, labels: as for ``MixedScans``.
@@ -130,11 +131,16 @@ def mix(
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
     if as_sensor == "auto":
-        target = sensor_of(reals)
-        alike = all(same_grid(target, sensor_of(source)) for source, _ in each(synthetics))
-        as_sensor = None if alike else target
+        as_sensor = None if reals is None else _sensor_for(reals, synthetics)
     as_sensor = read_transfer(as_sensor, synthetics)
     return MixedScans(reals, synthetics, ratio, labels, as_sensor=as_sensor, **options)
+
+
+def _sensor_for(reals: Any, synthetics: Any) -> Sensor | None:
+    """The sensor of the real scans; None if that of the synthetic ones has the same grid."""
+    target = sensor_of(each(reals)[0][0])
+    alike = all(same_grid(target, sensor_of(source)) for source, _ in each(synthetics))
+    return None if alike else target
 
 
 def _open_real(where: Any) -> Any:

@@ -26,7 +26,7 @@ _SAME_SURFACE = 0.02  # relative range difference of two neighbouring cells on t
 
 
 @dataclass(frozen=True)
-class Score:
+class ScanMeasure:
     """One number that describes a scan.
 
     Args:
@@ -69,16 +69,16 @@ def _confidence(image: RangeImage, scan: Scan) -> float:
     return float(image.channels["confidence"][image.mask].mean()) if image.mask.any() else 0.0
 
 
-MEASURES: dict[str, Score] = {
-    "empty": Score("share of cells without a return", None, _empty),
-    "unlabelled": Score("share of returns without a label", "label", _unlabelled),
-    "floating": Score(
+MEASURES: dict[str, ScanMeasure] = {
+    "empty": ScanMeasure("share of cells without a return", None, _empty),
+    "unlabelled": ScanMeasure("share of returns without a label", "label", _unlabelled),
+    "floating": ScanMeasure(
         "share of ground returns (road to terrain) above the sensor", "label", _floating
     ),
-    "speckle": Score(
+    "speckle": ScanMeasure(
         "share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle
     ),
-    "confidence": Score("mean confidence of the returns", "confidence", _confidence),
+    "confidence": ScanMeasure("mean confidence of the returns", "confidence", _confidence),
 }
 """Measures by the name of their score; a share of an empty set is 0."""
 
