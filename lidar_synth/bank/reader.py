@@ -47,7 +47,7 @@ class Bank:
         >>> bank[0].id, sorted(bank.fields)
         ('town/1/0', ['confidence', 'label', 'reflectance'])
         >>> bank.image(0).range.shape
-        (64, 1024)
+        (64, 2048)
     """
 
     def __init__(self, root: str | Path) -> None:

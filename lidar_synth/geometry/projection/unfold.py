@@ -66,7 +66,7 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         >>> scan = open_scans("demo_out/town")[0]
         >>> image = unfold(scan)
         >>> image.range.shape, image.sensor.name
-        ((64, 1024), 'town/beams')
+        ((64, 2048), 'hdl64e_lasers')
     """
     lasers = (sensor or scan.sensor).by_beams()
     grid = grid_of(lasers)._replace(edges=np.empty(0, np.float32))  # the rows follow from the rings
