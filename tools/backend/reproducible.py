@@ -3,12 +3,14 @@ built.
 
 Setuptools writes the times and owners of the files into the source archive. Here every time is
 ``SOURCE_DATE_EPOCH`` (https://reproducible-builds.org/specs/source-date-epoch/), or the first day
-of 2020 where it is not set, and files have no owner. Wheels follow the variable by themselves.
+of 2020 where it is not set, and files have no owner. Wheels take the times from the variable by
+themselves, but the permissions from the process that builds them: here all may read.
 """
 
 import gzip
 import os
 import tarfile
+import zipfile
 from pathlib import Path
 
 from setuptools import build_meta
@@ -38,5 +40,25 @@ def build_sdist(sdist_directory: str, config_settings: dict[str, object] | None 
             member.gname = ""
             member.pax_headers = {}
             new.addfile(member, old.extractfile(member) if member.isfile() else None)
+    part.replace(path)
+    return name
+
+
+def build_wheel(
+    wheel_directory: str,
+    config_settings: dict[str, object] | None = None,
+    metadata_directory: str | None = None,
+) -> str:
+    """Build the wheel; the name of its file."""
+    name = build_meta.build_wheel(wheel_directory, config_settings, metadata_directory)
+    path = Path(wheel_directory) / name
+    part = path.with_suffix(".part")
+    with (
+        zipfile.ZipFile(path) as old,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for member in old.infolist():
+            member.external_attr = 0o100644 << 16
+            new.writestr(member, old.read(member))
     part.replace(path)
     return name
