@@ -210,7 +210,7 @@ def test_temporary_files_of_killed_processes_are_removed(
     halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
     for path in halves:
         path.touch()
-    hold = f"from lidar_synth.files.lock import shared; from pathlib import Path\nwith lock_shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"  # noqa: E501
+    hold = f"from lidar_synth.files.lock import lock_shared; from pathlib import Path\nwith lock_shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"  # noqa: E501
     with subprocess.Popen(
         [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
