@@ -11,6 +11,7 @@ an undisturbed run.
 """
 
 import argparse
+import encodings.cp437  # noqa: F401  for zip files, where "nobody" may not read Python's folder
 import os
 import random
 import resource
