@@ -14,10 +14,10 @@ from conftest import random_scan
 from project import ROOT
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, scan_hash
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
-from lidar_synth.lab.evaluate.cache import Cached, extract_all, scan_hash, weights_hash
+from lidar_synth.lab.evaluate.cache import Cached, extract_all, weights_hash
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS
 from lidar_synth.lab.evaluate.leaderboard import compare_published, leaderboard
 from lidar_synth.lab.evaluate.measures import KINDS

@@ -95,6 +95,27 @@ def test_a_pass_that_is_left_early_is_begun_again() -> None:
     assert loader.epoch == 1
 
 
+def test_a_pass_of_counted_batches_is_followed_by_the_next_epoch() -> None:
+    loader = mixture().loader(batch_size=4)
+    for epoch in range(3):
+        assert ids(batch for _, batch in zip(range(len(loader)), loader, strict=False)) == in_order(
+            epoch
+        )
+        assert loader.state_dict()["epoch"] == loader.epoch == epoch + 1
+
+
+def test_the_epoch_of_the_mixture_counts() -> None:
+    train = mixture()
+    loader = train.loader(batch_size=4)
+    ids(islice(loader, 2))
+    for epoch in (5, 2):
+        train.set_epoch(epoch)
+        assert (loader.state_dict()["epoch"], loader.state_dict()["position"]) == (epoch, 0)
+        assert ids(loader) == in_order(epoch)
+    loader.set_epoch(2)
+    assert ids(loader) == in_order(2)
+
+
 def test_bad_sizes_are_refused() -> None:
     with pytest.raises(ConfigError, match="batch_size=0"):
         mixture().loader(batch_size=0)

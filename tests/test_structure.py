@@ -72,6 +72,13 @@ def test_a_backward_import_is_noticed(tmp_path: Path) -> None:
     assert backward_imports(tmp_path) == ["noise imports generate.flow.path"]
 
 
+def test_integrations_never_import_the_laboratory() -> None:
+    files = [
+        p for p in INTEGRATIONS.rglob("*.py") if any(m.startswith("lab.") for m in imported(p))
+    ]
+    assert files == []
+
+
 def test_the_package_never_imports_its_integrations() -> None:
     assert all(
         not any(m.startswith("integrations") for m in imported(p))

@@ -4,6 +4,7 @@
 All of them are in the sensor frame: right-handed, x forward, y left, z up, metres, float32.
 """
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -330,3 +331,14 @@ def identity_of(source: Any) -> str:
         return str(own)
     names = hash_of_names(map(str, getattr(source, "ids", ())))
     return f"{type(source).__name__}:{len(source)}:{names[:16]}"
+
+
+def scan_hash(scan: Scan) -> str:
+    """SHA-256 of the points of a scan, their fields and its sensor."""
+    digest = hashlib.sha256(repr(scan.sensor).encode())
+    for name in ("points", *POINT_FIELDS):
+        values = getattr(scan, name)
+        if values is not None:
+            digest.update(f"{name} {values.dtype} {values.shape} ".encode())
+            digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()

@@ -11,8 +11,9 @@ from lidar_synth.mixing.batches import MixedBatches
 class MixedLoader(DataLoader[Any]):
     """A ``DataLoader`` of a mixture that sets its own epoch and can resume.
 
-    Each pass is one epoch, from the mixture's own or that of a loaded state on; a pass that is left
-    early is begun again by the next one. In a distributed training each rank gets its share.
+    Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of the
+    loader or of the mixture chooses another. A pass that is left early is begun again by the next
+    one. In a distributed training each rank gets its share.
 
     Args:
         dataset: a ``MixedScans``.
@@ -36,36 +37,39 @@ class MixedLoader(DataLoader[Any]):
     ) -> None:
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
-        self._epoch: int = dataset.epoch
-        self._done = 0
+        self._pass: tuple[int, int] = (
+            dataset.epoch,
+            0,
+        )  # its epoch, and number of its batches done
         options.setdefault("collate_fn", dataset.collate)
         super().__init__(dataset, batch_sampler=self._batches, num_workers=num_workers, **options)
 
     @property
     def epoch(self) -> int:
-        """The epoch of the pass that is running, or else of the next one."""
-        return self._epoch
+        """The epoch of the pass that is running or, after its last batch, of the next one."""
+        epoch = int(self._mixed.epoch)
+        return epoch + 1 if self._pass == (epoch, len(self._batches)) else epoch
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next pass; raises as ``MixedScans.set_epoch``."""
         self._mixed.set_epoch(epoch)
-        self._epoch = epoch
-        self._done = 0
+        self._pass = (epoch, 0)
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        self.set_epoch(self._epoch)
-        for batch in super().__iter__():
-            self._done += 1
+        epoch = self.epoch
+        self.set_epoch(epoch)
+        # Counted before each batch is yielded: a loop that takes as many batches as there are never
+        # asks for the end of the pass.
+        for done, batch in enumerate(super().__iter__(), 1):
+            self._pass = (epoch, done)
             yield batch
-        self._epoch += 1
-        self._done = 0
+        self._pass = (epoch, len(self._batches))
 
     def state_dict(self) -> dict[str, Any]:
         """The progress after the latest batch, from which any number of ranks and workers can
         resume."""
-        if self._mixed.epoch != self._epoch:  # a pass has ended, and no other has begun
-            return self._batches.state_dict(done=len(self._batches))
-        return self._batches.state_dict(done=self._done)
+        epoch, done = self._pass
+        return self._batches.state_dict(done=done if epoch == self._mixed.epoch else 0)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state with the next pass.
@@ -74,5 +78,4 @@ class MixedLoader(DataLoader[Any]):
             ConfigError: on an invalid state, or one of another mixture.
         """
         self._batches.load_state_dict(state)
-        self._epoch = self._mixed.epoch
-        self._done = 0
+        self._pass = (self._mixed.epoch, 0)

@@ -123,8 +123,8 @@ def _scores(
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
+    from lidar_synth.geometry.scan import scan_hash
     from lidar_synth.lab.curate import FILE, keep_features_in, read_scores, score, write_scores
-    from lidar_synth.lab.evaluate.cache import scan_hash
 
     if split is not None and reference is None:
         raise ConfigError(f"--split {split} without a reference", "--reference as well")

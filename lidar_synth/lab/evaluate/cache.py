@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import sha256, write_arrays
 from lidar_synth.files.parsing import read_arrays
-from lidar_synth.geometry.scan import POINT_FIELDS, Scan, Source
+from lidar_synth.geometry.scan import Scan, Source, scan_hash
 
 VERSION = 1
 """Of the extractors' arithmetic; a change of it makes all features anew."""
@@ -46,18 +46,6 @@ def checked(
             "finite numbers",
         )
     return features
-
-
-def scan_hash(scan: Scan) -> str:
-    """SHA-256 of all that an extractor can see of a scan: its points, their fields and its
-    sensor."""
-    digest = hashlib.sha256(repr(scan.sensor).encode())
-    for name in ("points", *POINT_FIELDS):
-        values = getattr(scan, name)
-        if values is not None:
-            digest.update(f"{name} {values.dtype} {values.shape} ".encode())
-            digest.update(np.ascontiguousarray(values).tobytes())
-    return digest.hexdigest()
 
 
 def weights_hash(path: Path) -> str:
