@@ -15,7 +15,7 @@ from lidar_synth.lab.proof.plan import ProofPlan
 from lidar_synth.lab.proof.scores import groups_of
 from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.summary import summarise
-from lidar_synth.lab.proof.trial import Outcome
+from lidar_synth.lab.proof.trial import TrialOutcome
 
 PERSON = TRAIN_ID["person"]
 ROAD = TRAIN_ID["road"]
@@ -23,11 +23,11 @@ FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600}
 """Persons of 1,000 that each arm finds."""
 
 
-def outcome(found: int, persons: int) -> Outcome:
+def outcome(found: int, persons: int) -> TrialOutcome:
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     table[ROAD, ROAD] = 5000
     table[PERSON, PERSON], table[PERSON, ROAD] = min(found, persons), persons - min(found, persons)
-    return Outcome(table)
+    return TrialOutcome(table)
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")

@@ -20,7 +20,7 @@ from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.proof.study import _is_there, read_outcome, to_values
-from lidar_synth.lab.proof.trial import Outcome
+from lidar_synth.lab.proof.trial import TrialOutcome
 from lidar_synth.lab.train import TrainConfig, cache_latents, cache_scans, load_config, run
 from lidar_synth.lab.train.state import STATE, Recipe, Training, _checksum, read_progress
 
@@ -149,7 +149,9 @@ def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
 
 def test_outcomes_are_sealed(tmp_path: Path) -> None:
     path = tmp_path / "0-000.json"
-    outcome = Outcome(np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0)
+    outcome = TrialOutcome(
+        np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0
+    )
     path.write_bytes(seal(to_values(outcome)))
     assert np.array_equal(read_outcome(path).table, outcome.table)
     assert _is_there(path, read_outcome)

@@ -15,7 +15,7 @@ from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthErro
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin, returns
-from lidar_synth.lab.town.returns import Noise
+from lidar_synth.lab.town.returns import ReturnNoise
 from lidar_synth.lab.town.skin.features import features
 from lidar_synth.lab.town.skin.skin import BOXED, LONGEST, SOFT, shapes
 from lidar_synth.lab.town.skin.tables import grouped_quantiles, lookup
@@ -28,7 +28,7 @@ STREETS = 5
 pytestmark = pytest.mark.slow
 
 
-def cast(seed: int, skin: Skin | None = None, noise: Noise | None = None) -> list[Scan]:
+def cast(seed: int, skin: Skin | None = None, noise: ReturnNoise | None = None) -> list[Scan]:
     """One scan of each of some streets."""
     town = Town(seed, SENSOR, STREETS * STRETCH_FRAMES, noise=noise, skin=skin)
     return [town[STRETCH_FRAMES * k + 4] for k in range(STREETS)]
@@ -36,13 +36,13 @@ def cast(seed: int, skin: Skin | None = None, noise: Noise | None = None) -> lis
 
 @pytest.fixture(scope="module")
 def plain() -> list[Scan]:
-    return cast(11, noise=Noise(gain_std=0))
+    return cast(11, noise=ReturnNoise(gain_std=0))
 
 
 @pytest.fixture(scope="module")
 def undressed() -> list[Scan]:
     """The scans of ``dressed`` without a skin."""
-    return cast(13, noise=Noise(gain_std=0))
+    return cast(13, noise=ReturnNoise(gain_std=0))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def altered() -> list[Scan]:
     two odd lasers."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(returns, "_SPECKLE", returns._SPECKLE * 1.5)
-        scans = cast(12, noise=Noise(range_std=0.03, gain_std=0))
+        scans = cast(12, noise=ReturnNoise(range_std=0.03, gain_std=0))
     out = []
     for scan in scans:
         assert scan.ring is not None

@@ -4,6 +4,7 @@ import ast
 import graphlib
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -217,3 +218,9 @@ def test_a_mixture_loads_few_modules_and_no_network() -> None:
     loaded = {name for name in out.stdout.split() if name.startswith("lidar_synth")}
     assert len(loaded) <= 50
     assert not [n for n in loaded if n.startswith(("lidar_synth.lab.", "lidar_synth.generate"))]
+
+
+def test_no_class_name_stands_twice() -> None:
+    trees = [ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")]
+    names = Counter(n.name for tree in trees for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
+    assert [name for name, count in names.items() if count > 1] == []

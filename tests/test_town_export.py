@@ -18,7 +18,7 @@ from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.cli.town import town as command
 from lidar_synth.lab.town import LAYOUTS, Town, export_town, load_skin
 from lidar_synth.lab.town.export import _groups
-from lidar_synth.lab.town.returns import Noise
+from lidar_synth.lab.town.returns import ReturnNoise
 from lidar_synth.mixing import MixedScans
 
 COUNT = 3
@@ -225,7 +225,7 @@ def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town)
     [
         ({"skin": "pandar64"}, "'skin': None"),
         ({"motion": False}, "'motion': True"),
-        ({"noise": Noise(range_std=0.03)}, "'noise'"),
+        ({"noise": ReturnNoise(range_std=0.03)}, "'noise'"),
     ],
 )
 def test_a_folder_is_not_continued_by_a_town_whose_scans_differ(

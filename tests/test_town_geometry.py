@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from lidar_synth.lab.town.bodywork import GLASS
 from lidar_synth.lab.town.course import Course, Relief
-from lidar_synth.lab.town.ground import KINDS, NAMES, Ground
+from lidar_synth.lab.town.ground import KINDS, NAMES, TownGround
 from lidar_synth.lab.town.materials import MATERIALS, Finish, Finishes
 from lidar_synth.lab.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
 from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.plants import CORE, LEAF, SPECIES, VARIANTS, coarse_plant, plant
-from lidar_synth.lab.town.returns import Noise, cell_noise, laser_gains
+from lidar_synth.lab.town.returns import ReturnNoise, cell_noise, laser_gains
 from lidar_synth.lab.town.solid import Solid
 from lidar_synth.lab.town.street import KINDS as STREETS
 from lidar_synth.lab.town.street import LEFT, RIGHT, SHARES, sample_street
@@ -214,7 +214,7 @@ def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
     road = NAMES.index("road")
     pavement = NAMES.index("sidewalk")
     rects = [(-50.0, 50.0, -20.0, 20.0, pavement), (-50.0, 50.0, -3.0, 3.0, road)]
-    ground = Ground(
+    ground = TownGround(
         Course(-50, 50, 0, rng), Relief(0.0, rng), (3, 3), (-60, 60, -60, 60), (-50, 50), rects, []
     )
     step = float(ground.height(0, 3.01) - ground.height(0, 2.99))
@@ -290,8 +290,8 @@ def test_laser_gains_are_fixed_for_a_sensor() -> None:
     from lidar_synth.geometry.sensor import load_sensor
 
     sensor = load_sensor("town")
-    gains = laser_gains(sensor, Noise())
-    assert np.array_equal(gains, laser_gains(sensor, Noise())) and gains.shape == (64,)
+    gains = laser_gains(sensor, ReturnNoise())
+    assert np.array_equal(gains, laser_gains(sensor, ReturnNoise())) and gains.shape == (64,)
     assert 0.9 < gains.mean() < 1.2 and gains.std() > 0.05
 
 

@@ -34,7 +34,7 @@ from lidar_synth.lab.evaluate.extractors.bonnetal import PARTS, read_segmenter
 from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
 from lidar_synth.lab.importers import IMPORTERS
 from lidar_synth.lab.proof.study import read_outcome, to_values
-from lidar_synth.lab.proof.trial import Outcome
+from lidar_synth.lab.proof.trial import TrialOutcome
 from lidar_synth.lab.town.skin import skin as skins
 from lidar_synth.lab.train import (
     DistillConfig,
@@ -198,7 +198,9 @@ def make_states(root: Path) -> None:
     run.save(root / STATE)
     (root / STATE).write_bytes(in_order((root / STATE).read_bytes()))
     cached(root)
-    outcome = Outcome(np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0)
+    outcome = TrialOutcome(
+        np.arange(361).reshape(19, 19), [(1, np.eye(19, dtype=np.int64))], [0.5], 2.0
+    )
     (root / "outcome.json").write_bytes(seal(to_values(outcome)))
     costs = np.triu(np.ones((5, 5)), 1)
     times = (1.0, 0.75, 0.5, 0.25, 0.0)

@@ -18,11 +18,11 @@ import lidar_synth
 from lidar_synth.cli import COMMANDS, app
 from lidar_synth.generate.models.objective import Losses
 from lidar_synth.lab.train.config import (
-    Condition,
+    ConditionSection,
     Data,
     DistillConfig,
     ModelConfig,
-    Network,
+    NetworkSection,
     Run,
     Samples,
     SelectionSettings,
@@ -79,8 +79,8 @@ FURTHER = (
 SECTIONS: dict[str, tuple[type, ...]] = {
     "": (Run, TrainConfig),
     "data": (Data,),
-    "network": (Network,),
-    "condition": (Condition,),
+    "network": (NetworkSection,),
+    "condition": (ConditionSection,),
     "recipe": (Recipe,),
     "losses": (Losses,),
     "samples": (Samples,),

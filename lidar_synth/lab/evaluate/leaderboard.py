@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from lidar_synth.lab.evaluate.metric import SIDES, Score
 
 
-class Table(BaseModel):
+class PublishedTable(BaseModel):
     """Figures that one paper reports together.
 
     Args:
@@ -35,13 +35,13 @@ class Table(BaseModel):
 
 
 @cache
-def leaderboard() -> tuple[tuple[Table, ...], Mapping[str, str]]:
+def leaderboard() -> tuple[tuple[PublishedTable, ...], Mapping[str, str]]:
     """All tables, and {source: what it is}."""
     text = (
         files("lidar_synth.lab.evaluate").joinpath("leaderboard.yaml").read_text(encoding="utf-8")
     )
     values = yaml.safe_load(text)
-    return tuple(Table(**table) for table in values["tables"]), values["sources"]
+    return tuple(PublishedTable(**table) for table in values["tables"]), values["sources"]
 
 
 def compare_published(scores: Sequence[Score]) -> str:

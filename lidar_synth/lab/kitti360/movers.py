@@ -31,7 +31,7 @@ _GAP, _JUMP = (
 
 
 @dataclass
-class Track:
+class MovingTrack:
     """One moving object.
 
     Args:
@@ -97,7 +97,7 @@ class Movers:
             values.append(track.values)
         return np.concatenate(points), np.concatenate(values)
 
-    def present(self, frame: int) -> list[Track]:
+    def present(self, frame: int) -> list[MovingTrack]:
         """The objects that have a box at a frame."""
         return [track for track in self.tracks if frame in track.boxes]
 
@@ -135,7 +135,7 @@ def _rigid(box: NDArray[np.float64]) -> NDArray[np.float64]:
     return rigid
 
 
-def _tracks(boxes: WorldBoxes, frames: range) -> list[Track]:
+def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
     """The objects with one box per frame; an instance number that is used again is another
     object."""
     stamped = (boxes.windows[:, 0] == boxes.windows[:, 1]) & np.isin(boxes.windows[:, 0], frames)
@@ -148,7 +148,7 @@ def _tracks(boxes: WorldBoxes, frames: range) -> list[Track]:
     jump = np.linalg.norm(np.diff(place, axis=0), axis=1) > _JUMP * np.maximum(gap, 1)
     parts = np.split(order, np.flatnonzero((np.diff(instance) != 0) | (gap > _GAP) | jump) + 1)
     return [
-        Track(
+        MovingTrack(
             int(boxes.instances[part[0]]),
             {int(boxes.windows[i, 0]): boxes.transforms[i] for i in part},
         )
@@ -158,7 +158,7 @@ def _tracks(boxes: WorldBoxes, frames: range) -> list[Track]:
 
 
 def _gather(
-    track: Track,
+    track: MovingTrack,
     points: NDArray[np.float64],
     values: NDArray[np.uint32],
     frame: NDArray[np.int64],

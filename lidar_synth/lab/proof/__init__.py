@@ -10,7 +10,7 @@ from lidar_synth.lab.proof.command import CommandTrainer
 from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.study import prove
 from lidar_synth.lab.proof.summary import Proof
-from lidar_synth.lab.proof.trial import Job, Outcome, Trainer, reference
+from lidar_synth.lab.proof.trial import Job, Trainer, TrialOutcome, reference
 
 __all__ = [
     "ARMS",
@@ -18,11 +18,11 @@ __all__ = [
     "ArmStage",
     "CommandTrainer",
     "Job",
-    "Outcome",
     "Proof",
     "ProofSettings",
     "Row",
     "Trainer",
+    "TrialOutcome",
     "prove",
     "reference",
 ]

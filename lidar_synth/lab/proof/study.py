@@ -41,8 +41,8 @@ from lidar_synth.lab.proof.settings import ProofSettings
 from lidar_synth.lab.proof.summary import Proof, Results, summarise
 from lidar_synth.lab.proof.trial import (
     Job,
-    Outcome,
     Trainer,
+    TrialOutcome,
     pretrain,
     pretraining_seconds,
     reference,
@@ -276,7 +276,7 @@ def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
     return proof
 
 
-def to_values(outcome: Outcome) -> dict[str, Any]:
+def to_values(outcome: TrialOutcome) -> dict[str, Any]:
     """An outcome as plain values."""
     curve = [[step, table.tolist()] for step, table in outcome.curve]
     return {
@@ -287,7 +287,7 @@ def to_values(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def read_outcome(path: Path) -> Outcome:
+def read_outcome(path: Path) -> TrialOutcome:
     """The inverse of ``to_values``, from a sealed file.
 
     Raises:
@@ -298,7 +298,9 @@ def read_outcome(path: Path) -> Outcome:
     try:
         table = np.array(values["table"], np.int64)
         curve = [(int(step), np.array(part, np.int64)) for step, part in values["curve"]]
-        return Outcome(table, curve, [float(v) for v in values["losses"]], float(values["seconds"]))
+        return TrialOutcome(
+            table, curve, [float(v) for v in values["losses"]], float(values["seconds"])
+        )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
             f"{path} is damaged ({error!r})", "the outcome of a training", "Remove it."

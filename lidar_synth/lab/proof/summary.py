@@ -13,9 +13,9 @@ from lidar_synth.lab.proof.arms import BASE, GENERATOR_BUDGET, Row
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import FEWEST_PLACES, group_ious, interval, mean_group_iou
-from lidar_synth.lab.proof.trial import LOOKS, Outcome
+from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
 
-Results = dict[Pair, dict[Row, Outcome]]
+Results = dict[Pair, dict[Row, TrialOutcome]]
 """{pair: {arm: outcome}} of the complete pairs."""
 
 
@@ -201,7 +201,7 @@ def _budget(plan: ProofPlan, row: Row) -> str:
     return f"{text}; {extra}"
 
 
-def _class_ious(plan: ProofPlan, outcomes: Sequence[Outcome]) -> dict[str, float | None]:
+def _class_ious(plan: ProofPlan, outcomes: Sequence[TrialOutcome]) -> dict[str, float | None]:
     """IoU of every class in per cent, over the returns of all tested scans together."""
     total = np.sum([outcome.table for outcome in outcomes], 0)
     ious = 100 * group_ious(total, plan.groups)
@@ -210,7 +210,7 @@ def _class_ious(plan: ProofPlan, outcomes: Sequence[Outcome]) -> dict[str, float
     }
 
 
-def _curve(plan: ProofPlan, outcomes: Sequence[Outcome]) -> list[tuple[int, float]]:
+def _curve(plan: ProofPlan, outcomes: Sequence[TrialOutcome]) -> list[tuple[int, float]]:
     """(iterations, mean mIoU in per cent) during the training."""
     points: dict[int, list[float]] = {}
     for outcome in outcomes:

@@ -123,7 +123,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialOutcome:
     """What came of a training.
 
     Args:
@@ -141,8 +141,8 @@ class Outcome:
     seconds: float = 0.0
 
 
-Trainer = Callable[[Job], "Outcome | NDArray[np.int64]"]
-"""Trains as a job says and tests on its held-out scans; returns an ``Outcome``, or its table
+Trainer = Callable[[Job], "TrialOutcome | NDArray[np.int64]"]
+"""Trains as a job says and tests on its held-out scans; returns a ``TrialOutcome``, or its table
 alone."""
 
 
@@ -158,7 +158,7 @@ def turn_scan(scan: Scan, rng: np.random.Generator) -> Scan:
     return mirror_scan(scan, "y") if rng.random() < 0.5 else scan
 
 
-def run_trainer(trainer: Trainer, job: Job) -> Outcome:
+def run_trainer(trainer: Trainer, job: Job) -> TrialOutcome:
     """Run a trainer, and take its time.
 
     Raises:
@@ -166,7 +166,9 @@ def run_trainer(trainer: Trainer, job: Job) -> Outcome:
     """
     start = time.monotonic()
     result = trainer(job)
-    outcome = result if isinstance(result, Outcome) else Outcome(np.asarray(result, np.int64))
+    outcome = (
+        result if isinstance(result, TrialOutcome) else TrialOutcome(np.asarray(result, np.int64))
+    )
     expected = (len(NAMES), len(NAMES))
     if outcome.table.shape != expected:
         raise DataError(
@@ -175,7 +177,7 @@ def run_trainer(trainer: Trainer, job: Job) -> Outcome:
     return replace(outcome, seconds=time.monotonic() - start)
 
 
-def reference(job: Job) -> Outcome:
+def reference(job: Job) -> TrialOutcome:
     """Train the package's range-view segmenter on the grid of the scans, and test it on the
     held-out scans."""
     network, height = _fresh(job)
@@ -201,7 +203,7 @@ def reference(job: Job) -> Outcome:
         done += count
     table = test(SETTLING)
     parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
-    return Outcome(table, [*curve, (job.iterations, table)], parts)
+    return TrialOutcome(table, [*curve, (job.iterations, table)], parts)
 
 
 def pretrain(job: Job, path: Path) -> None:

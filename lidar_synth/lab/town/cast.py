@@ -21,7 +21,7 @@ MISS = -1
 """Surface number of a ray that hits nothing."""
 
 
-class Hits(NamedTuple):
+class SceneHits(NamedTuple):
     """The first hits of N rays.
 
     Args:
@@ -84,7 +84,7 @@ class Snapshot:
             [m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32
         )
 
-    def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> Hits:
+    def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> SceneHits:
         """Find the first hit of each ray.
 
         Args:
@@ -117,7 +117,7 @@ class Snapshot:
                 )
         length = np.sqrt(np.einsum("ij,ij->i", normal, normal))
         normal /= np.maximum(length, 1e-12)[:, None]
-        return Hits(distance, surface, normal)
+        return SceneHits(distance, surface, normal)
 
     def _candidates(self, directions: Floats, eye: Floats, margin: float) -> NDArray[np.bool_]:
         """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's

@@ -68,7 +68,7 @@ class Corner(NamedTuple):
     radius: float
 
 
-class Ground:
+class TownGround:
     """The ground of a stretch.
 
     Args:

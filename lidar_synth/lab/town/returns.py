@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.town.cast import MISS, Hits, Snapshot
+from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.materials import SurfaceTable, column
 from lidar_synth.lab.town.relief import relief
 
@@ -59,7 +59,7 @@ _ZERO_SHARE = 0.02
 
 
 @dataclass(frozen=True)
-class Noise:
+class ReturnNoise:
     """The measurement noise of the sensor.
 
     Args:
@@ -73,7 +73,7 @@ class Noise:
     threshold: float = 0.0045
 
 
-def laser_gains(sensor: Sensor, noise: Noise) -> Floats:
+def laser_gains(sensor: Sensor, noise: ReturnNoise) -> Floats:
     """(H,) gain of each laser, the same for every scan of a sensor; a few lasers are weak."""
     if not noise.gain_std:
         return np.ones(sensor.shape[0], np.float32)
@@ -102,7 +102,7 @@ def cell_noise(points: Floats, size: float) -> Floats:
 
 def see_through(
     snapshot: Snapshot,
-    hits: Hits,
+    hits: SceneHits,
     origins: Floats,
     directions: Floats,
     eye: Floats,
@@ -136,13 +136,13 @@ def see_through(
 
 
 def measure(
-    hits: Hits,
+    hits: SceneHits,
     origins: Floats,
     directions: Floats,
     laser: NDArray[np.intp],
     surfaces: SurfaceTable,
     gains: Floats,
-    noise: Noise,
+    noise: ReturnNoise,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Sample which rays return, and their range and reflectance.
@@ -187,7 +187,9 @@ def measure(
     return hit, measured, reflectance.astype(np.float32)
 
 
-def _return_probability(power: Floats, facing: Floats, distance: Floats, noise: Noise) -> Floats:
+def _return_probability(
+    power: Floats, facing: Floats, distance: Floats, noise: ReturnNoise
+) -> Floats:
     """(N,) probability that the signal of a hit exceeds the sensor's threshold."""
     spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))
     signal = power * np.minimum(1, facing * 9) * spreading + np.float32(0.002)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidar_synth.lab.town.furniture import StaticObject
-from lidar_synth.lab.town.ground import Ground
+from lidar_synth.lab.town.ground import TownGround
 from lidar_synth.lab.town.materials import RGB, Finishes
 from lidar_synth.lab.town.meshes import Mesh, merge
 from lidar_synth.lab.town.prototype import Prototype
@@ -51,7 +51,7 @@ class Scene:
         instances: the number of instances, of static objects and of movers.
     """
 
-    ground: Ground
+    ground: TownGround
     surfaces: Finishes = field(default_factory=Finishes)
     pending: list[tuple[StaticObject, float, float, float, float]] = field(default_factory=list)
     meshes: list[Mesh] = field(default_factory=list)

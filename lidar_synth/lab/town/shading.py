@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.lab.town.camera import CAMERA, all_pixels, pixel_rays
-from lidar_synth.lab.town.cast import MISS, Hits, Snapshot
+from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.materials import INDEX, SurfaceTable, column
 from lidar_synth.lab.town.returns import cell_noise
 from lidar_synth.lab.town.scene import Pose
@@ -84,7 +84,7 @@ def _value_noise(places: Floats, layer: float) -> Floats:
 
 def camera_hits(
     snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable
-) -> Hits:
+) -> SceneHits:
     """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of
     foliage and wire mesh."""
     origins = np.broadcast_to(eye, directions.shape)
@@ -136,7 +136,7 @@ def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.ui
 
 def shade(
     snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable, light: Light
-) -> tuple[Floats, Hits]:
+) -> tuple[Floats, SceneHits]:
     """Linear RGB (N, 3) along camera rays, and their hits."""
     hits = camera_hits(snapshot, eye, directions, surfaces)
     missed = hits.surface == MISS
@@ -240,7 +240,7 @@ def tone_map(image: Floats) -> NDArray[np.uint8]:
     return np.asarray(curve * 255 + 0.5, np.uint8)
 
 
-def _edges(hits: Hits, height: int, width: int) -> NDArray[np.bool_]:
+def _edges(hits: SceneHits, height: int, width: int) -> NDArray[np.bool_]:
     """(H, W) pixels at the edges between surfaces, which are then antialiased."""
     surface = hits.surface.reshape(height, width)
     edge = np.zeros(surface.shape, bool)

@@ -26,7 +26,7 @@ from lidar_synth.lab.town.cast import Snapshot
 from lidar_synth.lab.town.ego import HEIGHT, free_rays
 from lidar_synth.lab.town.materials import SurfaceTable
 from lidar_synth.lab.town.movers import ego_place, ego_pose, place_movers
-from lidar_synth.lab.town.returns import Noise, laser_gains, measure, see_through
+from lidar_synth.lab.town.returns import ReturnNoise, laser_gains, measure, see_through
 from lidar_synth.lab.town.scene import Pose
 from lidar_synth.lab.town.shading import render, sample_light
 from lidar_synth.lab.town.skin.skin import Skin, load_skin
@@ -85,7 +85,7 @@ class Town:
         sensor: str | Path | Sensor = "town",
         scans: int = 1000,
         interval: float = 0.4,
-        noise: Noise | None = None,
+        noise: ReturnNoise | None = None,
         motion: bool = True,
         skin: str | Path | Skin | None = None,
     ) -> None:
@@ -101,7 +101,7 @@ class Town:
         if self.skin is not None:
             self.skin.check(self.sensor)
         # A skin has the offsets of the real lasers.
-        self._noise = noise or (Noise(gain_std=0) if self.skin else Noise())
+        self._noise = noise or (ReturnNoise(gain_std=0) if self.skin else ReturnNoise())
         self._scans = scans
         self._motion = motion
         self._worlds: OrderedDict[int, World] = OrderedDict()

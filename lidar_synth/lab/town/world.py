@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lidar_synth.lab.town.backdrop import close_ends, line_side_streets, second_row
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.furnish import furnish
-from lidar_synth.lab.town.ground import KINDS, Ground
+from lidar_synth.lab.town.ground import KINDS, TownGround
 from lidar_synth.lab.town.lots import paint_lots, sample_lots
 from lidar_synth.lab.town.materials import SurfaceTable
 from lidar_synth.lab.town.movers import Mover
@@ -89,7 +89,7 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
     paint = pave(street, rng)
     paint_lots(lots, paint, rng)
     fine = (-REACH, street.length + REACH)
-    ground = Ground(course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners)
+    ground = TownGround(course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners)
     scene = Scene(ground)
     rows = [scene.surfaces.add(k.finish, k.raw) for k in KINDS.values()]
     scene.add_mesh(ground.mesh(rng), np.array(rows, np.int32))

@@ -29,7 +29,14 @@ from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network, network_class
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.evaluate.leakage import recordings_of, town
-from lidar_synth.lab.train.config import PARENTS, Condition, Data, Network, Run, TrainConfig
+from lidar_synth.lab.train.config import (
+    PARENTS,
+    ConditionSection,
+    Data,
+    NetworkSection,
+    Run,
+    TrainConfig,
+)
 
 
 def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
@@ -107,7 +114,7 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     return _add_condition(config, networks, header)
 
 
-def _same_condition(config: TrainConfig, condition: Condition, header: Header) -> Header:
+def _same_condition(config: TrainConfig, condition: ConditionSection, header: Header) -> Header:
     """The header of a conditional model that is trained further, with the shares of ``condition``
     that are given.
 
@@ -168,7 +175,7 @@ def _add_condition(
     derived = network_class(held.architecture).derived_arguments
     own = {name: value for name, value in held.arguments.items() if name not in derived}
     asked = config.model_copy(
-        update={"network": Network(architecture=held.architecture, arguments=own)}
+        update={"network": NetworkSection(architecture=held.architecture, arguments=own)}
     )
     state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
     parts = asked.parts(state, header.sensor.shape)

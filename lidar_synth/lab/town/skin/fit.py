@@ -17,7 +17,7 @@ from tqdm import tqdm
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.lab.town.returns import LEVELS, Noise
+from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
 from lidar_synth.lab.town.skin.estimate import estimate
 from lidar_synth.lab.town.skin.skin import Skin
@@ -79,7 +79,7 @@ def fit_skin(
         scan = scans[i]
         digest.update(np.ascontiguousarray(scan.points).tobytes() + scan.reflectance.tobytes())
         real.append(returns_of(scan, own, step, rng, centred=True))
-    town = Town(seed, own, streets * STRETCH_FRAMES, noise=Noise(gain_std=0))
+    town = Town(seed, own, streets * STRETCH_FRAMES, noise=ReturnNoise(gain_std=0))
     picked = [STRETCH_FRAMES * street + frame for street in range(streets) for frame in (4, 14)]
     cast = [
         returns_of(town[i], own, 1 / LEVELS, rng, centred=False)

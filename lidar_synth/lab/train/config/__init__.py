@@ -15,10 +15,10 @@ from lidar_synth.lab.train.config.models import (
     published_models,
 )
 from lidar_synth.lab.train.config.sections import (
-    Condition,
+    ConditionSection,
     Data,
     HeldOut,
-    Network,
+    NetworkSection,
     Run,
     Samples,
     Section,
@@ -27,13 +27,13 @@ from lidar_synth.lab.train.config.training import DistillConfig, SelectionSettin
 
 __all__ = [
     "PARENTS",
-    "Condition",
+    "ConditionSection",
     "Data",
     "DistillConfig",
     "HeldOut",
     "Listed",
     "ModelConfig",
-    "Network",
+    "NetworkSection",
     "Run",
     "Samples",
     "Section",

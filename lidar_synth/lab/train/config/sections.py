@@ -152,7 +152,7 @@ class Run(Section):
     rehearsal: Data | None = None
 
 
-class Network(Section):
+class NetworkSection(Section):
     """The network to train.
 
     Args:
@@ -164,7 +164,7 @@ class Network(Section):
     arguments: dict[str, Any] = {}
 
 
-class Condition(Section):
+class ConditionSection(Section):
     """The condition of a model.
 
     Args:

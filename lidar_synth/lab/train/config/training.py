@@ -12,7 +12,13 @@ from lidar_synth.generate.models import build_network, network_class
 from lidar_synth.generate.models.network import Autoencoder, Encoder
 from lidar_synth.generate.models.objective import Losses
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
-from lidar_synth.lab.train.config.sections import Condition, Count, Network, Run, Section
+from lidar_synth.lab.train.config.sections import (
+    ConditionSection,
+    Count,
+    NetworkSection,
+    Run,
+    Section,
+)
 
 
 class TrainConfig(Run):
@@ -47,9 +53,9 @@ class TrainConfig(Run):
     channels: tuple[str, ...] = ("range", "reflectance")
     normalisation: str = "r2flow"
     rays: Literal["centre", "corner"] = "centre"
-    network: Network = Network()
+    network: NetworkSection = NetworkSection()
     codec: Path | None = None
-    condition: Condition | None = None
+    condition: ConditionSection | None = None
     init: Path | None = None
     decoder: bool = False
     timesteps: Literal["uniform", "u_shaped", "logit_normal", "logit_normal_shifted"] = "uniform"
