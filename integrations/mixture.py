@@ -110,8 +110,7 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
             f"labels={settings['labels']!r} for {trainer}",
             "labels for every synthetic scan: 'generated', 'condition', 'pseudo' or 'mix'",
             "The trainer makes its own batches; a batch of only synthetic scans would have no "
-            "valid label, and its "
-            "loss, a mean over no label, is NaN.",
+            "valid label, and its loss, a mean over no label, is NaN.",
         )
 
 

@@ -38,8 +38,7 @@ from lidar_synth.geometry.scan import Scan
 
 USAGE = (
     "LIDAR_SYNTH_MIX=mix.yaml python -m lidar_synth.integrations.rangenet train.py ARGUMENTS, in "
-    "train/tasks/semantic "
-    "or CENet"
+    "train/tasks/semantic or CENet"
 )
 FAMILY = "lidar-bonnetal, SalsaNext or CENet"
 TRAINERS = {"tasks.semantic.modules.trainer": None, "modules.trainer": "dataset.kitti.parser"}
@@ -164,13 +163,11 @@ def check_stripes(dataset: Any) -> None:
     fitting = narrower[0] if narrower else "the columns of the synthetic scans"
     raise ConfigError(
         f"synthetic scans in images of {dataset.sensor_img_H} x {width}: {fill:.0%} of the cells "
-        "are filled, and "
-        f"{holes:.0%} of these have an empty cell to the right; in real scans {real_fill:.0%} and "
-        f"{real_gaps:.0%}",
+        f"are filled, and {holes:.0%} of these have an empty cell to the right; in real scans "
+        f"{real_fill:.0%} and {real_gaps:.0%}",
         "images of one density: a network tells these apart by the stripes",
         f"Set dataset.sensor.img_prop.width: {fitting} in the architecture's YAML. Real and "
-        "synthetic scans "
-        "are then projected to that width, in training, validation and inference.",
+        "synthetic scans are then projected to that width, in training, validation and inference.",
     )
 
 

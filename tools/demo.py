@@ -45,8 +45,7 @@ SHOWN = 4
 
 _TOWN_MODEL = (
     "The synthetic scans come from a model of a procedural town, which has not seen this dataset: "
-    "they look like the "
-    "town. For scans like yours, train a model on yours."
+    "they look like the town. For scans like yours, train a model on yours."
 )
 
 
@@ -112,9 +111,8 @@ def town(out: Path, scans: int, seed: int) -> Data:
         command("town", str(out / name), *words, "--jobs", str(os.cpu_count() or 1))
     notes = (
         "No real sensor measured these scans: no dataset was given, so scans of a procedural town "
-        "take the place of "
-        f"your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own data. The "
-        "synthetic scans come from the "
+        f"take the place of your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own "
+        "data. The synthetic scans come from the "
         'model that ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
     )
     real = list(open_scans(out / "town"))
@@ -206,17 +204,14 @@ def protocol_notes(protocol: Protocol, place: str) -> list[str]:
     """What a reader has to know to judge the figures."""
     return [
         f"Both trainings use the same {len(protocol.real)} labelled scans (the label budget), and "
-        "the same network, "
-        f"seeds, {protocol.steps} iterations of {protocol.batch} scans, and augmentation: "
-        f"{AUGMENTATION}. They differ "
-        f"in the share of synthetic samples: 0 and {100 * protocol.ratio:.0f} %. Each dot is the "
-        "mIoU of one seed on "
+        f"the same network, seeds, {protocol.steps} iterations of {protocol.batch} scans, and "
+        f"augmentation: {AUGMENTATION}. They differ in the share of synthetic samples: 0 and "
+        f"{100 * protocol.ratio:.0f} %. Each dot is the mIoU of one seed on "
         f"{len(protocol.held_out)} scans of {place}; the white line is the mean, ± the standard "
         "deviation.",
         "These are short trainings of a small network, made to finish in a minute or two: they "
-        "show the procedure, and "
-        "the mIoU is far below that of a full training. lidar-synth prove makes longer "
-        "comparisons.",
+        "show the procedure, and the mIoU is far below that of a full training. lidar-synth prove "
+        "makes longer comparisons.",
     ]
 
 

@@ -182,8 +182,7 @@ class Encoding:
                 raise DataError(
                     f"a range image with ranges from {returns.min():g} to {returns.max():g} m",
                     f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of "
-                    f"{self.sensor.name!r}, "
-                    "or 0 = no return",
+                    f"{self.sensor.name!r}, or 0 = no return",
                 )
         elif not _encode_shares(values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)):
             raise DataError(f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]")

@@ -141,8 +141,7 @@ def read_transfer(given: Any, scans: Any) -> Any:
         raise ConfigError(
             f"as_sensor: {dict(given)}",
             "sensor: a preset's name or a YAML file; optionally mount: [metres higher, degrees "
-            "down], like: a "
-            "folder of real scans",
+            "down], like: a folder of real scans",
         )
     return make_transfer(values["sensor"], tuple(mount), values["like"], scans)
 

@@ -115,10 +115,8 @@ def check_points(
             f"{where}: its reflectance (the fourth value of a point) runs from {low:g} to {high:g}",
             f"values in [0, {reflectance_max:g}]",
             f"Either it holds intensities on another scale (--reflectance-max {scale}, in Python "
-            "reflectance_max="
-            f"{scale}{_FOR_ALL if scale > 255 else ''}), or another number of floats per point "
-            "(--fields 5, fields=5; "
-            "nuScenes has 5), or it is damaged.",
+            f"reflectance_max={scale}{_FOR_ALL if scale > 255 else ''}), or another number of "
+            "floats per point (--fields 5, fields=5; nuScenes has 5), or it is damaged.",
         )
 
 

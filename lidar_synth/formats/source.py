@@ -92,8 +92,7 @@ class ScanFiles(ABC):
         if named is not None and not same_grid(self.sensor, named):
             warnings.warn(
                 f"{root} says that its scans are of sensor {named.name!r}; they are read as those "
-                "of "
-                f"{self.sensor.name!r}, which was given",
+                f"of {self.sensor.name!r}, which was given",
                 stacklevel=3,
             )
         self._unchecked = named is None

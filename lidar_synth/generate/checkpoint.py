@@ -334,8 +334,7 @@ def _read(path: Path, tensors: bool = True) -> _Content:
             f"{path} is a PyTorch pickle",
             "a .safetensors checkpoint",
             "A pickle can run code and is never loaded as a checkpoint. To convert weights of "
-            "R2Flow or LiDM: "
-            f"lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
+            f"R2Flow or LiDM: lidar-synth import {path} OUT.safetensors (--peer lidm for LiDM's)",
         )
     try:
         with safe_open(path, framework="pt") as content:

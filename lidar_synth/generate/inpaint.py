@@ -97,9 +97,8 @@ def check_model(generator: Generator, given: Sensor) -> None:
     wanted = generator.sensor
     if given.shape != wanted.shape or not np.array_equal(given.edges, wanted.edges):
         raise DataError(
-            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model "
-            f"of {wanted.name!r} "
-            f"({wanted.shape[0]} x {wanted.shape[1]})",
+            f"a scan of sensor {given.name!r} ({given.shape[0]} x {given.shape[1]}) for a model of "
+            f"{wanted.name!r} ({wanted.shape[0]} x {wanted.shape[1]})",
             "scans on the model's grid",
             "Use model=None, or a model that was trained for this sensor.",
         )

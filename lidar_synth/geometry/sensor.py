@@ -283,8 +283,7 @@ class Sensor:
         if unknown := int(np.isnan(offsets).sum()):
             warnings.warn(
                 f"sensor {self.name!r}: the azimuth offsets of {unknown} of {len(offsets)} beams "
-                "are not known; their "
-                "rays are cast with 0",
+                "are not known; their rays are cast with 0",
                 stacklevel=2,
             )
         firing = (2 * (np.arange(count) + 0.5) / count - 1) * np.pi

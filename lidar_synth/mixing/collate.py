@@ -89,10 +89,9 @@ class Collate:
                 f"a batch without any valid label or box (scans {batch['id'][:4]})",
                 "at least one, because the loss over no label is NaN",
                 "Use larger batches with balanced=True, so that each holds labelled scans; "
-                "labels='generated' or "
-                "another policy that gives labels; labels='none' for an unlabelled pool; or "
-                "unlabelled='allow' and "
-                "skip such batches in the training loop.",
+                "labels='generated' or another policy that gives labels; labels='none' for an "
+                "unlabelled pool; or unlabelled='allow' and skip such batches in the training "
+                "loop.",
             )
         return batch
 

@@ -23,8 +23,7 @@ from lidar_synth.mixing.state import count_accelerated
 
 REPEATED = (
     "epoch {} begins again, with the same scans in the same order as before. Make the mixture "
-    "once, and call "
-    "set_epoch(epoch) before each pass."
+    "once, and call set_epoch(epoch) before each pass."
 )
 
 SHARED_TWICE = (
@@ -113,8 +112,7 @@ class CurrentEpoch:
         if epoch < self._own and unused and not self._followers and count_accelerated():
             raise ConfigError(
                 f"epoch {epoch} where epoch {self._own} was set or resumed: a loader of "
-                "accelerator.prepare counts its "
-                "passes from 0",
+                "accelerator.prepare counts its passes from 0",
                 "the epoch that was set or resumed",
                 "from lidar_synth.integrations.accelerate import prepare; loader = "
                 "prepare(accelerator, loader).",
@@ -202,9 +200,8 @@ def check_pass(begun: int, epoch: int) -> None:
             f"set_epoch({epoch}) while a DataLoader was iterating over epoch {begun}",
             "set_epoch before iter(loader), as the workers fetch ahead",
             "Call set_epoch before the loop over the loader. If a trainer's hook runs later, pass "
-            "the DataLoader "
-            "batch_sampler=train.batches(batch_size): its batches keep the epoch in which "
-            "iteration began.",
+            "the DataLoader batch_sampler=train.batches(batch_size): its batches keep the epoch "
+            "in which iteration began.",
         )
 
 
@@ -217,8 +214,7 @@ def check_whole(dataset: Any) -> None:
     if isinstance(dataset, Subset):
         raise ConfigError(
             "a Subset of a mixture, of random_split for instance: its indices mean other scans in "
-            "every epoch, so that "
-            "held-out real scans would be trained on",
+            "every epoch, so that held-out real scans would be trained on",
             "the real scans split, then mixed",
             "kept, held_out = random_split(real, [0.9, 0.1]); train = MixedScans(kept, synth, ...)",
         )

@@ -261,8 +261,7 @@ def _unit(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     if factor > UNUSUAL_UNIT:
         text = (
             f"the median distance of points is {synthetic.distance:.4g} instead of "
-            f"{real.distance:.4g}: "
-            "coordinates in another unit, such as centimetres"
+            f"{real.distance:.4g}: coordinates in another unit, such as centimetres"
         )
         yield Contradiction(text, factor > OTHER_UNIT)
 
@@ -285,8 +284,7 @@ def _axes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     if ours * theirs < 0:
         text = (
             f"roads run along {'x' if ours > 0 else 'y'} instead of {'x' if theirs > 0 else 'y'}: "
-            "other axes, such as "
-            "nuScenes' x to the right and y forward"
+            "other axes, such as nuScenes' x to the right and y forward"
         )
         yield Contradiction(text, True)
 

@@ -31,9 +31,8 @@ def report_repeats(plan: MixingPlan) -> None:
         if source.length is not None and count > OFTEN * source.length:
             log.warning(
                 "the %d scans of a synthetic source (%s) come %.0f times each in an epoch: a "
-                "network learns them by "
-                "heart. Bake more (lidar-synth bake OUT --count %d), use a generator, or a lower "
-                "ratio.",
+                "network learns them by heart. Bake more (lidar-synth bake OUT --count %d), use a "
+                "generator, or a lower ratio.",
                 source.length,
                 source.identity[:40],
                 count / source.length,
@@ -68,9 +67,8 @@ class Notices:
         if self._labelled and self._unlabelled is not None:
             self._warn(
                 "real scan %r has no labels: all its points are 255 = ignore, and only synthetic "
-                "scans teach classes. "
-                "Open labelled scans (lidar-synth label kitti360 makes labels of KITTI-360), or "
-                "leave it out.",
+                "scans teach classes. Open labelled scans (lidar-synth label kitti360 makes "
+                "labels of KITTI-360), or leave it out.",
                 self._unlabelled,
             )
             self._labelled = False
@@ -85,9 +83,8 @@ class Notices:
             if max(ours, theirs) > OTHER_SIZE * min(ours, theirs):
                 self._warn(
                     "a real scan has %d points, a synthetic one %d, on the same nominal grid: the "
-                    "density tells them "
-                    "apart. Give load_generator columns= of that density, or use as_sensor= or "
-                    "collate='range'.",
+                    "density tells them apart. Give load_generator columns= of that density, or "
+                    "use as_sensor= or collate='range'.",
                     theirs,
                     ours,
                 )
@@ -117,9 +114,8 @@ class Notices:
         if scan.boxes is None:
             log.warning(
                 "real scans have boxes, synthetic ones have none: a detector would learn that "
-                "their objects are "
-                "background. For a detector, use labels='mix' with objects, or labels='boxes' if "
-                "the scans have boxes."
+                "their objects are background. For a detector, use labels='mix' with objects, or "
+                "labels='boxes' if the scans have boxes."
             )
             return
         from lidar_synth.labels.edit import measure  # loads networks

@@ -61,8 +61,7 @@ def check_unshared(what: str, rank: int, world_size: int) -> None:
             "among the same processes again: most samples would never be seen",
             "only one of the two to divide the samples",
             "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, "
-            "loader); if it is not "
-            f"prepared, call {what} with rank=accelerator.process_index, "
+            f"loader); if it is not prepared, call {what} with rank=accelerator.process_index, "
             "world_size=accelerator.num_processes.",
         )
 

@@ -84,8 +84,7 @@ def on_cpu(net: Any, rounds: int) -> None:
         busy.append(time.process_time() - before)
     print(
         f"\n### One evaluation on the CPU, {torch.get_num_threads()} threads, "
-        f"float32\n\n{machine()}; "
-        f"torch {torch.__version__}; median (best) of {rounds}\n"
+        f"float32\n\n{machine()}; torch {torch.__version__}; median (best) of {rounds}\n"
     )
     print("| what | s | GFLOP/s | share of the product's rate |\n|---|---:|---:|---:|")
     rates = {
@@ -199,8 +198,7 @@ def precision(net: nn.Module, half: nn.Module) -> None:
         metres = (decode(scan[:, 0]) - decode(exact[:, 0])).abs().flatten()
         print(
             f"| {name} | {float((scan - exact).norm() / exact.norm()):.1e} | "
-            f"{float(metres.median()):.4f} "
-            f"| {float(metres[: 1 << 24].quantile(0.99)):.4f} |"
+            f"{float(metres.median()):.4f} | {float(metres[: 1 << 24].quantile(0.99)):.4f} |"
         )
 
 

@@ -24,8 +24,7 @@ LAST_LEARNT = 30
 FIRST_MEASURED = 60
 LICENCE = (
     "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of "
-    "their names or marks "
-    "beyond attribution; no attempt to identify persons"
+    "their names or marks beyond attribution; no attempt to identify persons"
 )
 SOURCE = (
     "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"

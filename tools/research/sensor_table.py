@@ -70,8 +70,7 @@ def row(name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None
     step = f"{1000 * fit.sensor.range_step:.0f} mm" if fit.sensor.range_step else ""
     print(
         f"| {name} | {len(scans)} | {len(fit.points)} | {error} | {fit.share:.2%} | "
-        f"{fit.sensor.firings} "
-        f"| {fit.azimuths.known} | {step} | {seconds:.1f} |",
+        f"{fit.sensor.firings} | {fit.azimuths.known} | {step} | {seconds:.1f} |",
         flush=True,
     )
     return fit

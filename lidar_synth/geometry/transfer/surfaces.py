@@ -180,8 +180,7 @@ def _check_rings(
     if 2 * np.count_nonzero(jump > SCATTERED * gap) > len(jump):
         raise DataError(
             f"scan {scan.id!r}: its points lie on no rings of {scan.sensor.name!r} (neighbours "
-            "differ by "
-            f"{np.degrees(np.median(jump)):.2f} degrees of elevation, rings by "
+            f"differ by {np.degrees(np.median(jump)):.2f} degrees of elevation, rings by "
             f"{np.degrees(gap):.2f})",
             "the points of one revolution",
             "Set scan.ring, or open the scan with its own sensor.",

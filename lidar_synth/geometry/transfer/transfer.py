@@ -130,10 +130,8 @@ class Transfer:
             seen = _seen(surfaces, self.target, self.mount)
             raise DataError(
                 f"scan {scan.id!r} of {scan.sensor.name!r}: none of its surfaces lies within the "
-                "field of view and the "
-                f"range of {self.target.name!r} ({self.target.down:.1f} to {self.target.up:.1f} "
-                "degrees; "
-                f"{100 * seen:.0f} % of it was seen)",
+                f"field of view and the range of {self.target.name!r} ({self.target.down:.1f} to "
+                f"{self.target.up:.1f} degrees; {100 * seen:.0f} % of it was seen)",
                 "sensors whose fields of view overlap",
                 "Check the two sensors and the mount.",
             )
@@ -239,9 +237,8 @@ def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched:
     lacks = []
     if blind:
         lacks.append(
-            f"{blind} of its {len(elevation)} lasers look outside the recorded {seen.min():.1f} "
-            f"to {seen.max():.1f} "
-            "degrees and return nothing"
+            f"{blind} of its {len(elevation)} lasers look outside the recorded {seen.min():.1f} to "
+            f"{seen.max():.1f} degrees and return nothing"
         )
     if unmatched:
         lacks.append(

@@ -256,9 +256,8 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
         or np.abs(model.heights).max() >= 1
     ):
         raise DataError(
-            f"no beams found: {quality:.0%} of the points lie near the middle of {len(room)} "
-            "bands of elevation "
-            f"(anywhere: 50%)",
+            f"no beams found: {quality:.0%} of the points lie near the middle of {len(room)} bands "
+            "of elevation (anywhere: 50%)",
             f"at least {LEAST_QUALITY:.0%}",
             FRAME_HINT,
         )

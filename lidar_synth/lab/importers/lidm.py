@@ -358,10 +358,9 @@ def _averaged(weights: dict[str, Tensor]) -> dict[str, Tensor]:
 _COUNTERS = (f"{UNET_EMA}decay", f"{UNET_EMA}num_updates")
 _SCHEDULE = (
     "logvar betas alphas_cumprod alphas_cumprod_prev sqrt_alphas_cumprod "
-    "sqrt_one_minus_alphas_cumprod "
-    "log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod sqrt_recipm1_alphas_cumprod "
-    "posterior_variance "
-    "posterior_log_variance_clipped posterior_mean_coef1 posterior_mean_coef2 scale_factor"
+    "sqrt_one_minus_alphas_cumprod log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod "
+    "sqrt_recipm1_alphas_cumprod posterior_variance posterior_log_variance_clipped "
+    "posterior_mean_coef1 posterior_mean_coef2 scale_factor"
 ).split()
 
 

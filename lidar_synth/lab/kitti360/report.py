@@ -160,8 +160,7 @@ class LabelReport:
             if len(frames) > self.labelled[drive]:
                 raise DataError(
                     f"{len(frames)} of {len(frames) + self.labelled[drive]} scans of {drive} do "
-                    "not lie on its "
-                    "accumulated clouds",
+                    "not lie on its accumulated clouds",
                     "poses, calibration, scans and clouds of the same drive",
                     "Check data_poses and calibration; those scans got no labels.",
                 )

@@ -55,8 +55,7 @@ def body(values: Values) -> str:
 _USES = "what it uses"
 _DIFFERENCE = (
     "Percentage points. A dot is the mean over places and seeds, the bar its 95 % interval "
-    "(bootstrap over places and "
-    "seeds). Where the bar crosses 0, the difference may be chance."
+    "(bootstrap over places and seeds). Where the bar crosses 0, the difference may be chance."
 )
 
 
@@ -64,14 +63,11 @@ def what_was_done(values: Values) -> str:
     """One paragraph for a reader who has never seen such a comparison."""
     return (
         f"The same small network was trained in {len(values['arms'])} ways on the same "
-        f"{values['labelled']} labelled "
-        "scans, and tested on places that it had not seen: each of "
-        f"{len(values['tested_places'])} places was left out "
-        f"in turn, with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have "
-        "the same iterations "
-        "and augmentation, unless the table says otherwise. mIoU is the mean over classes of the "
-        "share of "
-        "correctly labelled returns (intersection over union)."
+        f"{values['labelled']} labelled scans, and tested on places that it had not seen: each of "
+        f"{len(values['tested_places'])} places was left out in turn, with {values['seeds']} "
+        f"seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations and "
+        "augmentation, unless the table says otherwise. mIoU is the mean over classes of the "
+        "share of correctly labelled returns (intersection over union)."
     )
 
 
@@ -88,9 +84,8 @@ def protocol(values: Values) -> list[str]:
         "as possible; another "
         "choice with each place and seed. The table says what else an arm uses.",
         f"Trainer: {values['trainer']}; {values['iterations']} iterations of {values['batch']} "
-        "scans, grid of "
-        f"{settings['columns']} columns, {values['precision']}; turned and mirrored at random in "
-        "all arms.",
+        f"scans, grid of {settings['columns']} columns, {values['precision']}; turned and mirrored "
+        "at random in all arms.",
         f"Classes: {', '.join(values['classes'])}."
         + (f" Not in your labels: {', '.join(values['absent'])}." if values["absent"] else ""),
         f"Sensor: {values['sensor']}. Machine: {values['machine']}. Date: {values['date']}.",

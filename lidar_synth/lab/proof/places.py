@@ -101,11 +101,9 @@ def find_places(source: Source, by: str = "auto") -> Places:
         raise DataError(
             f"{len(source)} scans of one place ({next(iter(places))})",
             "scans of at least two places, better of five or more: networks are tested on places "
-            "that they have not "
-            "seen",
+            "that they have not seen",
             "Add drives or sequences. If a single drive is all there is, split it: --places "
-            "stretch "
-            "(places='stretch').",
+            "stretch (places='stretch').",
         )
     return dict(sorted(places.items()))
 

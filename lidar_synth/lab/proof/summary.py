@@ -289,8 +289,7 @@ def headline(values: Mapping[str, Any]) -> str:
     else:
         text = (
             f"{start}, no gain is shown: the best arm with synthetic scans, “{best['title']}”, "
-            "changes the mIoU "
-            f"by {change}, from {base['miou']:.1f} %."
+            f"changes the mIoU by {change}, from {base['miou']:.1f} %."
         )
     if over["real"] != base["title"]:
         text += f" Against “{over['real']}”: {format_signed(over['difference'])} {span(over['interval'])}."
@@ -312,11 +311,9 @@ def limits(values: Mapping[str, Any]) -> list[str]:
     if values["pairs"] < values["planned_pairs"]:
         found.append(
             f"{values['pairs']} of {values['planned_pairs']} trainings per arm fitted into the "
-            "time: "
-            f"{len(values['tested_places'])} of {len(values['places'])} places were tested, with "
-            f"{values['seeds']} "
-            f"seed{'s' * (values['seeds'] > 1)}. Run the same command with more --minutes to add "
-            "the others."
+            f"time: {len(values['tested_places'])} of {len(values['places'])} places were tested, "
+            f"with {values['seeds']} seed{'s' * (values['seeds'] > 1)}. Run the same command with "
+            "more --minutes to add the others."
         )
     if values["absent"]:
         found.append(
@@ -326,17 +323,14 @@ def limits(values: Mapping[str, Any]) -> list[str]:
         chosen = values["chosen_elsewhere"]
         found.append(
             "The best of several arms looks better than it is, because it was chosen on the "
-            "places that it is "
-            f"measured on. Chosen on the other places each time: {format_signed(chosen['difference'])} "
-            f"{span(chosen['interval'])}."
+            "places that it is measured on. Chosen on the other places each time: "
+            f"{format_signed(chosen['difference'])} {span(chosen['interval'])}."
         )
     if values["trainer"] == "reference":
         found.append(
             f"The network is small and the training short ({values['iterations']} iterations of "
-            f"{values['batch']} "
-            f"scans of {values['settings']['columns']} columns): a full training starts from a "
-            "higher mIoU and may "
-            "gain less. Test your own trainer with --trainer."
+            f"{values['batch']} scans of {values['settings']['columns']} columns): a full training "
+            "starts from a higher mIoU and may gain less. Test your own trainer with --trainer."
         )
     found.append(
         "Tested on single scans of this dataset only: another sensor, country or season was not "

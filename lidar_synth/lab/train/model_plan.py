@@ -192,8 +192,7 @@ def _split(model: str, overrides: Sequence[str], settings: ModelConfig) -> dict[
             raise ConfigError(
                 f"override {override!r}",
                 f"STAGE.KEY=VALUE for a stage of {model} ({', '.join(own)}), output=FOLDER, or a "
-                "key of all its "
-                f"recipes ({', '.join(common)})",
+                f"key of all its recipes ({', '.join(common)})",
                 f"Such as {next(iter(own))}.recipe.batch=4.",
             )
     split = {name: [*every, *values] for name, values in own.items()}

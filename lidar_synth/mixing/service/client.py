@@ -135,8 +135,7 @@ class Client:
         made = self._slots.counters[0]
         return ProcessError(
             f"the generator process of the rolling bank (process {self.pid}, {made} scans made so "
-            f"far) has not {what} "
-            f"within {self.timeout:g} s",
+            f"far) has not {what} within {self.timeout:g} s",
             "a model that is fast enough",
             "Increase timeout=, use a faster device or fewer steps, or reuse scans in memory: "
             "starved='reuse'.",

@@ -91,9 +91,8 @@ def load_frozen_clip(location: str, device: str) -> nn.Module:
     path = Path(location)
     hint = (
         "Save CLIP ViT-L/14 as a folder (transformers: openai/clip-vit-large-patch14) or as "
-        "open_clip's .safetensors "
-        f"file, and set {CLIP_VARIABLE} to it; or train with the encoder 'views', which needs "
-        "neither."
+        f"open_clip's .safetensors file, and set {CLIP_VARIABLE} to it; or train with the encoder "
+        "'views', which needs neither."
     )
     if not location or not path.exists():
         given = f"{CLIP_VARIABLE}={location}" if location else f"{CLIP_VARIABLE} is not set"

@@ -78,8 +78,7 @@ def returns_of(
     if len(away) and np.median(away) > _ANOTHER:
         raise DataError(
             f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
-            "lasers of "
-            f"{lasers.name!r} (median)",
+            f"lasers of {lasers.name!r} (median)",
             "scans of this sensor",
         )
     dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step

@@ -147,17 +147,15 @@ def write_card(
         "```",
         "",
         f"It generates scans of {escape_markdown(sensor.name)} ({sensor.shape[0]} x "
-        f"{sensor.columns} cells, "
-        f"{sensor.range_min:g} to {sensor.range_max:g} m). It is {model}, adapted to "
-        f"{escape_markdown(facts['data'])}.",
+        f"{sensor.columns} cells, {sensor.range_min:g} to {sensor.range_max:g} m). It is {model}, "
+        f"adapted to {escape_markdown(facts['data'])}.",
         "",
         f"**Licence.** {escape_markdown(facts['licence'])}. The licence of {model} applies too.",
         "",
         f"**Labels.** They are {facts['labels']}.",
         "",
-        f"**Scans.** Trained on {_span(work.scans.train)}; held out: "
-        f"{_span(work.scans.held_out)}. The checkpoint "
-        "lists them, and tests on them are refused.",
+        f"**Scans.** Trained on {_span(work.scans.train)}; held out: {_span(work.scans.held_out)}. "
+        "The checkpoint lists them, and tests on them are refused.",
         "",
         "stage | steps | minutes | loss on held-out scans before | after",
         "---|---:|---:|---:|---:",
@@ -181,9 +179,8 @@ def write_card(
         f"of training scans, to another one | {near['training']:.3f}",
         "",
         f"{near['closer']:.0%} of the generated scans are nearer to a training scan than 95 % of "
-        "the held-out ones "
-        "are. About 5 % are expected of new scans; many more are copies, or scans that are more "
-        "ordinary.",
+        "the held-out ones are. About 5 % are expected of new scans; many more are copies, or "
+        "scans that are more ordinary.",
         "",
     ]
     write_file(path, "\n".join(lines).encode())

@@ -190,8 +190,7 @@ def _checked(scan: Scan, sensor: Sensor, usual: float) -> bool:
     ):
         raise DataError(
             f"scan {scan.id!r} of sensor {scan.sensor.name!r}, with {outside:.0%} of the points "
-            "outside of the view of "
-            f"{sensor.name!r}",
+            f"outside of the view of {sensor.name!r}",
             "scans of one sensor",
             "Adapt a model to each sensor by itself; --sensor names that of the scans.",
         )
