@@ -146,9 +146,8 @@ def _library() -> Any:
     """``open3d.ml.torch``, or an error that says which of its parts is missing."""
     try:
         ml3d = import_module("open3d.ml.torch")
-        return SimpleNamespace(
-            datasets=ml3d.datasets, pipelines=ml3d.pipelines
-        )  # they are imported when first used
+        # They are imported when first used.
+        return SimpleNamespace(datasets=ml3d.datasets, pipelines=ml3d.pipelines)
     except (ImportError, OSError, RuntimeError) as error:
         if isinstance(error, ImportError):
             hint = (

@@ -95,9 +95,8 @@ def tell_epochs() -> None:
             batches.sampler = Rest(
                 batches.sampler if several else SequentialSampler(train_loader.dataset)
             )
-            batches.sampler.skipped = len(
-                batches.sampler
-            )  # nothing for the iterator that OpenPCDet makes and drops
+            # Nothing for the iterator that OpenPCDet makes and drops.
+            batches.sampler.skipped = len(batches.sampler)
         return whole_training(model, optimizer, train_loader, *args, **options)
 
     def train_one_epoch(

@@ -26,9 +26,8 @@ class Mixed:
     """
 
     _current: int | None = None  # the position whose sample is being made
-    _synthetic: Callable[
-        [Scan], Any
-    ]  # processes a synthetic scan with the trainer's own augmentation
+    # Processes a synthetic scan with the trainer's own augmentation.
+    _synthetic: Callable[[Scan], Any]
     mixed: Any = None
     dataset_cfg: Any
     class_names: Any

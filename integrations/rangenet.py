@@ -307,9 +307,8 @@ def main() -> None:
         USAGE, "numpy.float", "imp", "tensorflow.summary", "torchvision", "torch.load"
     )
     if Path(script).with_name("__init__.py").is_file():
-        import_module(
-            "__init__"
-        )  # the trainer's own, which its scripts import first: it puts ../.. on the path
+        # The trainer's own, which its scripts import first: it puts ../.. on the path.
+        import_module("__init__")
     register()
     run(script)
 

@@ -45,10 +45,11 @@ TYPES = {
     "instance": "<u2",
     "boxes": "<i4",
 }
+# Of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused.
 BOXES = (
     256,
     9,
-)  # of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused
+)
 CLASSES = (
     "Car",
     "Van",
@@ -65,6 +66,7 @@ LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1
 FILTERS = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32)
 REPAIR = "copy it again, or run lidar-synth repair"
 PLAN = "python -m lidar_synth.integrations.plan makes a plan"
+# Raised by h5py, numpy and json on damaged files.
 DAMAGE = (
     AttributeError,
     ArithmeticError,
@@ -77,7 +79,7 @@ DAMAGE = (
     ValueError,
     zipfile.BadZipFile,
     zlib.error,
-)  # raised by h5py, numpy and json on damaged files
+)
 
 
 class ReaderError(ValueError):
@@ -350,9 +352,8 @@ class _Shard:
         dtype = np.dtype(TYPES[name])
         rows, columns = self.shapes[name]
         size = rows * columns * dtype.itemsize
-        plain = zlib.decompressobj().decompress(
-            chunk[:-4], size + 1
-        )  # the scan's CRC covers HDF5's own Fletcher-32
+        # The scan's CRC covers HDF5's own Fletcher-32.
+        plain = zlib.decompressobj().decompress(chunk[:-4], size + 1)
         _require(len(plain) == size, f"its {name} does not hold {size} bytes")
         planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
         return np.ascontiguousarray(planes.T).view(dtype).reshape(rows, columns)

@@ -87,9 +87,8 @@ def _tensorflow() -> bool:
             "tensorboard, for logs",
             "pip install tensorboard",
         ) from error
-    assert (
-        tensorboard.tf.io
-    )  # TensorBoard looks for TensorFlow once, when this is first used: before there is ours
+    # TensorBoard looks for TensorFlow once, when this is first used: before there is ours.
+    assert tensorboard.tf.io
     summary = _module("tensorflow.summary", FileWriter=writer.FileWriter)
     _module(
         "tensorflow",

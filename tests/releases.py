@@ -201,9 +201,8 @@ def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
             f"{UNET_EMA}num_updates": torch.tensor(7),
         }
     if model is CAMERA:
-        weights["cond_stage_model.model.visual.proj"] = torch.zeros(
-            3, 3
-        )  # frozen CLIP, which is not imported
+        # Frozen CLIP, which is not imported.
+        weights["cond_stage_model.model.visual.proj"] = torch.zeros(3, 3)
     return weights
 
 

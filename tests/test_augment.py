@@ -111,9 +111,8 @@ def test_boxes_contain_the_same_points(name: str, seed: int) -> None:
     kept = [scan.boxes.names.index(n) for n in changed.boxes.names]
     assert np.array_equal(after, before[kept][:, left])
     gone = np.setdiff1d(np.arange(6), kept)
-    assert (
-        before[gone].any(1).all() and not before[gone][:, left].any()
-    )  # they lost all that they had
+    # They lost all that they had.
+    assert before[gone].any(1).all() and not before[gone][:, left].any()
     assert np.array_equal(changed.boxes.occlusion, scan.boxes.occlusion[kept])
     for key in ("label", "raw_label", "instance", "ring"):
         assert np.array_equal(changed.fields()[key], scan.fields()[key][left])

@@ -206,9 +206,8 @@ def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
 def test_impossible_values_of_a_scan_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, name: str, value: Any, message: str
 ) -> None:
-    monkeypatch.setattr(
-        "lidar_synth.formats.writer.check_scan", lambda scan, where: None
-    )  # another program's file
+    # Another program's file.
+    monkeypatch.setattr("lidar_synth.formats.writer.check_scan", lambda scan, where: None)
     scan = some_scan()
     scan.confidence = np.ones(len(scan), np.float32)
     if name == "pose":

@@ -433,9 +433,8 @@ def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: 
         and "label policy" in output
     )
     assert not out.exists()
-    actual = (
-        CliRunner().invoke(app, [*call[:-1]]).output
-    )  # the estimate is close to the actual size
+    # The estimate is close to the actual size.
+    actual = CliRunner().invoke(app, [*call[:-1]]).output
     estimated, written = (float(text.split(" MB")[0].split()[-1]) for text in (output, actual))
     assert estimated == pytest.approx(written, rel=0.4)
 
@@ -444,9 +443,8 @@ def test_the_index_needs_a_record_of_every_shard(plan: BakePlan) -> None:
     bake(plan, share=Share(0, 2), progress=False)
     bake(plan, share=Share(1, 2), progress=False)
     (plan.out / INDEX).unlink()
-    assert (
-        finish(plan) is None
-    )  # a finished bake has removed the records, so a rerun checks the shards
+    # A finished bake has removed the records, so a rerun checks the shards.
+    assert finish(plan) is None
 
 
 SHARD = b"shard".ljust(64)

@@ -96,9 +96,8 @@ def test_a_signal_keeps_finished_shards(
     times = {name: (plan.out / name).stat().st_mtime_ns for name in kept}
     bake(plan, progress=False)
     assert files(plan.out) == expected
-    assert times == {
-        name: (plan.out / name).stat().st_mtime_ns for name in kept
-    }  # not written twice
+    # Not written twice.
+    assert times == {name: (plan.out / name).stat().st_mtime_ns for name in kept}
 
 
 def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
@@ -349,9 +348,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(
     small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        shard_module, "_PACKED", 0
-    )  # disables the check of free space before a shard
+    # Disables the check of free space before a shard.
+    monkeypatch.setattr(shard_module, "_PACKED", 0)
     plan = plan_in(small_disk / "bank", model)
     with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
         bake(plan, progress=False)

@@ -126,9 +126,8 @@ def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_pa
         elif upsets[-1] == "an actor was killed" and becomes_true(
             lambda: len(actors() - first) == 2, 10
         ):
-            upsets.append(
-                "another started"
-            )  # not before this returns and the engine hears of the loss
+            # Not before this returns and the engine hears of the loss.
+            upsets.append("another started")
         elif upsets[-1] == "another started" and writing(plan) & second:
             cluster.remove_node(nodes.pop(), allow_graceful=False)
             assert becomes_true(lambda: not actors() & second)

@@ -46,9 +46,8 @@ def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
         except DataError as error:
             assert "shard-00001.h5" in str(error), error
             refused += 1
-        assert (
-            sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256
-        )  # as verify does
+        # As verify does.
+        assert sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256
     assert refused > 90  # half of such a small shard is unused space for metadata
 
 

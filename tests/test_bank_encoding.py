@@ -38,9 +38,8 @@ def test_decoded_images_differ_by_at_most_half_a_step(sensor: Sensor) -> None:
     decoded = encoding.decode(encoding.encode(image))
     assert np.abs(decoded.range - image.range).max() <= encoding.scale / 2 * 1.02
     assert np.array_equal(decoded.mask, image.mask)
-    assert np.array_equal(
-        project(unproject(decoded)).mask, image.mask
-    )  # nothing leaves the sensor's limits
+    # Nothing leaves the sensor's limits.
+    assert np.array_equal(project(unproject(decoded)).mask, image.mask)
     assert np.array_equal(decoded.label, image.label)
     for name, levels in LEVELS.items():
         assert np.abs(decoded.channels[name] - image.channels[name]).max() <= 0.5001 / levels

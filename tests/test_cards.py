@@ -31,9 +31,8 @@ def test_a_card_names_the_sizes_and_the_licence_of_its_weights(name: str) -> Non
     ]
     assert sizes == pytest.approx([float(flow), float(autoencoder)], abs=0.05)
     assert generator.header.provenance["licence"] == "MIT" and "**Licence.** MIT" in card
-    assert (
-        len(re.findall(r"^[^|\n]+ \| [^|\n]+ \|.*$", card, re.M)) == 1 + 10
-    )  # a heading and ten numbers
+    # A heading and ten numbers.
+    assert len(re.findall(r"^[^|\n]+ \| [^|\n]+ \|.*$", card, re.M)) == 1 + 10
 
 
 def test_the_method_has_the_timesteps_of_the_shipped_student() -> None:

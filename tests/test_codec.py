@@ -216,9 +216,8 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
     (own / 2).backward()
     for name, parameter in judge.named_parameters():
         assert parameter.grad is not None
-        assert torch.allclose(by_both[name], parameter.grad, atol=1e-6), (
-            name
-        )  # the gradient of the adversarial term alone
+        # The gradient of the adversarial term alone.
+        assert torch.allclose(by_both[name], parameter.grad, atol=1e-6), name
 
 
 @pytest.mark.slow
@@ -236,9 +235,8 @@ def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str
     )
     assert sum(r.loss for r in records[-5:]) < 0.75 * sum(r.loss for r in records[:5])
     average: Any = training.average
-    assert torch.equal(
-        average.network.scale, trained.network.scale
-    )  # buffers are copied, not averaged
+    # Buffers are copied, not averaged.
+    assert torch.equal(average.network.scale, trained.network.scale)
     after = reconstruction_figures(Latent(average.network, TENSORS), tensors(), SENSOR)
     assert set(after) == {"mae", "within_5cm", "drop_accuracy", "chamfer", "label_accuracy"}
     assert after["mae"] < before["mae"]

@@ -107,20 +107,20 @@ def test_the_measures_match_their_definitions() -> None:
         0,
         0,
     ]
+    # The first row looks up, the others down.
     image.channels["label"][0, 1:5] = (
         ROAD,
         ROAD,
         IGNORE,
         BUILDING,
-    )  # the first row looks up, the others down
+    )
     scan = unproject(image)
     assert MEASURES["unlabelled"].of(image, scan) == pytest.approx(1 / (8 * 31))
     assert MEASURES["floating"].of(image, scan) == pytest.approx(2 / (5 * 31 + 2))
     assert MEASURES["speckle"].of(image, scan) == 0
     image.channels["label"][0, 10] = ROAD
-    pairs = (
-        8 * 27 - 2
-    )  # four walls of 7 in every row, less what is beside the gap and beside the unknown label
+    # Four walls of 7 in every row, less what is beside the gap and beside the unknown label.
+    pairs = 8 * 27 - 2
     assert MEASURES["speckle"].of(image, unproject(image)) == pytest.approx(2 / pairs)
 
 

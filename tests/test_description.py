@@ -95,9 +95,8 @@ def test_what_is_written_is_read_without_arguments(
 @pytest.mark.parametrize("first", WRITERS)
 def test_conversions_keep_sensor_and_origin(tmp_path: Path, first: str) -> None:
     chain = [first, *(name for name in WRITERS if name != first)]
-    chain.sort(
-        key=lambda name: name != first and name in IMAGES
-    )  # images have no boxes, which kitti_object needs
+    # Images have no boxes, which kitti_object needs.
+    chain.sort(key=lambda name: name != first and name in IMAGES)
     scan = a_scan()
     write_all(first, tmp_path / "0", [scan])
     if first != "kitti_object":
@@ -302,9 +301,8 @@ def test_the_lines_of_a_header_are_short(tmp_path: Path, to: str) -> None:
 def test_a_damaged_provenance_is_refused(
     tmp_path: Path, to: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "lidar_synth.formats.writer.check_facts", lambda scan, where: None
-    )  # another program's file
+    # Another program's file.
+    monkeypatch.setattr("lidar_synth.formats.writer.check_facts", lambda scan, where: None)
     origin = Origin(SYNTHETIC, {"seed": {"nested": 1}})
     write_all(to, tmp_path, [a_scan(origin=origin)])
     with pytest.raises(DataError, match="not a short text or a number"):

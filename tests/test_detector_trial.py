@@ -154,10 +154,11 @@ def test_a_view_has_each_return_in_its_pixel() -> None:
     i = int((10.05 + REACH) / CELL)
     j = int((-3.25 + REACH) / CELL)
     pixel = seen[i // 2, j // 2].reshape(2, 2, SLICES + 2)[i % 2, j % 2]
+    # 2.5 and 4.4 m above the lowest slice's bottom.
     assert np.flatnonzero(pixel[:SLICES]).tolist() == [
         8,
         14,
-    ]  # 2.5 and 4.4 m above the lowest slice's bottom
+    ]
     assert pixel[SLICES] == 127 and pixel[SLICES + 1] == int(40 * np.log2(3))
     assert np.count_nonzero(seen) == 4  # the returns outside the view are nowhere
 

@@ -150,9 +150,8 @@ def features_of(
             extract = load_lidm(path, "lidm")
 
             def features(image: torch.Tensor) -> NDArray[np.float32]:
-                given.append(
-                    torch.cat([image, torch.full((1, 64, 64), -1.0)]).numpy()
-                )  # remission is unknown
+                # Remission is unknown.
+                given.append(torch.cat([image, torch.full((1, 64, 64), -1.0)]).numpy())
                 return extract([random_scan(presets()["town"], 10)])[0]
 
             return features
@@ -213,9 +212,8 @@ def test_the_images_of_lidm_move_the_returns_that_lidm_moves(
     assert len(ours ^ theirs) <= 0.1 * len(theirs)
     assert ours - theirs <= neighbours(theirs) and theirs - ours <= neighbours(ours)
     before = set(np.flatnonzero(PREPARATIONS["r3dpa"].image(scan, False)[0] > 0))
-    assert len(ours) < len(before) and len(ours - before) > 0.05 * len(
-        before
-    )  # moved to the next row or column
+    # Moved to the next row or column.
+    assert len(ours) < len(before) and len(ours - before) > 0.05 * len(before)
     both = np.array(sorted(ours & theirs))
     expected = peer["lidm image"][:, np.searchsorted(peer["lidm cells"], both)]
     same = np.isclose(image[:4, both], expected, rtol=1e-5).all(0)

@@ -331,6 +331,5 @@ def test_the_table_of_a_real_pandar64_is_found(pandaset: Path) -> None:
     assert (np.abs(np.array(fit.sensor.elevations) - table[:, 1]) < 0.02).sum() >= 60
     assert fit.share > 0.98 and fit.sensor.firings == 1800
     wrong = np.array(fit.sensor.azimuths) - table[:, 2]
-    assert (
-        np.abs(wrong - np.median(wrong)).max() < 0.15
-    )  # lasers fire one after the other, within 30 microseconds
+    # Lasers fire one after the other, within 30 microseconds.
+    assert np.abs(wrong - np.median(wrong)).max() < 0.15

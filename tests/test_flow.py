@@ -95,10 +95,11 @@ def test_autoguidance_passes_the_condition_on() -> None:
     cond = torch.randn(3, 2)
     out = autoguide(lambda y, t, c: y + c, lambda y, t, c: y - c, 3.0)(y, t, cond)
     assert torch.allclose(out, y + 5 * cond, atol=1e-5)
+    # Dtype under autocast.
     halves = (
         lambda y, t, c: (y + c).bfloat16(),
         lambda y, t, c: (y - c).bfloat16(),
-    )  # dtype under autocast
+    )
     assert torch.allclose(autoguide(*halves, 3.0)(y, t, cond), y + 5 * cond, atol=0.2)
 
 

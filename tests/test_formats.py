@@ -430,6 +430,5 @@ def test_a_folder_of_npz_files_has_the_sensor_stored_in_them(tmp_path: Path) -> 
     WRITERS["npz"](tmp_path).write(random_scan(sensor, 500, seed=0), 0)
     assert open_scans(tmp_path).sensor == sensor
     (tmp_path / "000000.npz").write_bytes(b"")
-    assert (
-        open_scans(tmp_path).sensor.name == "hdl64e_kitti"
-    )  # what is wrong is said when it is read
+    # What is wrong is said when it is read.
+    assert open_scans(tmp_path).sensor.name == "hdl64e_kitti"

@@ -91,9 +91,8 @@ def test_scans_are_the_returns_of_the_images(generator: Generator) -> None:
     assert len(scan) == image.mask.sum()
     assert np.array_equal(scan.label, image.label[image.mask])
     assert np.array_equal(scan.confidence, image.channels["confidence"][image.mask])
-    assert np.array_equal(
-        project(scan).mask, image.mask
-    )  # every return is projected into its own cell
+    # Every return is projected into its own cell.
+    assert np.array_equal(project(scan).mask, image.mask)
 
 
 def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
@@ -413,10 +412,11 @@ def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
         for c in (None, SENSOR.columns // 2)
     ]
     assert [plan.facts.sensor.columns for plan in plans] == [SENSOR.columns, SENSOR.columns // 2]
+    # As in banks of earlier versions.
     assert ["columns" in plan.facts.settings for plan in plans] == [
         False,
         True,
-    ]  # as in banks of earlier versions
+    ]
     with pytest.raises(ConfigError, match="one of"):
         load_generator(path, columns=10)
     with pytest.raises(ConfigError, match="one of 2048, 1024"):

@@ -77,9 +77,8 @@ def test_a_network_is_told_where_its_step_ends() -> None:
     trained = network(ends=True)
     y = torch.randn(2, 2, 8, 64)
     with torch.no_grad():
-        assert torch.equal(
-            fresh.step(torch.rand(2)), torch.zeros(2, 16)
-        )  # at first the end makes no difference
+        # At first the end makes no difference.
+        assert torch.equal(fresh.step(torch.rand(2)), torch.zeros(2, 16))
         ends = [trained(y, 0.8, None, end) for end in (0.0, 0.5, torch.tensor([0.0, 0.5]))]
         assert distance(ends[0], ends[1]) > 0.01
         assert torch.allclose(ends[2][0], ends[0][0], atol=1e-4) and torch.allclose(
@@ -198,9 +197,8 @@ def test_condition_tokens_change_the_velocity() -> None:
     cond = torch.randn(2, 7, 5)
     v = net(y, 0.5, cond)
     assert v.shape == y.shape
-    torch.testing.assert_close(
-        net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4
-    )  # the order of tokens does not matter
+    # The order of tokens does not matter.
+    torch.testing.assert_close(net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4)
     other = net(y, 0.5, torch.stack([cond[0], -cond[1]]))
     torch.testing.assert_close(other[0], v[0], rtol=1e-5, atol=1e-5)
     assert distance(other[1], v[1]) > 1e-3

@@ -58,9 +58,8 @@ def test_arrays_are_what_numpy_reads(
         and read.shape == expected.shape
     )
     start = 10 + content[8] + 256 * content[9]
-    old = (
-        content[:start].replace(b"'", b'"') + content[start:] if text else content
-    )  # as others write it
+    # As others write it.
+    old = content[:start].replace(b"'", b'"') + content[start:] if text else content
     assert np.array_equal(parse_npy(old, "here"), expected) and read.flags.writeable
 
 

@@ -73,9 +73,8 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
     assert header.provenance["data"] == "KITTI-360"
     seen = {part["dataset"]: part["drives"] for part in header.provenance["seen"]}
     assert "2013_05_28_drive_0002_sync" in seen["KITTI-360"]
-    assert ("odometry 21" in seen.get("KITTI", {})) == (
-        VELOCITY in networks
-    )  # by the autoencoder inside a flow's file
+    # By the autoencoder inside a flow's file.
+    assert ("odometry 21" in seen.get("KITTI", {})) == (VELOCITY in networks)
     if VELOCITY in networks:  # the averaged weights are imported, not the last ones
         head = networks[VELOCITY].state_dict()["head.bias"]
         assert torch.equal(head, weights[f"{UNET_EMA}diffusion_modelout2bias"])

@@ -263,9 +263,8 @@ def test_boxes_are_bottom_centred_and_planes_point_up(made: Path) -> None:
         assert np.allclose(boxes[:, 2], floor, atol=1e-6) and np.array_equal(
             boxes[:, :2], scan.boxes.values[:, :2]
         )
-        assert (
-            info["plane"][2] > 0.99 and abs(info["plane"][3] - 1.73) < 0.05
-        )  # the sensor stands 1.73 m above the road
+        # The sensor stands 1.73 m above the road.
+        assert info["plane"][2] > 0.99 and abs(info["plane"][3] - 1.73) < 0.05
         real = dataset.get_data_info(slot)["plane"]
         assert np.allclose(real, info["plane"], atol=0.05)
 

@@ -127,9 +127,8 @@ def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
     assert np.allclose(back.reflectance, scan.reflectance, atol=1e-6)
     assert turned.boxes is not None and scan.boxes is not None
     assert set(turned.boxes.names) == {"car"} and len(turned.boxes) == 3
-    assert (
-        np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3
-    )  # those on a face
+    # Those on a face.
+    assert np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3
 
 
 def test_names_of_boxes_become_nuscenes_classes() -> None:

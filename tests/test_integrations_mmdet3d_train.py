@@ -80,9 +80,8 @@ def test_pointpillars_trains_validates_and_resumes(tmp_path: Path) -> None:
         re.search(r"Car_3D_AP40_moderate_strict: \d", whole)
         and (tmp_path / "whole" / "iter_4.pth").is_file()
     )
-    names = [
-        line.split()[-1] for line in samples(whole)
-    ]  # real scans by their files, synthetic ones by their ids
+    # Real scans by their files, synthetic ones by their ids.
+    names = [line.split()[-1] for line in samples(whole)]
     assert {name.endswith(".bin") for name in names} == {False, True}
     load = ("--resume", "whole/iter_2.pth", "--work-dir", "resumed")
     assert samples(typed(tmp_path, TRAIN, "pointpillars_kitti.py", *load)) == samples(whole)[2:]

@@ -292,15 +292,15 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(
     assert sorted(seen) == [0, 1, 2]
     for names in seen.values():
         assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
+    # Of 11.
     assert (
         len({n for names in seen.values() for n in names if n.startswith("synthetic_")})
         == 3 * EXTRA - 1
-    )  # of 11
+    )
     losses = [float(loss) for loss in re.findall(r"loss: (\S+) Lr", said)]
     assert len(losses) == 15 and np.isfinite(losses).all()
-    assert (
-        len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4
-    )  # after each epoch, and the best
+    # After each epoch, and the best.
+    assert len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4
     checkpoint = tmp_path / "run" / "model" / "epoch_2.pth"
     rest = train(made, SEGMENTATION, tmp_path, "resume=True", f"weight={checkpoint}", **values)
     assert samples(rest) == {2: seen[2]}

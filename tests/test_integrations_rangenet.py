@@ -220,9 +220,8 @@ def test_a_width_with_stripes_is_refused(made: Path, dense: Path) -> None:
     ):
         parser(dense, sensor=sensor_of(2 * SENSOR.columns))
     parser(dense)  # both kinds in images of the synthetic scans' width
-    parser(
-        made, sensor=sensor_of(2 * SENSOR.columns)
-    )  # stripes in both kinds do not tell them apart
+    # Stripes in both kinds do not tell them apart.
+    parser(made, sensor=sensor_of(2 * SENSOR.columns))
 
 
 @pytest.fixture

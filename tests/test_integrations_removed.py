@@ -75,10 +75,11 @@ def test_a_removed_name_works_again(name: str, tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("lidar_synth:")]
+    # The library that has the name is installed.
     real = not lines and name in (
         "tensorflow.summary",
         "torchvision",
-    )  # the library that has the name is installed
+    )
     assert real or lines == [f"lidar_synth: provides {name} ({NAMES[name][0]})"]
 
 

@@ -69,9 +69,8 @@ def test_points_of_a_moving_object_follow_its_box(tmp_path: Path) -> None:
     points, values = movers.at(1)  # no point was measured in this frame
     assert np.allclose(sorted(points.tolist()), [(2.5, 0, 0), (2.5, 0.9, 0)], atol=1e-5)
     assert set(values.tolist()) == {26 | 26001 << 16}
-    assert (
-        len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0
-    )  # the point in no box, only in its own frame
+    # The point in no box, only in its own frame.
+    assert len(movers.at(3)[0]) == 3 and len(movers.at(9)[0]) == 0
 
 
 def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points(

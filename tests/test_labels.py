@@ -104,9 +104,8 @@ def test_a_policy_is_a_function_of_scan_and_generator(
     policy = make_policy(policy_name, real=real, fields=known, **options)
     first = policy(synthetic, keyed_rng(4, 1))
     again = policy(synthetic, keyed_rng(4, 1))
-    copied = pickle.loads(pickle.dumps(policy))(
-        synthetic, keyed_rng(4, 1)
-    )  # as spawned workers get it
+    # As spawned workers get it.
+    copied = pickle.loads(pickle.dumps(policy))(synthetic, keyed_rng(4, 1))
     assert same(first, again) and same(first, copied)
     other = policy(synthetic, keyed_rng(4, 2))
     assert same(first, other) == (policy_name != "mix")
@@ -215,9 +214,8 @@ def test_a_sector_is_the_others_and_the_rest_is_kept() -> None:
 def test_objects_that_the_edge_of_a_sector_cuts_leave() -> None:
     ours = cast([car(0, 10), car(10, 0.5), car(12, -12)])
     theirs = cast([car(0, -9), car(10, 0, np.pi / 2), car(-8, -5)])
-    mixed = swap_sector(
-        ours, theirs, 512, 512
-    )  # the right half is theirs; the edges are straight ahead and behind
+    # The right half is theirs; the edges are straight ahead and behind.
+    mixed = swap_sector(ours, theirs, 512, 512)
     assert mixed.boxes is not None and mixed.instance is not None and mixed.label is not None
     assert np.allclose(mixed.boxes.values[:, :2], [[0, 10], [0, -9], [-8, -5]])
     assert mixed.boxes.instance.tolist() == [1, 2, 3]
@@ -438,9 +436,8 @@ def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic:
     source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")
     if kind == "objects":
         source = KITTIObject(real_scans / "kitti_object")
-    options = (
-        {"clear": False} if kind == "objects" else {}
-    )  # else the scan's own objects leave holes, which are filled
+    # Else the scan's own objects leave holes, which are filled.
+    options = {"clear": False} if kind == "objects" else {}
     policy = make_policy("mix", real=source, fields=FIELDS, kind=kind, **options)
     for seed in range(3):
         mixed = policy(synthetic, keyed_rng(seed))

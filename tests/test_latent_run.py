@@ -74,9 +74,8 @@ def test_a_latent_model_of_label_maps_generates(codec: Path, teacher: Path) -> N
     # Small networks, hardly trained: a weak guidance may end at the same codes of the autoencoder.
     [guided] = generator.scans(3, [1], real, guidance=100.0)
     assert (scan.id, scan.sensor) == ("teacher/3/1", SENSOR)
-    assert (
-        scan.label is not None and scan.confidence is not None
-    )  # of its own: the tensor carries labels
+    # Of its own: the tensor carries labels.
+    assert scan.label is not None and scan.confidence is not None
     assert len(scan) > 0 and not np.array_equal(scan.points, guided.points)
     together = torch.cat(list(replace(generator, batch=2).samples(3, [5, 1], real)))
     [alone] = generator.samples(3, [1], real)

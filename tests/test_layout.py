@@ -130,9 +130,8 @@ def test_the_image_is_that_of_walking_along_the_rays(seed: int, sensor: Sensor) 
     assert same.mean() > 0.985
     assert len(np.unique(code)) > 6
     steps = np.abs(depth_of(image) - depth)[same]
-    assert (
-        np.quantile(steps, 0.99) < 0.06
-    )  # the walk stops after the surface, and grazes the ground later
+    # The walk stops after the surface, and grazes the ground later.
+    assert np.quantile(steps, 0.99) < 0.06
 
 
 def test_the_ground_hides_no_box() -> None:

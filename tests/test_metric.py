@@ -140,9 +140,8 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
     few = evaluate(
         REAL, FAKE, "town", {"moments": moments}, progress=False, replicates=40, extended=True
     )
-    assert (
-        next(s for s in few if s.metric == "Frechet distance of moments").low is None
-    )  # 4 scans, 6 features
+    # 4 scans, 6 features.
+    assert next(s for s in few if s.metric == "Frechet distance of moments").low is None
     assert "[" in str(by_name["BEV Jensen-Shannon distance"])
 
 
@@ -219,9 +218,8 @@ def test_features_are_made_once_per_scan_and_weights(tmp_path: Path) -> None:
     assert np.array_equal(first, moments(REAL[:3])) and np.array_equal(
         again, moments([REAL[2], REAL[3], REAL[0]])
     )
-    assert np.array_equal(
-        cached(REAL[:1], True), moments(REAL[:1]) + 1
-    )  # prepared as a generated scan
+    # Prepared as a generated scan.
+    assert np.array_equal(cached(REAL[:1], True), moments(REAL[:1]) + 1)
     Cached(count, tmp_path, "weights 2")(REAL[:1])
     assert count.seen[4:] == [REAL[0].id] * 2
 

@@ -113,9 +113,8 @@ def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> No
     assert compared("lidm", "mmd", *both) == pytest.approx(
         vectors[f"lidm/mmd{suffix}"][0], rel=1e-4
     )
-    assert compared("r3dpa", "jsd", *both) == compared(
-        "lidm", "jsd", *both
-    )  # R3DPA keeps LiDM's code for it
+    # R3DPA keeps LiDM's code for it.
+    assert compared("r3dpa", "jsd", *both) == compared("lidm", "jsd", *both)
 
 
 @pytest.mark.slow
@@ -140,9 +139,8 @@ def test_squared_mmd_by_hand() -> None:
     across = (1 + 1 + 8 + 27) / 4
     assert squared_mmd(a, b, subsets=3) == pytest.approx(within - 2 * across)
     assert squared_mmd(a, a, subsets=3) == pytest.approx((1 + 1) - 2 * (1 + 1 + 1 + 8) / 4)  # -3.5
-    everything = (
-        np.arange(6.0)[:, None] / 3
-    )  # all pairs of disjoint halves of one set: 0 on average
+    # All pairs of disjoint halves of one set: 0 on average.
+    everything = np.arange(6.0)[:, None] / 3
     halves = [list(chosen) for chosen in combinations(range(6), 3)]
     pairs = [(h, [i for i in range(6) if i not in h]) for h in halves]
     three = [squared_mmd(everything[h], everything[rest], subsets=1) for h, rest in pairs]
@@ -161,9 +159,8 @@ def test_frechet_distance_by_hand() -> None:
     few = a[:3]  # covariances of rank 2 in 6 dimensions
     assert frechet_distance(few, few + 1) == pytest.approx(6, abs=1e-6)
     assert frechet_distance(few, few.astype(np.float32)) == pytest.approx(0, abs=1e-6)
-    assert all(
-        frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60))
-    )  # never below, by rounding
+    # Never below, by rounding.
+    assert all(frechet_distance(f, f) >= 0 for f in rng.normal(size=(20, 6, 60)))
 
 
 @given(data=st.data(), bins=st.integers(1, 20))
@@ -226,9 +223,8 @@ def test_each_protocol_tells_near_from_far(name: str) -> None:
     )
     assert len(same) == sum(m.kind != FEATURES for m in PROTOCOLS[name].measures.values())
     for zero, small, large in zip(same, near, far, strict=True):
-        apart = (
-            PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated
-        )  # the two sets are made differently
+        # The two sets are made differently.
+        apart = PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated
         assert zero.value == pytest.approx(0, abs=1e-6) or apart
         assert small.value < large.value
         assert (small.protocol, small.real, small.generated) == (name, 8, 6)
@@ -307,9 +303,8 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
     everything = evaluate(
         real, fake, limited, {"moments": lambda some: np.ones((len(some), 2))}, progress=False
     )
-    assert (
-        everything[0] == score and everything[-1].real == 6
-    )  # features are of all scans, as R2Flow takes them
+    # Features are of all scans, as R2Flow takes them.
+    assert everything[0] == score and everything[-1].real == 6
 
 
 def test_bad_input() -> None:

@@ -26,9 +26,8 @@ def test_poses_between_are_those_of_scipy() -> None:
     at = np.random.default_rng(1).uniform(times[0], times[-1], 500)
     found = interpolate_poses(times, poses, at)
     expected = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
-    assert (
-        np.abs(found[:, :3, :3] - expected).max() < 1e-6
-    )  # the times have seven digits after the point
+    # The times have seven digits after the point.
+    assert np.abs(found[:, :3, :3] - expected).max() < 1e-6
     for axis in range(3):
         assert np.allclose(found[:, axis, 3], np.interp(at, times, poses[:, axis, 3]), atol=1e-9)
     assert (found[:, 3] == (0, 0, 0, 1)).all()

@@ -47,12 +47,13 @@ def test_no_return_is_encoded_as_minus_one_and_the_farthest_return_as_one() -> N
     scale = NORMALISATIONS["r2flow"]
     x = scale.encode(torch.tensor([0.0, 79.9999, 1.45, 80.0]))
     assert x.tolist() == [-1, pytest.approx(1, abs=1e-6), -1, -1]
+    # 80 m is outside.
     assert scale.decode(torch.tensor([-3.0, -1.0, 1.0, 3.0])).tolist() == [
         0,
         0,
         0,
         0,
-    ]  # 80 m is outside
+    ]
 
 
 def test_reflectance_is_decoded_and_clamped() -> None:

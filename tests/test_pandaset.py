@@ -136,9 +136,8 @@ def test_boxes_stand_where_they_do_in_the_world(root: Path, motion_compensated: 
         ahead = np.array([-np.sin(row["yaw"]), np.cos(row["yaw"])])
         assert np.allclose(corners[i].mean(0), centre, atol=1e-4)
         front = corners[i][[0, 3, 4, 7]].mean(0)[:2] - centre[:2]
-        assert np.allclose(
-            front, ahead * row["dimensions.y"] / 2, atol=0.02
-        )  # the sensor is tilted, boxes are not
+        # The sensor is tilted, boxes are not.
+        assert np.allclose(front, ahead * row["dimensions.y"] / 2, atol=0.02)
         assert np.isclose(scan.boxes.values[i, 4], row["dimensions.x"])
         assert np.isclose(scan.boxes.values[i, 5], row["dimensions.z"])
 
@@ -178,9 +177,8 @@ def test_a_camera_sees_what_the_sensor_passes(root: Path) -> None:
             PandaSet(root, motion_compensated=True)[1].points[at] @ scan.pose[:3, :3].T
             + scan.pose[:3, 3]
         )
-        expected = (np.linalg.inv(poses[1]) @ [*world, 1])[
-            :3
-        ]  # the camera's poses are those of the vehicle here
+        # The camera's poses are those of the vehicle here.
+        expected = (np.linalg.inv(poses[1]) @ [*world, 1])[:3]
         found = (camera.camera_from_sensor @ [*scan.points[at], 1])[:3]
         assert np.allclose(found, expected, atol=0.3 if not compensated else 1e-3), times[1]
 

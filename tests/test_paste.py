@@ -96,9 +96,8 @@ def test_a_pasted_object_stands_on_the_ground(ground: float, labelled: bool) -> 
         [0, 0, pasted.boxes.values[0, 2] - candidate.box[2]], np.float32
     )
     cells = np.unique(locate(lowered, SENSOR).cell)
-    assert (pasted.instance == 1).sum() == len(
-        cells
-    )  # the ground before it hides not even its lowest row
+    # The ground before it hides not even its lowest row.
+    assert (pasted.instance == 1).sum() == len(cells)
     assert pasted.boxes.values[0, 2] - pasted.boxes.values[0, 5] / 2 == pytest.approx(
         ground, abs=0.02
     )
@@ -149,9 +148,8 @@ def test_objects_in_front_occlude_a_pasted_object() -> None:
     assert wide.boxes is not None and not len(wide.boxes)  # hidden
     assert np.array_equal(wide.points, cast([], [wall(9, 0, np.pi / 2, 3)]).points)
     none = paste(replace(cast(), boxes=None), [])
-    assert (
-        none.boxes is not None and len(none.boxes) == 0
-    )  # a detector's sample has boxes, be there any or not
+    # A detector's sample has boxes, be there any or not.
+    assert none.boxes is not None and len(none.boxes) == 0
 
 
 def test_gaps_between_occluding_returns_show_nothing() -> None:
@@ -204,9 +202,8 @@ def test_pasted_objects_occlude_one_another_in_any_order() -> None:
         assert len(pasted) == len(truth)
         assert np.allclose(project(pasted).range, project(truth).range, atol=1e-4)
         assert pasted.boxes is not None
-        assert np.allclose(
-            pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01
-        )  # from near to far
+        # From near to far.
+        assert np.allclose(pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01)
         assert_nothing_shares_a_ray(pasted, 1)
     twice = paste(cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2)
     assert twice.boxes is not None and len(twice.boxes) == 2  # the second found no place
@@ -254,10 +251,11 @@ def test_fields_of_a_scan_with_pasted_objects() -> None:
     assert (boxes.truncation[0], boxes.alpha[0]) == (np.float32(0.2), 1)
     about = paste(host, [candidate.turned(0.2)]).boxes
     assert about is not None
+    # In another direction the camera saw nothing of it.
     assert (about.truncation[0], about.alpha[0]) == (
         -1,
         -10,
-    )  # in another direction the camera saw nothing of it
+    )
 
 
 @pytest.mark.parametrize("name", ["town", "hdl64e_lasers"])

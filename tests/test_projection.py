@@ -130,9 +130,8 @@ def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
     sensor = replace(SMALL[kind], range_min=float(low), range_max=float(high))
     points = np.zeros((4, 3), np.float32)
     for i, distance in enumerate((low, high, *outside)):
-        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][
-            i
-        ]  # four different directions
+        # Four different directions.
+        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]
     scan = Scan(points, np.zeros(4, np.float32), sensor)
     assert (locate(points, sensor).cell >= 0).tolist() == [True, True, False, False]
     assert locate(points, sensor).range[:2].tolist() == [low, high]
@@ -212,9 +211,8 @@ def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
     image = image_of(sensor.by_beams(), 5, share=share)
     points = []
     rows = []
-    image.range[image.mask] = np.maximum(
-        image.range[image.mask], 5
-    )  # rings of nearer points are ambiguous in crops
+    # Rings of nearer points are ambiguous in crops.
+    image.range[image.mask] = np.maximum(image.range[image.mask], 5)
     for row in range(sensor.shape[0]):
         order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
         order = order[image.range[row, order] > 0]

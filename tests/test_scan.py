@@ -45,9 +45,8 @@ def test_a_box_contains_its_corners_and_nothing_beyond(seed: int) -> None:
 
 def test_corners_follow_the_yaw_and_points_near_the_floor_can_be_excluded() -> None:
     box = Boxes(np.array([[0, 0, 0, 4, 2, 2, np.pi / 2]], np.float32), ("Car",))
-    assert np.allclose(
-        box.corners()[0, 0], [-1, 2, -1], atol=1e-6
-    )  # front left of a car that looks to the left
+    # Front left of a car that looks to the left.
+    assert np.allclose(box.corners()[0, 0], [-1, 2, -1], atol=1e-6)
     points = np.array([[0, 1.9, 0], [1.9, 0, 0], [0, 0, -0.9]], np.float32)
     assert box.contain(points).tolist() == [[True, False, True]]
     assert box.contain(points, above_floor=0.3).tolist() == [[True, False, False]]
@@ -123,8 +122,7 @@ def test_kitti360_merges_only_motorcyclists_and_trunks() -> None:
 
 @pytest.mark.parametrize("kind", [DataError, ConfigError, FileError, LibraryError])
 def test_errors_state_input_expectation_and_hint_and_can_be_copied(kind: type) -> None:
-    error = copy.copy(
-        kind("a.bin is cut", "whole points", "Copy it again.")
-    )  # as pickling would rebuild it
+    # As pickling would rebuild it.
+    error = copy.copy(kind("a.bin is cut", "whole points", "Copy it again."))
     assert str(error) == "a.bin is cut; expected whole points. Copy it again."
     assert isinstance(error, LidarSynthError) and isinstance(error, ValueError | OSError)

@@ -66,9 +66,8 @@ def test_rays_are_unit_vectors_in_the_documented_frame(sensor: Sensor, rays: str
         assert np.allclose(np.linalg.norm(rays_xyz, axis=-1), 1, atol=1e-6)
         assert np.all(np.diff(rays_xyz[:, 0, 2]) < 0)  # row 0 is the highest
         middle = s.columns // 2
-        assert (
-            rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0
-        )  # ahead in the middle, the seam behind
+        # Ahead in the middle, the seam behind.
+        assert rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0
         assert rays_xyz[0, middle + s.columns // 4, 1] < 0  # clockwise: to the right of ahead is -y
         assert not rays_xyz.flags.writeable
 

@@ -302,9 +302,8 @@ def test_all_ways_of_loading_give_the_same_scans_for_the_same_plan(
         ]
         ways = [[sample for batch in loader for sample in batch] for loader in loaders]
         assert [len(way) for way in ways] == [24, 24, 24]
-        assert (
-            len({name for name, _ in ways[0] if name.startswith("small")}) == 12
-        )  # with reuse, the same ones come again in the next epoch
+        # With reuse, the same ones come again in the next epoch.
+        assert len({name for name, _ in ways[0] if name.startswith("small")}) == 12
         for first, *others in zip(*ways, strict=True):
             for other in others:
                 assert other[0] == first[0]

@@ -101,10 +101,11 @@ def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(bank: Rolli
     assert time.monotonic() - start < 10
     os.kill(bank.pid, signal.SIGCONT)
     bank._client.timeout = 60.0
+    # Late answers are not taken for these.
     assert [bank[n].id for n in (7, 5)] == [
         "small/0/7",
         "small/0/5",
-    ]  # late answers are not taken for these
+    ]
     os.kill(bank.pid, signal.SIGSTOP)
     bank.close()
     assert gone(bank.pid)

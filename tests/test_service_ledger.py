@@ -15,11 +15,12 @@ def test_sequential_prefetch_follows_the_requests() -> None:
     assert outlook.upcoming({0, 1, 3}) == (2, 2)
     outlook.answer(5)
     assert outlook.upcoming({2}) == (3, 3)
+    # Farther behind than the window.
     assert [outlook.next_use(n, 0) for n in (0, 1, 2)] == [
         NEVER,
         1,
         2,
-    ]  # farther behind than the window
+    ]
     assert outlook.next_use(2, served=1) == NEVER
     outlook.answer(70)  # training goes on at another place
     assert outlook.upcoming(()) == (70, 70)

@@ -53,9 +53,8 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
         f"init={made}",
         f"output={tmp_path / 'flow'}",
     )
-    flow = load_generator(
-        tmp_path / "flow" / "flow.safetensors"
-    )  # it is not told where a step ends
+    # It is not told where a step ends.
+    flow = load_generator(tmp_path / "flow" / "flow.safetensors")
     assert not flow.network.ends and flow.header.other_grids == ()
 
 

@@ -51,9 +51,8 @@ def test_returns_of_a_label_map_have_its_labels(columns: int) -> None:
         known = image.mask & wanted.mask & (wanted.label != IGNORE)
         assert known.sum() > 0.8 * wanted.mask.sum()
         same = (image.label == wanted.label)[known].mean()
-        assert same == 1 or (
-            columns == 1024 and same > 0.9
-        )  # a column that stands for two has the label of one
+        # A column that stands for two has the label of one.
+        assert same == 1 or (columns == 1024 and same > 0.9)
         near = np.abs(image.range - wanted.range)[known] < 0.05 * wanted.range[known]
         assert near.mean() > 0.5  # it stands where the map's scan stood, roughly
 

@@ -146,9 +146,8 @@ def test_grids_that_do_not_descend_within_0_and_1_are_refused(grid: tuple[float,
 
 def test_uniform_grids_are_evenly_spaced() -> None:
     assert uniform_grid(4) == (1.0, 0.75, 0.5, 0.25, 0.0)
-    assert (
-        uniform_grid(100)[70] == 0.3
-    )  # the nearest float, which headers and configurations display as 0.3
+    # The nearest float, which headers and configurations display as 0.3.
+    assert uniform_grid(100)[70] == 0.3
     assert uniform_grid(2, 0.58, 0.22) == pytest.approx((0.58, 0.4, 0.22))
 
 

@@ -43,9 +43,8 @@ def test_a_kernel_of_size_3_is_a_dense_convolution() -> None:
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(len(voxels), 5, generator=generator)
     kernel = torch.randn(27, 5, 7, generator=generator)
-    weight = kernel.view(3, 3, 3, 5, 7).permute(
-        4, 3, 2, 1, 0
-    )  # (z, y, x, in, out): x is the fastest
+    # (z, y, x, in, out): x is the fastest.
+    weight = kernel.view(3, 3, 3, 5, 7).permute(4, 3, 2, 1, 0)
     expected = at(F.conv3d(dense(voxels, features), weight, padding=1), voxels)
     torch.testing.assert_close(
         convolve(features, kernel, neighbours(voxels), len(voxels)), expected
@@ -58,9 +57,8 @@ def test_a_kernel_of_size_2_and_its_transpose_are_dense_convolutions() -> None:
     level = pyramid(fine, 2)[1]
     features = torch.randn(len(fine), 5, generator=generator)
     kernel = torch.randn(8, 5, 7, generator=generator)
-    weight = kernel.view(2, 2, 2, 5, 7).permute(
-        4, 3, 0, 1, 2
-    )  # (x, y, z, in, out): z is the fastest
+    # (x, y, z, in, out): z is the fastest.
+    weight = kernel.view(2, 2, 2, 5, 7).permute(4, 3, 0, 1, 2)
     assert level.children is not None
     coarse = convolve(features, kernel, level.children, len(level.voxels))
     torch.testing.assert_close(
@@ -125,9 +123,8 @@ def test_interpolation_is_exact_on_a_full_grid_and_leaves_missing_voxels_out() -
     slope = torch.tensor([1.0, 2.0, 3.0])
     points = torch.from_numpy(np.random.default_rng(0).integers(0, 3 * 8, (50, 3)))
     found = interpolate((coarse * 8.0 @ slope)[:, None], coarse, points, 8)[:, 0]
-    torch.testing.assert_close(
-        found, points.float() @ slope
-    )  # a linear function is interpolated exactly
+    # A linear function is interpolated exactly.
+    torch.testing.assert_close(found, points.float() @ slope)
     two = torch.tensor([(0, 0, 0), (1, 0, 0)])
     found = interpolate(
         torch.tensor([[10.0], [20.0]]), two, torch.tensor([(2, 6, 7), (8, 0, 0)]), 8
@@ -155,9 +152,8 @@ def test_voxels_too_far_apart_are_refused() -> None:
 def test_rings_and_bands_by_hand() -> None:
     voxels = torch.tensor([(0, 0, 0), (0, 200, 0), (0, -200, 0), (4000, 0, 0), (-4000, 0, 0)])
     features = torch.tensor([[1.0], [2.0], [4.0], [8.0], [16.0]])
-    found = mean_over_rings(
-        features, voxels, 0.05, 56.0
-    )  # distances 0, 10, 10, 200, 200 m from the centre
+    # Distances 0, 10, 10, 200, 200 m from the centre.
+    found = mean_over_rings(features, voxels, 0.05, 56.0)
     expected = torch.zeros(16)
     expected[0] = 1
     expected[int((10 - 4) / (52 / 16))] = 3

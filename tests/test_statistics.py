@@ -91,9 +91,8 @@ def test_values_are_those_of_float64_definitions(name: str) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_equal_sets_are_0_apart(name: str) -> None:
     make, (a, _), _ = CASES[name]
-    assert (
-        make(a, a).value == pytest.approx(0, abs=1e-7) or name == "kernel"
-    )  # which is unbiased, not 0
+    # Which is unbiased, not 0.
+    assert make(a, a).value == pytest.approx(0, abs=1e-7) or name == "kernel"
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "kernel"])
@@ -215,15 +214,12 @@ def test_precision_recall_density_and_coverage_by_hand() -> None:
     fake = np.array([[1.6], [1.9], [30.0]])
     found = manifold(real, fake, k=1)
     assert found.precision.value == pytest.approx(2 / 3)  # 30 lies in no real ball
-    assert found.density.value == pytest.approx(
-        (2 + 2 + 0) / 3
-    )  # 1.6 is in the balls of 1 and 3, and so is 1.9
-    assert found.recall.value == pytest.approx(
-        2 / 4
-    )  # 3 and 7 are in the ball of 30, 0 and 1 in none
-    assert found.coverage.value == pytest.approx(
-        2 / 4
-    )  # the balls of 1 and 3 hold 1.6, those of 0 and 7 nothing
+    # 1.6 is in the balls of 1 and 3, and so is 1.9.
+    assert found.density.value == pytest.approx((2 + 2 + 0) / 3)
+    # 3 and 7 are in the ball of 30, 0 and 1 in none.
+    assert found.recall.value == pytest.approx(2 / 4)
+    # The balls of 1 and 3 hold 1.6, those of 0 and 7 nothing.
+    assert found.coverage.value == pytest.approx(2 / 4)
 
 
 def test_neighbours_tell_fidelity_from_diversity() -> None:

@@ -136,9 +136,8 @@ def test_every_module_is_imported_by_something() -> None:
     ]
     used = set().union(*(imports_of(path, known) - {name} for name, path in known.items()))
     used |= set().union(*(imports_of(path, known) for path in outside))
-    used |= {
-        name for name in known if name.startswith("lidar_synth.lab.cli.")
-    }  # loaded by name, with the command
+    # Loaded by name, with the command.
+    used |= {name for name in known if name.startswith("lidar_synth.lab.cli.")}
     used |= {
         f"lidar_synth.labels.{home.split('.')[0]}" for home in (*POLICIES.values(), *KINDS.values())
     }

@@ -162,9 +162,8 @@ def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
     for image in images:
         assert image.label is not None and set(np.unique(image.label)) <= {*range(19), 255}
         assert ((image.range == 0) | ((image.range >= 1.45) & (image.range <= 80))).all()
-    assert torch.equal(
-        *(Latent(network, FORMAT).decode(z) for _ in range(2))
-    )  # the most likely image
+    # The most likely image.
+    assert torch.equal(*(Latent(network, FORMAT).decode(z) for _ in range(2)))
 
 
 def test_half_the_columns_show_the_same_street() -> None:
@@ -231,16 +230,13 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     assert bounded.mask[~inside].mean() == pytest.approx(
         free.mask[~inside].mean() if cars < 3 else 0, abs=0.1
     )
-    road = inside & (
-        free.channels["label"] == TRAIN_ID["road"]
-    )  # rays through a box may miss the object
+    # Rays through a box may miss the object.
+    road = inside & (free.channels["label"] == TRAIN_ID["road"])
     assert np.array_equal(free.range[road], bounded.range[road])
-    assert np.array_equal(
-        free.range, image_of(torch.zeros_like(layout)).range
-    )  # nothing is known of a blank layout
-    layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES[
-        "Cyclist"
-    ]  # what stands in a box has its class
+    # Nothing is known of a blank layout.
+    assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)
+    # What stands in a box has its class.
+    layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES["Cyclist"]
     assert np.array_equal(object_, image_of(layout).channels["label"] == TRAIN_ID["bicyclist"])
 
 
@@ -345,9 +341,8 @@ def test_the_noise_of_scans_is_measured() -> None:
     network = small().eval()
     with torch.no_grad():
         numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
-        numbers[:, 0] = torch.tensor(
-            [1.0, 2.3, 3.6]
-        )  # surfaces far apart, almost without reflectances of 0
+        # Surfaces far apart, almost without reflectances of 0.
+        numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])
         numbers[:, 3], numbers[:, 4], numbers[:, 7] = -4.5, 0.5, -6
         network.roughness.fill_(0.3)
         network.alike.fill_(0.6)
@@ -367,9 +362,8 @@ def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(merg
     fields = relief_fields(uniform(0, [0], (64, 4096 // merged)), merged)[0]
     assert fields.mean((1, 2)).abs().max() < 0.06
     for field, span in zip(fields, SPANS, strict=True):
-        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(
-            1, abs=0.12
-        )  # at every column
+        # At every column.
+        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(1, abs=0.12)
         for lag in range(0, 2 * span + 1, 2):
             found = (field * field.roll(-lag // merged, 1)).mean()
             assert found == pytest.approx(correlation(span // merged, lag // merged), abs=0.06)

@@ -352,9 +352,8 @@ def test_the_vehicle_moves_while_the_sensor_turns() -> None:
     elevation, height = still.sensor.optics()
     for scan, largest in ((still, 1e-4), (moving, 2.0)):
         x, y, z = scan.points.T
-        start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(
-            -elevation[scan.ring]
-        )  # of the ray, towards behind
+        # Of the ray, towards behind.
+        start = np.hypot(x, y) + (z - height[scan.ring]) / np.tan(-elevation[scan.ring])
         assert abs(start[scan.ring > 20]).max() < largest
     behind = (np.arctan2(abs(y), x) > 2.9) & (scan.ring > 20)
     left = np.median(start[behind & (y > 0)])

@@ -65,9 +65,8 @@ def test_it_sees_what_the_target_itself_records(scan: Scan, target: str, mount: 
         & _near(truth, 50)
     )
     assert (at_found[at_truth >= 0] >= 0)[inside[at_truth[at_truth >= 0]]].mean() > 0.96
-    assert (
-        both.sum() > 0.96 * (at_found >= 0).sum()
-    )  # it returns little where the target returns nothing
+    # It returns little where the target returns nothing.
+    assert both.sum() > 0.96 * (at_found >= 0).sum()
 
 
 def _near(scan: Scan, most: float) -> np.ndarray:
@@ -271,9 +270,8 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
     has the car."""
     scan = record(HDL64E)
     later = record(HDL64E, car=(CAR_BOX[0] + 3, *CAR_BOX[1:]), at=2.0)
-    blind = scan[
-        (scan.points[:, 1] < 1) | (scan.points[:, 0] < 0)
-    ]  # neither the car nor what is behind it
+    # Neither the car nor what is behind it.
+    blind = scan[(scan.points[:, 1] < 1) | (scan.points[:, 0] < 0)]
     alone = Transfer(HDL64E)(blind)
     filled = Transfer(HDL64E).cast(blind, sweeps=[later]).scan
     assert len(filled) > 1.1 * len(alone)

@@ -70,9 +70,8 @@ def test_columns_wrap_around_and_rows_do_not() -> None:
     net = network(position=False)
     y = state()
     out = net(y, T)
-    assert torch.allclose(
-        net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4
-    )  # by a multiple of the total stride
+    # By a multiple of the total stride.
+    assert torch.allclose(net(y.roll(2, -1), T), out.roll(2, -1), atol=1e-4)
     assert not torch.allclose(net(y.roll(2, -2), T), out.roll(2, -2), atol=1e-2)
 
 
@@ -101,9 +100,8 @@ def test_every_weight_gets_a_gradient(arguments: dict[str, Any], checkpointing: 
     net(state(), T, cond.get(next(iter(arguments), ""))).square().mean().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
-        assert parameter.grad.any() or "conv1.bias" in name, (
-            name
-        )  # a norm after it can cancel a bias
+        # A norm after it can cancel a bias.
+        assert parameter.grad.any() or "conv1.bias" in name, name
 
 
 @torch.no_grad()
@@ -117,9 +115,8 @@ def test_conditions_change_the_velocity() -> None:
     tokens = torch.randn(2, 4, 5)
     out = context(y, T, tokens)
     assert not torch.allclose(out, context(y, T, tokens * 2), atol=1e-3)
-    assert torch.allclose(
-        out, context(y, T, tokens.flip(1)), atol=1e-5
-    )  # the order of tokens does not matter
+    # The order of tokens does not matter.
+    assert torch.allclose(out, context(y, T, tokens.flip(1)), atol=1e-5)
 
 
 @torch.no_grad()

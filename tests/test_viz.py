@@ -80,13 +80,14 @@ def test_colours_increase_with_the_values() -> None:
     pixels = picture(RangeImage(ranges, SMALL), "range", scale)
     np.testing.assert_array_equal(pixels[0], scale.table[scale.index(ranges[0])])
     assert (np.diff(scale.index(ranges[0]).astype(int)) >= 0).all()
+    # Gamma 1/2.
     assert scale.index(np.array([-5.0, 0.0, 20.0, 80.0, 500.0])).tolist() == [
         0,
         0,
         128,
         255,
         255,
-    ]  # gamma 1/2
+    ]
 
 
 @pytest.mark.parametrize("name", ["height", "range", "reflectance"])

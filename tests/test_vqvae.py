@@ -166,9 +166,8 @@ def test_latents_have_mean_0_and_variance_1() -> None:
     z = net.eval().encode(x)
     assert torch.allclose(z.mean((0, 2, 3)), torch.zeros(4), atol=1e-4)
     assert torch.allclose(z.std((0, 2, 3)), torch.ones(4), atol=1e-4)
-    assert torch.allclose(
-        net.decode(z), net(x).output, atol=1e-5
-    )  # the decoder reverts the normalisation
+    # The decoder reverts the normalisation.
+    assert torch.allclose(net.decode(z), net(x).output, atol=1e-5)
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])

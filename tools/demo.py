@@ -130,9 +130,8 @@ def town(out: Path, scans: int, seed: int) -> Data:
 def semantic_kitti(root: str, scans: int) -> Data:
     """SemanticKITTI, with a sequence held out: 08, or the last one."""
     source = open_scans(root, layout="semantic_kitti", split="all")
-    labelled = [
-        i for i, name in enumerate(source.ids) if int(name[:2]) < 11
-    ]  # the test set has no labels
+    # The test set has no labels.
+    labelled = [i for i, name in enumerate(source.ids) if int(name[:2]) < 11]
     sequences = {key: list(found) for key, found in groupby(labelled, lambda i: source.ids[i][:2])}
     held_out = "08" if "08" in sequences else max(sequences)
     chosen = [i for key, found in sequences.items() if key != held_out for i in found]
@@ -246,9 +245,8 @@ def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
 
 def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
     """Write the page, with some scans of each kind."""
-    real = [
-        replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)
-    ]  # the town stands in for real scans
+    # The town stands in for real scans.
+    real = [replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)]
     names = (data.name, "Synthetic scan, generated in 4 steps")
     shown = real + spread(bank, SHOWN)
     text = html_page(

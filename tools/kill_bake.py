@@ -30,9 +30,8 @@ def start(plan: BakePlan, engine: str, workers: int) -> int:
     """Bake in a child process with its own process group; returns its id."""
     child = os.fork()
     if child:
-        os.setpgid(
-            child, child
-        )  # in the parent too: the child may be killed before it sets its group itself
+        # In the parent too: the child may be killed before it sets its group itself.
+        os.setpgid(child, child)
         return child
     os.setpgid(0, 0)
     try:

@@ -112,9 +112,8 @@ def _work(
     rank: int,
 ) -> None:
     """One worker: writes shards until none is left or the run is stopped."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # on Windows, where the parent cannot block it before the start
+    # On Windows, where the parent cannot block it before the start.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if plan.job.device == "cuda":
         import torch

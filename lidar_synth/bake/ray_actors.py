@@ -16,9 +16,8 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
-_LOSSES = (
-    5  # lost actors per worker, without a finished shard in between, after which the bake fails
-)
+# Lost actors per worker, without a finished shard in between, after which the bake fails.
+_LOSSES = 5
 
 
 class Baker:

@@ -16,10 +16,11 @@ from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
+# Submitit's default of 5 minutes may be too short for a shard.
 _OPTIONS = {
     "cluster": "slurm",
     "timeout_min": 240,
-}  # submitit's default of 5 minutes may be too short for a shard
+}
 _TIMEOUTS = 1000  # how often a job may run out of time and resume
 _POLL = 1  # seconds between two checks of the jobs
 

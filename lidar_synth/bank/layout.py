@@ -35,14 +35,12 @@ CONDITION = "condition"
 
 _ATTRIBUTES = 64
 _ATTRIBUTE_SIZE = 1 << 20
-_BASE = (
-    12 << 10
-)  # bytes of a shard's metadata, without facts of more than 4 kB and without the chunks' addresses
+# Bytes of a shard's metadata, without facts of more than 4 kB and without the chunks' addresses.
+_BASE = 12 << 10
 _PLACE = 16  # bytes of a chunk's address in the metadata
 _PASSES = 32  # most reads to collect the metadata
-_BLOSC2_ARRAY = (
-    32 << 20
-)  # most bytes of one Blosc2 array: unlike deflate, Blosc2 has no highest compression ratio
+# Most bytes of one Blosc2 array: unlike deflate, Blosc2 has no highest compression ratio.
+_BLOSC2_ARRAY = 32 << 20
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,8 @@ from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.geometry.scan import RangeImage
 
 _VERSION = "v110"
-_PAGE = (
-    4 << 20
-)  # bytes: a paged file keeps its metadata together, for fewer requests over a network
+# Bytes: a paged file keeps its metadata together, for fewer requests over a network.
+_PAGE = 4 << 20
 _BLOCK = 4 << 20  # bytes by which a shard grows in memory
 _PENDING = 8  # scans per thread that may wait to be written
 

@@ -71,9 +71,8 @@ model."""
 MODELS = ".models.json"
 """The file beside converted scans with the provenances of the models that generated them."""
 
-_MOST_RUNS = (
-    200  # maximum number of intervals of a drive; more become one from the first frame to the last
-)
+# Maximum number of intervals of a drive; more become one from the first frame to the last.
+_MOST_RUNS = 200
 _SHOWN = 6  # number of drives in a message
 
 

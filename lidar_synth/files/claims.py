@@ -67,9 +67,8 @@ def hold_claim(path: Path, settings: dict[str, Any]) -> Iterator[None]:
         with hold_writing(path):
             yield
         if not _alone(path):
-            claim(
-                path, settings
-            )  # again: the process that came first may have written nothing and taken it back
+            # Again: the process that came first may have written nothing and taken it back.
+            claim(path, settings)
     finally:
         if first and _alone(path):
             path.unlink(missing_ok=True)

@@ -161,9 +161,8 @@ def _write_missing(
         ):
             _count(report, done, name_of(source, done.number) or str(done.number))
             if done.origin is not None and jobs > 1 and (writer.root / NAME).is_file():
-                add_origin(
-                    writer.root, done.origin
-                )  # again: two workers may have added theirs at the same moment
+                # Again: two workers may have added theirs at the same moment.
+                add_origin(writer.root, done.origin)
     writer.finish()
     return report
 

@@ -110,9 +110,8 @@ class NuScenes(ScanFiles):
             id=self.ids[index],
             **labels,
         )
-        kept = ~(
-            np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2
-        )  # keeps NaN, which on_bad handles
+        # Keeps NaN, which on_bad handles.
+        kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)
         if not kept.any():
             raise DataError(
                 f"{path}: all {len(scan)} points are nearer than {NEAREST:g} m",

@@ -102,9 +102,8 @@ class Polar:
             )
             mixed = paste(mixed, turned, count=self.objects)
         known = has_boxes and (scan.label is not None or scan.boxes is not None)
-        return (
-            mixed if known else replace(mixed, boxes=None)
-        )  # with boxes, all other objects would be negatives
+        # With boxes, all other objects would be negatives.
+        return mixed if known else replace(mixed, boxes=None)
 
 
 @dataclass(frozen=True)

@@ -163,10 +163,8 @@ class MixedBatches(Sampler[list[int]]):
         self._start = (0, 0)  # epoch and position of the loaded state
         self._taken = (0, 0)  # epoch, and number of its batches taken so far
         self._warned = False
-        self._fetched = (
-            0,
-            0,
-        )  # samples that the dataset fetched before the latest complete pass, and in that pass
+        # Samples that the dataset fetched before the latest complete pass, and in that pass.
+        self._fetched = (0, 0)
 
     def __len__(self) -> int:
         """Number of batches in a pass."""

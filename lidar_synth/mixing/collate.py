@@ -113,9 +113,8 @@ def collate_by_default(items: Sequence[Item], **options: Any) -> Any:
         ) from error
 
 
-default_collate_fn_map[Item] = (
-    collate_by_default  # as torch's documentation of default_collate says
-)
+# As torch's documentation of default_collate says.
+default_collate_fn_map[Item] = collate_by_default
 
 
 def _offset_points(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Tensor]:

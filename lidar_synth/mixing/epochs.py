@@ -78,13 +78,11 @@ class CurrentEpoch:
         self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
-        self._own = (
-            0  # the epoch that this process set, or the current epoch when this process started
-        )
+        # The epoch that this process set, or the current epoch when this process started.
+        self._own = 0
         self._process = os.getpid()
-        self._passes: WeakKeyDictionary[Any, int] = (
-            WeakKeyDictionary()
-        )  # {fetcher: epoch of its pass}
+        # {fetcher: epoch of its pass}.
+        self._passes: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
         self._followers: WeakSet[Any] = WeakSet()
 
     def __int__(self) -> int:

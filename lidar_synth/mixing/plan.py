@@ -200,9 +200,8 @@ class MixingPlan:
         """
         p, q = share_of(self.mixture.ratio, self.epoch).as_integer_ratio()
         exact = synthetic_before(self.mixture, self.epoch)
-        ahead = floor(
-            (ceil(exact) - exact) * q
-        )  # surplus from rounding up so far, in units of 1 / q
+        # Surplus from rounding up so far, in units of 1 / q.
+        ahead = floor((ceil(exact) - exact) * q)
         return -((ahead - positions * p) // q)
 
     def _local(self, source: int, number: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -34,9 +34,8 @@ often, all equally); ``"replace"`` has as many samples as there are real scans, 
 synthetic; a number is the length itself."""
 
 _FINEST = 2**30  # largest denominator of a source's share: products stay within 64 bits
-_FIRST_EPOCHS = (
-    100  # number of epochs of a changing schedule that determine lengths of epochs and laps
-)
+# Number of epochs of a changing schedule that determine lengths of epochs and laps.
+_FIRST_EPOCHS = 100
 
 
 @dataclass(frozen=True)

@@ -183,6 +183,5 @@ def mix_for_trainer(
     options = {key: value for key, value in settings.items() if key != "synthetic"}
     synthetic = open_synthetic(settings["synthetic"])
     options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
-    return MixedScans.wrap(
-        range(real), synthetic, to_sample=to_sample, compare=False, **options
-    )  # numbers, no samples
+    # Numbers, no samples.
+    return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)

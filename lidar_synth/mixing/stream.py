@@ -120,11 +120,12 @@ class MixedStream(IterableDataset[Any]):
         worker = self._place()["worker"]
         workers = self._place()["workers"]
         batches = islice(self._batches(begin, position), worker, None, workers)
+        # First: the number of the epoch's first sample.
         epoch, first, announced = (
             begin,
             -position,
             0,
-        )  # first: the number of the epoch's first sample
+        )
         for number in islice(chain.from_iterable(batches), self._given, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)

@@ -43,9 +43,8 @@ def has_screen() -> bool:
         return True
     if _can_connect("libX11.so.6", "XOpenDisplay", "XCloseDisplay"):
         return True
-    wayland = (
-        "XDG_RUNTIME_DIR" in os.environ
-    )  # without it, libwayland prints an error to the terminal
+    # Without it, libwayland prints an error to the terminal.
+    wayland = "XDG_RUNTIME_DIR" in os.environ
     return wayland and _can_connect(
         "libwayland-client.so.0", "wl_display_connect", "wl_display_disconnect"
     )

@@ -78,9 +78,8 @@ def mutate(name: str, content: bytes, rng: Random) -> bytes:
     count = rng.choice((1, 1, 1, 2, 3))
     structured = sum(rng.random() < 0.75 for _ in range(count)) if known else 0
     if suffix == ".h5":
-        structured = min(
-            structured, 1
-        )  # HDF5 itself crashes when it is to write into a file with such contents
+        # HDF5 itself crashes when it is to write into a file with such contents.
+        structured = min(structured, 1)
     for i in range(count):
         content = (
             apply(rng.choice(known), content, rng)

@@ -157,9 +157,8 @@ def on_cuda(net: nn.Module, rounds: int) -> None:
         noise = torch.randn(batch, 2, 64, 1024, device="cuda")
         torch.compiler.reset()
         torch.cuda.reset_peak_memory_stats()
-        fast = torch.compile(
-            half, mode="reduce-overhead"
-        )  # CUDA graphs: kernels are not launched singly
+        # CUDA graphs: kernels are not launched singly.
+        fast = torch.compile(half, mode="reduce-overhead")
         times = []
         for velocity in (half, fast):
             for _ in range(3):
@@ -222,9 +221,8 @@ def main() -> None:
         scale = 1 if sys.platform == "darwin" else 1024
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale / 1e9)
         return
-    peak = peak_memory(
-        options.model
-    )  # first, because a child's peak starts with the memory of its parent
+    # First, because a child's peak starts with the memory of its parent.
+    peak = peak_memory(options.model)
     net = full_network(options.model)
     on_cpu(net, options.rounds)
     weights = sum(values.nbytes for values in net.parameters()) / 1e9

@@ -86,9 +86,8 @@ def from_camera() -> list[list[tuple[str, Picture]]]:
     for i in range(2):
         town = Town(UNSEEN, scans=(i + 1) * STRETCH_FRAMES)
         image = town.image(i * STRETCH_FRAMES)
-        small = Image.fromarray(image).resize(
-            (320, 96), Image.Resampling.BICUBIC
-        )  # as its encoder takes it
+        # As its encoder takes it.
+        small = Image.fromarray(image).resize((320, 96), Image.Resampling.BICUBIC)
         [made] = generator.scans(0, [i], condition=np.array(small).transpose(2, 0, 1))
         rows += [
             [("condition: a camera image", image)],

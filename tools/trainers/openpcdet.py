@@ -78,9 +78,8 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     )
     mixture = {"synthetic": str(synthetic), "ratio": 0.5}
     small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
-    small |= {
-        "BALANCED_RESAMPLING": False
-    }  # it divides by the number of objects of each class; the town has four
+    # It divides by the number of objects of each class; the town has four.
+    small |= {"BALANCED_RESAMPLING": False}
     small["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]["SAMPLE_GROUPS"] = ["car:2", "pedestrian:2"]
     (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").write_text(yaml.safe_dump(small))
     changes = f"DATA_CONFIG.DATA_PATH {data} DATA_CONFIG.VERSION v1.0-mini"

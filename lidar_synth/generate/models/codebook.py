@@ -15,9 +15,8 @@ their vectors."""
 DECAY = 0.99
 """Decay of the moving averages, per batch."""
 
-_LEAST = (
-    0.03  # average vectors per batch below which a code of an "ema" codebook is dead and is reset
-)
+# Average vectors per batch below which a code of an "ema" codebook is dead and is reset.
+_LEAST = 0.03
 
 
 class Codebook(nn.Module):

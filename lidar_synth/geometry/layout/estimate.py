@@ -19,9 +19,8 @@ SECTORS = 512
 _LEAST = 3  # returns of an outline in a sector
 # metres between the first wall of a sector and what stands behind it; and between connected sectors
 _GAP = 1.5
-_STEP = (
-    0.5  # metres by which the edges of connected sectors may differ, before they are two outlines
-)
+# Metres by which the edges of connected sectors may differ, before they are two outlines.
+_STEP = 0.5
 _EDGE = 0.05  # metres between the outermost return and the edge of an outline
 # metres; the returns of a building in one sector differ less in their distance, without labels
 _FLAT = 0.3

@@ -176,10 +176,11 @@ def _cross_walls(dx, dy, walls, which, at):  # type: ignore[no-untyped-def]
     count = 0
     for k in range(len(walls)):
         x1, y1, low1, high1, x2, y2, low2, high2 = walls[k]
+        # The side of the direction on which each end is.
         first, second = (
             dx * y1 - dy * x1,
             dx * y2 - dy * x2,
-        )  # the side of the direction on which each end is
+        )
         if (first < 0) == (second < 0) or first == second:
             continue
         share = first / (first - second)

@@ -37,9 +37,8 @@ def _rows_by_elevation(
     rows = np.empty(len(elevations), np.int64)
     end = len(beams)
     for ring in reversed(range(len(elevations))):
-        end = (
-            int(np.argmin(total[ring + 1, : end + 1])) - 1
-        )  # the first minimum is the row that was assigned
+        # The first minimum is the row that was assigned.
+        end = int(np.argmin(total[ring + 1, : end + 1])) - 1
         rows[ring] = end
     return rows
 

@@ -157,9 +157,8 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                 from_b = b
                 between = joined
                 apart = at_a - at_b
-                upper = i < n and (
-                    j == m or to_a <= to_b
-                )  # the next return of the upper ring comes first
+                # The next return of the upper ring comes first.
+                upper = i < n and (j == m or to_a <= to_b)
                 if upper:
                     c = next_a
                     before = a

@@ -69,9 +69,8 @@ def estimate(scan: Scan) -> ScanSurfaces:
     _check(scan)
     ring, on_grid = rings_of(scan)
     azimuth = -np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
-    order = np.argsort(
-        ring * 8.0 + azimuth, kind="stable"
-    )  # fast where rings are in order, as in most files
+    # Fast where rings are in order, as in most files.
+    order = np.argsort(ring * 8.0 + azimuth, kind="stable")
     scan = scan[order]
     ring = ring[order]
     azimuth = azimuth[order]

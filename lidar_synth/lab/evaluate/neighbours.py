@@ -61,9 +61,8 @@ def manifold(
             f"{len(x)} real and {len(y)} generated samples", f"more than k = {k} of each"
         )
     real_radii, fake_radii = (_by_rows(s, s, lambda d: d.kthvalue(k + 1).values) for s in (x, y))
-    balls = _by_rows(
-        y, x, lambda d: (d <= real_radii).double().sum(1)
-    )  # real balls around each generated sample
+    # Real balls around each generated sample.
+    balls = _by_rows(y, x, lambda d: (d <= real_radii).double().sum(1))
     recalled = _by_rows(x, y, lambda d: (d <= fake_radii).any(1).double())
     nearest = _by_rows(x, y, lambda d: d.min(1).values)
     count = len(x)

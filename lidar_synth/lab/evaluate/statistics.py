@@ -101,9 +101,8 @@ def _sum(
     total = np.zeros(size, np.int64)
     for one, count in zip(histograms, counts, strict=True):
         if count:
-            total[place[one.bins]] += one.amounts * np.int64(
-                count
-            )  # a bin occurs once in a histogram
+            # A bin occurs once in a histogram.
+            total[place[one.bins]] += one.amounts * np.int64(count)
     return total
 
 

@@ -126,9 +126,8 @@ def _codec(key: str, levels: int, attending: Collection[int]) -> tuple[str, ...]
             else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
         )
     side = "down" if where == "encoder" else "up"
-    level = (
-        int(number) if side == "down" else levels - 1 - int(number)
-    )  # our decoder numbers its levels in the order of computation
+    # Our decoder numbers its levels in the order of computation.
+    level = int(number) if side == "down" else levels - 1 - int(number)
     if kind == "levels":
         first, _, inside = inside.partition(".")
         block, is_attention = divmod(int(first), 2) if level in attending else (int(first), 0)

@@ -24,10 +24,11 @@ MOVED = 0.5
 """Distance, metres, by which a box without points has to move to count as moving."""
 
 _SPACING = 0.03  # of the points of one object, metres
+# Frames, and metres per frame, above which the same instance number is another object.
 _GAP, _JUMP = (
     10,
     15.0,
-)  # frames, and metres per frame, above which the same instance number is another object
+)
 
 
 @dataclass

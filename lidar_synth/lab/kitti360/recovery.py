@@ -56,13 +56,13 @@ BOX_CONFIDENCE = 0.5
 _WIDEST = 3000.0  # metres around the frames of a window
 _CHUNK = 1 << 20  # points of a cloud read at a time
 _HEIGHTS = (-50.0, 60.0)  # metres relative to the car
+# Points that measure the fit, and their distance from the sensor, metres.
 _PROBES, _PROBED = (
     1000,
     (3.0, 25.0),
-)  # points that measure the fit, and their distance from the sensor, metres
-_UPRIGHT = (
-    -1.0
-)  # height in the sensor's frame, metres, above which a point does not lie on the road
+)
+# Height in the sensor's frame, metres, above which a point does not lie on the road.
+_UPRIGHT = -1.0
 _CLOSE, _ABOUT = 0.2, 1.0  # metres: a probe on the clouds, and a probe that the clouds reach at all
 _FEW = 50  # probes that the clouds reach, below which a frame has too little structure to be judged
 _COVERED = 0.2  # minimum share of the points within reach that have neighbours, in such a frame

@@ -23,14 +23,16 @@ _FEWEST = 6  # points of a cube that show its shape
 _THIN = 0.08  # metres, standard deviation up to which a cube says where points lie
 _NOISE = 0.03  # metres, of points across a surface
 _MOST = 4_000_000  # points of a cloud that are used
+# Metres between a point and its cube, for three steps each.
 _WIDE, _CLOSE = (
     (2.0, 1.5, 1.0, 0.7),
     (0.7, 0.5),
-)  # metres between a point and its cube, for three steps each
+)
+# Steps, and metres (or radians times 10 m) below which there is no further one.
 _STEPS, _STILL = (
     3,
     2e-3,
-)  # steps, and metres (or radians times 10 m) below which there is no further one
+)
 _PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2  # of errors of a pose: metres and radians
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction
 _GAIN = 1.03  # factor of the score by which a transform has to be better than none

@@ -85,13 +85,14 @@ class ProofPlan:
         """Plain values that determine every training, to tell whether one that exists may be
         kept."""
         own = asdict(self.settings)
+        # They add trainings, or score the same ones.
         free = (
             "arms",
             "ratios",
             "seeds",
             "classes",
             "only",
-        )  # they add trainings, or score the same ones
+        )
         digest = hash_of_names(self.names)
         return {
             "format": FORMAT,

@@ -134,9 +134,8 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             at = nth % size
             around = min(at, size - 1 - at, _SMOOTH)
             smooth = _edge(known, rho, side[at - around : at + around + 1], -1)
-            jump = (
-                abs(smooth - edge) > SAME * edge
-            )  # the source is of another surface than the edge
+            # The source is of another surface than the edge.
+            jump = abs(smooth - edge) > SAME * edge
             out[j] = rho[source] if jump else base * rho[source] / smooth
             if not ground[source] and far[j] - INSIDE < out[j] < far[j]:
                 out[j] = far[j]

@@ -219,9 +219,8 @@ def cut_out(scan: Scan, box: int) -> Object:
     select_boxes(scan, box)
     if scan.ring is None:
         ring, on_grid = rings_of(scan)
-        sensor = (
-            replace(scan.sensor, firings=None) if on_grid else scan.sensor
-        )  # as many as columns
+        # As many as columns.
+        sensor = replace(scan.sensor, firings=None) if on_grid else scan.sensor
         scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
     found = objects_of(scan, least=1)
     if box not in found:
@@ -384,9 +383,8 @@ def _behind(
         mine = np.flatnonzero(rays.ring[window] == ring)
         hit = np.flatnonzero(np.isfinite(rho[mine]))
         if len(hit):
-            start = hit[
-                np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)
-            ]  # after the widest gap
+            # After the widest gap.
+            start = hit[np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)]
             length = len(mine) - np.diff(hit, append=hit[0] + len(mine)).max() + 1
             inner = mine[(start + np.arange(length)) % len(mine)]
             behind[inner] = rays.rho[window[inner]] > np.min(rho[mine][hit])

@@ -67,9 +67,8 @@ class Ledger:
         self, slots: int, counters: NDArray[np.int64], starved: Starved = "wait", replaced: int = 0
     ) -> None:
         empty = [Slot(place, -1 - place) for place in range(slots)]
-        self._slots = {
-            slot.number: slot for slot in empty
-        }  # by scan number, in the order in which they were claimed
+        # By scan number, in the order in which they were claimed.
+        self._slots = {slot.number: slot for slot in empty}
         self._counters = counters
         self._starved = starved
         self._awaited: list[int] = []  # numbers of scans for which readers wait

@@ -84,9 +84,8 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
         slots: the shared memory to fill.
         started: the pipe to which the address is sent once the model is loaded.
     """
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C goes to all processes of a terminal; the parent ends us
+    # Ctrl-C goes to all processes of a terminal; the parent ends us.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_watch_parent, daemon=True).start()
     try:
         if plan.threads:

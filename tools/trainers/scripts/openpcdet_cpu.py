@@ -49,9 +49,8 @@ def prepare(tree: Path) -> None:
         _module("pcdet.version", __version__="0.6.0")
     for name in NEEDS_GPU:
         _module(f"pcdet.ops.{name}")
-    _module(
-        "pcdet.datasets.argo2.argo2_dataset", Argo2Dataset=None
-    )  # imports av2 and kornia for its own data
+    # Imports av2 and kornia for its own data.
+    _module("pcdet.datasets.argo2.argo2_dataset", Argo2Dataset=None)
     functions = {name: value for name, value in vars(compiled).items() if not name.startswith("__")}
     _module("pcdet.ops.roiaware_pool3d.roiaware_pool3d_cuda", **functions)
     overlaps = Overlaps(compiled.boxes_iou_bev_cpu)

@@ -89,10 +89,11 @@ def add_camera(folder: Path) -> None:
     if any(row["channel"] == "CAM_FRONT" for row in tables["sensor"]):
         return
     tables["sensor"].append({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"})
+    # Z ahead, x right, y down.
     pose = {
         "translation": [1.7, 0, 1.5],
         "rotation": [0.5, -0.5, 0.5, -0.5],
-    }  # z ahead, x right, y down
+    }
     lens = {"camera_intrinsic": [[1266, 0, 800], [0, 1266, 450], [0, 0, 1]]}
     tables["calibrated_sensor"].append(
         {"token": "camera", "sensor_token": "camera", **pose, **lens}

@@ -47,9 +47,8 @@ def main() -> None:
 
     def shown(self: Any, idx: int) -> Any:
         data = read(self, idx)
-        print(
-            f"epoch {self.mixed.epoch} sample {data['name']}\n", end="", flush=True
-        )  # workers print at once
+        # Workers print at once.
+        print(f"epoch {self.mixed.epoch} sample {data['name']}\n", end="", flush=True)
         return data
 
     MixedSemanticKITTI.get_data = shown

@@ -78,9 +78,8 @@ class SemanticMapEncoder(Encoder):
         """
         check_shape(labels, self.resolution, "a label map")
         codes = torch.where(labels == IGNORE, len(NAMES), labels.long())
-        x = (
-            F.one_hot(codes, len(NAMES) + 1).movedim(-1, 1).to(self.mix.weight.dtype)
-        )  # channels last in memory
+        # Channels last in memory.
+        x = F.one_hot(codes, len(NAMES) + 1).movedim(-1, 1).to(self.mix.weight.dtype)
         if self.method == "rescale":
             for rows, columns in self.halvings:
                 x = F.interpolate(

@@ -50,12 +50,13 @@ class _Step(NamedTuple):
     up: Grid
 
 
+# By stride.
 _STEPS: dict[Grid, _Step] = {
     (1, 2): _Step((3, 3), (0, 1, 1, 1), (1, 5)),
     (1, 4): _Step((3, 5), (1, 1, 1, 1), (1, 7)),
     (2, 1): _Step((3, 3), (1, 1, 1, 1), (5, 1)),
     (2, 2): _Step((3, 3), (0, 1, 0, 1), (3, 3)),
-}  # by stride
+}
 
 
 class Reconstruction(NamedTuple):

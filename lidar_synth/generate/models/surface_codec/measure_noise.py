@@ -58,9 +58,8 @@ def measure_noise(
         normalisation: of the ranges.
         generator: random numbers for reflectances of 0, whose score is not known.
     """
-    sums = torch.zeros(
-        codes, 4, dtype=torch.float64
-    )  # pairs, |e1 - e2|, products and squares of scores
+    # Pairs, |e1 - e2|, products and squares of scores.
+    sums = torch.zeros(codes, 4, dtype=torch.float64)
     relief = torch.zeros(codes, 1 + len(LAGS), 2, dtype=torch.float64)
     for x, code, surfaces in images:
         distance, value = to_patches(x[:, :2], PATCH).unbind(1)

@@ -151,9 +151,8 @@ class Surfaces(NamedTuple):
         common = common.gather(1, chosen.mT.expand(-1, -1, common.shape[2]))
         scale, dull, blank, likely, kind, patch = common.unbind(2)
         if codes is not None:
-            own = (
-                self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)
-            )  # above 0, for the signs of its bits
+            # Above 0, for the signs of its bits.
+            own = self._of(codes).gather(1, chosen)[:, 0].exp().clamp_min(_SURE)
             likely = torch.where(codes < 0, likely, own)
             kind = torch.where(codes < 0, kind, codes)
         if bounds is not None:

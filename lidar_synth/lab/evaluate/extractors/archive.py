@@ -127,9 +127,8 @@ def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False)
             f"{where}: its weights are not tensors by name", "the state dictionary of a network"
         )
     own = module.state_dict()
-    counters = {
-        k: v for k, v in own.items() if k.endswith("num_batches_tracked")
-    }  # absent before PyTorch 0.4.1
+    # Absent before PyTorch 0.4.1.
+    counters = {k: v for k, v in own.items() if k.endswith("num_batches_tracked")}
     chosen = counters | {k: v for k, v in state.items() if k in own or not extra}
     differences = {
         "lacks": [k for k in own if k not in chosen],
