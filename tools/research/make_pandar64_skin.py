@@ -16,7 +16,7 @@ from lidar_synth.files.parsing import read_arrays
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town, fit_skin, load_skin
-from lidar_synth.lab.town.returns import LEVELS, Noise
+from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
 
 OUT = Path("lidar_synth/lab/town/skin/pandar64.skin")
@@ -95,7 +95,7 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
     towns = {
         "physical model": (Town(seed, sensor, count), 1 / LEVELS, False),
         "lasers of equal gain": (
-            Town(seed, sensor, count, noise=Noise(gain_std=0)),
+            Town(seed, sensor, count, noise=ReturnNoise(gain_std=0)),
             1 / LEVELS,
             False,
         ),
