@@ -23,7 +23,9 @@ try:
     from accelerate.data_loader import prepare_data_loader
 except ImportError as error:
     raise LibraryError(
-        f"accelerate cannot be imported ({error})", "1.0 or later", "pip install accelerate"
+        f"accelerate cannot be imported ({error})",
+        "1.0 or later",
+        "pip install accelerate",
     ) from error
 
 
@@ -52,7 +54,11 @@ def prepare(accelerator: Any, loader: DataLoader[Any]) -> Any:
         >>> sum(len(batch["domain"]) for batch in prepare(Accelerator(cpu=True), loader))
         4
     """
-    divided = loader.dataset if isinstance(loader.dataset, MixedStream) else loader.batch_sampler
+    divided = (
+        loader.dataset
+        if isinstance(loader.dataset, MixedStream)
+        else loader.batch_sampler
+    )
     if not isinstance(divided, MixedBatches | MixedStream):
         raise ConfigError(
             f"a loader whose batches come from {type(divided).__name__}",

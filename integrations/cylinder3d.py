@@ -58,14 +58,18 @@ def register() -> Any:
         """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8,
         strength)."""
 
-        def __init__(self, data_path: str, imageset: str = "train", **options: Any) -> None:
+        def __init__(
+            self, data_path: str, imageset: str = "train", **options: Any
+        ) -> None:
             super().__init__(data_path, imageset, **options)
             self.mixed = None
             if imageset == "train":
                 settings = read_settings()
                 refuse_unlabelled(settings, "Cylinder3D")
                 self._ids = trainer_ids(self.learning_map, take_classes(settings), _IDS)
-                self.mixed = mix_for_trainer(len(self.im_idx), settings, lambda scan, rng: scan)
+                self.mixed = mix_for_trainer(
+                    len(self.im_idx), settings, lambda scan, rng: scan
+                )
 
         def set_epoch(self, epoch: int) -> None:
             """Set the epoch, also for workers."""
@@ -83,7 +87,9 @@ def register() -> Any:
             points = points_of(sample)
             label = class_ids(sample, self._ids)[:, None]
             return (
-                (points[:, :3], label, points[:, 3]) if self.return_ref else (points[:, :3], label)
+                (points[:, :3], label, points[:, 3])
+                if self.return_ref
+                else (points[:, :3], label)
             )
 
     Mixed.__name__ = NAME

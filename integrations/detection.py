@@ -13,7 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from lidar_synth.integrations.nuscenes import nuscenes_names, turned_boxes, turned_points
+from lidar_synth.integrations.nuscenes import (
+    nuscenes_names,
+    turned_boxes,
+    turned_points,
+)
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE
@@ -60,12 +64,13 @@ def ground_plane(scan: Scan) -> NDArray[np.float64]:
         close = np.abs(points[:, 2] - sides @ fit) < reach
         if close.sum() < 10:
             raise DataError(
-                f"scan {scan.id!r} has {close.sum()} returns of the ground", "ground for a plane"
+                f"scan {scan.id!r} has {close.sum()} returns of the ground",
+                "ground for a plane",
             )
         fit = np.linalg.lstsq(sides[close], points[close, 2], rcond=None)[0]
-    plane: NDArray[np.float64] = np.array([-fit[0], -fit[1], 1, -fit[2]]) / np.linalg.norm(
-        [fit[0], fit[1], 1]
-    )
+    plane: NDArray[np.float64] = np.array(
+        [-fit[0], -fit[1], 1, -fit[2]]
+    ) / np.linalg.norm([fit[0], fit[1], 1])
     return plane
 
 
@@ -82,7 +87,11 @@ def check_names(scan: Scan, classes: Collection[str]) -> None:
     Raises:
         DataError: if there are boxes, but none of these classes.
     """
-    if scan.boxes is not None and len(scan.boxes) and not set(scan.boxes.names) & set(classes):
+    if (
+        scan.boxes is not None
+        and len(scan.boxes)
+        and not set(scan.boxes.names) & set(classes)
+    ):
         raise DataError(
             f"boxes of {sorted(set(scan.boxes.names))} in synthetic scan {scan.id!r}",
             f"some of {', '.join(classes)}",
@@ -90,7 +99,9 @@ def check_names(scan: Scan, classes: Collection[str]) -> None:
         )
 
 
-def plane_in_camera(plane: NDArray[np.float64], camera: Calibration) -> NDArray[np.float64]:
+def plane_in_camera(
+    plane: NDArray[np.float64], camera: Calibration
+) -> NDArray[np.float64]:
     """(4,) a plane of the sensor frame, transformed to the camera frame."""
     moved: NDArray[np.float64] = plane @ camera.sensor_from_camera
     return moved
@@ -133,7 +144,11 @@ def difficulty(boxes: Boxes) -> NDArray[np.int32]:
     height = np.where(known, boxes.image_box[:, 3] - boxes.image_box[:, 1], apparent)
     level = np.full(len(boxes), -1, np.int32)
     for number, (least, truncated, occluded) in reversed(list(enumerate(LEVELS))):
-        fits = (height >= least) & (boxes.truncation <= truncated) & (boxes.occlusion <= occluded)
+        fits = (
+            (height >= least)
+            & (boxes.truncation <= truncated)
+            & (boxes.occlusion <= occluded)
+        )
         level[fits & (boxes.occlusion >= 0)] = number
     return level
 

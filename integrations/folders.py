@@ -85,7 +85,9 @@ def export_mixture(
         },
     )
     writer: Writer = (
-        SemanticKITTIWriter(root) if layout == "semantic_kitti" else KITTIObjectWriter(root)
+        SemanticKITTIWriter(root)
+        if layout == "semantic_kitti"
+        else KITTIObjectWriter(root)
     )
     rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
     for position in tqdm(range(count), unit="scan", disable=not progress):
@@ -94,11 +96,18 @@ def export_mixture(
         written += _write(writer, scan, position, camera)
     first = 0 if layout == "semantic_kitti" else count
     others: Writer = (
-        SemanticKITTIWriter(root, sequence="08") if layout == "semantic_kitti" else writer
+        SemanticKITTIWriter(root, sequence="08")
+        if layout == "semantic_kitti"
+        else writer
     )
-    for number in tqdm(range(len(held)), "validation", unit="scan", disable=not progress):
+    for number in tqdm(
+        range(len(held)), "validation", unit="scan", disable=not progress
+    ):
         written += _write(
-            others, replace(held[number], id=f"validation {number}"), first + number, camera
+            others,
+            replace(held[number], id=f"validation {number}"),
+            first + number,
+            camera,
         )
     writer.finish()
     if layout == "kitti" and validation is not None:
@@ -135,7 +144,8 @@ def _sample(mixed: MixedScans, epoch: int, position: int) -> Scan:
     scan = mixed.sample(epoch, position)
     if not isinstance(scan, Scan):
         raise ConfigError(
-            f"samples of the type {type(scan).__name__}", "scans: to_sample=lambda scan, rng: scan"
+            f"samples of the type {type(scan).__name__}",
+            "scans: to_sample=lambda scan, rng: scan",
         )
     return scan
 
@@ -168,7 +178,8 @@ def write_planes(root: str | Path, split: str = "trainval") -> int:
             camera = scans.calibration(number)
             if camera is None:
                 raise DataError(
-                    f"scan {name} of {root} has no calibration", f"training/calib/{frame}.txt"
+                    f"scan {name} of {root} has no calibration",
+                    f"training/calib/{frame}.txt",
                 )
             _write_plane(Path(root), frame, scans[number], camera)
             written += 1

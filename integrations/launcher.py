@@ -131,7 +131,11 @@ def _kept(move: Any) -> Any:
     def moved(self: Any, *args: Any, **options: Any) -> Any:
         left = [value for value in args if not _on_gpu(value)]
         named = {key: value for key, value in options.items() if not _on_gpu(value)}
-        return move(self, *left, **named) if left or set(named) - {"non_blocking"} else self
+        return (
+            move(self, *left, **named)
+            if left or set(named) - {"non_blocking"}
+            else self
+        )
 
     return moved
 
@@ -139,7 +143,10 @@ def _kept(move: Any) -> Any:
 def _made(make: Any) -> Any:
     @wraps(make)
     def made(*args: Any, **options: Any) -> Any:
-        return make(*args, **{key: value for key, value in options.items() if not _on_gpu(value)})
+        return make(
+            *args,
+            **{key: value for key, value in options.items() if not _on_gpu(value)},
+        )
 
     return made
 

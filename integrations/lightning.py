@@ -27,7 +27,9 @@ try:
     import lightning
 except ImportError as error:
     raise LibraryError(
-        f"lightning cannot be imported ({error})", "2.4 or later", "pip install lightning==2.5.5"
+        f"lightning cannot be imported ({error})",
+        "2.4 or later",
+        "pip install lightning==2.5.5",
     ) from error
 
 STOLEN = ("2.6.2", "2.6.3")
@@ -116,7 +118,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
                 "a MixedScans, whose batches resume after the last one that was trained on",
                 "Of a MixedStream: MixedData(stream.scans).",
             )
-        if on_device and not all(isinstance(source, Generated) for source in train.synthetic):
+        if on_device and not all(
+            isinstance(source, Generated) for source in train.synthetic
+        ):
             raise ConfigError(
                 f"on_device with {[type(s).__name__ for s in train.synthetic]}",
                 "a generator: load_generator(...)",
@@ -142,7 +146,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._resume = None
         dataset: Any = OnDevice(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
-        return _Loader(dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers())
+        return _Loader(
+            dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers()
+        )
 
     def teardown(self, stage: str) -> None:
         """Set the mixture back to its first epoch, in which another training begins."""
@@ -157,7 +163,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
         """Batches of real scans."""
         return self._plain(self.test)
 
-    def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
+    def transfer_batch_to_device(
+        self, batch: Any, device: Any, dataloader_idx: int
+    ) -> Any:
         """Transfer a batch; an unfinished one is transferred later, when its synthetic samples are
         made."""
         if isinstance(batch, Unfinished):
@@ -178,7 +186,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             for i, scan in zip(wanted, scans, strict=True):
                 batch[i] = self.train.finish(scan, batch[i].epoch, batch[i].position)
         device = self.trainer.strategy.root_device if self.trainer else "cpu"
-        return super().transfer_batch_to_device(self.train.collate(batch), device, dataloader_idx)
+        return super().transfer_batch_to_device(
+            self.train.collate(batch), device, dataloader_idx
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The progress of training, after the last batch that Lightning counts as processed."""
@@ -201,13 +211,20 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._batches.load_state_dict(state_dict)
 
     def _workers(self) -> dict[str, Any]:
-        return {"num_workers": self.num_workers, "persistent_workers": self.num_workers > 0}
+        return {
+            "num_workers": self.num_workers,
+            "persistent_workers": self.num_workers > 0,
+        }
 
     def _plain(self, scans: Source | None) -> Any:
         if scans is None:
             return []
-        collate = self.train.collate if isinstance(self.train.collate, Collate) else Collate()
-        return DataLoader(Items(scans), self.batch_size, collate_fn=collate, **self._workers())
+        collate = (
+            self.train.collate if isinstance(self.train.collate, Collate) else Collate()
+        )
+        return DataLoader(
+            Items(scans), self.batch_size, collate_fn=collate, **self._workers()
+        )
 
 
 class Unfinished(list[Any]):
@@ -241,14 +258,21 @@ class _Epochs:
         ranks."""
         steps = self._steps()
         trainer = self._data.trainer
-        done = trainer.fit_loop.epoch_loop.batch_progress.current.processed if trainer else 0
+        done = (
+            trainer.fit_loop.epoch_loop.batch_progress.current.processed
+            if trainer
+            else 0
+        )
         mixture = self._batches.dataset.mixture
         place = (
             (self._epoch, steps[done].start)
             if done < len(steps)
             else after_epoch(mixture, self._epoch)
         )
-        return make_state(mixture, *place) | {"step": steps.size, "first": self._data._first}
+        return make_state(mixture, *place) | {
+            "step": steps.size,
+            "first": self._data._first,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a state.
@@ -277,7 +301,9 @@ class _Epochs:
 
     def _steps(self) -> CutSteps:
         batches = self._batches
-        return cut_steps(0, len(batches.dataset), batches.batch_size, batches.world_size)
+        return cut_steps(
+            0, len(batches.dataset), batches.batch_size, batches.world_size
+        )
 
 
 class _Loader(DataLoader[Any]):

@@ -55,7 +55,8 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
     if not isinstance(given, Mapping):
         if given not in FILE_CLASSES:
             raise ConfigError(
-                f"classes: {given}", f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}"
+                f"classes: {given}",
+                f"one of {', '.join(FILE_CLASSES)}, or {{class name: id}}",
             )
         return FILE_CLASSES[given]
     wrong = {
@@ -64,7 +65,9 @@ def take_classes(settings: dict[str, Any]) -> Taxonomy:
         if n not in TRAIN_ID or type(i) is not int or not 0 < i < 1 << 16
     }
     if wrong or not given:
-        raise ConfigError(f"classes: {wrong}", f"ids from 1 to 65535 by some of {', '.join(NAMES)}")
+        raise ConfigError(
+            f"classes: {wrong}", f"ids from 1 to 65535 by some of {', '.join(NAMES)}"
+        )
     return Taxonomy(
         "classes",
         {0: IGNORE} | {i: TRAIN_ID[n] for n, i in given.items()},
@@ -91,7 +94,9 @@ def trainer_ids(
     classes = taxonomy.encode(np.arange(len(NAMES), dtype=np.uint8)).tolist()
     if missing := sorted({raw for raw in classes if raw} - set(learning_map)):
         raise ConfigError(
-            f"a map of classes without {missing}", f"the ids of {taxonomy.name}", "Set classes."
+            f"a map of classes without {missing}",
+            f"the ids of {taxonomy.name}",
+            "Set classes.",
         )
     ids = np.full_like(table, table[IGNORE])
     ids[: len(NAMES)] = [learning_map[raw] if raw else table[IGNORE] for raw in classes]
@@ -176,7 +181,8 @@ def points_of(scan: Scan) -> NDArray[np.float32]:
 
 
 def inner(
-    dataset: Any, names: tuple[str, ...] = ("dataset", "datasets", "point_cloud_dataset")
+    dataset: Any,
+    names: tuple[str, ...] = ("dataset", "datasets", "point_cloud_dataset"),
 ) -> Iterator[Any]:
     """A dataset and all datasets that it wraps, recursively."""
     yield dataset

@@ -51,13 +51,19 @@ try:
     from mmengine.runner import EpochBasedTrainLoop
 except ImportError as error:
     raise LibraryError(
-        f"mmdet3d cannot be imported ({error})", "1.4.0", "bash tools/install_mmdet3d.sh"
+        f"mmdet3d cannot be imported ({error})",
+        "1.4.0",
+        "bash tools/install_mmdet3d.sh",
     ) from error
 
 if not mmdet3d.__version__.startswith("1.4."):
-    raise LibraryError(f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh")
+    raise LibraryError(
+        f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh"
+    )
 
-from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints  # needs mmengine
+from lidar_synth.integrations.mmdet3d_checkpoints import (
+    allow_checkpoints,
+)  # needs mmengine
 
 allow_checkpoints()
 
@@ -101,7 +107,9 @@ class SynthBoxes:
                 "Give synthetic scans boxes by labels='mix'; ObjectSample adds more.",
             )
         if str(options.get("box_type_3d", "LiDAR")).lower() != "lidar":
-            raise ConfigError(f"box_type_3d={options['box_type_3d']!r} of {name}", "'LiDAR'")
+            raise ConfigError(
+                f"box_type_3d={options['box_type_3d']!r} of {name}", "'LiDAR'"
+            )
         super().__init__(**options)
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
@@ -121,15 +129,22 @@ class SynthBoxes:
         check_names(scan, known)
         mapping = self.label_mapping  # type: ignore[attr-defined]
         labels = np.array(
-            [mapping[known.index(n)] if n in known else -1 for n in given.names], np.int64
+            [mapping[known.index(n)] if n in known else -1 for n in given.names],
+            np.int64,
         ).reshape(-1)
         values = given.values
-        if getattr(self, "with_velocity", False):  # nothing moves in the sweeps of a synthetic scan
+        if getattr(
+            self, "with_velocity", False
+        ):  # nothing moves in the sweeps of a synthetic scan
             values = np.column_stack([values, np.zeros((len(values), 2), np.float32)])
         boxes = LiDARInstance3DBoxes(
             values[labels >= 0], box_dim=values.shape[1], origin=(0.5, 0.5, 0.5)
         )
-        return {"gt_bboxes_3d": boxes, "gt_labels_3d": labels[labels >= 0], "instances": []}
+        return {
+            "gt_bboxes_3d": boxes,
+            "gt_labels_3d": labels[labels >= 0],
+            "instances": [],
+        }
 
 
 @DATASETS.register_module(force=True)
@@ -194,7 +209,9 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
         self.num_samples = math.ceil(
             (length - (0 if self.round_up else self.rank)) / self.world_size
         )
-        self.total_size = self.num_samples * self.world_size if self.round_up else length
+        self.total_size = (
+            self.num_samples * self.world_size if self.round_up else length
+        )
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         """The (epoch, index) of each sample."""
@@ -263,7 +280,9 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
             return
         loader.sampler.set_epoch(runner.epoch)
         done = runner.iter - runner.epoch * len(loader)
-        if self._resumes and 0 < done <= len(loader):  # otherwise at the start of an epoch
+        if self._resumes and 0 < done <= len(
+            loader
+        ):  # otherwise at the start of an epoch
             loader.sampler.start = done * loader.batch_size
         self._resumes = False
 
@@ -274,7 +293,11 @@ def _checked(dataset: Any) -> list[Folder]:
     Raises:
         ConfigError: see ``SynthSampler``.
     """
-    held = [each for each in inner(dataset) if isinstance(getattr(each, "ann_file", None), str)]
+    held = [
+        each
+        for each in inner(dataset)
+        if isinstance(getattr(each, "ann_file", None), str)
+    ]
     mixed = [each for each in held if is_mixed(Path(each.ann_file).resolve().parent)]
     if not mixed:
         raise ConfigError(
@@ -295,7 +318,9 @@ def _checked(dataset: Any) -> list[Folder]:
 def _check_dataset(dataset: Any) -> None:
     if isinstance(dataset, Seg3DDataset):
         ids = id_table(0, dataset.ignore_index, np.int64)
-        require_ids(dict(enumerate(np.asarray(dataset.seg_label_mapping).tolist())), ids)
+        require_ids(
+            dict(enumerate(np.asarray(dataset.seg_label_mapping).tolist())), ids
+        )
     elif isinstance(dataset, Det3DDataset) and not isinstance(dataset, SynthBoxes):
         raise ConfigError(
             f"{type(dataset).__name__} with a mixed list: its synthetic scans would have no boxes",

@@ -50,4 +50,6 @@ def allow_checkpoints() -> None:
         HistoryBuffer,
         *dtypes,
     )
-    torch.serialization.add_safe_globals([*names, (method_of_history, "builtins.getattr")])
+    torch.serialization.add_safe_globals(
+        [*names, (method_of_history, "builtins.getattr")]
+    )

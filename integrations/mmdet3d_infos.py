@@ -79,7 +79,9 @@ def write_infos(
     out = Path(out).resolve()
     given = _read(real)
     if not isinstance(given, dict) or not given.get("data_list"):
-        raise DataError(f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later")
+        raise DataError(
+            f"{real} has no 'data_list'", "an info list of MMDetection3D 1.1 or later"
+        )
     entries = given["data_list"]
     detects = "instances" in entries[0]
     if not detects:
@@ -106,7 +108,8 @@ def write_infos(
         for i in range(folder.slots)
     ]
     write_file(
-        out / MIXTURE, json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode()
+        out / MIXTURE,
+        json.dumps(facts | {"plan": folder.mixed.plan(0).hash}, indent=1).encode(),
     )
     listed = {"metainfo": given.get("metainfo", {}), "data_list": entries + slots}
     write_file(out / INFOS, json.dumps(listed, default=_plain).encode())
@@ -116,8 +119,12 @@ def write_infos(
 
 def _read(real: str | Path) -> Any:
     if Path(real).suffix == ".json":
-        return parse_json(read_text(Path(real)), str(real), "an info list of MMDetection3D")
-    from mmengine.fileio import load  # reads the trainer's own pickle, as the trainer does
+        return parse_json(
+            read_text(Path(real)), str(real), "an info list of MMDetection3D"
+        )
+    from mmengine.fileio import (
+        load,
+    )  # reads the trainer's own pickle, as the trainer does
 
     return load(str(real))
 
@@ -132,7 +139,8 @@ def _complete(settings: dict[str, Any]) -> dict[str, Any]:
     } | settings
     if not isinstance(settings["ratio"], int | float | list | dict):
         raise ConfigError(
-            f"ratio={settings['ratio']!r} for a list", "a number, a list or {epoch: ratio}"
+            f"ratio={settings['ratio']!r} for a list",
+            "a number, a list or {epoch: ratio}",
         )
     for name in ("synthetic", "as_sensor"):
         if isinstance(where := settings.get(name), str | Path) and Path(where).exists():
@@ -140,7 +148,9 @@ def _complete(settings: dict[str, Any]) -> dict[str, Any]:
     return settings
 
 
-def _layout(given: dict[str, Any], entry: Entry, layout: str | None, real: str | Path) -> str:
+def _layout(
+    given: dict[str, Any], entry: Entry, layout: str | None, real: str | Path
+) -> str:
     """The layout of a list: the one that is given, or nuScenes' if the list says so, or KITTI's."""
     dataset = str(given.get("metainfo", {}).get("dataset", "")).lower()
     name = layout or ("nuscenes" if dataset == "nuscenes" else "kitti")
@@ -148,9 +158,12 @@ def _layout(given: dict[str, Any], entry: Entry, layout: str | None, real: str |
         raise ConfigError(f"layout={name!r}", f"one of {', '.join(LAYOUTS)}")
     found = entry["lidar_points"].get("num_pts_feats", LAYOUTS[name].features)
     if found != LAYOUTS[name].features:
-        fits = ", ".join(f"{each!r} ({known.features})" for each, known in LAYOUTS.items())
+        fits = ", ".join(
+            f"{each!r} ({known.features})" for each, known in LAYOUTS.items()
+        )
         raise ConfigError(
-            f"{real}: points of {found} values for layout={name!r}", f"another layout: {fits}"
+            f"{real}: points of {found} values for layout={name!r}",
+            f"another layout: {fits}",
         )
     return name
 
@@ -170,7 +183,9 @@ def _slot(out: Path, number: int, features: int, real: Entry, detects: bool) -> 
     if "timestamp" in real:
         slot["timestamp"] = real["timestamp"]
     if "lidar_sweeps" in real:
-        slot["lidar_sweeps"] = [_sweep(f"{base}.bin", sweep) for sweep in real["lidar_sweeps"]]
+        slot["lidar_sweeps"] = [
+            _sweep(f"{base}.bin", sweep) for sweep in real["lidar_sweeps"]
+        ]
     return slot | {"instances": []}
 
 
@@ -203,7 +218,9 @@ def _camera(entry: Entry, real: str | Path, view: bool | None) -> dict[str, Any]
 
 
 def _make_absolute(entry: Entry, root: Path, points: str, sweeps: str) -> None:
-    entry["lidar_points"]["lidar_path"] = str(root / points / entry["lidar_points"]["lidar_path"])
+    entry["lidar_points"]["lidar_path"] = str(
+        root / points / entry["lidar_points"]["lidar_path"]
+    )
     if "pts_semantic_mask_path" in entry:
         entry["pts_semantic_mask_path"] = str(root / entry["pts_semantic_mask_path"])
     for sweep in entry.get("lidar_sweeps", ()):  # the trainer takes the name only, too
@@ -215,7 +232,9 @@ def _make_absolute(entry: Entry, root: Path, points: str, sweeps: str) -> None:
 
 def _check_files(entry: Entry) -> None:
     paths = [entry["lidar_points"]["lidar_path"], entry.get("pts_semantic_mask_path")]
-    paths += [sweep["lidar_points"]["lidar_path"] for sweep in entry.get("lidar_sweeps", ())]
+    paths += [
+        sweep["lidar_points"]["lidar_path"] for sweep in entry.get("lidar_sweeps", ())
+    ]
     for path in filter(None, paths):
         if not Path(path).is_file():
             raise FileError(
@@ -234,7 +253,9 @@ def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
     """
     by_class: dict[int, list[int]] = {}
     for number, entry in enumerate(entries):
-        valid = [each for each in entry["instances"] if each.get("bbox_3d_isvalid", True)]
+        valid = [
+            each for each in entry["instances"] if each.get("bbox_3d_isvalid", True)
+        ]
         for label in {each["bbox_label_3d"] for each in valid} - {-1}:
             by_class.setdefault(int(label), []).append(number)
     if not by_class:
@@ -243,7 +264,8 @@ def _balanced(entries: list[Entry], seed: int) -> list[Entry]:
     rng = np.random.default_rng(seed)
     drawn = [rng.choice(by_class[label], max(share, 1)) for label in sorted(by_class)]
     return [
-        json.loads(json.dumps(entries[i], default=_plain)) for i in np.concatenate(drawn).tolist()
+        json.loads(json.dumps(entries[i], default=_plain))
+        for i in np.concatenate(drawn).tolist()
     ]
 
 

@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lidar_synth.integrations.detection import difficulty, ground_plane, in_view, plane_in_camera
+from lidar_synth.integrations.detection import (
+    difficulty,
+    ground_plane,
+    in_view,
+    plane_in_camera,
+)
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text, write_file
@@ -21,7 +26,16 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.kitti_labels import boxes_to_camera
 from lidar_synth.geometry.scan import Boxes, Scan
 
-CLASSES = ("Pedestrian", "Cyclist", "Car", "Van", "Truck", "Person_sitting", "Tram", "Misc")
+CLASSES = (
+    "Pedestrian",
+    "Cyclist",
+    "Car",
+    "Van",
+    "Truck",
+    "Person_sitting",
+    "Tram",
+    "Misc",
+)
 """The classes of ``KittiDataset``, in its order."""
 ORDERS = ("uniform", "sequential")
 
@@ -57,19 +71,31 @@ def semantic_kitti_list(
         frames = [frame for other, frame in names if other == sequence]
         count = max(1, round(share * len(frames)))
         base = f"sequences/{sequence}"
-        chosen = range(count) if order == "sequential" else np.arange(count) * len(frames) // count
+        chosen = (
+            range(count)
+            if order == "sequential"
+            else np.arange(count) * len(frames) // count
+        )
         for frame in (frames[i] for i in chosen):
-            entry: dict[str, Any] = {"sample_idx": len(entries), "sample_id": f"{sequence}{frame}"}
+            entry: dict[str, Any] = {
+                "sample_idx": len(entries),
+                "sample_id": f"{sequence}{frame}",
+            }
             entry["lidar_points"] = {
                 "lidar_path": f"{base}/velodyne/{frame}.bin",
                 "num_pts_feats": 4,
             }
-            entries.append(entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"})
+            entries.append(
+                entry | {"pts_semantic_mask_path": f"{base}/labels/{frame}.label"}
+            )
     return write_list(out, "SemanticKITTI", entries, {})
 
 
 def kitti_list(
-    root: str | Path, out: str | Path, split: str = "train", points: str = "velodyne_reduced"
+    root: str | Path,
+    out: str | Path,
+    split: str = "train",
+    points: str = "velodyne_reduced",
 ) -> Path:
     """Write the list of a KITTI object folder; its paths are relative to
     ``<root>/training/<points>``.
@@ -103,14 +129,21 @@ def kitti_list(
         file = Path(root) / part / points / f"{frame}.bin"
         if points == "velodyne_reduced" and not file.is_file():
             write_file(
-                file, np.column_stack([seen.points, seen.reflectance]).astype("<f4").tobytes()
+                file,
+                np.column_stack([seen.points, seen.reflectance])
+                .astype("<f4")
+                .tobytes(),
             )
         planes = Path(root) / part / "planes" / f"{frame}.txt"
         plane = (
-            read_plane(planes) if planes.is_file() else plane_in_camera(ground_plane(scan), camera)
+            read_plane(planes)
+            if planes.is_file()
+            else plane_in_camera(ground_plane(scan), camera)
         )
         entries.append(_entry(frame, scan, seen, camera) | {"plane": plane.tolist()})
-    return write_list(out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)})
+    return write_list(
+        out, "KITTI", entries, {name: i for i, name in enumerate(CLASSES)}
+    )
 
 
 def read_plane(path: Path) -> Any:
@@ -118,7 +151,9 @@ def read_plane(path: Path) -> Any:
     KITTI."""
     lines = read_text(path).splitlines()
     if len(lines) < 4:
-        raise DataError(f"{path} has {len(lines)} lines", "four, the plane in the last one")
+        raise DataError(
+            f"{path} has {len(lines)} lines", "four, the plane in the last one"
+        )
     return np.array(lines[3].split(), np.float64)
 
 
@@ -137,7 +172,9 @@ def _entry(frame: str, scan: Scan, seen: Scan, camera: Calibration) -> dict[str,
         "height": camera.image_size[1],
         "width": camera.image_size[0],
     }
-    image |= {k: v.tolist() for k, v in (("cam2img", cam2img), ("lidar2cam", lidar2cam))}
+    image |= {
+        k: v.tolist() for k, v in (("cam2img", cam2img), ("lidar2cam", lidar2cam))
+    }
     image["lidar2img"] = (cam2img @ lidar2cam).tolist()
     return {
         "sample_idx": int(frame),
@@ -168,7 +205,11 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
             "bbox_3d": box,
             "bbox_label_3d": label,
         }
-        facts |= {"depth": floor[i, 2], "num_lidar_pts": counts[i], "difficulty": levels[i]}
+        facts |= {
+            "depth": floor[i, 2],
+            "num_lidar_pts": counts[i],
+            "difficulty": levels[i],
+        }
         facts |= {
             "truncated": boxes.truncation[i],
             "occluded": boxes.occlusion[i],
@@ -182,7 +223,10 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
 
 
 def write_list(
-    out: str | Path, name: str, entries: list[dict[str, Any]], categories: dict[str, int]
+    out: str | Path,
+    name: str,
+    entries: list[dict[str, Any]],
+    categories: dict[str, int],
 ) -> Path:
     """Write entries as a list of the trainer.
 

@@ -50,18 +50,25 @@ def nuscenes_list(
         from nuscenes.utils.splits import create_splits_scenes
     except ImportError as error:
         raise LibraryError(
-            f"nuScenes' devkit ({error})", "nuscenes-devkit 1.2", "bash tools/install_mmdet3d.sh"
+            f"nuScenes' devkit ({error})",
+            "nuscenes-devkit 1.2",
+            "bash tools/install_mmdet3d.sh",
         ) from error
     if split not in SPLITS.get(version, {}):
         raise DataError(
-            f"split {split!r} of {version!r}", "train or val of v1.0-trainval or v1.0-mini"
+            f"split {split!r} of {version!r}",
+            "train or val of v1.0-trainval or v1.0-mini",
         )
     if not (Path(root) / version).is_dir():
-        raise FileError(f"{Path(root) / version} is not a folder", f"nuScenes' tables of {version}")
+        raise FileError(
+            f"{Path(root) / version} is not a folder", f"nuScenes' tables of {version}"
+        )
     tables = NuScenes(version, str(root), verbose=False)
     scenes = set(create_splits_scenes()[SPLITS[version][split]])
     samples = [
-        each for each in tables.sample if tables.get("scene", each["scene_token"])["name"] in scenes
+        each
+        for each in tables.sample
+        if tables.get("scene", each["scene_token"])["name"] in scenes
     ]
     if not samples:
         raise DataError(
@@ -69,9 +76,12 @@ def nuscenes_list(
             f"some of {', '.join(sorted(scenes)[:3])}, ...",
         )
     entries = [
-        _entry(tables, sample, sweeps) | {"sample_idx": i} for i, sample in enumerate(samples)
+        _entry(tables, sample, sweeps) | {"sample_idx": i}
+        for i, sample in enumerate(samples)
     ]
-    return write_list(out, "nuscenes", entries, {name: i for i, name in enumerate(CLASSES)})
+    return write_list(
+        out, "nuscenes", entries, {name: i for i, name in enumerate(CLASSES)}
+    )
 
 
 def _entry(tables: Any, sample: dict[str, Any], sweeps: int) -> dict[str, Any]:
@@ -97,7 +107,9 @@ def _entry(tables: Any, sample: dict[str, Any], sweeps: int) -> dict[str, Any]:
     return entry | {"lidar_points": points, "instances": _instances(tables, frame)}
 
 
-def _sweep(tables: Any, frame: dict[str, Any], key: NDArray[np.float64]) -> dict[str, Any]:
+def _sweep(
+    tables: Any, frame: dict[str, Any], key: NDArray[np.float64]
+) -> dict[str, Any]:
     in_ego, in_world = _poses(tables, frame)
     sensor_from_key = np.linalg.inv(in_world @ in_ego) @ key
     points = {"lidar_path": frame["filename"], "lidar2sensor": sensor_from_key.tolist()}
@@ -118,10 +130,23 @@ def _instances(tables: Any, frame: dict[str, Any]) -> list[dict[str, Any]]:
         width, length, height = box.wlh
         ahead = box.orientation.rotation_matrix[:, 0]
         label = -1 if name is None else CLASSES.index(name)
-        instance = {"bbox_3d": [*box.center, length, width, height, np.arctan2(ahead[1], ahead[0])]}
+        instance = {
+            "bbox_3d": [
+                *box.center,
+                length,
+                width,
+                height,
+                np.arctan2(ahead[1], ahead[0]),
+            ]
+        }
         instance["velocity"] = (turn @ tables.box_velocity(box.token))[:2]
-        instance = {key: np.asarray(values, float).tolist() for key, values in instance.items()}
-        counts = {"num_lidar_pts": row["num_lidar_pts"], "num_radar_pts": row["num_radar_pts"]}
+        instance = {
+            key: np.asarray(values, float).tolist() for key, values in instance.items()
+        }
+        counts = {
+            "num_lidar_pts": row["num_lidar_pts"],
+            "num_radar_pts": row["num_radar_pts"],
+        }
         valid = sum(counts.values()) > 0
         found.append(
             instance
@@ -131,7 +156,9 @@ def _instances(tables: Any, frame: dict[str, Any]) -> list[dict[str, Any]]:
     return found
 
 
-def _poses(tables: Any, frame: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _poses(
+    tables: Any, frame: dict[str, Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(4, 4) sensor to vehicle and vehicle to world, metres."""
     from nuscenes.utils.geometry_utils import transform_matrix
     from pyquaternion import Quaternion
@@ -141,6 +168,7 @@ def _poses(tables: Any, frame: dict[str, Any]) -> tuple[NDArray[np.float64], NDA
         tables.get("ego_pose", frame["ego_pose_token"]),
     ]
     sensor, vehicle = (
-        transform_matrix(row["translation"], Quaternion(row["rotation"])) for row in rows
+        transform_matrix(row["translation"], Quaternion(row["rotation"]))
+        for row in rows
     )
     return sensor, vehicle

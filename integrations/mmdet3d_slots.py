@@ -95,7 +95,9 @@ class Folder:
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
         self.mixed = mix_for_trainer(self.real, self.settings, lambda scan, rng: scan)
         self.slots = self.mixed.mixture.laps[0]
-        self._view = None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
+        self._view = (
+            None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
+        )
         self._cached: OrderedDict[tuple[int, int], Scan] = OrderedDict()
         self._positions: tuple[int, NDArray[np.int64]] | None = None
         self._epoch: int | None = None
@@ -148,7 +150,10 @@ class Folder:
     @property
     def whole(self) -> bool:
         """Whether every epoch has each entry of the list once: one ratio, and all real scans."""
-        return self.mixed.mixture.epoch_size == "add" and settled(self.mixed.mixture.ratio) == 0
+        return (
+            self.mixed.mixture.epoch_size == "add"
+            and settled(self.mixed.mixture.ratio) == 0
+        )
 
     def entries(self, epoch: int) -> NDArray[np.int64]:
         """(N,) the list's entries that an epoch has, in the order of its plan."""
@@ -210,7 +215,9 @@ def read_url(url: str) -> bytes:
     source, number, kind = split_url(url)
     scan = scan_of(source, number)
     if kind == "bin":
-        points = open_folder(Path(source)).layout.points if is_mixed(source) else points_of
+        points = (
+            open_folder(Path(source)).layout.points if is_mixed(source) else points_of
+        )
         return points(scan).astype("<f4").tobytes()
     class_ids(scan, _TRAIN_IDS)
     return encode_labels(scan, SEMANTIC_KITTI).astype("<u4").tobytes()
@@ -227,7 +234,12 @@ def split_url(url: str) -> tuple[str, int, str]:
     """
     source, _, name = url.removeprefix(PREFIX).rpartition("/")
     number, _, kind = name.partition(".")
-    if not (url.startswith(PREFIX) and source and number.isdigit() and kind in ("bin", "label")):
+    if not (
+        url.startswith(PREFIX)
+        and source
+        and number.isdigit()
+        and kind in ("bin", "label")
+    ):
         raise DataError(f"{url!r}", f"{PREFIX}<folder or bank>/<number>.bin or .label")
     return source, int(number), kind
 
@@ -239,7 +251,11 @@ def is_mixed(source: str | Path) -> bool:
 
 def scan_of(source: str, number: int) -> Scan:
     """The scan that a URL names."""
-    return open_folder(Path(source)).scan(number) if is_mixed(source) else _opened(source)[number]
+    return (
+        open_folder(Path(source)).scan(number)
+        if is_mixed(source)
+        else _opened(source)[number]
+    )
 
 
 def require_boxes(scan: Scan) -> Boxes:

@@ -58,9 +58,13 @@ def as_nuscenes(scan: Scan) -> Scan:
         names = nuscenes_names(boxes.names, f"scan {scan.id!r}")
         seen = boxes.contain(scan.points).any(1) if len(boxes) else np.zeros(0, bool)
         kept = np.array([name is not None for name in names], bool) & seen
-        boxes = turned_boxes(replace(boxes, names=tuple(name or "" for name in names))[kept])
+        boxes = turned_boxes(
+            replace(boxes, names=tuple(name or "" for name in names))[kept]
+        )
     ring = scan.ring if scan.ring is not None else _rings(scan)
-    return replace(scan, points=turned_points(scan.points), ring=ring, boxes=boxes, pose=None)
+    return replace(
+        scan, points=turned_points(scan.points), ring=ring, boxes=boxes, pose=None
+    )
 
 
 def nuscenes_names(names: tuple[str, ...], where: str) -> list[str | None]:
@@ -71,7 +75,9 @@ def nuscenes_names(names: tuple[str, ...], where: str) -> list[str | None]:
     """
     if unknown := sorted(set(names) - set(NAMES)):
         raise DataError(
-            f"boxes of {unknown} in {where}", f"some of {', '.join(NAMES)}", "Rename the boxes."
+            f"boxes of {unknown} in {where}",
+            f"some of {', '.join(NAMES)}",
+            "Rename the boxes.",
         )
     return [NAMES[name] for name in names]
 

@@ -62,10 +62,13 @@ def dataset_class() -> Any:
             ConfigError: with ``use_cache``, or settings that cannot be served.
         """
 
-        def __init__(self, dataset_path: str, mixture: Any = None, **options: Any) -> None:
+        def __init__(
+            self, dataset_path: str, mixture: Any = None, **options: Any
+        ) -> None:
             if options.get("use_cache"):
                 raise ConfigError(
-                    "use_cache=True for a mixture, whose scans change from epoch to epoch", "False"
+                    "use_cache=True for a mixture, whose scans change from epoch to epoch",
+                    "False",
                 )
             super().__init__(dataset_path, **options)
             self.mixture = read_settings(mixture)
@@ -93,7 +96,9 @@ def _split_class(stock: Any) -> Any:
         def __init__(self, dataset: Any, split: str = "training") -> None:
             # First, because the base class makes a sampler, which reads the length.
             self.mixed = mix_for_trainer(
-                len(dataset.get_split_list(split)), dataset.mixture, lambda scan, rng: scan
+                len(dataset.get_split_list(split)),
+                dataset.mixture,
+                lambda scan, rng: scan,
             )
             super().__init__(dataset, split=split)
 
@@ -112,7 +117,11 @@ def _split_class(stock: Any) -> Any:
                 data: dict[str, Any] = super().get_data(sample)
                 return data
             points = points_of(sample)
-            return {"point": points[:, :3], "feat": points[:, 3:], "label": class_ids(sample, _IDS)}
+            return {
+                "point": points[:, :3],
+                "feat": points[:, 3:],
+                "label": class_ids(sample, _IDS),
+            }
 
         def get_attr(self, idx: int) -> dict[str, Any]:
             """Name and path; the name of a synthetic scan contains its number, and is therefore
@@ -121,7 +130,12 @@ def _split_class(stock: Any) -> Any:
             if not self.mixed.domain(idx):
                 attr: dict[str, Any] = super().get_attr(number)
                 return attr | {"idx": idx}
-            return {"idx": idx, "name": f"synthetic_{number}", "path": "", "split": self.split}
+            return {
+                "idx": idx,
+                "name": f"synthetic_{number}",
+                "path": "",
+                "split": self.split,
+            }
 
     return MixedSplit
 
@@ -132,7 +146,9 @@ class _Loader(EpochLoader):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(
-            *args, **options | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {})
+            *args,
+            **options
+            | ({"worker_init_fn": _seed} if options.get("worker_init_fn") else {}),
         )
 
 
@@ -155,9 +171,7 @@ def _library() -> Any:
                 "needs."
             )
         elif isinstance(error, RuntimeError):
-            hint = (
-                "Each release of Open3D has operators for one release of torch: install that one."
-            )
+            hint = "Each release of Open3D has operators for one release of torch: install that one."
         else:
             hint = (
                 "Open3D's operators for CUDA do not load with a torch for CPUs: pip install "

@@ -31,7 +31,9 @@ except ImportError as error:
 
 if not pcdet.__version__.startswith("0.6."):
     raise LibraryError(
-        f"OpenPCDet {pcdet.__version__}", "0.6", "git checkout v0.6.0, python setup.py develop"
+        f"OpenPCDet {pcdet.__version__}",
+        "0.6",
+        "git checkout v0.6.0, python setup.py develop",
     )
 
 from lidar_synth.integrations.openpcdet_kitti import MixedKitti

@@ -25,7 +25,10 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
         self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any
     ) -> None:
         super().__init__(
-            dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options
+            dataset_cfg=dataset_cfg,
+            class_names=class_names,
+            training=training,
+            **options,
         )
         if training:
             self._check_files()
@@ -33,7 +36,9 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
             self._start(CLASSES)
 
     def _synthetic(self, scan: Scan) -> Any:
-        scan = in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
+        scan = (
+            in_view(scan, self._view[1]) if self.dataset_cfg.FOV_POINTS_ONLY else scan
+        )
         assert scan.boxes is not None
         plane = plane_in_camera(ground_plane(scan), self._view[1])
         calib = self._view[0]
@@ -64,7 +69,9 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
             missing = [f for f in frames if not (folder / f"{f}.txt").is_file()]
             if missing:
                 raise ConfigError(
-                    f"{folder} without {len(missing)} scans ({missing[0]}, ...)", expected, hint
+                    f"{folder} without {len(missing)} scans ({missing[0]}, ...)",
+                    expected,
+                    hint,
                 )
 
     def _camera(self) -> tuple[Any, Calibration, Any]:
@@ -73,7 +80,8 @@ class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
         items = set(self.dataset_cfg.get("GET_ITEM_LIST", ["points"]))
         if items - {"points"}:
             raise ConfigError(
-                f"GET_ITEM_LIST {sorted(items)} with MixedKitti", "['points']: there is no picture"
+                f"GET_ITEM_LIST {sorted(items)} with MixedKitti",
+                "['points']: there is no picture",
             )
         info = self.kitti_infos[0]
         calib = self.get_calib(info["point_cloud"]["lidar_idx"])

@@ -36,10 +36,13 @@ class Mixed:
         """Make the mixture and check its first synthetic scans; ``known`` are the class names that
         a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
-        self.mixed = mix_for_trainer(super().__len__(), settings, lambda scan, rng: scan)  # type: ignore[misc]
+        real: int = super().__len__()  # type: ignore[misc]
+        self.mixed = mix_for_trainer(real, settings, lambda scan, rng: scan)
         self._check_boxes({*self.class_names, *known})
 
-    def merge_all_iters_to_one_epoch(self, merge: bool = True, epochs: int | None = None) -> None:
+    def merge_all_iters_to_one_epoch(
+        self, merge: bool = True, epochs: int | None = None
+    ) -> None:
         """Refuse to merge epochs of a mixture, which differ from one another.
 
         Raises:
@@ -47,7 +50,8 @@ class Mixed:
         """
         if merge and self.mixed is not None:
             raise ConfigError(
-                f"merge_all_iters_to_one_epoch with {type(self).__name__}", "epochs one by one"
+                f"merge_all_iters_to_one_epoch with {type(self).__name__}",
+                "epochs one by one",
             )
         super().merge_all_iters_to_one_epoch(merge, epochs)  # type: ignore[misc]
 
@@ -58,7 +62,9 @@ class Mixed:
 
     def domain(self, index: int) -> int:
         """0 if the sample at ``index`` is real in this epoch, 1 if it is synthetic."""
-        return 0 if self.mixed is None else int(self.mixed.domain(index % len(self.mixed)))
+        return (
+            0 if self.mixed is None else int(self.mixed.domain(index % len(self.mixed)))
+        )
 
     def __len__(self) -> int:
         # While OpenPCDet's own code works, it counts real scans.
@@ -102,7 +108,9 @@ class Mixed:
             scan = self.mixed[int(position)]
             if scan.boxes is None:
                 given = f"synthetic scan {scan.id!r} has no boxes"
-                raise DataError(given, "boxes, or every object in it would be background", hint)
+                raise DataError(
+                    given, "boxes, or every object in it would be background", hint
+                )
             if lost := sorted(set(scan.boxes.names) - set(known)):
                 raise DataError(
                     f"boxes of {lost} in synthetic scan {scan.id!r}",
@@ -128,5 +136,7 @@ class Mixed:
         steps = self.dataset_cfg.DATA_AUGMENTOR
         unused = steps.get("DISABLE_AUG_LIST", [])
         return [
-            s for s in steps.AUG_CONFIG_LIST if s.NAME == "gt_sampling" and s.NAME not in unused
+            s
+            for s in steps.AUG_CONFIG_LIST
+            if s.NAME == "gt_sampling" and s.NAME not in unused
         ]

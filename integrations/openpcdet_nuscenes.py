@@ -28,7 +28,10 @@ class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
         self, dataset_cfg: Any, class_names: Any, training: bool = True, **options: Any
     ) -> None:
         super().__init__(
-            dataset_cfg=dataset_cfg, class_names=class_names, training=training, **options
+            dataset_cfg=dataset_cfg,
+            class_names=class_names,
+            training=training,
+            **options,
         )
         if not training:
             return
@@ -58,7 +61,9 @@ class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
                 "frame_id": f"synthetic/{scan.id}",
                 "metadata": {"token": f"synthetic/{scan.id}"},
                 "gt_boxes": np.pad(
-                    scan.boxes.values.astype(float), ((0, 0), (0, 2)), constant_values=np.nan
+                    scan.boxes.values.astype(float),
+                    ((0, 0), (0, 2)),
+                    constant_values=np.nan,
                 ),
                 "gt_names": np.array(scan.boxes.names, dtype=str),
             }
@@ -67,7 +72,9 @@ class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
         if self.dataset_cfg.get("SET_NAN_VELOCITY_TO_ZEROS", False):
             boxes = np.nan_to_num(boxes)
         sample["gt_boxes"] = (
-            boxes if self.dataset_cfg.PRED_VELOCITY else boxes[:, [0, 1, 2, 3, 4, 5, 6, -1]]
+            boxes
+            if self.dataset_cfg.PRED_VELOCITY
+            else boxes[:, [0, 1, 2, 3, 4, 5, 6, -1]]
         )
         return sample
 

@@ -73,7 +73,9 @@ def write_plan(
         )
     if not is_bank(settings.get("synthetic", "")):
         raise ConfigError(
-            f"synthetic: {settings.get('synthetic')}", "a bank", "lidar-synth bake OUT writes one."
+            f"synthetic: {settings.get('synthetic')}",
+            "a bank",
+            "lidar-synth bake OUT writes one.",
         )
     mixed = mix_for_trainer(real, settings, lambda scan, rng: scan)
     if (
@@ -88,7 +90,10 @@ def write_plan(
             "is installed.",
         )
     plans = [mixed.plan(epoch) for epoch in range(epochs)]
-    arrays = {f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1) for plan in plans}
+    arrays = {
+        f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1)
+        for plan in plans
+    }
     values = {
         "format": PLAN_FORMAT,
         "order": VERSION,
@@ -118,7 +123,10 @@ def main() -> None:
     options = parser.parse_args()
     try:
         hashes = write_plan(
-            read_settings(options.mix), options.out, real=options.real, epochs=options.epochs
+            read_settings(options.mix),
+            options.out,
+            real=options.real,
+            epochs=options.epochs,
         )
     except LidarSynthError as error:
         print(f"lidar-synth: {error}", file=sys.stderr)

@@ -71,7 +71,9 @@ class MixedSemanticKITTI(SemanticKITTIDataset):  # type: ignore[misc]
         self._ids = trainer_ids(
             self.learning_map, taxonomy, id_table(0, self.ignore_index, np.int32)
         )
-        self.mixed = mix_for_trainer(len(self.data_list), settings, lambda scan, rng: scan)
+        self.mixed = mix_for_trainer(
+            len(self.data_list), settings, lambda scan, rng: scan
+        )
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, also for workers, persistent ones included."""
@@ -164,6 +166,7 @@ class SynthEpoch(HookBase):  # type: ignore[misc]
         loader = self.trainer.train_loader
         if not mixtures(loader):
             raise ConfigError(
-                "the hook SynthEpoch without a mixture", "MixedSemanticKITTI in data.train"
+                "the hook SynthEpoch without a mixture",
+                "MixedSemanticKITTI in data.train",
             )
         self.trainer.train_loader = EpochOf(loader, self.trainer)

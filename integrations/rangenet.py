@@ -41,7 +41,10 @@ USAGE = (
     "train/tasks/semantic or CENet"
 )
 FAMILY = "lidar-bonnetal, SalsaNext or CENet"
-TRAINERS = {"tasks.semantic.modules.trainer": None, "modules.trainer": "dataset.kitti.parser"}
+TRAINERS = {
+    "tasks.semantic.modules.trainer": None,
+    "modules.trainer": "dataset.kitti.parser",
+}
 """{module of the trainer: module from which it imports its parser, or None where it loads the
 parser by its path}."""
 STRIPES = 0.25
@@ -77,15 +80,21 @@ def dataset_class(stock: Any) -> Any:
         scan_files: Any
         label_files: Any
 
-        def __init__(self, settings: dict[str, Any], *args: Any, **options: Any) -> None:
+        def __init__(
+            self, settings: dict[str, Any], *args: Any, **options: Any
+        ) -> None:
             super().__init__(*args, **options)
             refuse_unlabelled(settings, "a range-view trainer")
             if not self.gt:
-                raise ConfigError("a mixture without labels (gt=False)", "gt=True, for training")
+                raise ConfigError(
+                    "a mixture without labels (gt=False)", "gt=True, for training"
+                )
             settings = dict(settings)
             self.taxonomy = take_classes(settings)
             _check_classes(self.learning_map, self.learning_map_inv, self.taxonomy)
-            self.mixed = mix_for_trainer(len(self.scan_files), settings, lambda scan, rng: scan)
+            self.mixed = mix_for_trainer(
+                len(self.scan_files), settings, lambda scan, rng: scan
+            )
             check_stripes(self)
 
         def set_epoch(self, epoch: int) -> None:
@@ -141,16 +150,22 @@ def check_stripes(dataset: Any) -> None:
     Raises:
         ConfigError: at such a width; the error names one that fits.
     """
-    synthetic = [dataset.mixed[int(i)] for i in np.flatnonzero(dataset.mixed.plan().domain)[:3]]
+    synthetic = [
+        dataset.mixed[int(i)] for i in np.flatnonzero(dataset.mixed.plan().domain)[:3]
+    ]
     real = list(dataset.scan_files[:3])
     if not (synthetic and real):
         return
 
     def measure(width: int) -> list[tuple[float, float]]:
         kinds = [
-            [dataset.image(source, width) for source in sources] for sources in (real, synthetic)
+            [dataset.image(source, width) for source in sources]
+            for sources in (real, synthetic)
         ]
-        return [(float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds]
+        return [
+            (float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)])))
+            for k in kinds
+        ]
 
     (real_fill, real_gaps), (fill, holes) = measure(width := dataset.sensor_img_W)
     if holes - real_gaps <= STRIPES:
@@ -183,7 +198,9 @@ def make_parser(stock: Any, settings: Any = None) -> Any:
         LibraryError: if the module is not a parser of these trainers.
     """
     missing = [
-        name for name in ("Parser", "SemanticKitti", "LaserScan") if not hasattr(stock, name)
+        name
+        for name in ("Parser", "SemanticKitti", "LaserScan")
+        if not hasattr(stock, name)
     ]
     if missing:
         raise LibraryError(f"a parser.py without {missing}", f"the parser of {FAMILY}")
@@ -240,12 +257,18 @@ def register() -> None:
         LibraryError: if the trainer's code cannot be imported, or is not of this family.
     """
     module, parser = _trainer()
-    if not ((parser or hasattr(module, "imp")) and hasattr(module.Trainer, "train_epoch")):
-        raise LibraryError(f"{module.__file__} without imp or Trainer.train_epoch", FAMILY)
+    if not (
+        (parser or hasattr(module, "imp")) and hasattr(module.Trainer, "train_epoch")
+    ):
+        raise LibraryError(
+            f"{module.__file__} without imp or Trainer.train_epoch", FAMILY
+        )
     train = module.Trainer.train_epoch
 
     @wraps(train)
-    def train_epoch(self: Any, train_loader: Any, *args: Any, epoch: int, **options: Any) -> Any:
+    def train_epoch(
+        self: Any, train_loader: Any, *args: Any, epoch: int, **options: Any
+    ) -> Any:
         train_loader.dataset.set_epoch(epoch)
         return train(self, train_loader, *args, epoch=epoch, **options)
 
@@ -264,7 +287,9 @@ def _trainer() -> tuple[Any, Any]:
         try:
             return import_module(name), parser and import_module(parser)
         except ImportError as error:
-            if error.name != "tasks":  # it is this trainer, without something that it imports
+            if (
+                error.name != "tasks"
+            ):  # it is this trainer, without something that it imports
                 raise LibraryError(
                     f"{name} cannot be imported ({error})",
                     f"{FAMILY} with all that it imports",
@@ -278,7 +303,11 @@ def _loader(load: Any) -> SimpleNamespace:
 
     def load_source(name: str, path: str) -> Any:
         loaded = load(name, path)
-        return SimpleNamespace(Parser=make_parser(loaded)) if name == "parserModule" else loaded
+        return (
+            SimpleNamespace(Parser=make_parser(loaded))
+            if name == "parserModule"
+            else loaded
+        )
 
     return SimpleNamespace(load_source=load_source)
 
@@ -322,7 +351,9 @@ def _write(folder: Path, scan: Scan, taxonomy: Taxonomy) -> tuple[str, str]:
         folder / "synthetic" / kind / f"{name}.{ext}"
         for kind, ext in (("velodyne", "bin"), ("labels", "label"))
     ]
-    for path, values in zip(paths, (points_of(scan), encode_labels(scan, taxonomy)), strict=True):
+    for path, values in zip(
+        paths, (points_of(scan), encode_labels(scan, taxonomy)), strict=True
+    ):
         path.parent.mkdir(parents=True)
         path.write_bytes(values.astype(values.dtype.newbyteorder("<")).tobytes())
     return str(paths[0]), str(paths[1])

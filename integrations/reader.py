@@ -151,7 +151,10 @@ class Bank:
         with _reading(self.root / "index.json", REPAIR):
             self._sources = values["sources"]
             self._shards = values["shards"]
-            self.sensor, self.fields = self._sources[0]["sensor"], tuple(self._sources[0]["fields"])
+            self.sensor, self.fields = (
+                self._sources[0]["sensor"],
+                tuple(self._sources[0]["fields"]),
+            )
             self.shape = _shape(self.sensor)
             self._directions = _directions(self.sensor, self.shape)
             lasers = {"elevations", "heights"} <= set(
@@ -164,7 +167,9 @@ class Bank:
             self._scale = self.sensor["range_max"] / 65535
             for facts in self._sources:
                 self._check_facts(facts)
-            self._ends = np.cumsum([self._check_entry(entry) for entry in self._shards]).tolist()
+            self._ends = np.cumsum(
+                [self._check_entry(entry) for entry in self._shards]
+            ).tolist()
             _require(
                 values["scans"] == self._ends[-1],
                 f"{values['scans']} scans, in shards {self._ends[-1]}",
@@ -191,7 +196,9 @@ class Bank:
             f"{self._sources[entry['source']]['model']}/{entry['seed']}/{entry['first'] + position}"
         )
         if rows is not None:
-            fields["boxes"] = (rows[:, 2:] * np.array([*6 * [1e-4], 1e-5])).astype(np.float32)
+            fields["boxes"] = (rows[:, 2:] * np.array([*6 * [1e-4], 1e-5])).astype(
+                np.float32
+            )
             fields["names"] = tuple(CLASSES[code - 1] for code in rows[:, 0])
         return Scan(points, **{"label": None, "confidence": None, **fields})
 
@@ -207,7 +214,10 @@ class Bank:
         far = self.sensor["range_max"] * (1 - 1e-6)
         metres = arrays["range"].astype(np.float32) * np.float32(self._scale)
         inside = np.minimum(np.maximum(metres, np.float32(near)), np.float32(far))
-        decoded = {**arrays, "range": np.where(arrays["range"] > 0, inside, np.float32(0))}
+        decoded = {
+            **arrays,
+            "range": np.where(arrays["range"] > 0, inside, np.float32(0)),
+        }
         for name in set(LEVELS) & set(arrays):
             decoded[name] = arrays[name].astype(np.float32) / np.float32(LEVELS[name])
         if "instance" in arrays:
@@ -249,7 +259,11 @@ class Bank:
         if number not in self._open:
             entry = self._shards[number]
             self._open[number] = _Shard(
-                self.root, entry, self._sources[entry["source"]], self._names, self.shape
+                self.root,
+                entry,
+                self._sources[entry["source"]],
+                self._names,
+                self.shape,
             )
             if len(self._open) > 16:
                 self._open.popitem(last=False)[1].file.close()
@@ -257,7 +271,10 @@ class Bank:
 
     def _check_facts(self, facts: dict[str, Any]) -> None:
         form = FORMATS[bool({"boxes", "instance"} & set(facts["fields"]))]
-        _require(facts["format"] == form, f"scans of format {facts['format']!r}, not {form!r}")
+        _require(
+            facts["format"] == form,
+            f"scans of format {facts['format']!r}, not {form!r}",
+        )
         if facts["compression"] != "gzip":
             raise ReaderError(
                 f"{self.root} is compressed by {facts['compression']!r}; bake it with "
@@ -268,29 +285,43 @@ class Bank:
             self.fields,
             self._scale,
         )
-        _require(same, "several sensors or fields, or a scale that does not fit the sensor")
+        _require(
+            same, "several sensors or fields, or a scale that does not fit the sensor"
+        )
         _require(set(self.fields) <= set(TYPES), f"fields {self.fields}")
 
     def _check_entry(self, entry: dict[str, Any]) -> int:
         """The number of scans that a shard contributes."""
         dropped = entry.get("dropped", [])
-        numbers = [entry[key] for key in ("seed", "first", "scans", "source", "bytes")] + dropped
+        numbers = [
+            entry[key] for key in ("seed", "first", "scans", "source", "bytes")
+        ] + dropped
         _require(
             all(type(n) is int and 0 <= n < 1 << 64 for n in numbers),
             f"numbers of {entry['file']!r}",
         )
-        _require(entry["source"] < len(self._sources), f"the source of {entry['file']!r}")
-        _require(re.fullmatch(r"\w[\w.-]*\.h5", entry["file"]), f"the shard {entry['file']!r}")
+        _require(
+            entry["source"] < len(self._sources), f"the source of {entry['file']!r}"
+        )
+        _require(
+            re.fullmatch(r"\w[\w.-]*\.h5", entry["file"]),
+            f"the shard {entry['file']!r}",
+        )
         # A scan takes 20 bytes for its seed, index and CRC alone.
         _require(
             20 * entry["scans"] <= entry["bytes"],
             f"{entry['bytes']} bytes cannot hold {entry['scans']} scans",
         )
         ascending = np.all(np.diff([-1.0, *dropped, entry["scans"]]) > 0)
-        _require(ascending and len(dropped) < entry["scans"], f"dropped scans of {entry['file']!r}")
+        _require(
+            ascending and len(dropped) < entry["scans"],
+            f"dropped scans of {entry['file']!r}",
+        )
         path = self.root / entry["file"]
         size = path.stat().st_size if path.is_file() else 0
-        _require(size == entry["bytes"], f"{path} is {size} bytes long, not {entry['bytes']}")
+        _require(
+            size == entry["bytes"], f"{path} is {size} bytes long, not {entry['bytes']}"
+        )
         return int(entry["scans"] - len(dropped))
 
 
@@ -298,7 +329,12 @@ class _Shard:
     """An open shard. Everything that it declares is checked before memory is allocated for it."""
 
     def __init__(
-        self, root: Path, entry: dict[str, Any], facts: dict[str, Any], names: list[str], shape: Any
+        self,
+        root: Path,
+        entry: dict[str, Any],
+        facts: dict[str, Any],
+        names: list[str],
+        shape: Any,
     ) -> None:
         self.entry = entry
         self.shapes = {name: BOXES if name == "boxes" else shape for name in names}
@@ -307,14 +343,17 @@ class _Shard:
             self._check_attributes(facts)
             extra = ["condition"] if "condition" in self.file else []
             _require(
-                set(self.file) == {*NUMBERS, *names, *extra}, f"it holds {sorted(self.file)[:9]}"
+                set(self.file) == {*NUMBERS, *names, *extra},
+                f"it holds {sorted(self.file)[:9]}",
             )
             self.numbers = {
-                name: np.asarray(self._dataset(name, kind)[:]) for name, kind in NUMBERS.items()
+                name: np.asarray(self._dataset(name, kind)[:])
+                for name, kind in NUMBERS.items()
             }
             self.conditions = self._dataset("condition", None)[:] if extra else None
             self.datasets = {
-                name: self._dataset(name, TYPES[name], of) for name, of in self.shapes.items()
+                name: self._dataset(name, TYPES[name], of)
+                for name, of in self.shapes.items()
             }
 
     def read(self, position: int) -> dict[str, NDArray[Any]]:
@@ -322,7 +361,9 @@ class _Shard:
         arrays = {name: self._inflate(name, position) for name in self.shapes}
         seed, index, crc = (int(self.numbers[name][position]) for name in NUMBERS)
         condition = b"" if self.conditions is None else bytes(self.conditions[position])
-        found = zlib.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
+        found = zlib.crc32(
+            seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition
+        )
         for array in arrays.values():
             found = zlib.crc32(array.tobytes(), found)
         _require(found == crc, "its CRC does not match")
@@ -332,13 +373,16 @@ class _Shard:
             arrays.get(n, np.zeros((1, 1))) for n in ("label", "confidence", "boxes")
         )
         _require(((label <= 18) | (label == IGNORE)).all(), "it has labels above 18")
-        _require((confidence <= LEVELS["confidence"]).all(), "it has confidences above 1")
+        _require(
+            (confidence <= LEVELS["confidence"]).all(), "it has confidences above 1"
+        )
         _require(
             ((boxes[:, 0] >= 0) & (boxes[:, 0] <= len(CLASSES))).all(),
             "it has boxes of unknown classes",
         )
         return {
-            n: values[values[:, 0] > 0] if n == "boxes" else values for n, values in arrays.items()
+            n: values[values[:, 0] > 0] if n == "boxes" else values
+            for n, values in arrays.items()
         }
 
     def _inflate(self, name: str, position: int) -> NDArray[Any]:
@@ -346,7 +390,10 @@ class _Shard:
         place = (position, 0, 0)
         stored = self.datasets[name].id
         info = stored.get_chunk_info_by_coord(place)
-        found = info.byte_offset is not None and info.byte_offset + info.size <= self.entry["bytes"]
+        found = (
+            info.byte_offset is not None
+            and info.byte_offset + info.size <= self.entry["bytes"]
+        )
         _require(found and not info.filter_mask, f"its {name} is missing")
         chunk = stored.read_direct_chunk(place)[1]
         dtype = np.dtype(TYPES[name])
@@ -360,7 +407,10 @@ class _Shard:
 
     def _check_attributes(self, facts: dict[str, Any]) -> None:
         """The attributes repeat the index: text and numbers as such, everything else as JSON."""
-        expected = {**facts, **{key: self.entry[key] for key in ("seed", "first", "scans")}}
+        expected = {
+            **facts,
+            **{key: self.entry[key] for key in ("seed", "first", "scans")},
+        }
         _require(
             set(self.file.attrs) == set(expected),
             "its attributes are not those of the bank's index",
@@ -371,7 +421,9 @@ class _Shard:
             text = kind.get_class() == h5py.h5t.STRING and not kind.is_variable_str()
             number = kind.get_class() in (h5py.h5t.INTEGER, h5py.h5t.FLOAT)
             _require(
-                attribute.shape == () and (text or number) and kind.get_size() <= 1 << 20,
+                attribute.shape == ()
+                and (text or number)
+                and kind.get_size() <= 1 << 20,
                 f"its attribute {name}",
             )
             found = self.file.attrs[name]
@@ -393,11 +445,19 @@ class _Shard:
         given = dataset.id.get_type()
         layout = properties.get_layout()
         outside = properties.get_external_count()
-        _require(layout != h5py.h5d.VIRTUAL and not outside, f"{name} is stored in another file")
+        _require(
+            layout != h5py.h5d.VIRTUAL and not outside,
+            f"{name} is stored in another file",
+        )
         text = given.get_class() == h5py.h5t.STRING and not given.is_variable_str()
         fits = text if kind is None else given.equal(h5py.h5t.py_create(np.dtype(kind)))
-        _require(fits and dataset.shape == (scans, *shape), f"{name} has another type or shape")
-        filters = tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
+        _require(
+            fits and dataset.shape == (scans, *shape),
+            f"{name} has another type or shape",
+        )
+        filters = tuple(
+            properties.get_filter(i)[0] for i in range(properties.get_nfilters())
+        )
         contiguous = (
             layout == h5py.h5d.CONTIGUOUS
             and dataset.id.get_storage_size() == scans * given.get_size()
@@ -448,7 +508,10 @@ class MixedEpochs:
                 f"it was made with another bank than {bank.root}",
             )
             given = len(real) if hasattr(real, "__len__") else planned
-            _require(given == planned, f"it is for {planned} real samples, but there are {given}")
+            _require(
+                given == planned,
+                f"it is for {planned} real samples, but there are {given}",
+            )
         self._epoch = multiprocessing.Value("q", 0)
         self._loaded = (-1, np.zeros((0, 2), np.int64))
 
@@ -469,7 +532,11 @@ class MixedEpochs:
             raise IndexError(f"sample {index} of {len(self)}")
         synthetic, number = self._order()[index].tolist()
         if not synthetic:
-            return self.real[number] if hasattr(self.real, "__getitem__") else self.real(number)
+            return (
+                self.real[number]
+                if hasattr(self.real, "__getitem__")
+                else self.real(number)
+            )
         scan = self._labelled(self.bank[number])
         return scan if self.to_sample is None else self.to_sample(scan)
 
@@ -485,7 +552,9 @@ class MixedEpochs:
         how = self.settings["labels"]
         threshold = self.settings["threshold"]
         if how == "none":
-            return scan._replace(label=None, confidence=None, boxes=None, names=None, instance=None)
+            return scan._replace(
+                label=None, confidence=None, boxes=None, names=None, instance=None
+            )
         if how == "boxes" or label is None:
             return scan
         if how == "condition" or confidence is None:
@@ -522,7 +591,8 @@ def _read_index(path: Path) -> dict[str, Any]:
         form = values.get("format")
         _require(form in FORMATS, f"format {form!r}, expected one of {FORMATS}")
         _require(
-            given == _checksum(values), "it does not match its checksum: it was damaged or edited"
+            given == _checksum(values),
+            "it does not match its checksum: it was damaged or edited",
         )
     return values
 
@@ -539,7 +609,8 @@ def _shape(sensor: dict[str, Any]) -> tuple[int, int]:
     columns = sensor["columns"]
     whole = type(rows) is int and type(columns) is int and min(rows, columns) >= 2
     _require(
-        whole and rows * columns <= 1 << 22, f"a sensor of {rows!r} rows and {columns!r} columns"
+        whole and rows * columns <= 1 << 22,
+        f"a sensor of {rows!r} rows and {columns!r} columns",
     )
     _require(
         0 <= sensor["range_min"] < sensor["range_max"] < 1e300,
@@ -568,4 +639,6 @@ def _directions(sensor: dict[str, Any], shape: tuple[int, int]) -> NDArray[Any]:
     )
     x = np.cos(azimuth) * np.cos(elevation)
     y = -np.sin(azimuth) * np.cos(elevation)
-    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], -1).astype(np.float32)
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], -1).astype(
+        np.float32
+    )

@@ -120,7 +120,9 @@ def _spconv() -> bool:
     """
     if not find_spec("spconv"):
         raise LibraryError(
-            "spconv is not installed", "spconv 2, for this trainer's network", "pip install spconv"
+            "spconv is not installed",
+            "spconv 2, for this trainer's network",
+            "pip install spconv",
         )
     if not find_spec("spconv.pytorch"):
         return False  # spconv 1
@@ -154,7 +156,9 @@ def _spconv() -> bool:
 def _torch_load() -> bool:
     """Numpy's numbers in a checkpoint: ``torch.load`` reads them again, and still runs no code."""
     scalar: Any = np.float64(0).__reduce__()[0]
-    kinds = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64)]
+    kinds = [
+        type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64)
+    ]
     missing = scalar not in torch.serialization.get_safe_globals()
     torch.serialization.add_safe_globals([scalar, np.dtype, *kinds])
     return missing

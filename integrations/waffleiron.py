@@ -48,7 +48,9 @@ def dataset_class(stock: Any) -> Any:
     class Mixed(stock):  # type: ignore[misc]
         """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set."""
 
-        mixed: Any = None  # while the stock class extracts instances, it has only real scans
+        mixed: Any = (
+            None  # while the stock class extracts instances, it has only real scans
+        )
 
         def __init__(self, **options: Any) -> None:
             super().__init__(**options)
@@ -57,7 +59,9 @@ def dataset_class(stock: Any) -> Any:
                 refuse_unlabelled(settings, "WaffleIron")
                 require_ids(self.learning_map, _FILE_IDS)
                 self.real = copy(self)
-                self.mixed = mix_for_trainer(len(self.real), settings, lambda scan, rng: scan)
+                self.mixed = mix_for_trainer(
+                    len(self.real), settings, lambda scan, rng: scan
+                )
                 self.set_epoch(0)
 
         def set_epoch(self, epoch: int) -> None:
@@ -77,7 +81,11 @@ def dataset_class(stock: Any) -> Any:
             sample = self.mixed[int(index)]
             if not isinstance(sample, Scan):
                 return self.real.__load_pc_internal__(sample)
-            return points_of(sample), class_ids(sample, _IDS), np.zeros(len(sample), np.uint32)
+            return (
+                points_of(sample),
+                class_ids(sample, _IDS),
+                np.zeros(len(sample), np.uint32),
+            )
 
         def load_pc(self, index: int) -> Any:
             """Points (N, 4), labels (N,), augmented by WaffleIron, and a name."""
@@ -114,7 +122,8 @@ def register() -> Any:
     missing = [n for n in ("load_pc", "__load_pc_internal__") if not hasattr(stock, n)]
     if missing or not hasattr(manager, "one_epoch"):
         raise LibraryError(
-            f"WaffleIron without {missing or 'TrainingManager.one_epoch'}", "WaffleIron 0.3"
+            f"WaffleIron without {missing or 'TrainingManager.one_epoch'}",
+            "WaffleIron 0.3",
         )
 
     mixed = dataset_class(stock)

@@ -34,7 +34,9 @@ class LidarSynthError(Exception):
     def __init__(self, given: str, expected: str = "", hint: str = "") -> None:
         # A single string in args, so that the exception can be pickled between worker processes.
         super().__init__(
-            given + (f"; expected {expected}" if expected else "") + (f". {hint}" if hint else "")
+            given
+            + (f"; expected {expected}" if expected else "")
+            + (f". {hint}" if hint else "")
         )
 
 
@@ -87,5 +89,7 @@ def choose(kind: str, name: str, table: Mapping[str, Choice], hint: str = "") ->
     """
     if name not in table:
         hint = f"{hint} {suggest(name, table)}".strip()
-        raise ConfigError(f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint)
+        raise ConfigError(
+            f"{kind} {name!r}", f"one of {', '.join(map(repr, table))}", hint
+        )
     return table[name]

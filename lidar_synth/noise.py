@@ -110,10 +110,14 @@ def keyed_rng(*key: int) -> np.random.Generator:
         ConfigError: on an integer out of range.
     """
     if any(not 0 <= k < 2**64 for k in key):
-        raise ConfigError(f"the key {key} of a random generator", "integers, 0 <= k < 2^64")
+        raise ConfigError(
+            f"the key {key} of a random generator", "integers, 0 <= k < 2^64"
+        )
     # Two words per integer, and the number of integers first: numpy's SeedSequence treats (1,) and
     # (1, 0) as equal.
-    return np.random.default_rng([len(key), *(word for k in key for word in (k & _WORD, k >> 32))])
+    return np.random.default_rng(
+        [len(key), *(word for k in key for word in (k & _WORD, k >> 32))]
+    )
 
 
 def key_words(seed: int, index: int, count: int) -> NDArray[np.uint64]:
@@ -165,7 +169,11 @@ def philox(counter: Tensor, seed: int) -> Tensor:
 
 
 def _words(
-    seed: int, indices: Sequence[int], shape: Sequence[int], device: torch.device | str, stream: int
+    seed: int,
+    indices: Sequence[int],
+    shape: Sequence[int],
+    device: torch.device | str,
+    stream: int,
 ) -> tuple[Tensor, int]:
     """(4, B, blocks) random 32-bit words, and the number of elements of one sample."""
     count = math.prod(shape)
@@ -173,14 +181,20 @@ def _words(
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
     if any(not 0 <= i < 2**63 for i in indices):
         raise ConfigError(
-            f"index {next(i for i in indices if not 0 <= i < 2**63)}", "0 <= index < 2^63"
+            f"index {next(i for i in indices if not 0 <= i < 2**63)}",
+            "0 <= index < 2^63",
         )
     if min(shape, default=1) < 1 or count >= 2**34:
         raise ConfigError(
-            f"noise of shape {tuple(shape)}", "positive sizes, less than 2^34 elements in all"
+            f"noise of shape {tuple(shape)}",
+            "positive sizes, less than 2^34 elements in all",
         )
     # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
-    place = torch.device(device) if torch.device(device).type == "cuda" else torch.device("cpu")
+    place = (
+        torch.device(device)
+        if torch.device(device).type == "cuda"
+        else torch.device("cpu")
+    )
     blocks = torch.arange(-(-count // 4), device=place)
     index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
     counter = (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
@@ -189,6 +203,8 @@ def _words(
     ), count
 
 
-def _samples(lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str) -> Tensor:
+def _samples(
+    lanes: Tensor, shape: Sequence[int], count: int, device: torch.device | str
+) -> Tensor:
     """Reshape words (4, B, blocks) to samples (B, *shape) on ``device``."""
     return lanes.movedim(0, -1).flatten(1)[:, :count].reshape(-1, *shape).to(device)

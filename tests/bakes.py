@@ -14,7 +14,10 @@ def plan_in(out: Path, model: Path, **settings: Any) -> BakePlan:
     """A plan with the tests' default settings, updated by ``settings``."""
     return make_plan(
         out,
-        BakeJob(**{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4} | settings),
+        BakeJob(
+            **{"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 4}
+            | settings
+        ),
     )
 
 

@@ -43,15 +43,21 @@ def some_image(seed: int = 0, sensor: Sensor = SENSOR) -> RangeImage:
     metres = rng.uniform(sensor.range_min, sensor.range_max, sensor.shape)
     channels = {
         "reflectance": (rng.random(sensor.shape) * seen).astype(np.float32),
-        "label": np.where(seen, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8),
+        "label": np.where(seen, rng.integers(0, 19, sensor.shape), IGNORE).astype(
+            np.uint8
+        ),
         "confidence": (rng.random(sensor.shape) * seen).astype(np.float32),
     }
     values = rng.uniform(
         (-40, -40, -2, 0.5, 0.5, 0.5, -3), (40, 40, 1, 9, 3, 3, 3), (seed % 4, 7)
     ).astype(np.float32)
-    names = tuple(rng.choice(["Car", "Pedestrian", "Misc", "Motorcyclist"], len(values)).tolist())
+    names = tuple(
+        rng.choice(["Car", "Pedestrian", "Misc", "Motorcyclist"], len(values)).tolist()
+    )
     boxes = Boxes(values, names, instance=np.arange(1, len(values) + 1, dtype=np.int32))
-    channels["instance"] = (rng.integers(0, len(values) + 1, sensor.shape) * seen).astype(np.int32)
+    channels["instance"] = (
+        rng.integers(0, len(values) + 1, sensor.shape) * seen
+    ).astype(np.int32)
     return RangeImage((metres * seen).astype(np.float32), sensor, channels, boxes)
 
 
@@ -90,9 +96,9 @@ def write_golden_bank(root: Path) -> None:
     sensor = load_sensor(Path(__file__).parents[1] / "configs" / "tiny_sensor.yaml")
     images = [project(scan) for scan in Town(0, sensor, 3)]
     for image in images:
-        image.channels["confidence"] = (image.channels["reflectance"] * image.mask).astype(
-            np.float32
-        )
+        image.channels["confidence"] = (
+            image.channels["reflectance"] * image.mask
+        ).astype(np.float32)
     write_bank(root, images, fields=("reflectance", "label", "confidence"))
     bank = Bank(root)
     scans = [numbers(bank, i) for i in range(len(bank))]
@@ -110,7 +116,9 @@ def numbers(bank: Bank, number: int) -> dict[str, Any]:
         "returns": len(bank[number].points),
         "range": round(float(image.range.sum(dtype=np.float64)), 3),
         "reflectance": round(float(image.reflectance.sum(dtype=np.float64)), 3),
-        "confidence": round(float(image.channels["confidence"].sum(dtype=np.float64)), 3),
+        "confidence": round(
+            float(image.channels["confidence"].sum(dtype=np.float64)), 3
+        ),
         "labels": np.bincount(image.label.reshape(-1), minlength=256)[
             [*range(19), IGNORE]
         ].tolist(),

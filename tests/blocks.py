@@ -18,7 +18,10 @@ REFLECTANCE = {ROAD: 0.25, BUILDING: 0.5, CAR: 0.75}
 
 
 def record(
-    sensor: Sensor, mount: Mount | None = None, car: tuple[float, ...] = CAR_BOX, at: float = 0.0
+    sensor: Sensor,
+    mount: Mount | None = None,
+    car: tuple[float, ...] = CAR_BOX,
+    at: float = 0.0,
 ) -> Scan:
     """What a sensor records of the scene, without noise; in its own frame.
 
@@ -32,9 +35,12 @@ def record(
     matrix = (mount or Mount()).matrix.copy()
     matrix[0, 3] += at
     azimuth = rays.first[:, None] + np.arange(rays.firings) * rays.step
-    slope, height = (np.broadcast_to(v[:, None], azimuth.shape) for v in (rays.slope, rays.height))
+    slope, height = (
+        np.broadcast_to(v[:, None], azimuth.shape) for v in (rays.slope, rays.height)
+    )
     ways = (
-        np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1).reshape(-1, 3) @ matrix[:3, :3].T
+        np.stack([np.cos(azimuth), -np.sin(azimuth), slope], -1).reshape(-1, 3)
+        @ matrix[:3, :3].T
     )
     starts = (
         np.stack([0 * slope, 0 * slope, height], -1).reshape(-1, 3) @ matrix[:3, :3].T
@@ -56,8 +62,12 @@ def record(
         label=label,
         instance=(label == CAR).astype(np.int32),
         ring=np.repeat(np.arange(len(rays.slope)), rays.firings)[kept].astype(np.int16),
-        time=(np.tile(np.arange(rays.firings), len(rays.slope))[kept] * 1e-4).astype(np.float32),
-        boxes=(mount or Mount()).boxes(Boxes(ahead, ("Car",), instance=np.array([1], np.int32))),
+        time=(np.tile(np.arange(rays.firings), len(rays.slope))[kept] * 1e-4).astype(
+            np.float32
+        ),
+        boxes=(mount or Mount()).boxes(
+            Boxes(ahead, ("Car",), instance=np.array([1], np.int32))
+        ),
         pose=matrix,
         id="blocks",
     )
@@ -74,7 +84,9 @@ def image(scan: Scan) -> NDArray[np.int64]:
     return index
 
 
-def _road(starts: NDArray[np.float64], ways: NDArray[np.float64]) -> NDArray[np.float64]:
+def _road(
+    starts: NDArray[np.float64], ways: NDArray[np.float64]
+) -> NDArray[np.float64]:
     with np.errstate(divide="ignore"):
         along = (GROUND - starts[:, 2]) / ways[:, 2]
     return np.where(ways[:, 2] < -1e-9, along, np.inf)
@@ -90,7 +102,9 @@ def _box(
     start = (starts - box[:3]) @ turn.T
     way = ways @ turn.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        sides = np.stack([(sign * np.array(box[3:6]) / 2 - start) / way for sign in (-1, 1)])
+        sides = np.stack(
+            [(sign * np.array(box[3:6]) / 2 - start) / way for sign in (-1, 1)]
+        )
     near = sides.min(0).max(1)
     far = sides.max(0).min(1)
     return np.where((near <= far) & (near > 0), near, np.inf)

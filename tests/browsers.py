@@ -48,7 +48,9 @@ class Page:
         size: of the window, in pixels.
     """
 
-    def __init__(self, driver: Any, path: Path, size: tuple[int, int] = (1000, 620)) -> None:
+    def __init__(
+        self, driver: Any, path: Path, size: tuple[int, int] = (1000, 620)
+    ) -> None:
         self.driver = driver
         driver.set_window_size(*size)
         driver.get(path.as_uri())
@@ -92,9 +94,9 @@ class Page:
         actions = ActionChains(self.driver, duration=20)
         if shift:
             actions.key_down(Keys.SHIFT)
-        actions.move_to_element(self.all(".view canvas")[view]).click_and_hold().move_by_offset(
-            dx, dy
-        ).release()
+        actions.move_to_element(
+            self.all(".view canvas")[view]
+        ).click_and_hold().move_by_offset(dx, dy).release()
         if shift:
             actions.key_up(Keys.SHIFT)
         actions.perform()

@@ -15,7 +15,9 @@ def checkout(variable: str, what: str) -> Path:
     """The folder that a variable names; the whole test file is skipped where it is not set."""
     value = os.environ.get(variable)
     if not value:
-        pytest.skip(f"{variable} is not set to a checkout of {what}", allow_module_level=True)
+        pytest.skip(
+            f"{variable} is not set to a checkout of {what}", allow_module_level=True
+        )
     path = Path(value)
     if not path.is_dir():
         raise FileNotFoundError(f"{variable}={value} leads to no folder")
@@ -34,14 +36,20 @@ SCRIPTS = Path(__file__).parent.parent / "tools" / "trainers" / "scripts"
 
 
 def run_script(
-    script: Path, *arguments: str, cwd: Path, mixture: Path | None = None, **variables: str
+    script: Path,
+    *arguments: str,
+    cwd: Path,
+    mixture: Path | None = None,
+    **variables: str,
 ) -> str:
     """What a Python script says.
 
     Raises:
         RuntimeError: with what it said, if it fails.
     """
-    environment = os.environ | variables | ({} if mixture is None else {VARIABLE: str(mixture)})
+    environment = (
+        os.environ | variables | ({} if mixture is None else {VARIABLE: str(mixture)})
+    )
     done = subprocess.run(
         [sys.executable, str(script), *arguments],
         cwd=cwd,

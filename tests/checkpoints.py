@@ -21,7 +21,13 @@ from lidar_synth.geometry.normalize import NORMALISATIONS
 from lidar_synth.geometry.sensor import Sensor
 
 SENSOR = Sensor(
-    "small", columns=32, range_min=1.0, range_max=80.0, rows=8, fov_up=3.0, fov_down=-25.0
+    "small",
+    columns=32,
+    range_min=1.0,
+    range_max=80.0,
+    rows=8,
+    fov_up=3.0,
+    fov_down=-25.0,
 )
 
 
@@ -41,14 +47,21 @@ HEADER = Header(
     normalisation=NORMALISATIONS["r2flow"],
     channels=("range", "reflectance", "label"),
     time_grid=(1.0, 0.86, 0.58, 0.22, 0.0),
-    provenance={"data": "town", "data_licence": "MIT", "licence": "MIT", "metrics": {"jsd": 0.1}},
+    provenance={
+        "data": "town",
+        "data_licence": "MIT",
+        "licence": "MIT",
+        "metrics": {"jsd": 0.1},
+    },
     conditioning={"semantic": {"classes": 19}},
 )
 
 
 def network(seed: int = 0) -> nn.Module:
     torch.manual_seed(seed)
-    net = build_network("hdit", ARGUMENTS | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    net = build_network(
+        "hdit", ARGUMENTS | {"angles": torch.from_numpy(SENSOR.ray_angles())}
+    )
     for parameter in net.parameters():
         nn.init.normal_(parameter)
     return net
@@ -83,5 +96,9 @@ def replace_weights(path: Path, change: Any) -> None:
     save_file(
         tensors,
         path,
-        {"lidar_synth": checksummed({**HEADER.to_dict(), "weights": weights_hash(tensors)})},
+        {
+            "lidar_synth": checksummed(
+                {**HEADER.to_dict(), "weights": weights_hash(tensors)}
+            )
+        },
     )

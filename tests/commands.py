@@ -123,14 +123,21 @@ def _config(kind: Any) -> Callable[[dict[str, Any], Path | None], None]:
             if folder is None:
                 return
             recipe = folder / recipe
-        load_config(kind, recipe, [os.path.expandvars(o) for o in values["overrides"] or ()])
+        load_config(
+            kind, recipe, [os.path.expandvars(o) for o in values["overrides"] or ()]
+        )
 
     return load
 
 
 def _train(values: dict[str, Any], folder: Path | None) -> None:
     if values["recipe"] in {one.name for one in published_models()}:
-        plan_model(values["recipe"], values["overrides"] or (), values["minutes"], values["until"])
+        plan_model(
+            values["recipe"],
+            values["overrides"] or (),
+            values["minutes"],
+            values["until"],
+        )
     else:
         _config(TrainConfig)(values, folder)
 
@@ -151,10 +158,14 @@ def _bake(values: dict[str, Any], folder: Path | None) -> None:
     _one_of("engine", (*ENGINES,))(values, folder)
 
 
-def _one_of(option: str, known: tuple[str, ...]) -> Callable[[dict[str, Any], Path | None], None]:
+def _one_of(
+    option: str, known: tuple[str, ...]
+) -> Callable[[dict[str, Any], Path | None], None]:
     def compare(values: dict[str, Any], folder: Path | None) -> None:
         if values[option] not in known:
-            raise WrongCommand(f"--{option} {values[option]!r} is none of {', '.join(known)}")
+            raise WrongCommand(
+                f"--{option} {values[option]!r} is none of {', '.join(known)}"
+            )
 
     return compare
 
@@ -209,7 +220,9 @@ def _script(path: Path, words: list[str], folder: Path | None) -> None:
             try:
                 runpy.run_path(str(path), run_name="__main__")
             except SystemExit as stop:
-                raise WrongCommand(f"{path.name} {shlex.join(words)}: wrong arguments") from stop
+                raise WrongCommand(
+                    f"{path.name} {shlex.join(words)}: wrong arguments"
+                ) from stop
             except _Parsed:
                 return
             raise WrongCommand(f"{path.name} has not parsed its arguments")
@@ -223,7 +236,10 @@ def torchrun(words: list[str], folder: Path | None) -> None:
         given = get_args_parser().parse_args(words)
     except SystemExit as stop:
         raise WrongCommand(f"torchrun {shlex.join(words)}: wrong arguments") from stop
-    python(["-m"] * given.module + [given.training_script, *given.training_script_args], folder)
+    python(
+        ["-m"] * given.module + [given.training_script, *given.training_script_args],
+        folder,
+    )
 
 
 def make(words: list[str], folder: Path | None) -> None:
@@ -249,9 +265,13 @@ def pip(words: list[str], folder: Path | None) -> None:
         for word in words
         if (found := re.fullmatch(r"(?:\./)?(?:\.|lidar[-_]synth)(?:\[(.*)\])?", word))
     ]
-    extras = {extra.strip() for found in own for extra in (found[1] or "").split(",")} - {""}
+    extras = {
+        extra.strip() for found in own for extra in (found[1] or "").split(",")
+    } - {""}
     if unknown := extras - set(PYPROJECT["project"]["optional-dependencies"]):
-        raise WrongCommand(f"pip install: extras {sorted(unknown)} are not in pyproject.toml")
+        raise WrongCommand(
+            f"pip install: extras {sorted(unknown)} are not in pyproject.toml"
+        )
 
 
 def bash(words: list[str], folder: Path | None) -> None:
@@ -274,5 +294,16 @@ CHECKS: dict[str, Callable[[list[str], Path | None], None]] = {
 }
 """How the arguments of each program are checked."""
 
-NEVER_RUN = ("make", "pip", "git", "apt-get", "sudo", "docker", "source", ".", "wget", "unzip")
+NEVER_RUN = (
+    "make",
+    "pip",
+    "git",
+    "apt-get",
+    "sudo",
+    "docker",
+    "source",
+    ".",
+    "wget",
+    "unzip",
+)
 """Programs that a test never runs: they install, download, or run these tests themselves."""

@@ -18,7 +18,9 @@ from lidar_synth.geometry.sensor import Sensor, presets
 # tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
+settings.register_profile(
+    "untimed", deadline=None
+)  # a busy machine is no fault of the code
 settings.load_profile("untimed")
 
 
@@ -91,7 +93,11 @@ def random_scan(sensor: Sensor, count: int = 3000, seed: int = 0) -> Scan:
     azimuth = rng.uniform(-np.pi, np.pi, count)
     elevation = np.radians(rng.uniform(sensor.down - 1, sensor.up + 1, count))
     distance = np.exp(
-        rng.uniform(np.log(max(sensor.range_min, 0.5) * 0.9), np.log(sensor.range_max * 1.1), count)
+        rng.uniform(
+            np.log(max(sensor.range_min, 0.5) * 0.9),
+            np.log(sensor.range_max * 1.1),
+            count,
+        )
     )
     points = np.stack(
         [

@@ -13,13 +13,17 @@ app = typer.Typer()
 app.command()(convert)
 
 
-def a_sequence(root: Path, *, tr: bool = True, calib: bool = True, times: bool = True) -> Path:
+def a_sequence(
+    root: Path, *, tr: bool = True, calib: bool = True, times: bool = True
+) -> Path:
     """Three scans in KITTI's own odometry layout, with side files as they are there: F lines, exact
     text."""
     source = root / "sequences" / "07"
     write_all("semantic_kitti", root, [some_scan(i) for i in range(3)], sequence="07")
     [path.unlink() for path in source.glob("*.txt")]
-    rows = [[700.0 + i, 0, 600, 5 * i, 0, 700, 180, 0.2, 0, 0, 1, 0.005] for i in range(4)]
+    rows = [
+        [700.0 + i, 0, 600, 5 * i, 0, 700, 180, 0.2, 0, 0, 1, 0.005] for i in range(4)
+    ]
     lines = [f"P{i}: {' '.join(f'{v:.9e}' for v in row)}" for i, row in enumerate(rows)]
     lines += ["Tr: 0 -1 0 0.05 0 0 -1 -0.08 1 0 0 -0.27"] if tr else []
     if calib:

@@ -137,10 +137,17 @@ def _block(part: re.Match[str], line: int, marks: dict[str, str]) -> Block:
         )
     code = textwrap.dedent(part["code"])
     if language == "console":
-        code = "\n".join(said[2:] for said in code.splitlines() if said.startswith("$ "))
+        code = "\n".join(
+            said[2:] for said in code.splitlines() if said.startswith("$ ")
+        )
     name = _TITLE.search(rest) or _NAMED.match(code)
     return Block(
-        LANGUAGES[language], code, line, name[1] if name else None, reason, marks.get("slow")
+        LANGUAGES[language],
+        code,
+        line,
+        name[1] if name else None,
+        reason,
+        marks.get("slow"),
     )
 
 
@@ -148,7 +155,11 @@ def commands_of(code: str) -> list[str]:
     """The commands of a shell block: lines without comments, joined where a line ends in a
     backslash."""
     lines = re.sub(r"\s*\\\n\s*", " ", code).splitlines()
-    return [line for line in (re.sub(r"(^|\s+)#.*", "", line).strip() for line in lines) if line]
+    return [
+        line
+        for line in (re.sub(r"(^|\s+)#.*", "", line).strip() for line in lines)
+        if line
+    ]
 
 
 def spans_of(text: str) -> list[tuple[int, str]]:
@@ -158,7 +169,11 @@ def spans_of(text: str) -> list[tuple[int, str]]:
         (prose.count("\n", 0, found.start()) + 1, found[1])
         for found in re.finditer(r"`([^`]+)`", prose)
     )
-    return [(line, " ".join(said.split())) for line, said in spans if said.startswith(STARTS)]
+    return [
+        (line, " ".join(said.split()))
+        for line, said in spans
+        if said.startswith(STARTS)
+    ]
 
 
 def words_of(command: str) -> list[str]:
@@ -167,7 +182,11 @@ def words_of(command: str) -> list[str]:
 
 PAGES = [
     ROOT / "README.md",
-    *(page for page in sorted(ROOT.glob("docs/**/*.md")) if "research" not in page.parts),
+    *(
+        page
+        for page in sorted(ROOT.glob("docs/**/*.md"))
+        if "research" not in page.parts
+    ),
 ]
 """README.md and the pages of docs/ outside docs/research."""
 

@@ -17,7 +17,9 @@ def _moments(t: Tensor, y: Tensor, spread: float = STD) -> tuple[Tensor, Tensor]
     return (1 - t) * MEAN, ((1 - t) ** 2 * spread**2 + t**2).sqrt()
 
 
-def gaussian_velocity(y: Tensor, t: Tensor, cond: Any = None, spread: float = STD) -> Tensor:
+def gaussian_velocity(
+    y: Tensor, t: Tensor, cond: Any = None, spread: float = STD
+) -> Tensor:
     """E[y1 - y0 | y_t = y] for data N(MEAN, spread^2), element by element."""
     mean, std = _moments(t, y, spread)
     t = per_sample(t, y)

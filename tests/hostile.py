@@ -35,11 +35,17 @@ def npy(header: str, body: bytes = b"", version: int = 1) -> bytes:
     content = header.encode("latin-1") + b"\n"
     width = {1: 2, 2: 4, 3: 4}[version]
     return (
-        b"\x93NUMPY" + bytes([version, 0]) + len(content).to_bytes(width, "little") + content + body
+        b"\x93NUMPY"
+        + bytes([version, 0])
+        + len(content).to_bytes(width, "little")
+        + content
+        + body
     )
 
 
-def described(descr: str = "'<f4'", shape: str = "(20, 4)", order: str = "False") -> str:
+def described(
+    descr: str = "'<f4'", shape: str = "(20, 4)", order: str = "False"
+) -> str:
     return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}"
 
 
@@ -53,7 +59,9 @@ HOSTILE_NPY = {
     "160 GB": npy(described(shape="(10000000000, 4)"), bytes(64)),
     "more than bits": npy(described(shape="(4611686018427387904, 8)"), b""),
     "nothing of much": npy(described(shape="(0, 99999999999, 99999999999)"), b""),
-    "a token that does not end": npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3L"),
+    "a token that does not end": npy(
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (3L"
+    ),
     "deep": npy("(" * 5000),
     "minus": npy("-" * 9000 + "1"),
     "blanks": npy("{'descr': '<f4'," + " " * 9900),
@@ -88,4 +96,8 @@ LINEAR = {
 def tags_of(card: str) -> set[str]:
     """The HTML elements that a card in Markdown is shown with, its header left out."""
     body = card.split("---\n", 2)[2] if card.startswith("---\n") else card
-    return set(re.findall(r"<(\w+)", markdown.markdown(body, extensions=["tables", "fenced_code"])))
+    return set(
+        re.findall(
+            r"<(\w+)", markdown.markdown(body, extensions=["tables", "fenced_code"])
+        )
+    )

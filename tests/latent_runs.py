@@ -51,7 +51,11 @@ UNET = {
 }
 
 
-SEMANTIC = {"kind": "semantic", "arguments": {"channels": 3, "method": "patches"}, "dropout": 0.2}
+SEMANTIC = {
+    "kind": "semantic",
+    "arguments": {"channels": 3, "method": "patches"},
+    "dropout": 0.2,
+}
 
 
 def write_config(scans: Path, folder: Path, name: str, **values: Any) -> Path:

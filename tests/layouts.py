@@ -33,9 +33,15 @@ WRITTEN_AS = {
 
 def turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """(3, 3) rotation about z, then y, then x."""
-    about_z = np.array([(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)])
+    about_z = np.array(
+        [(np.cos(yaw), -np.sin(yaw), 0), (np.sin(yaw), np.cos(yaw), 0), (0, 0, 1)]
+    )
     about_y = np.array(
-        [(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))]
+        [
+            (np.cos(pitch), 0, np.sin(pitch)),
+            (0, 1, 0),
+            (-np.sin(pitch), 0, np.cos(pitch)),
+        ]
     )
     about_x = np.array(
         [(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))]
@@ -59,7 +65,11 @@ def some_boxes(seed: int = 0, count: int = 5) -> Boxes:
     size = rng.uniform((0.5, 0.5, 1.4), (5, 2, 2), (count, 3))
     names = rng.choice(["Car", "Truck", "Pedestrian", "Cyclist"], count).tolist()
     values = np.column_stack([centre, size, rng.uniform(-3.1, 3.1, count)])
-    return Boxes(values.astype(np.float32), names, instance=np.arange(1, count + 1, dtype=np.int32))
+    return Boxes(
+        values.astype(np.float32),
+        names,
+        instance=np.arange(1, count + 1, dtype=np.int32),
+    )
 
 
 def some_camera() -> Calibration:
@@ -68,7 +78,9 @@ def some_camera() -> Calibration:
     moved[:3, :3] = moved[:3, :3] @ turn(0.01, -0.015, 0.008)
     moved[:3, 3] = 0.05, -0.08, -0.27
     return Calibration(
-        np.array([(600.0, 0, 350, 45), (0, 600, 130, 0), (0, 0, 1, 0.005)]), moved, (700, 260)
+        np.array([(600.0, 0, 350, 45), (0, 600, 130, 0), (0, 0, 1, 0.005)]),
+        moved,
+        (700, 260),
     )
 
 
@@ -108,9 +120,9 @@ def nuscenes_arrays(count: int = 320, seed: int = 0) -> tuple[np.ndarray, np.nda
     x = np.cos(elevation) * np.sin(azimuth)
     y = np.cos(elevation) * np.cos(azimuth)
     points = np.stack([x, y, np.sin(elevation)], -1) * distance[:, None]
-    return np.column_stack([points, rng.integers(0, 256, count), ring]).astype("<f4"), rng.integers(
-        0, 32, count
-    )
+    return np.column_stack([points, rng.integers(0, 256, count), ring]).astype(
+        "<f4"
+    ), rng.integers(0, 32, count)
 
 
 def write_nuscenes(root: Path, count: int = 3, labels: bool = True) -> list[Path]:
@@ -128,10 +140,16 @@ def write_nuscenes(root: Path, count: int = 3, labels: bool = True) -> list[Path
             file.parent.mkdir(parents=True, exist_ok=True)
             classes.astype("u1").tofile(file)
             samples.append(
-                {"token": f"token{i}", "filename": f"samples/LIDAR_TOP/{paths[-1].name}"}
+                {
+                    "token": f"token{i}",
+                    "filename": f"samples/LIDAR_TOP/{paths[-1].name}",
+                }
             )
             segments.append(
-                {"sample_data_token": f"token{i}", "filename": file.relative_to(root).as_posix()}
+                {
+                    "sample_data_token": f"token{i}",
+                    "filename": file.relative_to(root).as_posix(),
+                }
             )
     if labels:
         (root / "v1.0-mini").mkdir()
@@ -163,12 +181,18 @@ def write_kitti_raw(root: Path, count: int = 3) -> list[Path]:
 
 
 MAKERS: dict[str, Callable[[Path], list[Path]]] = {
-    "bank": lambda root: write_bank(root, [project(some_scan(i)) for i in range(3)], shard_size=1),
-    "kitti360": lambda root: write_all("kitti360", root, [some_scan(i) for i in range(3)]),
+    "bank": lambda root: write_bank(
+        root, [project(some_scan(i)) for i in range(3)], shard_size=1
+    ),
+    "kitti360": lambda root: write_all(
+        "kitti360", root, [some_scan(i) for i in range(3)]
+    ),
     "semantic_kitti": lambda root: write_all(
         "semantic_kitti", root, [some_scan(i) for i in range(3)]
     ),
-    "kitti_object": lambda root: write_all("kitti_object", root, [some_scan(i) for i in range(3)]),
+    "kitti_object": lambda root: write_all(
+        "kitti_object", root, [some_scan(i) for i in range(3)]
+    ),
     "folder": lambda root: write_all("kitti", root, [some_scan(i) for i in range(3)]),
     "range": lambda root: write_all("range", root, [some_scan(i) for i in range(3)]),
     "png": lambda root: write_all("png", root, [some_scan(i) for i in range(3)]),

@@ -18,7 +18,10 @@ needs_limits = pytest.mark.skipif(
 
 
 def in_limits(
-    call: Callable[..., object], *arguments: Any, megabytes: int = 500, seconds: float = 60
+    call: Callable[..., object],
+    *arguments: Any,
+    megabytes: int = 500,
+    seconds: float = 60,
 ) -> str:
     """What becomes of ``call(*arguments)``.
 
@@ -52,12 +55,17 @@ def in_limits(
 
 
 def _limited(
-    sender: Connection, megabytes: int, call: Callable[..., object], arguments: tuple[Any, ...]
+    sender: Connection,
+    megabytes: int,
+    call: Callable[..., object],
+    arguments: tuple[Any, ...],
 ) -> None:
     import resource
 
     [taken] = re.findall(r"VmData:\s*(\d+) kB", _STATUS.read_text())
-    resource.setrlimit(resource.RLIMIT_DATA, ((int(taken) << 10) + (megabytes << 20),) * 2)
+    resource.setrlimit(
+        resource.RLIMIT_DATA, ((int(taken) << 10) + (megabytes << 20),) * 2
+    )
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         call(*arguments)

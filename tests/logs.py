@@ -36,7 +36,9 @@ def write_log(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 def turn_time(scan: Scan) -> np.ndarray:
     """Seconds since the seam behind the sensor, clockwise, at 10 turns a second."""
-    return (-np.arctan2(*scan.points[:, 1::-1].T.astype(float)) / (2 * np.pi) + 0.5) * 0.1
+    return (
+        -np.arctan2(*scan.points[:, 1::-1].T.astype(float)) / (2 * np.pi) + 0.5
+    ) * 0.1
 
 
 def axes(scan: Scan) -> dict[str, np.ndarray]:

@@ -24,7 +24,9 @@ def shift(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def mixed(real: int = 9, ratio: Any = 0.4, **options: Any) -> MixedScans:
-    return MixedScans(Scans("r", real), Endless(), ratio, augment=shift, reuse=2, **options)
+    return MixedScans(
+        Scans("r", real), Endless(), ratio, augment=shift, reuse=2, **options
+    )
 
 
 def loader(train: MixedScans, workers: int, **options: Any) -> DataLoader[Any]:

@@ -18,11 +18,19 @@ class Scans(list[Scan]):
     """Scans in memory; ``<name><i>`` with 20 to 29 points each."""
 
     def __init__(
-        self, name: str, count: int, sensor: Sensor = SENSOR, domain: int = REAL, seed: int = 0
+        self,
+        name: str,
+        count: int,
+        sensor: Sensor = SENSOR,
+        domain: int = REAL,
+        seed: int = 0,
     ) -> None:
-        scans = (random_scan(sensor, 20 + i % 10, seed=1000 * seed + i) for i in range(count))
+        scans = (
+            random_scan(sensor, 20 + i % 10, seed=1000 * seed + i) for i in range(count)
+        )
         super().__init__(
-            replace(scan, id=f"{name}{i}", domain=domain) for i, scan in enumerate(scans)
+            replace(scan, id=f"{name}{i}", domain=domain)
+            for i, scan in enumerate(scans)
         )
         self.sensor = sensor
 
@@ -34,14 +42,18 @@ class Endless:
     length = None
 
     def __init__(
-        self, fields: Sequence[str] = ("reflectance", "label", "confidence"), name: str = "s"
+        self,
+        fields: Sequence[str] = ("reflectance", "label", "confidence"),
+        name: str = "s",
     ) -> None:
         self.fields = frozenset(fields)
         self.identity = name
 
     def __getitem__(self, number: int) -> Scan:
         scan = random_scan(SENSOR, 15 + number % 7, seed=10_000 + number)
-        confidence = np.full(len(scan), 0.5, np.float32) if "confidence" in self.fields else None
+        confidence = (
+            np.full(len(scan), 0.5, np.float32) if "confidence" in self.fields else None
+        )
         label = scan.label if "label" in self.fields else None
         return replace(
             scan,

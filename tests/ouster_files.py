@@ -25,7 +25,26 @@ def ouster_metadata(
         "beam_azimuth_angles": [(4.23, 1.41, -1.41, -4.22)[i % 4] for i in range(rows)],
         "lidar_origin_to_beam_origin_mm": 15.806,
     }
-    transform = {"lidar_to_sensor_transform": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, LIFT, 0, 0, 0, 1]}
+    transform = {
+        "lidar_to_sensor_transform": [
+            -1,
+            0,
+            0,
+            0,
+            0,
+            -1,
+            0,
+            0,
+            0,
+            0,
+            1,
+            LIFT,
+            0,
+            0,
+            0,
+            1,
+        ]
+    }
     config = {"lidar_mode": "1024x10", "udp_port_lidar": 7502}
     data_format = {
         "pixels_per_column": rows,

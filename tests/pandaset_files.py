@@ -51,7 +51,9 @@ def dump(tree: Any, protocol: int = 3) -> bytes:
 INDEXES = "pandas.core.indexes"
 
 
-def array(values: Any, *, dtype: str | None = None, shape: tuple[int, ...] | None = None) -> Call:
+def array(
+    values: Any, *, dtype: str | None = None, shape: tuple[int, ...] | None = None
+) -> Call:
     """An array as numpy pickles it; ``dtype`` and ``shape`` may say something else than it
     holds."""
     values = np.asarray(values)
@@ -74,14 +76,19 @@ def array(values: Any, *, dtype: str | None = None, shape: tuple[int, ...] | Non
         False,
         data,
     )
-    return Call("numpy.core.multiarray._reconstruct", (Name("numpy.ndarray"), (0,), b"b"), made)
+    return Call(
+        "numpy.core.multiarray._reconstruct", (Name("numpy.ndarray"), (0,), b"b"), made
+    )
 
 
 def table(columns: dict[str, Any]) -> Call:
     """A table as pandas 0.25 pickles it: columns of one type in one block."""
     names = list(columns)
     arrays = [np.asarray(values) for values in columns.values()]
-    arrays = [values.astype(object) if values.dtype.kind == "U" else values for values in arrays]
+    arrays = [
+        values.astype(object) if values.dtype.kind == "U" else values
+        for values in arrays
+    ]
     blocks = []
     for kind in sorted({values.dtype.str for values in arrays}):
         places = [i for i, values in enumerate(arrays) if values.dtype.str == kind]
@@ -94,7 +101,9 @@ def table(columns: dict[str, Any]) -> Call:
     labels = {"data": array(np.array(names, object)), "name": None}
     index = Call(f"{INDEXES}.base._new_Index", (Name(f"{INDEXES}.base.Index"), labels))
     length = {"start": 0, "stop": len(arrays[0]), "step": 1}
-    rows = Call(f"{INDEXES}.base._new_Index", (Name(f"{INDEXES}.range.RangeIndex"), length))
+    rows = Call(
+        f"{INDEXES}.base._new_Index", (Name(f"{INDEXES}.range.RangeIndex"), length)
+    )
     axes = [index, rows]
     state = (
         axes,
@@ -104,7 +113,9 @@ def table(columns: dict[str, Any]) -> Call:
     )
     manager = Call("pandas.core.internals.managers.BlockManager", (), state)
     return Call(
-        "pandas.core.frame.DataFrame", (), {"_data": manager, "_typ": "dataframe", "_metadata": []}
+        "pandas.core.frame.DataFrame",
+        (),
+        {"_data": manager, "_typ": "dataframe", "_metadata": []},
     )
 
 
@@ -128,7 +139,12 @@ def drive(count: int) -> tuple[np.ndarray, np.ndarray]:
 def quaternion(pose: np.ndarray) -> dict[str, float]:
     """The heading of a pose that turns about z."""
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
-    return {"w": float(np.cos(yaw / 2)), "x": 0.0, "y": 0.0, "z": float(np.sin(yaw / 2))}
+    return {
+        "w": float(np.cos(yaw / 2)),
+        "x": 0.0,
+        "y": 0.0,
+        "z": float(np.sin(yaw / 2)),
+    }
 
 
 def write_track(folder: Path, times: np.ndarray, poses: np.ndarray) -> None:
@@ -144,7 +160,9 @@ def write_track(folder: Path, times: np.ndarray, poses: np.ndarray) -> None:
     (folder / "timestamps.json").write_text(json.dumps(times.tolist()))
 
 
-def measured(seed: int, sensor: str = "pandar64", count: int = 400) -> tuple[Scan, np.ndarray]:
+def measured(
+    seed: int, sensor: str = "pandar64", count: int = 400
+) -> tuple[Scan, np.ndarray]:
     """A scan as the sensor measures it, with points on its beams, and the time of each point
     relative to the scan."""
     rng = np.random.default_rng(seed)
@@ -188,16 +206,22 @@ def write_pandaset(root: Path, count: int = 3) -> list[Path]:
             scan, time = measured(i, name)
             moving = interpolate_poses(times, poses, times[i] + time) @ MOUNTS[name]
             world = (
-                np.einsum("nij,nj->ni", moving[:, :3, :3], scan.points.astype(np.float64))
+                np.einsum(
+                    "nij,nj->ni", moving[:, :3, :3], scan.points.astype(np.float64)
+                )
                 + moving[:, :3, 3]
             )
             intensity = np.round(scan.reflectance.astype(np.float64) * 255)
             parts.append(
-                np.column_stack([world, intensity, times[i] + time, np.full(len(scan), device)])
+                np.column_stack(
+                    [world, intensity, times[i] + time, np.full(len(scan), device)]
+                )
             )
         rows = np.concatenate(parts)
         write_table(
-            path, dict(zip("xyzit", rows.T, strict=False)) | {"d": rows[:, 5].astype(np.int64)}
+            path,
+            dict(zip("xyzit", rows.T, strict=False))
+            | {"d": rows[:, 5].astype(np.int64)},
         )
         classes = np.random.default_rng(i).integers(1, 43, len(rows))
         write_table(folder / "annotations" / "semseg" / path.name, {"class": classes})

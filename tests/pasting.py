@@ -16,7 +16,9 @@ def assert_nothing_shares_a_ray(scan: Scan, first: int) -> None:
     column = np.floor((1 - np.arctan2(y, x) / np.pi) / 2 * width).astype(int) % width
     edges = scan.sensor.edges.astype(np.float64)
     row = np.clip(
-        np.searchsorted(-edges, -np.arcsin(z / distance), side="right") - 1, 0, height - 1
+        np.searchsorted(-edges, -np.arcsin(z / distance), side="right") - 1,
+        0,
+        height - 1,
     )
     for box, instance in zip(scan.boxes.values, scan.boxes.instance, strict=True):
         if instance < first:

@@ -13,7 +13,13 @@ from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.geometry.sensor import Sensor
 
 SMALL = Sensor(
-    "small", columns=64, rows=16, fov_up=10.0, fov_down=-30.0, range_min=1.0, range_max=80.0
+    "small",
+    columns=64,
+    rows=16,
+    fov_up=10.0,
+    fov_down=-30.0,
+    range_min=1.0,
+    range_max=80.0,
 )
 
 
@@ -22,7 +28,9 @@ ROAD = TRAIN_ID["road"]
 
 
 def page_data(page: str) -> dict[str, Any]:
-    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    match = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', page, re.S
+    )
     assert match
     data: dict[str, Any] = json.loads(match[1])
     return data

@@ -18,15 +18,25 @@ from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.objects import LABELS
 
 TOWN_SENSOR = Sensor(
-    "small town", columns=512, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0
+    "small town",
+    columns=512,
+    range_min=1.0,
+    range_max=80.0,
+    rows=32,
+    fov_up=3.0,
+    fov_down=-25.0,
 )
 
 
 class Scans(list[Scan]):
     """Scans in memory with names, as a source."""
 
-    def __init__(self, names: Sequence[str], poses: Sequence[float] | None = None) -> None:
-        super().__init__(replace(street(i, boxes=False), id=name) for i, name in enumerate(names))
+    def __init__(
+        self, names: Sequence[str], poses: Sequence[float] | None = None
+    ) -> None:
+        super().__init__(
+            replace(street(i, boxes=False), id=name) for i, name in enumerate(names)
+        )
         self.ids = tuple(names)
         for i, x in enumerate(poses or ()):
             pose = np.eye(4)
@@ -36,10 +46,14 @@ class Scans(list[Scan]):
 
 def drives(count: int = 3, scans: int = 4) -> Scans:
     """Scans of several drives."""
-    return Scans([f"{drive:02d}/{frame:06d}" for drive in range(count) for frame in range(scans)])
+    return Scans(
+        [f"{drive:02d}/{frame:06d}" for drive in range(count) for frame in range(scans)]
+    )
 
 
-def job(name: str, folder: Path, iterations: int = 20, ratio: float | None = None) -> Job:
+def job(
+    name: str, folder: Path, iterations: int = 20, ratio: float | None = None
+) -> Job:
     """A training on four scans, with pools of other scans and a bank of their cars as
     pedestrians."""
     real = [street(i, boxes=False) for i in range(4)]
@@ -76,8 +90,12 @@ def write_town(root: Path, streets: int, frames: Sequence[int]) -> Path:
     poses."""
     town = Town(0, TOWN_SENSOR, streets * STRETCH_FRAMES)
     writer = SemanticKITTIWriter(root)
-    for index, (number, frame) in enumerate((s, f) for s in range(streets) for f in frames):
-        writer.write(town[number * STRETCH_FRAMES + frame], index, name=f"00/{index:06d}")
+    for index, (number, frame) in enumerate(
+        (s, f) for s in range(streets) for f in frames
+    ):
+        writer.write(
+            town[number * STRETCH_FRAMES + frame], index, name=f"00/{index:06d}"
+        )
     writer.finish()
     return root
 

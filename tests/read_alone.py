@@ -25,7 +25,11 @@ def compare(where, found, expected):
 
 def scan_arrays(scan):
     """The values of a scan that are not None."""
-    return {name: np.asarray(value) for name, value in scan._asdict().items() if value is not None}
+    return {
+        name: np.asarray(value)
+        for name, value in scan._asdict().items()
+        if value is not None
+    }
 
 
 def main():
@@ -38,8 +42,12 @@ def main():
         found = {}
         bank.verify()
         for number in range(len(bank)):
-            found.update({f"{number} image {name}": v for name, v in bank.image(number).items()})
-            found.update({f"{number} {name}": v for name, v in scan_arrays(bank[number]).items()})
+            found.update(
+                {f"{number} image {name}": v for name, v in bank.image(number).items()}
+            )
+            found.update(
+                {f"{number} {name}": v for name, v in scan_arrays(bank[number]).items()}
+            )
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
         scans += len(bank)
     for folder in sorted((cases / "plans").iterdir()):
@@ -52,17 +60,22 @@ def main():
             for position in range(len(train)):
                 sample = train[position]
                 values = (
-                    {"real": np.array(sample)} if isinstance(sample, int) else scan_arrays(sample)
+                    {"real": np.array(sample)}
+                    if isinstance(sample, int)
+                    else scan_arrays(sample)
                 )
-                found.update({f"{epoch} {position} {key}": value for key, value in values.items()})
+                found.update(
+                    {
+                        f"{epoch} {position} {key}": value
+                        for key, value in values.items()
+                    }
+                )
                 assert train.domain(position) == (not isinstance(sample, int))
                 samples += 1
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
     heavy = {"torch", "numba", "deflate", "lidar_synth"} & set(sys.modules)
     assert not heavy, heavy
-    versions = (
-        f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
-    )
+    versions = f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
     print(f"{versions}: {scans} scans and {samples} samples are equal, bit for bit")
 
 

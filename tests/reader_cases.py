@@ -23,7 +23,12 @@ from lidar_synth.mixing import MixedScans
 ALL = ("reflectance", "label", "confidence")
 BOXED = (*ALL, "instance", "boxes")
 LASERS = Sensor(
-    "lasers", 48, 0.9, 120.0, elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5), heights=(0.1,) * 6
+    "lasers",
+    48,
+    0.9,
+    120.0,
+    elevations=(15.0, 7.5, 2.0, -1.0, -9.0, -24.5),
+    heights=(0.1,) * 6,
 )
 
 
@@ -55,7 +60,10 @@ def conditional(root: Path) -> None:
             writer.append(image)
     path = root / entry.file
     write_bank_files(
-        root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),))
+        root,
+        Index(
+            (facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),)
+        ),
     )
 
 
@@ -85,7 +93,9 @@ BANKS: dict[str, Any] = {
     "paged": lambda root: write_bank(root, images(), fields=ALL, layout="paged"),
     "limits": lambda root: write_bank(root, at_limits(), fields=ALL),
     "lasers": lambda root: write_bank(root, images(2, LASERS), fields=ALL),
-    "hdl64e": lambda root: write_bank(root, images(2, load_sensor("hdl64e_kitti")), fields=ALL),
+    "hdl64e": lambda root: write_bank(
+        root, images(2, load_sensor("hdl64e_kitti")), fields=ALL
+    ),
     "conditional": conditional,
     "curated": curated,
     "merged": merged,
@@ -94,9 +104,17 @@ BANKS: dict[str, Any] = {
 
 MIXTURES: dict[str, tuple[str, int, dict[str, Any]]] = {
     "generated": ("all fields", 11, {"ratio": 0.25, "seed": 3}),
-    "threshold": ("all fields", 11, {"ratio": 0.5, "label_options": {"threshold": 0.5}}),
+    "threshold": (
+        "all fields",
+        11,
+        {"ratio": 0.5, "label_options": {"threshold": 0.5}},
+    ),
     "condition": ("conditional", 5, {"ratio": [0.0, 0.3, 0.6], "labels": "condition"}),
-    "without confidence": ("labels", 7, {"ratio": 0.4, "reuse": 2, "epoch_size": "replace"}),
+    "without confidence": (
+        "labels",
+        7,
+        {"ratio": 0.4, "reuse": 2, "epoch_size": "replace"},
+    ),
     "no labels": ("reflectance", 7, {"ratio": 0.5, "labels": "none", "epoch_size": 20}),
     "curated": ("curated", 4, {"ratio": 0.6}),
     "boxes": ("boxes", 8, {"ratio": 0.5, "labels": "boxes", "unboxed": "keep"}),
@@ -118,11 +136,14 @@ def expected_scans(root: Path) -> dict[str, Any]:
             for name, v in {"range": image.range, **image.channels}.items()
         }
         found |= {
-            f"{number} {name}": v for name, v in {"points": scan.points, **scan.fields()}.items()
+            f"{number} {name}": v
+            for name, v in {"points": scan.points, **scan.fields()}.items()
         }
         found[f"{number} id"] = np.array(scan.id)
         if image.boxes is not None:
-            found[f"{number} image boxes"] = encode_boxes(image.boxes)[: len(image.boxes)]
+            found[f"{number} image boxes"] = encode_boxes(image.boxes)[
+                : len(image.boxes)
+            ]
         found |= {f"{number} {name}": v for name, v in boxes_of(scan).items()}
     return found
 
@@ -139,14 +160,23 @@ def boxes_of(scan: Scan) -> dict[str, Any]:
 def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[str, Any]:
     """Arrays of every sample of the first epochs, as ``MixedScans`` gives them."""
     options = {
-        key: value for key, value in settings.items() if key not in ("labels", "label_options")
+        key: value
+        for key, value in settings.items()
+        if key not in ("labels", "label_options")
     }
     bank = Bank(root)
     policy = make_policy(
-        settings.get("labels", "generated"), fields=bank.fields, **settings.get("label_options", {})
+        settings.get("labels", "generated"),
+        fields=bank.fields,
+        **settings.get("label_options", {}),
     )
     mixed = MixedScans.wrap(
-        range(real), bank, to_sample=lambda scan, rng: scan, compare=False, labels=policy, **options
+        range(real),
+        bank,
+        to_sample=lambda scan, rng: scan,
+        compare=False,
+        labels=policy,
+        **options,
     )
     found: dict[str, Any] = {}
     for epoch in range(EPOCHS):
@@ -161,7 +191,9 @@ def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[st
                 **boxes_of(sample),
                 "id": np.array(sample.id),
             }
-            found |= {f"{epoch} {position} {name}": value for name, value in values.items()}
+            found |= {
+                f"{epoch} {position} {name}": value for name, value in values.items()
+            }
     return found
 
 
@@ -177,9 +209,14 @@ def write_cases(folder: Path) -> None:
         root = folder / "banks" / bank / "bank"
         plan = folder / "plans" / name
         plan.mkdir(parents=True)
-        (plan / "mix.yaml").write_text(yaml.safe_dump({"synthetic": str(root), **settings}))
+        (plan / "mix.yaml").write_text(
+            yaml.safe_dump({"synthetic": str(root), **settings})
+        )
         write_plan(
-            {"synthetic": str(root), **settings}, plan / "plan.npz", real=real, epochs=EPOCHS
+            {"synthetic": str(root), **settings},
+            plan / "plan.npz",
+            real=real,
+            epochs=EPOCHS,
         )
         (plan / "bank.txt").write_text(f"{bank}\n{real}\n")
         np.savez(plan / "expected.npz", **expected_samples(root, real, settings))

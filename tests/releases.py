@@ -64,13 +64,17 @@ def peer_weights(position: str = "learned") -> dict[str, Tensor]:
     if position == "learned":
         weights["spatial_pe.embedding"] = torch.randn(1, 64, 16, 16)
     for ours, theirs in block_names(DEPTHS).items():
-        level = len(DEPTHS) - 1 if ours.startswith("middle") else int(ours.split(".")[1])
+        level = (
+            len(DEPTHS) - 1 if ours.startswith("middle") else int(ours.split(".")[1])
+        )
         for i, name in enumerate(HARMONICS):
             weights[f"{theirs}.{name}"] = state[f"rotary.{level}.harmonics"][i].clone()
     return weights
 
 
-def write_r2flow(path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG) -> Path:
+def write_r2flow(
+    path: Path, weights: dict[str, Tensor], cfg: dict[str, Any] = CFG
+) -> Path:
     """Write a file like R2Flow's training, including values that sampling does not need."""
     optimizer = {
         "state": {0: {"step": 1, "exp_avg": torch.zeros(3)}},
@@ -101,7 +105,13 @@ DDCONFIG = {
     "attn_levels": [],
     "dropout": 0.0,
 }
-FIRST = {"embed_dim": 4, "n_embed": 16, "lib_name": "lidm", "use_mask": False, "ddconfig": DDCONFIG}
+FIRST = {
+    "embed_dim": 4,
+    "n_embed": 16,
+    "lib_name": "lidm",
+    "use_mask": False,
+    "ddconfig": DDCONFIG,
+}
 UNET_PARAMS = {
     "image_size": [4, 16],
     "in_channels": 4,
@@ -136,13 +146,18 @@ SEMANTIC = UNCONDITIONAL | {
     },
 }
 CAMERA = UNCONDITIONAL | {
-    "unet_config": {"params": UNET_PARAMS | {"use_spatial_transformer": True, "context_dim": 12}},
+    "unet_config": {
+        "params": UNET_PARAMS | {"use_spatial_transformer": True, "context_dim": 12}
+    },
     "cond_stage_config": {
         "target": "lidm.modules.encoders.modules.FrozenClipMultiImageEmbedder",
         "params": {"model": "ViT-L/14", "out_dim": 12, "split_per_view": 4},
     },
 }
-MASKED = FIRST | {"use_mask": True, "ddconfig": DDCONFIG | {"out_ch": 2, "attn_levels": [1, 5]}}
+MASKED = FIRST | {
+    "use_mask": True,
+    "ddconfig": DDCONFIG | {"out_ch": 2, "attn_levels": [1, 5]},
+}
 MASKED_FLOW = UNCONDITIONAL | {"first_stage_config": {"params": MASKED}}
 MODELS = {
     "first stage": FIRST,
@@ -157,7 +172,11 @@ MODELS = {
 def config_of(
     model: dict[str, Any], target: str = "lidm.data.kitti.KITTI360Train", **dataset: Any
 ) -> dict[str, Any]:
-    data = {"dataset": DATASET | dataset, "aug": {"camera_drop": 0.5}, "train": {"target": target}}
+    data = {
+        "dataset": DATASET | dataset,
+        "aug": {"camera_drop": 0.5},
+        "train": {"target": target},
+    }
     return copy.deepcopy(
         {"model": {"target": "some.Model", "params": model}, "data": {"params": data}}
     )
@@ -166,14 +185,21 @@ def config_of(
 def schedule(start: float = 0.0015, end: float = 0.0195) -> dict[str, Tensor]:
     times = schedule_times(start, end, 1000)
     signal = ((1 - times) ** 2 / ((1 - times) ** 2 + times**2)).float()
-    return {"betas": torch.zeros(1000), "alphas_cumprod": signal, "logvar": torch.zeros(1000)}
+    return {
+        "betas": torch.zeros(1000),
+        "alphas_cumprod": signal,
+        "logvar": torch.zeros(1000),
+    }
 
 
 def random_weights(model: dict[str, Any], folder: Path) -> dict[str, Tensor]:
     """Random weights in LiDM's shapes; the projections of its attention are convolutions."""
     torch.manual_seed(0)
     parts = _parts(model, DATASET, {}, folder)[0]
-    nested, weights = set(parts) != {CODEC}, schedule() if "unet_config" in model else {}
+    nested, weights = (
+        set(parts) != {CODEC},
+        schedule() if "unet_config" in model else {},
+    )
     for name, part in parts.items():
         state = build_network(*part).state_dict()
         for ours, theirs in peer_names(name, part, nested).items():
@@ -214,7 +240,12 @@ def release(folder: Path, config: dict[str, Any], weights: dict[str, Tensor]) ->
         "param_groups": [{"lr": 1e-6}],
     }
     torch.save(
-        {"epoch": 3, "global_step": 9, "state_dict": weights, "optimizer_states": [optimizer]},
+        {
+            "epoch": 3,
+            "global_step": 9,
+            "state_dict": weights,
+            "optimizer_states": [optimizer],
+        },
         folder / "model.ckpt",
     )
     return folder / "model.ckpt"

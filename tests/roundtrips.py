@@ -16,4 +16,6 @@ def back(to: str, root: Path) -> ScanFiles:
 
 
 def same(a: object, b: object) -> bool:
-    return (a is None and b is None) or bool(np.array_equal(np.asarray(a), np.asarray(b)))
+    return (a is None and b is None) or bool(
+        np.array_equal(np.asarray(a), np.asarray(b))
+    )

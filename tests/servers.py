@@ -79,7 +79,9 @@ def serve(root: Path) -> Iterator[Served]:
             self._answer(
                 206,
                 part,
-                {"Content-Range": f"bytes {first}-{first + len(part) - 1}/{len(content)}"},
+                {
+                    "Content-Range": f"bytes {first}-{first + len(part) - 1}/{len(content)}"
+                },
             )
 
         def _stream(self) -> None:
@@ -94,7 +96,9 @@ def serve(root: Path) -> Iterator[Served]:
             path = root / self.path.lstrip("/")
             served.requests.append((path.name, 0))
             self.send_response(200 if path.is_file() else 404)
-            self.send_header("Content-Length", str(path.stat().st_size if path.is_file() else 0))
+            self.send_header(
+                "Content-Length", str(path.stat().st_size if path.is_file() else 0)
+            )
             self.send_header("Accept-Ranges", "bytes" if served.ranges else "none")
             self.end_headers()
 

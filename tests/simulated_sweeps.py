@@ -9,7 +9,9 @@ from lidar_synth.geometry.deskew import Trajectory, deskew
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
 
-BEAMS = tuple(np.r_[np.linspace(8, -4, 9), -5.5, -7.5, -9.0, -11.5, -14.0, -17.0, -21.0].tolist())
+BEAMS = tuple(
+    np.r_[np.linspace(8, -4, 9), -5.5, -7.5, -9.0, -11.5, -14.0, -17.0, -21.0].tolist()
+)
 """Elevations of 16 beams, degrees, unevenly spaced."""
 
 WALLS = 300
@@ -62,7 +64,12 @@ def turned(
     distance = _distances(azimuth, elevation, height, rng)
     rho = distance * np.cos(elevation)
     points = np.stack(
-        [rho * np.cos(azimuth), -rho * np.sin(azimuth), height + distance * np.sin(elevation)], 1
+        [
+            rho * np.cos(azimuth),
+            -rho * np.sin(azimuth),
+            height + distance * np.sin(elevation),
+        ],
+        1,
     )
     kept = (distance < 100) & (rng.random(len(ring)) < 0.9)
     scan = Scan(
@@ -76,7 +83,10 @@ def turned(
 
 
 def _distances(
-    azimuth: np.ndarray, elevation: np.ndarray, height: np.ndarray, rng: np.random.Generator
+    azimuth: np.ndarray,
+    elevation: np.ndarray,
+    height: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Level ground 1.7 m below the origin, and slanted walls whose distance changes every degree or
     so."""

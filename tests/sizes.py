@@ -39,7 +39,10 @@ class Size(NamedTuple):
 def _docstring_lines(tree: ast.AST) -> set[int]:
     lines: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, _SCOPES) and ast.get_docstring(node, clean=False) is not None:
+        if (
+            isinstance(node, _SCOPES)
+            and ast.get_docstring(node, clean=False) is not None
+        ):
             first = node.body[0]
             lines |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
     return lines

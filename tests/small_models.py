@@ -43,7 +43,9 @@ def write(
         "condition_channels": condition_channels,
     }
     torch.manual_seed(0)
-    network = build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    network = build_network(
+        "hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())}
+    )
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)  # a fresh network returns zero
     header = Header(
@@ -65,7 +67,9 @@ def write(
             torch.nn.init.normal_(networks[ENCODER].mix.weight, std=2.0)
         conditioning = {condition: {"dropout": dropout}}
         header = replace(
-            header, networks=header.networks | {ENCODER: encoder}, conditioning=conditioning
+            header,
+            networks=header.networks | {ENCODER: encoder},
+            conditioning=conditioning,
         )
     save_checkpoint(path, header, networks)
     return path

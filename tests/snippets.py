@@ -27,16 +27,22 @@ def check_python(code: str) -> None:
     """
     tree = ast.parse(code)
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lidar_synth"):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+            "lidar_synth"
+        ):
             known = names_of(str(node.module))
             assert all(alias.name in known for alias in node.names), (
                 f"{node.module} has not all of {ast.unparse(node)}"
             )
     for module in re.findall(r"[\"'](lidar_synth\.[\w.]+)[\"']", code):
         assert find_spec(module), f"there is no module {module}"
-    adapters = "\n".join(path.read_text() for path in (ROOT / "integrations").glob("*.py"))
+    adapters = "\n".join(
+        path.read_text() for path in (ROOT / "integrations").glob("*.py")
+    )
     for kind in re.findall(r"type=[\"']((?:Synth|Mixed)\w+)[\"']", code):
-        assert f'"{kind}"' in adapters or f"class {kind}" in adapters, f"no adapter has {kind!r}"
+        assert f'"{kind}"' in adapters or f"class {kind}" in adapters, (
+            f"no adapter has {kind!r}"
+        )
 
 
 def names_of(module: str) -> set[str]:
@@ -49,7 +55,11 @@ def names_of(module: str) -> set[str]:
         spec = find_spec(module)
         assert spec and spec.origin, f"there is no module {module}"
         nodes = ast.parse(Path(spec.origin).read_text()).body
-        return {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        return {
+            node.name
+            for node in nodes
+            if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        }
 
 
 def check_yaml(code: str, path: Path) -> None:
@@ -63,7 +73,9 @@ def check_yaml(code: str, path: Path) -> None:
     values = yaml.safe_load(code)
     assert isinstance(values, dict), "settings are keys and values"
     path.write_text(code)
-    if all(isinstance(entry, dict) and "range_max" in entry for entry in values.values()):
+    if all(
+        isinstance(entry, dict) and "range_max" in entry for entry in values.values()
+    ):
         assert load_sensor(path).name in values
     elif "objects" in values:
         assert load_layout(path).boxes.names
@@ -76,4 +88,6 @@ def check_yaml(code: str, path: Path) -> None:
             *DistillConfig.model_fields,
             *BakeJob.model_fields,
         }
-        assert set(values) <= keys, f"keys {sorted(set(values) - keys)} are known nowhere"
+        assert set(values) <= keys, (
+            f"keys {sorted(set(values) - keys)} are known nowhere"
+        )

@@ -24,19 +24,33 @@ CAMERA = Calibration(
 def street(seed: int, boxes: bool = True) -> Scan:
     """A street with two cars ahead of the sensor, 7 to 18 m away, and one behind it."""
     rng = np.random.default_rng(seed)
-    cars = [car(rng.uniform(7, 18), y, rng.uniform(-3, 3)) for y in (-2.5, 2.5)] + [car(-9, 2, 0.3)]
+    cars = [car(rng.uniform(7, 18), y, rng.uniform(-3, 3)) for y in (-2.5, 2.5)] + [
+        car(-9, 2, 0.3)
+    ]
     scan = cast(
-        cars, [wall(20, -9), wall(20, 9), wall(30, 0, 1.5)], sensor=SENSOR, id=f"street-{seed}"
+        cars,
+        [wall(20, -9), wall(20, 9), wall(30, 0, 1.5)],
+        sensor=SENSOR,
+        id=f"street-{seed}",
     )
     scan.reflectance = rng.random(len(scan)).astype(np.float32)
     assert scan.boxes is not None
-    seen = replace(scan.boxes, occlusion=np.zeros(3, np.int8), truncation=np.zeros(3, np.float32))
-    return replace(scan, boxes=seen if boxes else Boxes(np.zeros((0, 7), np.float32), ()))
+    seen = replace(
+        scan.boxes, occlusion=np.zeros(3, np.int8), truncation=np.zeros(3, np.float32)
+    )
+    return replace(
+        scan, boxes=seen if boxes else Boxes(np.zeros((0, 7), np.float32), ())
+    )
 
 
 def kitti(root: Path, count: int, boxes: bool = True) -> Path:
     """Write scans in KITTI's object layout, which count as real."""
-    write_all("kitti_object", root, [street(i, boxes) for i in range(count)], calibration=CAMERA)
+    write_all(
+        "kitti_object",
+        root,
+        [street(i, boxes) for i in range(count)],
+        calibration=CAMERA,
+    )
     write_planes(root)
     return root
 
@@ -50,7 +64,10 @@ def semantic_kitti(root: Path, count: int) -> Path:
 def synthetic(root: Path, count: int, boxes: bool = True, labels: bool = True) -> Path:
     """Write a folder of synthetic scans with labels and boxes."""
     scans = [street(1000 + i, boxes) for i in range(count)]
-    scans = [s if labels else replace(s, label=None, raw_label=None, instance=None) for s in scans]
+    scans = [
+        s if labels else replace(s, label=None, raw_label=None, instance=None)
+        for s in scans
+    ]
     write_all("npz", root, [replace(s, domain=1) for s in scans])
     return root
 

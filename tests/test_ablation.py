@@ -19,7 +19,9 @@ def test_a_student_learns_the_recorded_slope_within_the_recorded_part(
     draws = torch.Generator().manual_seed(0)
     y0, y1, slope = (torch.randn(6, 1, 2, 2, generator=draws) for _ in range(3))
     interval = torch.arange(6) % (len(student.parts) - 1)
-    start, end = (torch.tensor(student.parts)[interval + k].view(-1, 1, 1, 1) for k in (0, 1))
+    start, end = (
+        torch.tensor(student.parts)[interval + k].view(-1, 1, 1, 1) for k in (0, 1)
+    )
     begin = torch.lerp(y0, y1, start)
     y, t, v = supervision(
         student, {"y0": y0, "y1": y1, "interval": interval, "slope": slope}, draws
@@ -28,13 +30,20 @@ def test_a_student_learns_the_recorded_slope_within_the_recorded_part(
         part = int((slope - velocity).flatten(1).abs().sum(1).argmin())
         assert torch.allclose(velocity, slope[part], atol=1e-5)
         assert end[part].item() <= time.item() <= start[part].item()
-        assert torch.allclose(state, begin[part] + (time - start[part]) * slope[part], atol=1e-5)
+        assert torch.allclose(
+            state, begin[part] + (time - start[part]) * slope[part], atol=1e-5
+        )
 
 
-def test_students_that_equal_another_are_not_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_students_that_equal_another_are_not_trained(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     from ablation import students
 
     found = students(GRIDS)
     assert len(found) == len({(s.strategy, s.grid) for s in found}) == 12
-    assert {s.strategy for s in found if len(s.grid) == 2} == {"reflow", "timestep_distillation"}
+    assert {s.strategy for s in found if len(s.grid) == 2} == {
+        "reflow",
+        "timestep_distillation",
+    }

@@ -34,7 +34,12 @@ def number(scan: Scan, rng: Any) -> torch.Tensor:
 def mixed() -> MixedScans:
     """47 samples an epoch."""
     return MixedScans(
-        Scans("r", 37), Endless(), FALLING, epoch_size=47, to_sample=number, collate=torch.stack
+        Scans("r", 37),
+        Endless(),
+        FALLING,
+        epoch_size=47,
+        to_sample=number,
+        collate=torch.stack,
     )
 
 
@@ -46,7 +51,9 @@ def planned(epoch: int, start: int = 0) -> list[int]:
 
 def batched(train: MixedScans, workers: int, **options: Any) -> DataLoader[Any]:
     batches = train.batches(4, **options)
-    return DataLoader(train, batch_sampler=batches, num_workers=workers, collate_fn=train.collate)
+    return DataLoader(
+        train, batch_sampler=batches, num_workers=workers, collate_fn=train.collate
+    )
 
 
 def streamed(train: MixedScans, workers: int, **options: Any) -> DataLoader[Any]:
@@ -62,8 +69,16 @@ def seen(loader: Any) -> Counter[int]:
 
 
 def run(rank: int, port: int) -> None:
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "ACCELERATE_USE_CPU": "true"}
+    os.environ |= {
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "WORLD_SIZE": "2",
+    }
+    os.environ |= {
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "ACCELERATE_USE_CPU": "true",
+    }
     from accelerate import Accelerator
     from accelerate.state import AcceleratorState, PartialState
 
@@ -102,10 +117,16 @@ def check_refusals(accelerator: Any) -> None:
             train = mixed()
             train.set_epoch(5)
             loader = accelerator.prepare(make(train, 0, **sharing))
-            if make is batched or accelerator.is_main_process:  # which alone reads a stream
-                with pytest.raises(ConfigError, match="integrations.accelerate import prepare"):
+            if (
+                make is batched or accelerator.is_main_process
+            ):  # which alone reads a stream
+                with pytest.raises(
+                    ConfigError, match="integrations.accelerate import prepare"
+                ):
                     loader.set_epoch(loader.iteration)
-        with pytest.raises(ConfigError, match=r"of 2 and an Accelerator.*accelerate.prepare"):
+        with pytest.raises(
+            ConfigError, match=r"of 2 and an Accelerator.*accelerate.prepare"
+        ):
             iter(make(mixed(), 0))
     with pytest.raises(ConfigError, match="batches come from BatchSampler"):
         prepare(accelerator, DataLoader(mixed(), 4))

@@ -50,7 +50,11 @@ from lidar_synth.lab.train.held_out import read_history
 
 TINY = load_sensor(Path(__file__).parent.parent / "configs" / "tiny_sensor.yaml")
 OWN = Sensor(
-    "own", 120, 1.0, 100.0, elevations=tuple(np.linspace(2, -24, 16) - np.linspace(-1, 1, 16) ** 2)
+    "own",
+    120,
+    1.0,
+    100.0,
+    elevations=tuple(np.linspace(2, -24, 16) - np.linspace(-1, 1, 16) ** 2),
 )
 """The user's sensor: rows of uneven elevation, another number of columns."""
 SHORT = {
@@ -107,7 +111,9 @@ def tiny_model(path: Path, semantic: bool = False) -> Path:
         }
         parts |= {ENCODER: NetworkSpec("semantic_map", maps)}
         flow["condition_channels"] = 6
-    angles = torch.nn.functional.avg_pool2d(torch.from_numpy(TINY.ray_angles())[None], (4, 16))[0]
+    angles = torch.nn.functional.avg_pool2d(
+        torch.from_numpy(TINY.ray_angles())[None], (4, 16)
+    )[0]
     needed = {VELOCITY: {"angles": angles}}
     networks = {
         name: build_network(part.architecture, part.arguments | needed.get(name, {}))
@@ -159,20 +165,33 @@ def scans(own_scans: list[Scan], tmp_path_factory: pytest.TempPathFactory) -> Pa
 def adapted(model: Path, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("adapted") / "mine.safetensors"
     return adapt(
-        model, scans, out, minutes=0.02, town=4, licence="CC0", overrides=QUICK, progress=False
+        model,
+        scans,
+        out,
+        minutes=0.02,
+        town=4,
+        licence="CC0",
+        overrides=QUICK,
+        progress=False,
     )
 
 
-def test_an_adapted_model_generates_scans_of_the_users_sensor_with_labels(adapted: Path) -> None:
+def test_an_adapted_model_generates_scans_of_the_users_sensor_with_labels(
+    adapted: Path,
+) -> None:
     generator = load_generator(adapted)
     assert (generator.sensor.name, generator.sensor.shape) == ("own", (16, 128))
     np.testing.assert_allclose(generator.sensor.row_elevations(), OWN.row_elevations())
     [scan] = generator.scans(0, [0])
     assert len(scan) and {"reflectance", "label"} <= set(scan.fields())
-    assert generator.header.time_grid == (1.0, 0.6, 0.0), "as few steps as the model had"
+    assert generator.header.time_grid == (1.0, 0.6, 0.0), (
+        "as few steps as the model had"
+    )
 
 
-def test_every_stage_keeps_the_weights_with_the_least_loss_on_held_out_scans(adapted: Path) -> None:
+def test_every_stage_keeps_the_weights_with_the_least_loss_on_held_out_scans(
+    adapted: Path,
+) -> None:
     work = adapted.with_suffix(".adapt")
     for name in STAGES[1:]:
         history = read_history(work / name)
@@ -181,11 +200,16 @@ def test_every_stage_keeps_the_weights_with_the_least_loss_on_held_out_scans(ada
         facts = read_header(work / name / f"{name}.safetensors")[0].provenance
         assert facts["held_out_loss"] == min(losses)
         assert facts["iterations"] == history[losses.index(min(losses))].step
-        assert len(losses) - 1 - losses.index(min(losses)) <= SHORT["held_out"]["patience"] + 1
+        assert (
+            len(losses) - 1 - losses.index(min(losses))
+            <= SHORT["held_out"]["patience"] + 1
+        )
 
 
 def test_the_autoencoder_rehearses_the_town(adapted: Path) -> None:
-    facts = read_header(adapted.with_suffix(".adapt") / "codec" / "codec.safetensors")[0].provenance
+    facts = read_header(adapted.with_suffix(".adapt") / "codec" / "codec.safetensors")[
+        0
+    ].provenance
     assert facts["rehearsal"]["town"] == 4 and facts["data"]["layout"] == "range"
     assert overlap(seen_by(facts), town(TOWN_SEED))
 
@@ -215,9 +239,20 @@ def test_the_command_line_refuses_generated_scans_beside_the_training_scans(
 ) -> None:
     source = open_scans(scans)
     copy = write(tmp_path / "copy", [source[i] for i in range(2)])
-    call("sample", tmp_path / "generated", "--model", adapted, "--count", "2", "--to", "npz")
+    call(
+        "sample",
+        tmp_path / "generated",
+        "--model",
+        adapted,
+        "--count",
+        "2",
+        "--to",
+        "npz",
+    )
     with pytest.raises(ConfigError, match="whose model was trained on content"):
-        call("evaluate", copy, tmp_path / "generated", "--protocol", "r2flow", "--anyway")
+        call(
+            "evaluate", copy, tmp_path / "generated", "--protocol", "r2flow", "--anyway"
+        )
 
 
 def test_the_card_says_what_was_learnt_and_whether_it_repeats(adapted: Path) -> None:
@@ -240,7 +275,16 @@ def test_a_model_of_label_maps_is_adapted_with_its_encoder(
 ) -> None:
     model = tiny_model(tmp_path / "maps.safetensors", semantic=True)
     out = tmp_path / "mine.safetensors"
-    adapt(model, scans, out, minutes=0.02, town=2, licence=MARKUP, overrides=QUICK, progress=False)
+    adapt(
+        model,
+        scans,
+        out,
+        minutes=0.02,
+        town=2,
+        licence=MARKUP,
+        overrides=QUICK,
+        progress=False,
+    )
     generator = load_generator(out)
     assert not tags_of(out.with_suffix(".md").read_text()) & {"img", "a", "script", "b"}
     assert (generator.condition, generator.sensor.shape) == ("semantic", (16, 128))
@@ -248,7 +292,9 @@ def test_a_model_of_label_maps_is_adapted_with_its_encoder(
     [image] = generator.range_images(0, [0], own_scans[0])
     known = image.mask & (wanted != IGNORE)
     assert known.any() and np.array_equal(image.channels["label"][known], wanted[known])
-    weights = [load_checkpoint(path).networks[ENCODER].mix.weight for path in (model, out)]
+    weights = [
+        load_checkpoint(path).networks[ENCODER].mix.weight for path in (model, out)
+    ]
     assert not torch.equal(*weights), "its encoder was trained"
 
 
@@ -257,7 +303,8 @@ def test_scans_without_labels_get_those_that_the_autoencoder_learnt_on_the_town(
     model: Path, own_scans: list[Scan], tmp_path: Path
 ) -> None:
     bare = write(
-        tmp_path / "bare", [replace(scan, label=None, raw_label=None) for scan in own_scans]
+        tmp_path / "bare",
+        [replace(scan, label=None, raw_label=None) for scan in own_scans],
     )
     out = adapt(
         model,
@@ -269,11 +316,15 @@ def test_scans_without_labels_get_those_that_the_autoencoder_learnt_on_the_town(
         progress=False,
     )
     card = out.with_suffix(".md").read_text()
-    assert "guesses" in card and "labels that are right" not in card  # nobody knows which are
+    assert (
+        "guesses" in card and "labels that are right" not in card
+    )  # nobody knows which are
     work = out.with_suffix(".adapt")
     assert read_history(work / "labels")
     images = [open_scans(work / "labelled" / "train")[i] for i in range(2)]
-    assert all(scan.label is not None and scan.label.shape == (len(scan),) for scan in images)
+    assert all(
+        scan.label is not None and scan.label.shape == (len(scan),) for scan in images
+    )
     assert load_generator(out).scans(0, [0])[0].label is not None
 
 
@@ -304,8 +355,12 @@ def test_a_killed_adaptation_is_resumed(
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = json.loads(history.read_text())
-    prepared = (tmp_path / "mine.adapt" / "scans" / "train" / "000000.npz").stat().st_mtime_ns
-    longer = {name: SHORT | {"held_out": {"samples": 4, "patience": 99}} for name in STAGES}
+    prepared = (
+        (tmp_path / "mine.adapt" / "scans" / "train" / "000000.npz").stat().st_mtime_ns
+    )
+    longer = {
+        name: SHORT | {"held_out": {"samples": 4, "patience": 99}} for name in STAGES
+    }
     adapt(
         model,
         scans,
@@ -331,7 +386,9 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(
     model: Path, scans: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "mine.safetensors"
-    text = call("adapt", model, "--scans", scans, "--out", out, "--minutes", "60", "--dry-run")
+    text = call(
+        "adapt", model, "--scans", scans, "--out", out, "--minutes", "60", "--dry-run"
+    )
     for part in (
         "own: 16 x 120, as 16 x 128 cells",
         "10 scans to train on, 1 left out, 3 held out",
@@ -347,7 +404,9 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(
 @pytest.mark.slow
 def test_a_pixel_model_is_adapted_too(own_scans: list[Scan], tmp_path: Path) -> None:
     path = write_pixel_model(tmp_path / "pixel.safetensors")
-    own = replace(OWN, elevations=OWN.elevations[::2] if OWN.elevations else None, columns=40)
+    own = replace(
+        OWN, elevations=OWN.elevations[::2] if OWN.elevations else None, columns=40
+    )
     folder = write(tmp_path / "scans", of_town(own, 12))
     out = adapt(
         path,
@@ -375,7 +434,8 @@ def broken(own: list[Scan], kind: str) -> list[Scan]:
     if kind == "some labels":
         return [*own[:5], replace(own[5], label=None, raw_label=None), *own[6:]]
     return [
-        replace(scan, label=np.full(len(scan), IGNORE, np.uint8), raw_label=None) for scan in own
+        replace(scan, label=np.full(len(scan), IGNORE, np.uint8), raw_label=None)
+        for scan in own
     ]
 
 
@@ -422,7 +482,9 @@ def test_models_that_cannot_be_adapted_are_refused(
 def test_a_model_of_another_architecture_is_refused() -> None:
     header = read_header(find_model("town"))[0]
     other = header.networks["velocity"]._replace(architecture="unet")
-    with pytest.raises(ConfigError, match="architecture unet; expected architectures among surf"):
+    with pytest.raises(
+        ConfigError, match="architecture unet; expected architectures among surf"
+    ):
         check_movable(replace(header, networks=header.networks | {"velocity": other}))
 
 
@@ -431,7 +493,9 @@ def test_a_resumed_adaptation_has_the_same_scans_and_model(
 ) -> None:
     out = tmp_path / "mine.safetensors"
     (tmp_path / "mine.adapt").mkdir()
-    (tmp_path / "mine.adapt" / "adapt.json").write_text(json.dumps({"model": "another"}))
+    (tmp_path / "mine.adapt" / "adapt.json").write_text(
+        json.dumps({"model": "another"})
+    )
     with pytest.raises(ConfigError, match="mine.adapt was filled with"):
         adapt(model, scans, out)
 
@@ -459,25 +523,39 @@ def test_a_model_that_is_moved_to_its_own_sensor_stays_the_same(model: Path) -> 
     assert header == held.header
     for name, network in networks.items():
         for key, value in network.state_dict().items():
-            torch.testing.assert_close(value, held.networks[name].state_dict()[key], msg=key)
+            torch.testing.assert_close(
+                value, held.networks[name].state_dict()[key], msg=key
+            )
 
 
-def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(model: Path) -> None:
+def test_biases_of_rows_follow_the_elevation_and_positions_wrap_around(
+    model: Path,
+) -> None:
     held = load_checkpoint(model)
     codec = held.networks[CODEC]
     flow = held.networks[VELOCITY]
     rows = torch.from_numpy(TINY.row_elevations().reshape(8, 2).mean(1))
     with torch.no_grad():
         codec.place_stem[:] = rows.view(1, 1, -1, 1)
-        flow.position.table[:] = torch.cos(torch.arange(8) / 8 * 2 * torch.pi)[None, :, None]
+        flow.position.table[:] = torch.cos(torch.arange(8) / 8 * 2 * torch.pi)[
+            None, :, None
+        ]
     wider = replace(OWN, columns=256)
     moved = regrid(Checkpoint(held.header, held.networks, ""), wider)[1]
-    wanted = OWN.row_elevations().reshape(8, 2).mean(1).clip(float(rows.min()), float(rows.max()))
-    np.testing.assert_allclose(moved[CODEC].place_stem[0, 0, :, 0].detach(), wanted, atol=1e-5)
+    wanted = (
+        OWN.row_elevations()
+        .reshape(8, 2)
+        .mean(1)
+        .clip(float(rows.min()), float(rows.max()))
+    )
+    np.testing.assert_allclose(
+        moved[CODEC].place_stem[0, 0, :, 0].detach(), wanted, atol=1e-5
+    )
     table = moved[VELOCITY].position.table[0, :, 0].detach()
     assert table.shape == (16,)
     torch.testing.assert_close(
-        table[0], 0.75 * flow.position.table[0, 0, 0] + 0.25 * flow.position.table[0, -1, 0]
+        table[0],
+        0.75 * flow.position.table[0, 0, 0] + 0.25 * flow.position.table[0, -1, 0],
     )
 
 

@@ -32,8 +32,12 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 
 Points = NDArray[np.float32]
 
-HDL64, HDL32, OS1 = (load_sensor(name) for name in ("hdl64e_kitti", "hdl32e_nuscenes", "os1_128"))
-VLP16 = Sensor("vlp16", 1800, 0.5, 100.0, elevations=tuple(float(e) for e in range(15, -16, -2)))
+HDL64, HDL32, OS1 = (
+    load_sensor(name) for name in ("hdl64e_kitti", "hdl32e_nuscenes", "os1_128")
+)
+VLP16 = Sensor(
+    "vlp16", 1800, 0.5, 100.0, elevations=tuple(float(e) for e in range(15, -16, -2))
+)
 
 
 def street(sensor: Sensor, seed: int = 0, tilt: float = 0.0) -> Points:
@@ -45,24 +49,32 @@ def street(sensor: Sensor, seed: int = 0, tilt: float = 0.0) -> Points:
     rng = np.random.default_rng(seed)
     wall = 12 + 40 * np.abs(np.sin(3 * azimuth + rng.uniform(0, 6))) + 0 * elevation
     road = np.where(
-        elevation < -0.01, (1.7 + height) / np.sin(np.minimum(-elevation, np.pi / 2) + 1e-9), np.inf
+        elevation < -0.01,
+        (1.7 + height) / np.sin(np.minimum(-elevation, np.pi / 2) + 1e-9),
+        np.inf,
     )
     distance = np.minimum(wall / np.cos(elevation), road)
     distance = distance + rng.normal(0, 0.02, distance.shape)
     flat = distance * np.cos(elevation)
     up = distance * np.sin(elevation) + height
-    points = np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], -1).reshape(-1, 3)
+    points = np.stack(
+        [flat * np.cos(azimuth), -flat * np.sin(azimuth), up], -1
+    ).reshape(-1, 3)
     c = np.cos(np.radians(tilt))
     s = np.sin(np.radians(tilt))
     points = points @ np.array([(c, 0, s), (0, 1, 0), (-s, 0, c)])
     within = np.linalg.norm(points, axis=1)
-    return points[(within > sensor.range_min) & (within < sensor.range_max)].astype(np.float32)
+    return points[(within > sensor.range_min) & (within < sensor.range_max)].astype(
+        np.float32
+    )
 
 
 def quantised(points: Points) -> Points:
     """The points as they are after a projection to the grid of an HDL-64E, one in the centre of
     each cell."""
-    return unproject(project(Scan(points, np.zeros(len(points), np.float32), HDL64))).points
+    return unproject(
+        project(Scan(points, np.zeros(len(points), np.float32), HDL64))
+    ).points
 
 
 def nearest_beam(points: Points, sensor: Sensor) -> NDArray[np.intp]:
@@ -77,7 +89,9 @@ def every_fourth(points: Points) -> Points:
 
 
 def sixteen(points: Points) -> Points:
-    return points[(nearest_beam(points, HDL64) >= 40) & (nearest_beam(points, HDL64) < 56)]
+    return points[
+        (nearest_beam(points, HDL64) >= 40) & (nearest_beam(points, HDL64) < 56)
+    ]
 
 
 OWN: dict[str, tuple[Points, Sensor]] = {
@@ -99,9 +113,17 @@ OWN: dict[str, tuple[Points, Sensor]] = {
 }
 
 WRONG: dict[str, tuple[Points, Sensor, str]] = {
-    "OS1-128 as HDL-64E": (street(OS1), HDL64, r"% of the points lie above 3\.0 degrees"),
+    "OS1-128 as HDL-64E": (
+        street(OS1),
+        HDL64,
+        r"% of the points lie above 3\.0 degrees",
+    ),
     "HDL-32E as HDL-64E": (street(HDL32), HDL64, "above 3.0 degrees"),
-    "VLP-16 as HDL-64E": (street(VLP16), HDL64, "above 3.0 degrees.*beams have no points"),
+    "VLP-16 as HDL-64E": (
+        street(VLP16),
+        HDL64,
+        "above 3.0 degrees.*beams have no points",
+    ),
     "HDL-64E as VLP-16": (street(HDL64), VLP16, "below -16.0 degrees"),
     "HDL-64E as HDL-32E": (street(HDL64), HDL32, "lie between the beams"),
     "16 beams, one of four, as HDL-64E": (
@@ -164,7 +186,10 @@ SENSORLESS: dict[str, Callable[[Path, Scan], object]] = {
         for path in write_kitti_raw(root)
     ],
     **{
-        to: lambda root, scan, to=to: (write_all(to, root, [scan]), (root / NAME).unlink())  # type: ignore[misc]
+        to: lambda root, scan, to=to: (
+            write_all(to, root, [scan]),
+            (root / NAME).unlink(),
+        )  # type: ignore[misc]
         for to in ("kitti", "semantic_kitti", "kitti360")
     },
     "npy": lambda root, scan: np.save(
@@ -176,7 +201,10 @@ SENSORLESS: dict[str, Callable[[Path, Scan], object]] = {
 
 def a_scan(points: Points, sensor: Sensor = OS1) -> Scan:
     return Scan(
-        points, np.full(len(points), 0.5, np.float32), sensor, label=np.zeros(len(points), np.uint8)
+        points,
+        np.full(len(points), 0.5, np.float32),
+        sensor,
+        label=np.zeros(len(points), np.uint8),
     )
 
 
@@ -187,7 +215,8 @@ def test_readers_refuse_points_of_another_sensor_than_their_layout_has(
     SENSORLESS[layout](tmp_path, a_scan(street(OS1)))
     for on_bad in ("error", "skip", "drop-points"):
         with pytest.raises(
-            ConfigError, match=r"read as one of sensor 'hdl64e.*lie above 3\.0 degrees.*--sensor"
+            ConfigError,
+            match=r"read as one of sensor 'hdl64e.*lie above 3\.0 degrees.*--sensor",
         ):
             open_scans(tmp_path, on_bad=on_bad)[0]  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="read as one of sensor"):
@@ -199,7 +228,9 @@ def test_readers_refuse_points_of_another_sensor_than_their_layout_has(
         assert len(open_scans(tmp_path, sensor=OS1)[0]) > 0
 
 
-def test_one_scan_of_a_source_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_scan_of_a_source_is_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     compared = []
 
     def counted(points: Points, sensor: Sensor) -> Agreement:
@@ -207,7 +238,9 @@ def test_one_scan_of_a_source_is_compared(tmp_path: Path, monkeypatch: pytest.Mo
         return agreement(points, sensor)
 
     monkeypatch.setattr("lidar_synth.formats.source.agreement", counted)
-    write_all("kitti", tmp_path, [a_scan(street(HDL64, seed), HDL64) for seed in range(3)])
+    write_all(
+        "kitti", tmp_path, [a_scan(street(HDL64, seed), HDL64) for seed in range(3)]
+    )
     assert len(list(open_scans(tmp_path))) == 3 and compared == []
     (tmp_path / NAME).unlink()
     source = open_scans(tmp_path)
@@ -219,17 +252,25 @@ def test_one_scan_of_a_source_is_compared(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_conversion_that_is_refused_leaves_nothing_behind(tmp_path: Path) -> None:
     SENSORLESS["kitti360"](tmp_path / "in", a_scan(street(OS1)))
     with pytest.raises(ConfigError, match="hdl64e_kitti360"):
-        convert(open_scans(tmp_path / "in"), WRITERS["range"](tmp_path / "out"), progress=False)
+        convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["range"](tmp_path / "out"),
+            progress=False,
+        )
     assert not (tmp_path / "out").exists()
     convert(
-        open_scans(tmp_path / "in", sensor=OS1), WRITERS["range"](tmp_path / "out"), progress=False
+        open_scans(tmp_path / "in", sensor=OS1),
+        WRITERS["range"](tmp_path / "out"),
+        progress=False,
     )
     assert open_scans(tmp_path / "out").sensor == OS1
 
 
 def test_beams_that_do_not_fit_are_a_warning(tmp_path: Path) -> None:
     SENSORLESS["kitti"](tmp_path, a_scan(every_fourth(street(HDL64)), HDL64))
-    with pytest.warns(UserWarning, match="beams have no points though beams around them have"):
+    with pytest.warns(
+        UserWarning, match="beams have no points though beams around them have"
+    ):
         assert open_scans(tmp_path)[0].sensor == HDL64
 
 
@@ -244,7 +285,9 @@ def test_a_damaged_first_scan_does_not_prevent_the_comparison(tmp_path: Path) ->
 
 
 def pandar64(folder: Path) -> Sensor:
-    rows = np.loadtxt(folder / "pandaset" / "pandar64_elevations.csv", delimiter=",", skiprows=1)
+    rows = np.loadtxt(
+        folder / "pandaset" / "pandar64_elevations.csv", delimiter=",", skiprows=1
+    )
     return Sensor("pandar64", 1800, 0.3, 200.0, elevations=tuple(rows[:, 1]))
 
 
@@ -272,10 +315,15 @@ def agrees(points: Points, sensor: Sensor) -> bool:
 
 
 @pytest.mark.slow
-def test_every_recorded_scan_agrees_with_its_own_sensor(real_scans: Path, labelled: Path) -> None:
+def test_every_recorded_scan_agrees_with_its_own_sensor(
+    real_scans: Path, labelled: Path
+) -> None:
     scans = [
         scan
-        for source in (*recorded(real_scans), SemanticKITTI(labelled / "semantic_kitti"))
+        for source in (
+            *recorded(real_scans),
+            SemanticKITTI(labelled / "semantic_kitti"),
+        )
         for scan in source
     ]
     assert len(scans) > 50
@@ -288,12 +336,16 @@ def test_every_recorded_scan_agrees_with_its_own_sensor(real_scans: Path, labell
 
 
 @pytest.mark.slow
-def test_recorded_scans_contradict_other_sensors(real_scans: Path, labelled: Path) -> None:
+def test_recorded_scans_contradict_other_sensors(
+    real_scans: Path, labelled: Path
+) -> None:
     own = pandar64(labelled)
     for path in sorted((labelled / "pandaset" / "sensor_frame").glob("*.npz"))[::6]:
         points = np.load(path)["points"].astype(np.float32)
         assert agrees(points, own)
-        assert agreement(points, HDL64).outside > MOST_OUTSIDE  # refused if HDL-64E is only assumed
+        assert (
+            agreement(points, HDL64).outside > MOST_OUTSIDE
+        )  # refused if HDL-64E is only assumed
         assert not agrees(points, HDL32) and not agrees(points, VLP16)
     sweep = NuScenes(real_scans / "nuscenes")[0].points
     assert (

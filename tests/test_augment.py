@@ -16,7 +16,13 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import augment
-from lidar_synth.labels.augment import Augmentation, compose, mirror_scan, rotate_scan, scale_scan
+from lidar_synth.labels.augment import (
+    Augmentation,
+    compose,
+    mirror_scan,
+    rotate_scan,
+    scale_scan,
+)
 from lidar_synth.noise import keyed_rng
 
 STEPS: dict[str, Augmentation] = {
@@ -55,7 +61,9 @@ def scan_with_boxes(seed: int, count: int = 3000) -> Scan:
         instance=np.arange(1, 7),
     )
     margin = np.array([0, 0, 0, 2e-3, 2e-3, 2e-3, 0], np.float32)
-    wide, tight = (Boxes(scan.boxes.values + m, scan.boxes.names) for m in (margin, -margin))
+    wide, tight = (
+        Boxes(scan.boxes.values + m, scan.boxes.names) for m in (margin, -margin)
+    )
     return scan[(wide.contain(scan.points) == tight.contain(scan.points)).all(0)]
 
 
@@ -72,25 +80,34 @@ def freeze(scan: Scan) -> Scan:
 @pytest.mark.parametrize("name", STEPS)
 @settings(max_examples=15)
 @given(seed=seeds)
-def test_the_generator_alone_decides_and_nothing_given_is_changed(name: str, seed: int) -> None:
+def test_the_generator_alone_decides_and_nothing_given_is_changed(
+    name: str, seed: int
+) -> None:
     scan = freeze(scan_with_boxes(seed % 50))
     first, again, *others = (
         STEPS[name](scan, keyed_rng(s)) for s in (seed, *range(seed, seed + 6))
     )
-    assert first.points.dtype == np.float32 and first.fields().keys() == scan.fields().keys()
+    assert (
+        first.points.dtype == np.float32
+        and first.fields().keys() == scan.fields().keys()
+    )
     assert np.array_equal(first.points, again.points)
     for key, values in first.fields().items():
         assert values.dtype == scan.fields()[key].dtype and np.array_equal(
             values, again.fields()[key]
         )
-    assert first.boxes is not None and np.array_equal(first.boxes.values, again.boxes.values)
+    assert first.boxes is not None and np.array_equal(
+        first.boxes.values, again.boxes.values
+    )
     assert (first.reflectance >= 0).all() and (first.reflectance <= 1).all()
     assert (np.abs(first.boxes.values[:, 6]) <= np.float32(np.pi)).all() or name in (
         "jitter",
         "beam_drop",
         "range_drop",
     )
-    if not name.startswith("flip"):  # two may do the same by chance, such as nothing; six do not
+    if not name.startswith(
+        "flip"
+    ):  # two may do the same by chance, such as nothing; six do not
         assert not all(np.array_equal(first.points, other.points) for other in others)
     copied = pickle.loads(pickle.dumps(STEPS[name]))(scan, keyed_rng(seed))
     assert np.array_equal(copied.points, first.points)
@@ -127,11 +144,15 @@ def test_augmentations_can_be_inverted(seed: int, angle: float, factor: float) -
         mirror_scan(mirror_scan(scan, "x"), "x"),
         mirror_scan(mirror_scan(scan, "y"), "y"),
         scale_scan(scale_scan(scan, factor), 1 / factor),
-        rotate_scan(mirror_scan(mirror_scan(scan, "x"), "y"), np.pi),  # both flips are half a turn
+        rotate_scan(
+            mirror_scan(mirror_scan(scan, "x"), "y"), np.pi
+        ),  # both flips are half a turn
     ):
         assert np.allclose(changed.points, scan.points, atol=1e-4)
         assert changed.boxes is not None and scan.boxes is not None
-        assert np.allclose(changed.boxes.values[:, :6], scan.boxes.values[:, :6], atol=1e-4)
+        assert np.allclose(
+            changed.boxes.values[:, :6], scan.boxes.values[:, :6], atol=1e-4
+        )
         turns = (changed.boxes.values[:, 6] - scan.boxes.values[:, 6]) / (2 * np.pi)
         assert np.allclose(turns, turns.round(), atol=1e-5)
 
@@ -147,14 +168,26 @@ def test_yaws_turn_and_flip_with_their_boxes() -> None:
     ):
         assert changed.boxes is not None
         assert np.allclose(changed.boxes.values[0, [0, 1, 6]], expected, atol=1e-5)
-    assert np.allclose(scale_scan(scan, 2).boxes.values[0, 3:6], 2 * scan.boxes.values[0, 3:6])
+    assert np.allclose(
+        scale_scan(scan, 2).boxes.values[0, 3:6], 2 * scan.boxes.values[0, 3:6]
+    )
 
 
 def test_moving_a_scan_removes_its_camera_image() -> None:
     scan = scan_with_boxes(0)
-    for changed in (rotate_scan(scan, 1), mirror_scan(scan, "x"), scale_scan(scan, 1.1)):
-        assert changed.pose is None and changed.image_path is None and changed.boxes is not None
-        assert (changed.boxes.truncation == -1).all() and (changed.boxes.alpha == -10).all()
+    for changed in (
+        rotate_scan(scan, 1),
+        mirror_scan(scan, "x"),
+        scale_scan(scan, 1.1),
+    ):
+        assert (
+            changed.pose is None
+            and changed.image_path is None
+            and changed.boxes is not None
+        )
+        assert (changed.boxes.truncation == -1).all() and (
+            changed.boxes.alpha == -10
+        ).all()
     kept = augment.range_drop(scan, keyed_rng(0))
     assert kept.pose is scan.pose and kept.image_path == scan.image_path
 
@@ -162,14 +195,18 @@ def test_moving_a_scan_removes_its_camera_image() -> None:
 def test_without_boxes() -> None:
     scan = replace(scan_with_boxes(1), boxes=None, ring=None)
     changed = STEPS["all"](scan, keyed_rng(0))
-    assert changed.boxes is None and changed.ring is None and 0 < len(changed) < len(scan)
+    assert (
+        changed.boxes is None and changed.ring is None and 0 < len(changed) < len(scan)
+    )
     empty = STEPS["all"](scan[:0], keyed_rng(0))
     assert len(empty) == 0
 
 
 def test_yaw_and_scale_stay_within_their_limits() -> None:
     scan = cast([car(10, 0)])
-    turns = [augment.yaw(scan, keyed_rng(s), limit=30).boxes.values[0] for s in range(60)]
+    turns = [
+        augment.yaw(scan, keyed_rng(s), limit=30).boxes.values[0] for s in range(60)
+    ]
     angles = np.degrees([np.arctan2(y, x) for x, y, *_ in turns])
     assert 20 < angles.max() <= 30 and -30 <= angles.min() < -20
     sizes = [
@@ -182,7 +219,8 @@ def test_yaw_and_scale_stay_within_their_limits() -> None:
 def test_a_flip_happens_as_often_as_it_should() -> None:
     scan = cast([car(10, 3)])
     flipped = [
-        augment.flip_y(scan, keyed_rng(s), chance=0.3).boxes.values[0, 1] < 0 for s in range(200)
+        augment.flip_y(scan, keyed_rng(s), chance=0.3).boxes.values[0, 1] < 0
+        for s in range(200)
     ]
     assert 40 <= sum(flipped) <= 80
     assert augment.flip_x(scan, keyed_rng(0), chance=0) is scan
@@ -193,7 +231,9 @@ def test_jitter_is_along_the_ray() -> None:
     noisy = augment.jitter(scan, keyed_rng(0), spread=0.05, reflectance=0)
     before = np.linalg.norm(scan.points, axis=1)
     after = np.linalg.norm(noisy.points, axis=1)
-    assert np.allclose(noisy.points / after[:, None], scan.points / before[:, None], atol=1e-5)
+    assert np.allclose(
+        noisy.points / after[:, None], scan.points / before[:, None], atol=1e-5
+    )
     assert (after - before).std() == pytest.approx(0.05, rel=0.03)
     assert np.abs(after - before).max() < 0.151
     assert np.array_equal(noisy.reflectance, scan.reflectance)
@@ -219,7 +259,9 @@ def test_beams_go_as_wholes(rings: bool) -> None:
 def test_far_returns_are_lost_more_often() -> None:
     scan = random_scan(SENSOR, 40_000)
     kept = augment.range_drop(
-        replace(scan, confidence=np.arange(len(scan), dtype=np.float32)), keyed_rng(0), 0.8
+        replace(scan, confidence=np.arange(len(scan), dtype=np.float32)),
+        keyed_rng(0),
+        0.8,
     )
     distance = np.linalg.norm(scan.points, axis=1)
     here = np.isin(np.arange(len(scan)), kept.fields()["confidence"].astype(int))

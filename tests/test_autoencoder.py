@@ -42,8 +42,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def network(**arguments: Any) -> SurfaceAutoencoder:
     torch.manual_seed(0)
-    small = {"encoder_widths": [12, 16], "widths": [12, 16], "reaches": [1, 2], "depth": 1}
-    net = build_network("surfaces", {"resolution": [8, 64], "channels": 7} | small | arguments)
+    small = {
+        "encoder_widths": [12, 16],
+        "widths": [12, 16],
+        "reaches": [1, 2],
+        "depth": 1,
+    }
+    net = build_network(
+        "surfaces", {"resolution": [8, 64], "channels": 7} | small | arguments
+    )
     assert isinstance(net, SurfaceAutoencoder)
     with torch.no_grad():  # residual blocks begin as nothing
         for name, weight in net.named_parameters():
@@ -68,7 +75,11 @@ def test_columns_turn_together_in_image_and_latent() -> None:
     assert torch.allclose(net.encode(x.roll(16, -1)), z.roll(1, -1), atol=1e-5)
     noise = torch.rand(len(z), net.draws, *SENSOR.shape).clamp(1e-6, 1 - 1e-6)
     turned = net.decode(z.roll(1, -1), noise.roll(16, -1))
-    same = torch.isclose(turned, net.decode(z, noise).roll(16, -1), atol=1e-3).float().mean()
+    same = (
+        torch.isclose(turned, net.decode(z, noise).roll(16, -1), atol=1e-3)
+        .float()
+        .mean()
+    )
     assert same > 0.999  # rounding may choose another surface
 
 
@@ -105,7 +116,9 @@ def test_the_loss_by_hand(rare: float) -> None:
                 inverse = surfaces.inverse[patch, k, cell]
                 middle = TENSORS.normalisation.encode(1 / inverse)
                 distance = Laplace(middle, surfaces.scale[patch, k, 0])
-                parts = [part.expand_as(surfaces.weights) for part in surfaces.reflectance]
+                parts = [
+                    part.expand_as(surfaces.weights) for part in surfaces.reflectance
+                ]
                 values = ZeroInflatedLogistic(*(part[patch, k, cell] for part in parts))
                 shown = distance.log_prob(x[i, 0, row, column]) * 5
                 shown = shown - 0.5 * values.nll(x[i, 1, row, column])
@@ -116,11 +129,15 @@ def test_the_loss_by_hand(rare: float) -> None:
         total += shares[code] ** -rare * -float(likely.log())
         weight += shares[code] ** -rare
     assert trained(x).item() == pytest.approx(total / weight, rel=1e-4)
-    assert trained(x, torch.randn_like(x)).item() == pytest.approx(total / weight, rel=1e-4), (
-        "noise of deviation 0"
+    assert trained(x, torch.randn_like(x)).item() == pytest.approx(
+        total / weight, rel=1e-4
+    ), "noise of deviation 0"
+    noisy = Autoencoding(
+        net, TENSORS, SENSOR, Losses(noise=3.0), METRICS["l1"], {}
+    ).eval()
+    assert noisy(x, torch.randn_like(x)).item() != pytest.approx(
+        noisy(x).item(), rel=1e-3
     )
-    noisy = Autoencoding(net, TENSORS, SENSOR, Losses(noise=3.0), METRICS["l1"], {}).eval()
-    assert noisy(x, torch.randn_like(x)).item() != pytest.approx(noisy(x).item(), rel=1e-3)
 
 
 @pytest.mark.slow
@@ -164,7 +181,10 @@ def test_a_decoder_meets_what_the_flow_leaves() -> None:
     torch.testing.assert_close(example.y[:2], (asked[0] - 0.25 * 3 * asked[0])[:2])
     shaken = net.bounded(example.y)[2:] - net.bounded(z)[2:]
     torch.testing.assert_close(
-        shaken, torch.tensor([0.1, 0.2]).view(-1, 1, 1, 1) * some[2:], atol=1e-5, rtol=1e-4
+        shaken,
+        torch.tensor([0.1, 0.2]).view(-1, 1, 1, 1) * some[2:],
+        atol=1e-5,
+        rtol=1e-4,
     )
     assert example.velocity is x
     trained = Decoding(net, TENSORS, SENSOR, Losses(), METRICS["l1"], {})
@@ -191,7 +211,8 @@ def test_latents_that_were_made_before_are_those_that_are_made_on_the_way(
     assert torch.equal(held.y1, live.y1) and torch.equal(held.u, live.u)
     other = make_codec(network(depth=2), TENSORS, SENSOR.shape)
     assert not np.array_equal(
-        cache_latents(cache, TENSORS, other, "cpu", folder, "b", progress=False), latents
+        cache_latents(cache, TENSORS, other, "cpu", folder, "b", progress=False),
+        latents,
     )
 
 
@@ -204,15 +225,17 @@ def test_latents_that_are_turned_are_those_of_turned_scans() -> None:
     for y0, scan in zip(held(range(16)).y0, held.scans_at(range(16)), strict=True):
         x = TENSORS.encode(cache.read([scan]))
         turned = {
-            (mirrored, k): codec.encode((x.flip(-1) if mirrored else x).roll(16 * k, -1))[0]
+            (mirrored, k): codec.encode(
+                (x.flip(-1) if mirrored else x).roll(16 * k, -1)
+            )[0]
             for mirrored in (False, True)
             for k in range(4)
         }
         [match] = [key for key, z in turned.items() if torch.allclose(z, y0, atol=2e-3)]
         found.add(match)
-    assert {mirrored for mirrored, _ in found} == {False, True} and {k for _, k in found} == set(
-        range(4)
-    )
+    assert {mirrored for mirrored, _ in found} == {False, True} and {
+        k for _, k in found
+    } == set(range(4))
 
 
 def test_images_whose_labels_are_hidden_are_decoded_to_their_labels_anyway() -> None:
@@ -226,7 +249,13 @@ def test_images_whose_labels_are_hidden_are_decoded_to_their_labels_anyway() -> 
     )
     blank = TENSORS.from_images(
         [
-            replace(i, channels={**i.channels, "label": np.full_like(i.channels["label"], IGNORE)})
+            replace(
+                i,
+                channels={
+                    **i.channels,
+                    "label": np.full_like(i.channels["label"], IGNORE),
+                },
+            )
             for i in images()
         ]
     )

@@ -37,7 +37,12 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
             "P2: 1 2 3",
             "has .*'P2': 3.*expected P2 with 12",
         ),
-        ("semantic_kitti", "sequences/00/poses.txt", "1 0 0", "does not hold rows of 12 numbers"),
+        (
+            "semantic_kitti",
+            "sequences/00/poses.txt",
+            "1 0 0",
+            "does not hold rows of 12 numbers",
+        ),
         (
             "kitti360",
             "data_poses/2013_05_28_drive_0000_sync/poses.txt",
@@ -74,7 +79,12 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
             "Car 0 9 " + "1 " * 12,
             "occlusion of 0 to 3",
         ),
-        ("kitti_object", "training/label_2/000000.txt", "Car 0 0 " + "0 " * 12, "a size above 0"),
+        (
+            "kitti_object",
+            "training/label_2/000000.txt",
+            "Car 0 0 " + "0 " * 12,
+            "a size above 0",
+        ),
         (
             "kitti_object",
             "training/label_2/000000.txt",
@@ -101,8 +111,18 @@ DRIVE = "data_poses/2013_05_28_drive_0000_sync/poses.txt"
             "not rigid",
         ),
         ("kitti360", DRIVE, "7 " + "nan " * 12, "not rigid"),
-        ("kitti360", DRIVE, "7.5 1 0 0 0 0 1 0 0 0 0 1 0", "invalid or repeated frame numbers"),
-        ("kitti360", DRIVE, "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "invalid or repeated frame numbers"),
+        (
+            "kitti360",
+            DRIVE,
+            "7.5 1 0 0 0 0 1 0 0 0 0 1 0",
+            "invalid or repeated frame numbers",
+        ),
+        (
+            "kitti360",
+            DRIVE,
+            "7 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2,
+            "invalid or repeated frame numbers",
+        ),
         (
             "kitti360",
             "calibration/calib_cam_to_pose.txt",
@@ -123,7 +143,9 @@ def test_damaged_text_files_are_named(
     MAKERS[layout](tmp_path)
     assert (tmp_path / file).is_file()
     (tmp_path / file).write_text(text)
-    folder = Path(file).parent.name if file.startswith("calibration") else Path(file).name
+    folder = (
+        Path(file).parent.name if file.startswith("calibration") else Path(file).name
+    )
     with pytest.raises(DataError, match=f"{folder}.*({message})"):
         open_scans(tmp_path, layout=layout)[0]
 
@@ -145,7 +167,13 @@ def test_damaged_text_files_are_named(
             "<tx>1e400</tx>",
             "a box of frame 1 with .*inf",
         ),
-        ("kitti_raw", "tracklet_labels.xml", "<h>1.2</h>", "<h>0</h>", "size that is not positive"),
+        (
+            "kitti_raw",
+            "tracklet_labels.xml",
+            "<h>1.2</h>",
+            "<h>0</h>",
+            "size that is not positive",
+        ),
         ("kitti360", "*.xml", "encoding='utf-8'", "encoding='x'", "unknown encoding"),
         (
             "kitti360",
@@ -156,7 +184,13 @@ def test_damaged_text_files_are_named(
         ),
         ("kitti360", "*.xml", "<data>", "<data>nan ", "cannot reshape|no boxes"),
         ("kitti_object", "calib/000000.txt", "R0_rect: 1", "R0_rect: 2", "not rigid"),
-        ("kitti_object", "calib/000000.txt", "R0_rect: 1.0", "R0_rect: nan 1.0", "'R0_rect': 10"),
+        (
+            "kitti_object",
+            "calib/000000.txt",
+            "R0_rect: 1.0",
+            "R0_rect: nan 1.0",
+            "'R0_rect': 10",
+        ),
     ],
 )
 def test_a_changed_value_is_refused_by_the_name_of_its_file(
@@ -189,7 +223,8 @@ def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
     MAKERS["kitti_object"](tmp_path)
     (tmp_path / "ImageSets" / "train.txt").write_text("000000\n../velodyne/000001\n")
     with pytest.raises(
-        DataError, match=r"train.txt lists '../velodyne/000001'; expected names of frames"
+        DataError,
+        match=r"train.txt lists '../velodyne/000001'; expected names of frames",
     ):
         open_scans(tmp_path, split="train")
 
@@ -204,10 +239,17 @@ def test_names_of_frames_stay_in_their_folder(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("to", ["npz", "range", "webdataset"])
 def test_impossible_values_of_a_scan_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, name: str, value: Any, message: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    to: str,
+    name: str,
+    value: Any,
+    message: str,
 ) -> None:
     # Another program's file.
-    monkeypatch.setattr("lidar_synth.formats.writer.check_scan", lambda scan, where: None)
+    monkeypatch.setattr(
+        "lidar_synth.formats.writer.check_scan", lambda scan, where: None
+    )
     scan = some_scan()
     scan.confidence = np.ones(len(scan), np.float32)
     if name == "pose":
@@ -222,7 +264,11 @@ def test_impossible_values_of_a_scan_are_refused(
 @pytest.mark.parametrize("name", ["truncation", "image_box", "alpha", "dont_care"])
 def test_boxes_with_invalid_numbers_are_refused(name: str) -> None:
     with pytest.raises(DataError, match="non-finite"):
-        Boxes(np.ones((1, 7)), ("Car",), **{name: np.full((1, 4) if "_" in name else 1, np.nan)})
+        Boxes(
+            np.ones((1, 7)),
+            ("Car",),
+            **{name: np.full((1, 4) if "_" in name else 1, np.nan)},
+        )
 
 
 def test_cells_without_a_return_may_hold_anything(tmp_path: Path) -> None:
@@ -266,12 +312,17 @@ def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
         ({"reflectance": good["reflectance"] * 255}, r"expected values in \[0, 1\]"),
         ({"reflectance": good["reflectance"][1:]}, "one per point"),
         ({"sensor": np.array("{}")}, "sensor|missing"),
-        ({"label": np.full(len(scan), 19, "u1")}, r"labels \[19\]; expected train ids 0..18"),
+        (
+            {"label": np.full(len(scan), 19, "u1")},
+            r"labels \[19\]; expected train ids 0..18",
+        ),
     ):
         np.savez(path, **(good | change))
         with pytest.raises(DataError, match=f"scan.npz.*{message}"):
             open_scans(path)[0]
-    np.savez(path, **{name: values for name, values in good.items() if name != "sensor"})
+    np.savez(
+        path, **{name: values for name, values in good.items() if name != "sensor"}
+    )
     with pytest.raises(DataError, match="it has no sensor"):
         open_scans(path)[0]
     assert len(open_scans(path, sensor="hdl64e_kitti")[0]) == len(scan)
@@ -283,7 +334,9 @@ def test_arrays_that_are_not_scans_are_refused(tmp_path: Path) -> None:
 def test_a_range_image_of_another_sensor(tmp_path: Path) -> None:
     for to in ("range", "png"):
         write_all(to, tmp_path / to, [some_scan()])
-        with pytest.raises(DataError, match="made for sensor 'hdl64e_kitti', not for 'os1_128'"):
+        with pytest.raises(
+            DataError, match="made for sensor 'hdl64e_kitti', not for 'os1_128'"
+        ):
             open_scans(tmp_path / to, sensor="os1_128")[0]
     np.save(tmp_path / "image.npy", np.ones((32, 1024), "f4"))
     with pytest.raises(DataError, match=r"shape \(32, 1024\); expected \(64, 1024\)"):

@@ -10,7 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import MAKERS, nuscenes_arrays, some_scan, write_all, write_nuscenes, write_tars
+from layouts import (
+    MAKERS,
+    nuscenes_arrays,
+    some_scan,
+    write_all,
+    write_nuscenes,
+    write_tars,
+)
 
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
@@ -34,7 +41,9 @@ def remove(path: Path) -> None:
 
 
 def spoil(path: Path, value: float, field: int = 1) -> None:
-    points = np.fromfile(path, "<f4").reshape(-1, 5 if path.name.endswith(".pcd.bin") else 4)
+    points = np.fromfile(path, "<f4").reshape(
+        -1, 5 if path.name.endswith(".pcd.bin") else 4
+    )
     points[3, field] = value
     points.tofile(path)
 
@@ -50,7 +59,10 @@ def big_endian(path: Path) -> None:
 
 
 POINT_FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "cut": (cut, r"is \d+ bytes long; expected a multiple of 16: 4 float32.*on_bad='skip'"),
+    "cut": (
+        cut,
+        r"is \d+ bytes long; expected a multiple of 16: 4 float32.*on_bad='skip'",
+    ),
     "empty": (empty, r"is empty; expected 16 bytes for each point.*on_bad='skip'"),
     "missing": (remove, r"cannot be read \(No such file or directory\)"),
     "nan": (
@@ -80,13 +92,17 @@ POINT_FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 @pytest.mark.parametrize("fault", POINT_FAULTS)
 @pytest.mark.parametrize("layout", RAW)
-def test_a_bad_scan_is_named_or_skipped(tmp_path: Path, layout: str, fault: str) -> None:
+def test_a_bad_scan_is_named_or_skipped(
+    tmp_path: Path, layout: str, fault: str
+) -> None:
     paths = MAKERS[layout](tmp_path)
     source = open_scans(tmp_path, layout=layout)
     skipping = open_scans(tmp_path, layout=layout, on_bad="skip")
     damage, message = POINT_FAULTS[fault]
     damage(paths[1])
-    with pytest.raises((DataError, FileError), match=re.escape(str(paths[1])) + ".*" + message):
+    with pytest.raises(
+        (DataError, FileError), match=re.escape(str(paths[1])) + ".*" + message
+    ):
         source[1]
     assert len(source[0]) and len(source[2])
     check_skipping(skipping, message)
@@ -103,7 +119,11 @@ def check_skipping(source: object, message: str) -> None:
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # each bad scan is told of once
-        assert [source[i].id for i in range(3)] == [source.ids[0], source.ids[2], source.ids[2]]
+        assert [source[i].id for i in range(3)] == [
+            source.ids[0],
+            source.ids[2],
+            source.ids[2],
+        ]
 
 
 @pytest.mark.parametrize("layout", ["semantic_kitti", "folder", "kitti360"])
@@ -122,13 +142,18 @@ def check_skipping(source: object, message: str) -> None:
     ids=["length", "unknown id"],
 )
 def test_labels_that_do_not_fit_their_scan(
-    tmp_path: Path, layout: str, change: Callable[[np.ndarray], np.ndarray], message: str
+    tmp_path: Path,
+    layout: str,
+    change: Callable[[np.ndarray], np.ndarray],
+    message: str,
 ) -> None:
     points = MAKERS[layout](tmp_path)[1]
     [labels] = [p for p in tmp_path.rglob("*.label") if p.stem == points.stem]
     raw = np.fromfile(labels, "<u4")
     change(raw).astype("<u4").tofile(labels)
-    expected = message.format(labels=len(raw) - 3, count=len(raw), points=re.escape(str(points)))
+    expected = message.format(
+        labels=len(raw) - 3, count=len(raw), points=re.escape(str(points))
+    )
     source = open_scans(tmp_path, layout=layout)
     with pytest.raises(DataError, match=re.escape(str(labels)) + ".*" + expected):
         source[1]
@@ -139,7 +164,8 @@ def test_a_label_file_that_is_missing(tmp_path: Path) -> None:
     path = MAKERS["semantic_kitti"](tmp_path)[1]
     (path.parents[1] / "labels" / "000001.label").unlink()
     with pytest.raises(
-        FileError, match=r"has labels in .* for other scans, but no 000001.label; .*--on-bad skip"
+        FileError,
+        match=r"has labels in .* for other scans, but no 000001.label; .*--on-bad skip",
     ):
         SemanticKITTI(tmp_path)[1]
 
@@ -149,10 +175,19 @@ def test_a_label_file_that_is_missing(tmp_path: Path) -> None:
     [
         (cut, "a multiple of 20: 5 float32"),
         (lambda p: spoil(p, np.nan), "NaN or infinite"),
-        (lambda p: spoil(p, 300.0, 3), r"runs from .* to 300; expected values in \[0, 255\]"),
+        (
+            lambda p: spoil(p, 300.0, 3),
+            r"runs from .* to 300; expected values in \[0, 255\]",
+        ),
         (lambda p: spoil(p, 3.5, 4), "is not a ring"),
-        (lambda p: np.zeros((400, 5), "<f4").tofile(p), "all 400 points are nearer than 1 m"),
-        (lambda p: np.random.default_rng(0).random((400, 4), "f4").tofile(p), "is not a ring"),
+        (
+            lambda p: np.zeros((400, 5), "<f4").tofile(p),
+            "all 400 points are nearer than 1 m",
+        ),
+        (
+            lambda p: np.random.default_rng(0).random((400, 4), "f4").tofile(p),
+            "is not a ring",
+        ),
     ],
     ids=["cut", "nan", "intensity", "ring", "zeros", "four floats"],
 )
@@ -172,11 +207,14 @@ def test_lidarseg_that_does_not_fit_its_sweep(tmp_path: Path) -> None:
     path = tmp_path / "lidarseg" / "v1.0-mini" / "token1_lidarseg.bin"
     classes[:-1].astype("u1").tofile(path)
     with pytest.raises(
-        DataError, match=rf"{path} has 319 labels, .*LIDAR_TOP__1.pcd.bin has 320 points"
+        DataError,
+        match=rf"{path} has 319 labels, .*LIDAR_TOP__1.pcd.bin has 320 points",
     ):
         NuScenes(tmp_path)[1]
     np.where(classes == 3, 99, classes).astype("u1").tofile(path)
-    with pytest.raises(DataError, match=rf"{path} .*__1.pcd.bin.*unknown class ids \[99\]"):
+    with pytest.raises(
+        DataError, match=rf"{path} .*__1.pcd.bin.*unknown class ids \[99\]"
+    ):
         NuScenes(tmp_path)[1]
     (tmp_path / "v1.0-mini" / "lidarseg.json").write_text("[{}]")
     with pytest.raises(DataError, match=r"lidarseg.json: KeyError"):
@@ -205,7 +243,8 @@ def test_a_path_in_no_known_layout(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="nowhere does not exist"):
         open_scans(tmp_path / "nowhere")
     with pytest.raises(
-        ConfigError, match=r"layout 'kitti'; expected one of 'kitti360', 'semantic_kitti'"
+        ConfigError,
+        match=r"layout 'kitti'; expected one of 'kitti360', 'semantic_kitti'",
     ):
         open_scans(tmp_path, layout="kitti")
 
@@ -228,7 +267,9 @@ def test_wrong_splits(tmp_path: Path) -> None:
         match="KITTI object split 'training'; expected one of 'train', 'val', 'trainval'",
     ):
         open_scans(tmp_path / "kitti_object", split="training")
-    with pytest.raises(ConfigError, match="split 'train' of .*layout 'kitti_raw' has none"):
+    with pytest.raises(
+        ConfigError, match="split 'train' of .*layout 'kitti_raw' has none"
+    ):
         open_scans(tmp_path / "kitti_raw", split="train")
     with pytest.raises(DataError, match=r"no sequence of split 'val' \(it has 00\)"):
         open_scans(tmp_path / "semantic_kitti", split="val")
@@ -258,7 +299,9 @@ def test_a_source_without_one_good_scan(tmp_path: Path) -> None:
 def test_a_folder_of_two_kinds(tmp_path: Path) -> None:
     for to in ("kitti", "npz"):
         write_all(to, tmp_path, [some_scan()])
-    with pytest.raises(ConfigError, match="holds .bin and .npz files; expected one kind"):
+    with pytest.raises(
+        ConfigError, match="holds .bin and .npz files; expected one kind"
+    ):
         READERS["folder"](tmp_path)  # type: ignore[call-arg, arg-type]
 
 
@@ -290,7 +333,9 @@ def test_a_disk_that_is_full_leaves_no_half_scan(tmp_path: Path, to: str) -> Non
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not writer.complete(0)
     assert not [
-        p for p in tmp_path.rglob("*") if p.suffix in (".part", ".bin", ".npz", ".pcd", ".ply")
+        p
+        for p in tmp_path.rglob("*")
+        if p.suffix in (".part", ".bin", ".npz", ".pcd", ".ply")
     ]
     writer.write(scan, 0)
     assert writer.complete(0)
@@ -310,7 +355,9 @@ def test_a_disk_that_is_full_leaves_no_half_scan(tmp_path: Path, to: str) -> Non
         ("png", "label"),
     ],
 )
-def test_a_scan_is_complete_only_with_all_its_files(tmp_path: Path, to: str, blocked: str) -> None:
+def test_a_scan_is_complete_only_with_all_its_files(
+    tmp_path: Path, to: str, blocked: str
+) -> None:
     (tmp_path / blocked).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / blocked).write_text("in the way")
     writer = WRITERS[to](tmp_path)
@@ -327,13 +374,18 @@ def test_a_failed_write_keeps_the_existing_file(tmp_path: Path) -> None:
         file.write(b"half")  # type: ignore[attr-defined]
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(FileError, match=r"file cannot be written \(No space left on device\)"):
+    with pytest.raises(
+        FileError, match=r"file cannot be written \(No space left on device\)"
+    ):
         write_file(path, fail)
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
     # Who has the old file open goes on reading it: it is replaced, never written over.
     (tmp_path / "reader").hardlink_to(path)
     write_file(path, b"after")
-    assert path.read_bytes() == b"after" and (tmp_path / "reader").read_bytes() == b"before"
+    assert (
+        path.read_bytes() == b"after"
+        and (tmp_path / "reader").read_bytes() == b"before"
+    )
 
 
 def test_partial_files_are_never_read(tmp_path: Path) -> None:
@@ -347,7 +399,9 @@ def test_partial_files_are_never_read(tmp_path: Path) -> None:
 
 def test_the_hint_finds_the_number_of_fields(tmp_path: Path) -> None:
     np.zeros((3, 5), "<f4").tofile(tmp_path / "five.bin")
-    with pytest.raises(DataError, match="60 bytes long.*fits 5 floats per point: pass fields=5"):
+    with pytest.raises(
+        DataError, match="60 bytes long.*fits 5 floats per point: pass fields=5"
+    ):
         read_points(tmp_path / "five.bin")
     assert read_points(tmp_path / "five.bin", fields=5).shape == (3, 5)
 

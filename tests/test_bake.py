@@ -21,7 +21,15 @@ from test_generator import SENSOR, write
 from typer.testing import CliRunner
 
 import lidar_synth.bake.shard as shard_module
-from lidar_synth.bake import ENGINES, BakeJob, BakePlan, Resources, Share, bake, make_plan
+from lidar_synth.bake import (
+    ENGINES,
+    BakeJob,
+    BakePlan,
+    Resources,
+    Share,
+    bake,
+    make_plan,
+)
 from lidar_synth.bake.folder import SETTINGS, finish, prepare, write_bank_files
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
@@ -31,7 +39,13 @@ from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import open_scans
-from lidar_synth.generate.checkpoint import ENCODER, VELOCITY, Header, NetworkSpec, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    ENCODER,
+    VELOCITY,
+    Header,
+    NetworkSpec,
+    save_checkpoint,
+)
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import NORMALISATIONS
@@ -73,7 +87,9 @@ def test_a_bank_holds_the_models_scans(
     generator = load_generator(model)
     encoding = Encoding(generator.sensor, bank.fields)
     for i, image in enumerate(generator.range_images(4, range(COUNT))):
-        assert np.array_equal(bank.image(i).range, encoding.decode(encoding.encode(image)).range)
+        assert np.array_equal(
+            bank.image(i).range, encoding.decode(encoding.encode(image)).range
+        )
         assert bank[i].id == f"small/4/{i}"
         assert np.array_equal(bank[i].label, image.label[image.mask])
     facts = bank.facts
@@ -82,7 +98,11 @@ def test_a_bank_holds_the_models_scans(
         "generated",
         "MIT",
     )
-    assert facts.settings["seed"] == 4 and facts.software["torch"] and facts.software["deflate"]
+    assert (
+        facts.settings["seed"] == 4
+        and facts.software["torch"]
+        and facts.software["deflate"]
+    )
 
 
 def write_conditioned(path: Path) -> Path:
@@ -150,7 +170,9 @@ def test_conditions_come_from_a_dataset(tmp_path: Path) -> None:
     assert np.array_equal(bank.image(5).label, expected.label)
     assert min(regenerate(plan.out, str(model), progress=False).values()) == 1
     (plan.out / "shard-00001.h5").unlink()
-    assert repair(plan.out, str(model), progress=False) == {"shard-00001.h5": "regenerated"}
+    assert repair(plan.out, str(model), progress=False) == {
+        "shard-00001.h5": "regenerated"
+    }
 
 
 # The same bytes
@@ -214,9 +236,17 @@ def test_torchrun_writes_the_same_bytes(
         "--engine",
         "torchrun",
     ]
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        2,
+    ]
     subprocess.run(
-        [str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)], check=True
+        [str(a) for a in (*command, "-m", "lidar_synth", "bake", plan.out, *options)],
+        check=True,
     )
     assert files(plan.out) == expected
 
@@ -227,7 +257,8 @@ def test_a_missing_library_of_an_engine_is_reported(
 ) -> None:
     monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[engine], None)
     with pytest.raises(
-        LibraryError, match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'"
+        LibraryError,
+        match=rf"engine '{engine}', but .* pip install 'lidar_synth\[{engine}\]'",
     ):
         bake(plan, engine, progress=False)
 
@@ -242,9 +273,13 @@ def test_every_setting_is_an_option_with_its_description_and_default(
     name: str, field: FieldInfo
 ) -> None:
     text = " ".join(CliRunner().invoke(app, ["bake", "--help"]).output.split())
-    description = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
+    description = f"{field.description}" + (
+        "" if field.default is None else f" [{field.default}]"
+    )
     option = re.escape(f"--{name.replace('_', '-')} ")
-    assert re.search(option + r"(<\w+>|NAME,\.\.\.) " + re.escape(description), text), text
+    assert re.search(option + r"(<\w+>|NAME,\.\.\.) " + re.escape(description), text), (
+        text
+    )
 
 
 # Settings
@@ -282,7 +317,9 @@ def test_a_different_checkpoint_is_refused(plan: BakePlan, tmp_path: Path) -> No
     changed = plan_in(tmp_path / "changed", tmp_path / "small.safetensors")
     write(tmp_path / "small.safetensors", ("range",))
     shard_module._load.cache_clear()
-    with pytest.raises(ConfigError, match="expected the checkpoint that made the bank's scans"):
+    with pytest.raises(
+        ConfigError, match="expected the checkpoint that made the bank's scans"
+    ):
         bake(changed, progress=False)
 
 
@@ -297,7 +334,9 @@ def test_a_checkpoint_that_was_replaced_is_loaded_again(tmp_path: Path) -> None:
 def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
     bake(plan, progress=False)
     (plan.out / SETTINGS).unlink()
-    with pytest.raises(ConfigError, match="holds another bank; expected an empty folder"):
+    with pytest.raises(
+        ConfigError, match="holds another bank; expected an empty folder"
+    ):
         bake(plan, progress=False)
 
 
@@ -305,7 +344,9 @@ def test_a_bank_without_bake_settings_is_refused(plan: BakePlan) -> None:
 def test_a_file_of_the_user_is_not_replaced(plan: BakePlan, name: str) -> None:
     plan.out.mkdir()
     (plan.out / name).write_text("mine")
-    with pytest.raises(ConfigError, match=f"holds a {name}, which the bank's own would replace"):
+    with pytest.raises(
+        ConfigError, match=f"holds a {name}, which the bank's own would replace"
+    ):
         bake(plan, progress=False)
     assert [path.name for path in plan.out.iterdir()] == [name]
     assert (plan.out / name).read_text() == "mine"
@@ -333,14 +374,23 @@ def test_shards_of_small_banks_are_small(
         (["--threads", "0"], "threads = 0"),
         (["--threads", "5000"], "threads = 5000"),
         (["--solver", "rk4"], "solver 'rk4'; expected one of 'euler', 'heun'"),
-        (["--dtype", "float16"], "dtype 'float16'; expected one of 'float32', 'bfloat16'"),
+        (
+            ["--dtype", "float16"],
+            "dtype 'float16'; expected one of 'float32', 'bfloat16'",
+        ),
         (["--device", "tpu"], "device = 'tpu': Input should be 'cpu' or 'cuda'"),
         (["--compression", "lzf"], "compression = 'lzf'"),
         (["--layout", "flat"], "layout = 'flat'"),
         (["--fields", "ring"], r"fields \['ring'\] of model"),
-        (["--engine", "dask"], "engine 'dask'; expected one of 'local', 'processes', 'ray'"),
+        (
+            ["--engine", "dask"],
+            "engine 'dask'; expected one of 'local', 'processes', 'ray'",
+        ),
         (["--workers", "0"], "0 workers; expected at least 1"),
-        (["--shard-index", "3", "--num-shards", "3"], "--shard-index 3 of --num-shards 3"),
+        (
+            ["--shard-index", "3", "--num-shards", "3"],
+            "--shard-index 3 of --num-shards 3",
+        ),
         (["--slurm", "partition"], "--slurm 'partition'; expected KEY=VALUE"),
         (["--model", "city"], "model 'city'; expected a shipped one"),
     ],
@@ -357,19 +407,23 @@ def test_invalid_options_are_refused(
 def test_unsuitable_models_are_refused(tmp_path: Path) -> None:
     plain = write(tmp_path / "plain.safetensors", ("range", "reflectance"))
     with pytest.raises(
-        ConfigError, match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel"
+        ConfigError,
+        match=r"fields \['label'\] of model .*some of \['reflectance'\].*channel",
     ):
         plan_in(tmp_path / "bank", plain, fields=("reflectance", "label"))
     assert plan_in(tmp_path / "bank", plain).facts.label_policy == "none"
     with pytest.raises(
-        ConfigError, match="condition here for model .*takes no condition; expected none"
+        ConfigError,
+        match="condition here for model .*takes no condition; expected none",
     ):
         plan_in(tmp_path / "bank", plain, condition="here")
     with pytest.raises(
         ConfigError,
         match="condition None for model .*takes semantic conditions; expected a dataset",
     ):
-        plan_in(tmp_path / "bank", write_conditioned(tmp_path / "conditioned.safetensors"))
+        plan_in(
+            tmp_path / "bank", write_conditioned(tmp_path / "conditioned.safetensors")
+        )
     with pytest.raises(FileError, match="nowhere does not exist"):
         plan_in(
             tmp_path / "bank",
@@ -387,7 +441,9 @@ def test_options_override_a_configuration_file(
 ) -> None:
     config = tmp_path / "bake.yaml"
     config.write_text(
-        yaml.safe_dump({"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9})
+        yaml.safe_dump(
+            {"model": str(model), "count": COUNT, "shard_size": SIZE, "seed": 9}
+        )
     )
     result = CliRunner().invoke(
         app, ["bake", str(tmp_path / "bank"), "--config", str(config), "--seed", "4"]
@@ -396,24 +452,33 @@ def test_options_override_a_configuration_file(
     assert files(tmp_path / "bank") == expected
     config.write_text("model: small\nsize: 3\n")
     with pytest.raises(
-        ConfigError, match=r"bake.yaml: unknown key 'size'; known there: model, count, seed"
+        ConfigError,
+        match=r"bake.yaml: unknown key 'size'; known there: model, count, seed",
     ):
         CliRunner().invoke(
-            app, ["bake", str(tmp_path / "b"), "--config", str(config)], catch_exceptions=False
+            app,
+            ["bake", str(tmp_path / "b"), "--config", str(config)],
+            catch_exceptions=False,
         )
     with pytest.raises(FileError, match="nowhere.yaml cannot be read"):
         CliRunner().invoke(
-            app, ["bake", str(tmp_path / "b"), "--config", "nowhere.yaml"], catch_exceptions=False
+            app,
+            ["bake", str(tmp_path / "b"), "--config", "nowhere.yaml"],
+            catch_exceptions=False,
         )
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted(CONFIGS.glob("bake_*.yaml")), ids=lambda p: p.stem
+)
 def test_published_configurations_load(path: Path) -> None:
     assert validate(BakeJob, read_values(path, BakeJob), str(path)).count >= 1000
 
 
 @pytest.mark.slow
-def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: Path) -> None:
+def test_a_dry_run_writes_nothing_and_estimates_the_size(
+    model: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "bank"
     call = [
         "bake",
@@ -435,7 +500,9 @@ def test_a_dry_run_writes_nothing_and_estimates_the_size(model: Path, tmp_path: 
     assert not out.exists()
     # The estimate is close to the actual size.
     actual = CliRunner().invoke(app, [*call[:-1]]).output
-    estimated, written = (float(text.split(" MB")[0].split()[-1]) for text in (output, actual))
+    estimated, written = (
+        float(text.split(" MB")[0].split()[-1]) for text in (output, actual)
+    )
     assert estimated == pytest.approx(written, rel=0.4)
 
 

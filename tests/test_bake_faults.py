@@ -51,7 +51,9 @@ def expected(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 @pytest.fixture(scope="module")
 def sixty(model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of the bank that ``start`` bakes, without interruption in this process."""
-    plan = plan_in(tmp_path_factory.mktemp("sixty") / "bank", model, count=60, shard_size=5)
+    plan = plan_in(
+        tmp_path_factory.mktemp("sixty") / "bank", model, count=60, shard_size=5
+    )
     bake(plan, progress=False)
     return files(plan.out)
 
@@ -100,7 +102,9 @@ def test_a_signal_keeps_finished_shards(
     assert times == {name: (plan.out / name).stat().st_mtime_ns for name in kept}
 
 
-def start(out: Path, model: Path, *options: str, **others: Any) -> subprocess.Popen[str]:
+def start(
+    out: Path, model: Path, *options: str, **others: Any
+) -> subprocess.Popen[str]:
     command = [
         sys.executable,
         "-m",
@@ -137,7 +141,10 @@ def test_killed_and_terminated_runs_resume(
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
     assert process.returncode == 130
-    assert f"stopped; finished shards are kept in {out}, the same command resumes" in errors
+    assert (
+        f"stopped; finished shards are kept in {out}, the same command resumes"
+        in errors
+    )
     assert "Traceback" not in errors
     bake(plan_in(out, model, count=60, shard_size=5), progress=False)
     assert files(out) == sixty
@@ -147,7 +154,13 @@ def test_killed_and_terminated_runs_resume(
 def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
     """A terminal sends the signal to every process of the group; only the parent reports it."""
     process = start(
-        tmp_path / "bank", model, "--engine", "processes", "--workers", "2", process_group=0
+        tmp_path / "bank",
+        model,
+        "--engine",
+        "processes",
+        "--workers",
+        "2",
+        process_group=0,
     )
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     while (
@@ -174,7 +187,8 @@ def test_a_killed_worker_is_reported(
 
     prepare(plan)
     with pytest.raises(
-        FileError, match=r"a worker was killed \(exit status -9\).*finished shards are kept"
+        FileError,
+        match=r"a worker was killed \(exit status -9\).*finished shards are kept",
     ):
         ENGINES["processes"](plan, range(3), Resources(1), kill)
     assert multiprocessing.active_children() == []
@@ -211,7 +225,10 @@ def test_temporary_files_of_killed_processes_are_removed(
         path.touch()
     hold = f"from lidar_synth.files.lock import lock_shared; from pathlib import Path\nwith lock_shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"  # noqa: E501
     with subprocess.Popen(
-        [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", hold],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as other:
         assert other.stdout is not None and other.stdout.readline() == "\n"
         assert bake(plan, progress=False) is not None
@@ -228,7 +245,9 @@ SHARES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shares", ["all", pytest.param("shares", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "shares", ["all", pytest.param("shares", marks=pytest.mark.slow)]
+)
 def test_three_concurrent_bakes_write_the_same_bytes(
     model: Path, tmp_path: Path, sixty: dict[str, bytes], shares: str
 ) -> None:
@@ -258,8 +277,17 @@ def test_a_bake_that_ends_leaves_the_open_shard_of_another_one(
             "--model",
             plan.job.model,
         ]
-        command += ["--count", str(plan.job.count), "--shard-size", str(SIZE), "--seed", "4"]
-        ended.append(subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False))
+        command += [
+            "--count",
+            str(plan.job.count),
+            "--shard-size",
+            str(SIZE),
+            "--seed",
+            "4",
+        ]
+        ended.append(
+            subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+        )
         assert list(plan.out.glob(".*.part"))
 
     stop_after(plan, 4, another)
@@ -282,7 +310,9 @@ def test_two_concurrent_claims_of_a_folder(
         return seen
 
     monkeypatch.setattr(Path, "is_file", slow)
-    with pytest.raises(ConfigError, match="was filled with {'seed': 4}; expected {'seed': 5}"):
+    with pytest.raises(
+        ConfigError, match="was filled with {'seed': 4}; expected {'seed': 5}"
+    ):
         prepare(late)
 
 
@@ -309,16 +339,21 @@ def test_two_bakes_may_end_at_the_same_time(
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.98])
-def test_a_full_disk_by_limit(plan: BakePlan, expected: dict[str, bytes], share: float) -> None:
+def test_a_full_disk_by_limit(
+    plan: BakePlan, expected: dict[str, bytes], share: float
+) -> None:
     """A file cannot grow to the end of a shard; at a low limit HDF5 cannot even write its
     metadata."""
     bake(plan, share=Share(0, 4), progress=False)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    shortest = min(len(content) for name, content in expected.items() if name.endswith(".h5"))
+    shortest = min(
+        len(content) for name, content in expected.items() if name.endswith(".h5")
+    )
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * shortest), limits[1]))
     try:
         with pytest.raises(
-            FileError, match=r"cannot be written \(File too large\).*finished shards are kept"
+            FileError,
+            match=r"cannot be written \(File too large\).*finished shards are kept",
         ):
             bake(plan, progress=False)
     finally:
@@ -346,12 +381,17 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_full_disk(
-    small_disk: Path, model: Path, expected: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+    small_disk: Path,
+    model: Path,
+    expected: dict[str, bytes],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # Disables the check of free space before a shard.
     monkeypatch.setattr(shard_module, "_PACKED", 0)
     plan = plan_in(small_disk / "bank", model)
-    with pytest.raises(FileError, match=r"No space left on device.*finished shards are kept"):
+    with pytest.raises(
+        FileError, match=r"No space left on device.*finished shards are kept"
+    ):
         bake(plan, progress=False)
     kept = {path.name for path in plan.out.glob("*.h5")}
     assert 1 <= len(kept) < 4 and not list(plan.out.glob(".*.part"))
@@ -380,7 +420,9 @@ def test_free_space_is_checked_before_a_shard(
 def test_an_unwritable_folder_is_reported(model: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file" / "bank", Path("/proc/bank")):
-        with pytest.raises(FileError, match=r"cannot be written \(.*Choose another output folder"):
+        with pytest.raises(
+            FileError, match=r"cannot be written \(.*Choose another output folder"
+        ):
             bake(plan_in(out, model), progress=False)
 
 
@@ -396,7 +438,9 @@ def no_privileges() -> Iterator[None]:
         os.seteuid(user)
 
 
-def test_a_folder_that_becomes_read_only(model: Path, expected: dict[str, bytes]) -> None:
+def test_a_folder_that_becomes_read_only(
+    model: Path, expected: dict[str, bytes]
+) -> None:
     with (
         tempfile.TemporaryDirectory() as folder
     ):  # pytest's own folders are not accessible to other users

@@ -18,7 +18,9 @@ from lidar_synth.bake import ENGINES, BakePlan, Resources, bake
 from lidar_synth.bake.folder import SETTINGS, finish, prepare
 from lidar_synth.errors import ConfigError, FileError
 
-ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'lidar_synth[ray]'")
+ray = pytest.importorskip(
+    "ray", reason="ray is not installed: pip install 'lidar_synth[ray]'"
+)
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
@@ -78,7 +80,8 @@ def becomes_true(condition: Callable[[], bool], seconds: float = 200) -> bool:
 def writing(plan: BakePlan) -> set[int]:
     """Ids of the processes that are writing a shard, from the temporary files in the folder."""
     return {
-        int(part.name.removesuffix(".part").rpartition("-")[2]) for part in plan.out.glob(".*.part")
+        int(part.name.removesuffix(".part").rpartition("-")[2])
+        for part in plan.out.glob(".*.part")
     }
 
 
@@ -87,7 +90,9 @@ def test_the_engine_starts_and_stops_its_own_cluster(
 ) -> None:
     """Without an address the engine starts Ray and stops it; without a running cluster 'auto' is
     refused."""
-    with pytest.raises(ConfigError, match="Ray address 'auto' .*; expected a running cluster"):
+    with pytest.raises(
+        ConfigError, match="Ray address 'auto' .*; expected a running cluster"
+    ):
         bake(plan, "ray", Resources(1, "auto"), progress=False)
     assert bake(plan, "ray", Resources(2), progress=False) is not None
     assert not ray.is_initialized()
@@ -97,7 +102,9 @@ def test_the_engine_starts_and_stops_its_own_cluster(
 
 
 @pytest.mark.timeout(900)
-def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_path: Path) -> None:
+def test_a_bake_survives_lost_actors_and_nodes(
+    cluster: Any, model: Path, tmp_path: Path
+) -> None:
     """A second node joins; an actor of the first node and later the second node are killed while
     they write a shard."""
     single, plan = (
@@ -134,7 +141,12 @@ def test_a_bake_survives_lost_actors_and_nodes(cluster: Any, model: Path, tmp_pa
             upsets.append("a node left")
 
     ENGINES["ray"](plan, range(30), Resources(2), progress)
-    assert upsets == ["a node joined", "an actor was killed", "another started", "a node left"]
+    assert upsets == [
+        "a node joined",
+        "an actor was killed",
+        "another started",
+        "a node left",
+    ]
     assert len(first) == 1 and len(second) == 1 and sum(reported) == 1200
     assert finish(plan) is not None
     assert files(plan.out) == files(single.out)
@@ -162,7 +174,8 @@ def test_actors_that_never_finish_a_shard_stop_the_bake(
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     prepare(plan)
     with pytest.raises(
-        FileError, match=r"(?s)2 Ray actors were lost without a finished.*finished shards are kept"
+        FileError,
+        match=r"(?s)2 Ray actors were lost without a finished.*finished shards are kept",
     ):
         ENGINES["ray"](plan, range(4), Resources(1), lambda scans: None)
     assert not list(plan.out.glob("*.h5"))

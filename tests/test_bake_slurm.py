@@ -78,7 +78,8 @@ def test_a_failed_job_is_reported(plan: BakePlan) -> None:
     prepare(plan)
     (plan.out / SETTINGS).unlink()
     with pytest.raises(
-        FileError, match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json"
+        FileError,
+        match=r"(?s)Slurm job \d+.* failed .*has vanished or lost its .bake.json",
     ):
         ENGINES["slurm"](plan, range(4), Resources(2, slurm=LOCAL), lambda scans: None)
     assert len(list((plan.out / LOGS).glob("*.out"))) == 2  # kept for diagnosis
@@ -91,7 +92,8 @@ def test_a_missing_slurm_and_unknown_options_are_refused(
 ) -> None:
     monkeypatch.setenv("PATH", os.devnull)
     with pytest.raises(
-        ConfigError, match=r'Could not detect "srun".*expected a machine that submits to Slurm'
+        ConfigError,
+        match=r'Could not detect "srun".*expected a machine that submits to Slurm',
     ):
         bake(plan, "slurm", progress=False)
     with pytest.raises(ConfigError, match=r"(?s)'speed'.*options of submitit"):

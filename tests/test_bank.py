@@ -13,12 +13,28 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from banks import SENSOR, edit_index, numbers, some_facts, some_image, spoiled, write_bank
+from banks import (
+    SENSOR,
+    edit_index,
+    numbers,
+    some_facts,
+    some_image,
+    spoiled,
+    write_bank,
+)
 from torch.utils.data import DataLoader
 
 import lidar_synth.bank.reader as reader
 from lidar_synth.bake.folder import write_bank_files
-from lidar_synth.bank import FORMAT, Bank, Encoding, Entry, Index, ShardReader, ShardWriter
+from lidar_synth.bank import (
+    FORMAT,
+    Bank,
+    Encoding,
+    Entry,
+    Index,
+    ShardReader,
+    ShardWriter,
+)
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.files.disk import sha256
 from lidar_synth.formats import WRITERS, BankScans, open_scans
@@ -43,7 +59,9 @@ def test_a_chunk_that_skipped_a_filter_is_refused(root: Path) -> None:
     with h5py.File(path, "r+") as file:
         chunk = bytes(file["range"].id.read_direct_chunk((1, 0, 0))[1])
         file["range"].id.write_direct_chunk((1, 0, 0), chunk + b"0", filter_mask=1)
-    with pytest.raises(DataError, match=r"scan 1 cannot be read \(filters 1 were not applied\)"):
+    with pytest.raises(
+        DataError, match=r"scan 1 cannot be read \(filters 1 were not applied\)"
+    ):
         ShardReader(path, str(path)).read(1)
 
 
@@ -54,17 +72,32 @@ def test_plain_hdf5_reads_a_shard(tmp_path: Path) -> None:
         assert file.attrs["format"].decode() == FORMAT
         assert file.attrs["scale"] == 80 / 65535
         assert json.loads(file.attrs["sensor"]) == SENSOR.to_dict()
-        assert (file.attrs["seed"], file.attrs["first"], file.attrs["scans"]) == (5, 0, 3)
-        assert file["index"][:].tolist() == [0, 1, 2] and file["seed"][:].tolist() == [5, 5, 5]
+        assert (file.attrs["seed"], file.attrs["first"], file.attrs["scans"]) == (
+            5,
+            0,
+            3,
+        )
+        assert file["index"][:].tolist() == [0, 1, 2] and file["seed"][:].tolist() == [
+            5,
+            5,
+            5,
+        ]
         for name in ("range", *ALL):
             dataset = file[name]
-            assert (dataset.chunks, dataset.compression, dataset.shuffle, dataset.fletcher32) == (
+            assert (
+                dataset.chunks,
+                dataset.compression,
+                dataset.shuffle,
+                dataset.fletcher32,
+            ) == (
                 (1, 8, 32),
                 "gzip",
                 True,
                 True,
             )
-            expected = np.stack([Encoding(SENSOR, ALL).encode(image)[name] for image in images])
+            expected = np.stack(
+                [Encoding(SENSOR, ALL).encode(image)[name] for image in images]
+            )
             assert np.array_equal(dataset[:], expected)
 
 
@@ -83,11 +116,15 @@ def test_the_number_of_threads_changes_no_byte(tmp_path: Path, threads: int) -> 
     with ShardWriter(tmp_path / entry.file, facts, entry, threads=threads) as writer:
         for i in range(40):
             writer.append(some_image(i))
-    [path] = write_bank(tmp_path / "one", [some_image(i) for i in range(40)], shard_size=40)
+    [path] = write_bank(
+        tmp_path / "one", [some_image(i) for i in range(40)], shard_size=40
+    )
     assert (tmp_path / entry.file).read_bytes() == path.read_bytes()
 
 
-def test_a_shard_with_too_few_scans_or_a_bad_one_is_not_left_behind(tmp_path: Path) -> None:
+def test_a_shard_with_too_few_scans_or_a_bad_one_is_not_left_behind(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "shard-00000.h5"
     entry = Entry("shard-00000.h5", 5, 0, 2)
     with (
@@ -125,9 +162,16 @@ def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
         assert np.array_equal(image.range, expected.range) and np.array_equal(
             image.label, expected.label
         )
-        assert (scan.id, scan.domain, scan.sensor) == (f"small/5/{i}", SYNTHETIC, SENSOR)
+        assert (scan.id, scan.domain, scan.sensor) == (
+            f"small/5/{i}",
+            SYNTHETIC,
+            SENSOR,
+        )
         assert np.array_equal(scan.points, unproject(expected).points)
-        assert np.array_equal(scan.label, expected.label[expected.mask]) and scan.confidence is None
+        assert (
+            np.array_equal(scan.label, expected.label[expected.mask])
+            and scan.confidence is None
+        )
     assert bank[-1].id == "small/5/4" and len(list(iter(bank))) == 5
     assert list(bank.ids) == [f"small/5/{i}" for i in range(5)] and bank.ids[1:3] == [
         "small/5/1",
@@ -138,7 +182,10 @@ def test_a_bank_returns_the_scans_that_were_written(root: Path) -> None:
             bank[wrong]
         with pytest.raises(IndexError):
             bank.image(wrong)
-    assert np.array_equal(bank.image(-1).range, bank.image(4).range) and bank.ids[-1] == bank.ids[4]
+    assert (
+        np.array_equal(bank.image(-1).range, bank.image(4).range)
+        and bank.ids[-1] == bank.ids[4]
+    )
 
 
 def test_few_files_are_open_and_each_shard_is_parsed_once(
@@ -166,7 +213,9 @@ def test_memory_for_the_places_of_scans_is_bounded(
 
 
 @pytest.mark.parametrize("change", ["other scans", "damage", "shorter", "gone"])
-def test_a_shard_that_changed_while_it_was_closed_is_checked_again(root: Path, change: str) -> None:
+def test_a_shard_that_changed_while_it_was_closed_is_checked_again(
+    root: Path, change: str
+) -> None:
     bank = Bank(root)
     content = bank[0].points
     path = root / bank.index.shards[0].file
@@ -184,7 +233,9 @@ def test_a_shard_that_changed_while_it_was_closed_is_checked_again(root: Path, c
         path.write_bytes(path.read_bytes()[:-100])
     else:
         path.unlink()
-    with pytest.raises(FileError if change == "gone" else DataError, match="shard-00000.h5"):
+    with pytest.raises(
+        FileError if change == "gone" else DataError, match="shard-00000.h5"
+    ):
         bank[0]
 
 
@@ -232,7 +283,9 @@ def test_conditions_are_stored_by_name(tmp_path: Path) -> None:
         ShardReader(path, str(path)).read(1)
 
 
-def test_a_bank_can_be_opened_and_converted_like_any_source(root: Path, tmp_path: Path) -> None:
+def test_a_bank_can_be_opened_and_converted_like_any_source(
+    root: Path, tmp_path: Path
+) -> None:
     scans = open_scans(root)
     assert type(scans) is BankScans and scans.ids[4] == "small/5/4"
     with pytest.raises(ConfigError, match="sensor os1_128 for .*; expected 'small'"):
@@ -259,16 +312,20 @@ def test_a_paged_bank_reads_over_a_network(tmp_path: Path) -> None:
         Bank("nosuch://bank")
 
 
-def test_missing_libraries_are_reported(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries_are_reported(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(
-        LibraryError, match=r"s3://bucket/bank/index.json cannot be opened .*fsspec.*pip install"
+        LibraryError,
+        match=r"s3://bucket/bank/index.json cannot be opened .*fsspec.*pip install",
     ):
         Bank("s3://bucket/bank")
     facts = some_facts(compression="blosc2")
     with pytest.raises(
-        LibraryError, match=r"hdf5plugin cannot be imported .*pip install 'lidar_synth\[blosc2\]'"
+        LibraryError,
+        match=r"hdf5plugin cannot be imported .*pip install 'lidar_synth\[blosc2\]'",
     ):
         ShardWriter(root / "new.h5", facts, Entry("new.h5", 0, 0, 1))
 
@@ -279,7 +336,8 @@ def test_blosc2_banks_are_read(tmp_path: Path) -> None:
     encoding = Encoding(SENSOR, ("reflectance", "label"))
     for i in range(3):
         assert np.array_equal(
-            Bank(tmp_path).image(i).range, encoding.decode(encoding.encode(some_image(i))).range
+            Bank(tmp_path).image(i).range,
+            encoding.decode(encoding.encode(some_image(i))).range,
         )
 
 
@@ -306,8 +364,12 @@ def test_card_and_croissant(root: Path) -> None:
         assert text in card
     described = json.loads((root / "croissant.json").read_text())
     assert described["conformsTo"] == "http://mlcommons.org/croissant/1.0"
-    files = {f["name"]: (f["sha256"], f["contentSize"]) for f in described["distribution"]}
-    assert files == {e.file: (e.sha256, f"{e.bytes} B") for e in Bank(root).index.shards}
+    files = {
+        f["name"]: (f["sha256"], f["contentSize"]) for f in described["distribution"]
+    }
+    assert files == {
+        e.file: (e.sha256, f"{e.bytes} B") for e in Bank(root).index.shards
+    }
 
 
 def test_the_golden_bank_is_still_read() -> None:

@@ -68,11 +68,15 @@ def test_a_bank_holds_what_its_transfer_gives(bank: Bank, tmp_path: Path) -> Non
             image.label, expected.label
         )
     assert verify(tmp_path, progress=False) == []
-    with pytest.raises(DataError, match="turned into scans of 'theirs'.*bank as-sensor again"):
+    with pytest.raises(
+        DataError, match="turned into scans of 'theirs'.*bank as-sensor again"
+    ):
         job_of(turned.facts)
 
 
-def test_an_interrupted_run_resumes_and_damage_is_made_again(bank: Bank, tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_and_damage_is_made_again(
+    bank: Bank, tmp_path: Path
+) -> None:
     whole = tmp_path / "whole"
     out = tmp_path / "out"
     turn_bank(bank, whole, TRANSFER, progress=False)
@@ -84,7 +88,11 @@ def test_an_interrupted_run_resumes_and_damage_is_made_again(bank: Bank, tmp_pat
     assert not (out / INDEX).exists() and not list(out.glob(".*.part"))
     turn_bank(bank, out, TRANSFER, progress=False)
     assert first.stat().st_ino == written
-    shards = {name: data for name, data in contents(whole).items() if name.endswith((".h5", INDEX))}
+    shards = {
+        name: data
+        for name, data in contents(whole).items()
+        if name.endswith((".h5", INDEX))
+    }
     first.write_bytes(first.read_bytes()[:-50])
     turn_bank(bank, out, TRANSFER, progress=False)
     assert {name: contents(out)[name] for name in shards if name != INDEX} == {
@@ -97,10 +105,14 @@ def test_an_interrupted_run_resumes_and_damage_is_made_again(bank: Bank, tmp_pat
         turn_bank(bank, Path(bank.root), TRANSFER, progress=False)
 
 
-def test_settings_name_sensor_mount_and_scans_to_match(tmp_path: Path, bank: Bank) -> None:
+def test_settings_name_sensor_mount_and_scans_to_match(
+    tmp_path: Path, bank: Bank
+) -> None:
     writer = WRITERS["npz"](tmp_path / "real")
     bright = record(THEIRS)
-    writer.write(replace(bright, reflectance=np.clip(bright.reflectance * 2, 0, 1), id="0"), 0)
+    writer.write(
+        replace(bright, reflectance=np.clip(bright.reflectance * 2, 0, 1), id="0"), 0
+    )
     writer.finish()
     values = THEIRS.to_dict()
     (tmp_path / "theirs.yaml").write_text(yaml.safe_dump({values.pop("name"): values}))
@@ -111,9 +123,14 @@ def test_settings_name_sensor_mount_and_scans_to_match(tmp_path: Path, bank: Ban
     }
     matched = read_transfer(given, bank)
     assert matched.mount == Mount(0.1) and matched.target == THEIRS
-    assert abs(np.median(matched(bank[0]).reflectance) - np.median(bright.reflectance * 2)) < 0.05
+    assert (
+        abs(np.median(matched(bank[0]).reflectance) - np.median(bright.reflectance * 2))
+        < 0.05
+    )
     for wrong in ({"mount": [0, 0]}, given | {"mount": "high"}, given | {"noise": 1}):
-        with pytest.raises(ConfigError, match="as_sensor: .*expected sensor: a preset's name"):
+        with pytest.raises(
+            ConfigError, match="as_sensor: .*expected sensor: a preset's name"
+        ):
             read_transfer(wrong, bank)
     plain = mix_for_trainer(
         3,
@@ -121,7 +138,9 @@ def test_settings_name_sensor_mount_and_scans_to_match(tmp_path: Path, bank: Ban
         lambda scan, rng: scan,
     )
     made = [
-        sample for sample in map(plain.__getitem__, range(len(plain))) if isinstance(sample, Scan)
+        sample
+        for sample in map(plain.__getitem__, range(len(plain)))
+        if isinstance(sample, Scan)
     ]
     assert made and all(scan.sensor.name == "os1_128" for scan in made)
 
@@ -134,4 +153,7 @@ def test_what_scans_of_a_sensor_will_lack_is_said_once(
         transfer(bank[0])
         transfer(bank[1])
     [message] = [record.getMessage() for record in caplog.records]
-    assert "as 'wide': 6 of its 16 lasers look outside" in message and "like=FOLDER" in message
+    assert (
+        "as 'wide': 6 of its 16 lasers look outside" in message
+        and "like=FOLDER" in message
+    )

@@ -47,7 +47,10 @@ def test_no_flipped_bit_gives_a_wrong_scan(root: Path) -> None:
             assert "shard-00001.h5" in str(error), error
             refused += 1
         # As verify does.
-        assert sha256(path) != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256
+        assert (
+            sha256(path)
+            != Index.from_json((root / INDEX).read_bytes(), "").shards[1].sha256
+        )
     assert refused > 90  # half of such a small shard is unused space for metadata
 
 
@@ -59,21 +62,27 @@ def test_a_truncated_shard_is_found(root: Path) -> None:
     for length in rng.integers(0, len(content), 60).tolist():
         path.write_bytes(content[:length])
         with pytest.raises(
-            DataError, match=rf"shard-00001.h5 is {length} bytes long; expected {len(content)}"
+            DataError,
+            match=rf"shard-00001.h5 is {length} bytes long; expected {len(content)}",
         ):
             Bank(root)
-        with pytest.raises(DataError, match="shard-00001.h5"):  # and without knowing the size
+        with pytest.raises(
+            DataError, match="shard-00001.h5"
+        ):  # and without knowing the size
             shard = ShardReader(path, str(path), index.sources[0], index.shards[1])
             shard.read(0), shard.read(1)
 
 
 def test_a_missing_shard_and_a_missing_index_are_reported(root: Path) -> None:
     (root / "shard-00002.h5").unlink()
-    with pytest.raises(FileError, match=r"shard shard-00002.h5 is missing .*lidar-synth repair"):
+    with pytest.raises(
+        FileError, match=r"shard shard-00002.h5 is missing .*lidar-synth repair"
+    ):
         Bank(root)
     (root / INDEX).unlink()
     with pytest.raises(
-        FileError, match=r"holds no bank: index.json cannot be read .*Run an interrupted bake again"
+        FileError,
+        match=r"holds no bank: index.json cannot be read .*Run an interrupted bake again",
     ):
         open_scans(root)
 
@@ -88,14 +97,20 @@ def with_shard(root: Path, path: Path) -> Bank:
     return Bank(root)
 
 
-def test_files_that_do_not_belong_to_the_bank_are_refused(root: Path, tmp_path: Path) -> None:
+def test_files_that_do_not_belong_to_the_bank_are_refused(
+    root: Path, tmp_path: Path
+) -> None:
     foreign = tmp_path / "foreign.h5"
     with h5py.File(foreign, "w") as file:
         file["range"] = np.zeros((2, 8, 32), np.uint16)
-    with pytest.raises(DataError, match=r"shard-00000.h5 is not part of a bank \(format ''\)"):
+    with pytest.raises(
+        DataError, match=r"shard-00000.h5 is not part of a bank \(format ''\)"
+    ):
         with_shard(root, foreign)[0]
     foreign.write_text("no HDF5 at all, but as long as two scans")
-    with pytest.raises(DataError, match="shard-00000.h5 is truncated, damaged or not an HDF5 file"):
+    with pytest.raises(
+        DataError, match="shard-00000.h5 is truncated, damaged or not an HDF5 file"
+    ):
         with_shard(root, foreign)[0]
     with pytest.raises(
         DataError,
@@ -125,7 +140,9 @@ def test_scale_and_sensor_must_agree(root: Path) -> None:
     path = root / "shard-00000.h5"
     with h5py.File(path, "r+") as file:
         file.attrs["scale"] = 0.002
-    with pytest.raises(DataError, match=r"scale 0.002; expected 0.00122.* for sensor 'small'"):
+    with pytest.raises(
+        DataError, match=r"scale 0.002; expected 0.00122.* for sensor 'small'"
+    ):
         with_shard(root, path)[0]
 
 
@@ -140,7 +157,9 @@ def test_another_version_is_refused(root: Path) -> None:
     (root / INDEX).write_text(text)
     with h5py.File(root / "shard-00000.h5", "r+") as file:
         file.attrs["format"] = np.bytes_(b"lidar-synth-bank/3")
-    with pytest.raises(DataError, match=r"shard-00000.h5 is of format 'lidar-synth-bank/3'"):
+    with pytest.raises(
+        DataError, match=r"shard-00000.h5 is of format 'lidar-synth-bank/3'"
+    ):
         with_shard(root, root / "shard-00000.h5")[0]
 
 
@@ -153,7 +172,9 @@ def test_another_version_is_refused(root: Path) -> None:
         ('"format"', '"gormat"', "is not part of a bank"),
     ],
 )
-def test_a_damaged_index_is_refused(root: Path, old: str, new: str, message: str) -> None:
+def test_a_damaged_index_is_refused(
+    root: Path, old: str, new: str, message: str
+) -> None:
     (root / INDEX).write_text((root / INDEX).read_text().replace(old, new, 1))
     with pytest.raises(DataError, match=f"index.json {message}"):
         Bank(root)
@@ -161,18 +182,27 @@ def test_a_damaged_index_is_refused(root: Path, old: str, new: str, message: str
 
 def test_an_index_with_invalid_shards_is_refused(root: Path) -> None:
     [first, *_] = Index.from_json((root / INDEX).read_bytes(), INDEX).shards
-    for change in ({"file": "../other.h5"}, {"file": ".hidden.h5"}, {"source": 1}, {"scans": 0}):
+    for change in (
+        {"file": "../other.h5"},
+        {"file": ".hidden.h5"},
+        {"source": 1},
+        {"scans": 0},
+    ):
         with pytest.raises(DataError, match="a bank"):
             edit_index(root, shards=(replace(first, **change),))
     with pytest.raises(DataError, match="at least one, each only once"):
         edit_index(root, shards=(first, first))
 
 
-@pytest.mark.parametrize(("name", "code"), [("label", 127), ("label", 19), ("confidence", 16)])
+@pytest.mark.parametrize(
+    ("name", "code"), [("label", 127), ("label", 19), ("confidence", 16)]
+)
 def test_invalid_codes_are_refused_despite_a_matching_checksum(
     tmp_path: Path, name: str, code: int
 ) -> None:
-    [path] = write_bank(tmp_path, [some_image()], fields=("reflectance", "label", "confidence"))
+    [path] = write_bank(
+        tmp_path, [some_image()], fields=("reflectance", "label", "confidence")
+    )
     with h5py.File(path, "r+") as file:
         values = file[name][0]
         values[2, 3] = code

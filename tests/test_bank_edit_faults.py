@@ -21,8 +21,12 @@ from lidar_synth.files.lock import lock_shared
 CALLS: dict[str, Callable[[Bank, Path], object]] = {
     "merge": lambda bank, out: merge([bank], out / "one", progress=False),
     "head": lambda bank, out: head(bank, 5, out / "one", progress=False),
-    "split": lambda bank, out: split(bank, {out / "one": 0.5, out / "two": 0.5}, progress=False),
-    "drop": lambda bank, out: drop(bank, [1, 4], "by hand", out / "one", progress=False),
+    "split": lambda bank, out: split(
+        bank, {out / "one": 0.5, out / "two": 0.5}, progress=False
+    ),
+    "drop": lambda bank, out: drop(
+        bank, [1, 4], "by hand", out / "one", progress=False
+    ),
 }
 
 
@@ -37,7 +41,11 @@ class Killed(BaseException):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
 
 
 @pytest.mark.parametrize("call", CALLS)
@@ -69,13 +77,17 @@ def test_a_killed_call_is_completed_by_the_same_call(
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_the_folder_of_another_call_is_refused(call: str, bank: Bank, tmp_path: Path) -> None:
+def test_the_folder_of_another_call_is_refused(
+    call: str, bank: Bank, tmp_path: Path
+) -> None:
     head(bank, 3, tmp_path / "out" / "one", progress=False)
     before = contents(tmp_path / "out")
     with pytest.raises(ConfigError, match="was filled with"):
         CALLS[call](bank, tmp_path / "out")
     with pytest.raises(ConfigError, match="holds another bank"):
-        CALLS[call](bank, shutil.copytree(tmp_path / "bank", tmp_path / "other" / "one").parent)
+        CALLS[call](
+            bank, shutil.copytree(tmp_path / "bank", tmp_path / "other" / "one").parent
+        )
     assert contents(tmp_path / "out") == before
 
 
@@ -113,5 +125,7 @@ def test_commands_that_are_killed_resume_to_the_same_bytes() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = re.findall(r"\| ([a-z, -]+) \| 2 \|(?: \d+ \|){3}", done.stdout + done.stderr)
+    rows = re.findall(
+        r"\| ([a-z, -]+) \| 2 \|(?: \d+ \|){3}", done.stdout + done.stderr
+    )
     assert rows == some

@@ -42,7 +42,10 @@ def test_decoded_images_differ_by_at_most_half_a_step(sensor: Sensor) -> None:
     assert np.array_equal(project(unproject(decoded)).mask, image.mask)
     assert np.array_equal(decoded.label, image.label)
     for name, levels in LEVELS.items():
-        assert np.abs(decoded.channels[name] - image.channels[name]).max() <= 0.5001 / levels
+        assert (
+            np.abs(decoded.channels[name] - image.channels[name]).max()
+            <= 0.5001 / levels
+        )
 
 
 @settings(max_examples=50)
@@ -84,18 +87,24 @@ def test_codes_and_checksums_match_the_format() -> None:
         "label": [[255, 0], [18, 7]],
         "confidence": [[0, 15], [8, 2]],
     }
-    assert Encoding(sensor).metres(np.array([0, 1, 1000], np.uint16)).tolist() == pytest.approx(
-        [0, 0.001, 1.0]
+    assert Encoding(sensor).metres(
+        np.array([0, 1, 1000], np.uint16)
+    ).tolist() == pytest.approx([0, 0.001, 1.0])
+    content = (
+        "07000000000000000000000000010000",
+        "000001000200ffff00ff8040ff001207000f0802",
     )
-    content = "07000000000000000000000000010000", "000001000200ffff00ff8040ff001207000f0802"
-    expected = zlib.crc32(bytes.fromhex(content[0]) + b"seq/0001" + bytes.fromhex(content[1]))
+    expected = zlib.crc32(
+        bytes.fromhex(content[0]) + b"seq/0001" + bytes.fromhex(content[1])
+    )
     assert checksum(7, 2**40, arrays, b"seq/0001") == expected
 
 
 def test_encoding_into_existing_arrays() -> None:
     encoding = Encoding(SENSOR, ("label",))
     slots = {
-        name: np.zeros((3, *shape), dtype) for name, (shape, dtype) in encoding.arrays().items()
+        name: np.zeros((3, *shape), dtype)
+        for name, (shape, dtype) in encoding.arrays().items()
     }
     encoding.encode(some_image(), {name: values[1] for name, values in slots.items()})
     for name, values in encoding.encode(some_image()).items():
@@ -114,7 +123,10 @@ def test_encoding_into_existing_arrays() -> None:
         (spoiled("range", -1), "ranges from -1"),
         (spoiled("range", np.nan), "ranges from"),
         (spoiled("range", np.inf), "ranges from .* to inf"),
-        (spoiled("reflectance", 1.01), r"reflectance from 0 to 1.01; expected values in \[0, 1\]"),
+        (
+            spoiled("reflectance", 1.01),
+            r"reflectance from 0 to 1.01; expected values in \[0, 1\]",
+        ),
         (spoiled("reflectance", np.nan), "reflectance from"),
         (spoiled("confidence", -0.1), "confidence from -0.1"),
         (spoiled("label", 19), r"train ids \[19\]; expected 0..18, or 255"),
@@ -123,7 +135,9 @@ def test_encoding_into_existing_arrays() -> None:
             r"without \['reflectance', 'label', 'confidence'\]",
         ),
         (
-            some_image(0, Sensor("other", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)),
+            some_image(
+                0, Sensor("other", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
+            ),
             r"of \(8, 64\); expected",
         ),
     ],
@@ -135,7 +149,8 @@ def test_values_without_a_code_are_refused(image: RangeImage, message: str) -> N
 
 def test_unknown_fields_are_refused() -> None:
     with pytest.raises(
-        ConfigError, match=r"fields \['ring'\] of a bank; expected some of range, reflectance"
+        ConfigError,
+        match=r"fields \['ring'\] of a bank; expected some of range, reflectance",
     ):
         Encoding(SENSOR, ("label", "ring"))
 
@@ -147,7 +162,9 @@ def test_unknown_fields_are_refused() -> None:
 @pytest.mark.parametrize("fill", [None, 0, 255])
 def test_fletcher32_matches_hdf5(size: int, fill: int | None) -> None:
     data = (
-        np.random.default_rng(size).integers(0, 256, size) if fill is None else np.full(size, fill)
+        np.random.default_rng(size).integers(0, 256, size)
+        if fill is None
+        else np.full(size, fill)
     )
     with h5py.File("any", "w", driver="core", backing_store=False) as file:
         dataset = file.create_dataset(

@@ -90,7 +90,10 @@ def stored_outside(file: h5py.File, beside: Path) -> None:
     values = outside(file, beside, "crc")
     del file["crc"]
     file.create_dataset(
-        "crc", values.shape, "<u4", external=[(str(beside / "other.raw"), 0, values.nbytes)]
+        "crc",
+        values.shape,
+        "<u4",
+        external=[(str(beside / "other.raw"), 0, values.nbytes)],
     )
 
 
@@ -130,7 +133,9 @@ def huge_grid(file: h5py.File, _: Path) -> None:
             "compression_opts": 1,
             "fletcher32": True,
         }
-        dataset = file.create_dataset(name, (2, *shape[1:]), dtype, chunks=shape, **options)
+        dataset = file.create_dataset(
+            name, (2, *shape[1:]), dtype, chunks=shape, **options
+        )
         for position in range(2):
             dataset.id.write_direct_chunk((position, 0, 0), b"a chunk")
 
@@ -158,21 +163,29 @@ HARMFUL: dict[str, Change] = {
     ),
     "condition of any length": replaced(
         "condition",
-        lambda f, _: f.create_dataset("condition", data=["a", "b"], dtype=h5py.string_dtype()),
+        lambda f, _: f.create_dataset(
+            "condition", data=["a", "b"], dtype=h5py.string_dtype()
+        ),
     ),
     "crc as references": replaced(
         "crc", lambda f, _: f.create_dataset("crc", (2,), h5py.ref_dtype)
     ),
-    "crc as a compound": replaced("crc", lambda f, _: f.create_dataset("crc", (2,), "u4,u4")),
+    "crc as a compound": replaced(
+        "crc", lambda f, _: f.create_dataset("crc", (2,), "u4,u4")
+    ),
     "crc as a group": replaced("crc", lambda f, _: f.create_group("crc")),
     "another dataset": lambda f, _: f.create_dataset("other", (2,), "u4") and None,
     "external link": linked,
     "external storage": stored_outside,
     "virtual dataset": virtual,
     "soft link": soft_linked,
-    "other chunks": repacked(chunks=(2, 8, 32), shuffle=True, compression="gzip", fletcher32=True),
+    "other chunks": repacked(
+        chunks=(2, 8, 32), shuffle=True, compression="gzip", fletcher32=True
+    ),
     "no chunks": repacked(),
-    "another filter": repacked(chunks=(1, 8, 32), compression="lzf", shuffle=True, fletcher32=True),
+    "another filter": repacked(
+        chunks=(1, 8, 32), compression="lzf", shuffle=True, fletcher32=True
+    ),
     "no checksum": repacked(chunks=(1, 8, 32), compression="gzip", shuffle=True),
     "a grid of 10^9 cells": huge_grid,
     "a long attribute": attribute("other", np.zeros(1000)),
@@ -190,7 +203,9 @@ HARMFUL: dict[str, Change] = {
     not Path("/proc/self/statm").exists(), reason="needs Linux to measure the memory"
 )
 def test_malicious_shards_allocate_no_memory(tmp_path: Path) -> None:
-    made = [harmful(tmp_path / str(number), what) for number, what in enumerate(HARMFUL)]
+    made = [
+        harmful(tmp_path / str(number), what) for number, what in enumerate(HARMFUL)
+    ]
     assert all(path.stat().st_size < 100_000 for _, path in made)
     given = [made[0][0], str(LIMIT), *(path for _, path in made)]
     done = subprocess.run(
@@ -208,14 +223,18 @@ def test_a_malicious_shard_is_refused(tmp_path: Path, what: str) -> None:
     good, path = harmful(tmp_path, what)
     with ShardReader(good, "good") as shard:
         assert shard.read(1)["range"].any()
-    with pytest.raises(DataError, match="bad.h5"), ShardReader(path, str(path)) as shard:
+    with (
+        pytest.raises(DataError, match="bad.h5"),
+        ShardReader(path, str(path)) as shard,
+    ):
         shard.read(0)
 
 
 def harmful(folder: Path, what: str) -> tuple[Path, Path]:
     """A valid shard and a malicious one."""
     good, path = (
-        write_bank(folder / name, [some_image(i) for i in range(2)])[0] for name in ("good", "bad")
+        write_bank(folder / name, [some_image(i) for i in range(2)])[0]
+        for name in ("good", "bad")
     )
     path = path.rename(path.with_name("bad.h5"))
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
@@ -253,7 +272,11 @@ def places(values: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The path of every value in a JSON document."""
     found = [path] if path else []
     for key, child in values.items() if isinstance(values, dict) else enumerate(values):
-        found += places(child, (*path, key)) if isinstance(child, dict | list) else [(*path, key)]
+        found += (
+            places(child, (*path, key))
+            if isinstance(child, dict | list)
+            else [(*path, key)]
+        )
     return found
 
 
@@ -278,24 +301,31 @@ def use(root: Path) -> None:
 def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i) for i in range(3)])
     text = (tmp_path / INDEX).read_text()
-    values = {key: value for key, value in json.loads(text).items() if key != "checksum"}
+    values = {
+        key: value for key, value in json.loads(text).items() if key != "checksum"
+    }
     values["curation"] = ["nothing"]
     refused = 0
     for path in places(values):
         for wrong in WRONG:
             edited = with_value(values, path, wrong)
-            (tmp_path / INDEX).write_text(json.dumps(edited | {"checksum": _sum(edited)}))
+            (tmp_path / INDEX).write_text(
+                json.dumps(edited | {"checksum": _sum(edited)})
+            )
             try:
                 use(tmp_path)
             except LidarSynthError:
                 refused += 1
             except Exception as error:
-                pytest.fail(f"{path} = {str(wrong)[:40]!r}: {type(error).__name__}: {error}")
+                pytest.fail(
+                    f"{path} = {str(wrong)[:40]!r}: {type(error).__name__}: {error}"
+                )
     assert refused > 0.8 * len(places(values)) * len(WRONG)
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 10**6, '{"a":' * 10**5, "1" * 5000, "null", "[]", "1e400", "\ufeff{}", ""]
+    "text",
+    ["[" * 10**6, '{"a":' * 10**5, "1" * 5000, "null", "[]", "1e400", "\ufeff{}", ""],
 )
 def test_invalid_index_texts_are_refused(text: str) -> None:
     with pytest.raises(LidarSynthError, match="index"):
@@ -308,7 +338,9 @@ def test_a_deeply_nested_index_is_refused(tmp_path: Path) -> None:
     values = json.loads((tmp_path / INDEX).read_text())
     del values["checksum"]
     for depth in (10, 40, 300, 800):
-        values["sources"][0]["settings"] = json.loads('{"a":' * depth + "1" + "}" * depth)
+        values["sources"][0]["settings"] = json.loads(
+            '{"a":' * depth + "1" + "}" * depth
+        )
         (tmp_path / INDEX).write_text(json.dumps(values | {"checksum": _sum(values)}))
         with pytest.raises(LidarSynthError):  # the shard says something else
             use(tmp_path)
@@ -320,9 +352,24 @@ def test_a_bank_of_this_sensor_is_read(tmp_path: Path) -> None:
 
 
 def test_cards_show_markup_as_text(tmp_path: Path) -> None:
-    write_bank(tmp_path / "bank", [some_image()], provenance={"licence": MARKUP, "data": MARKUP})
+    write_bank(
+        tmp_path / "bank",
+        [some_image()],
+        provenance={"licence": MARKUP, "data": MARKUP},
+    )
     card = dataset_card(MARKUP, Bank(tmp_path / "bank").index)
-    assert tags_of(card) == {"h1", "p", "table", "thead", "tbody", "tr", "th", "td", "pre", "code"}
+    assert tags_of(card) == {
+        "h1",
+        "p",
+        "table",
+        "thead",
+        "tbody",
+        "tr",
+        "th",
+        "td",
+        "pre",
+        "code",
+    }
     assert all(
         line.count("|") - line.count("\\|") == 3
         for line in card.splitlines()

@@ -49,7 +49,9 @@ def test_random_access_transfers_little_more_than_the_scans(
         "layout": "plain" if layout == "before" else layout,
         "provenance": {"recipe": "x" * 20_000},
     }
-    write_bank(tmp_path / "bank", [images[i % 6] for i in range(60)], shard_size=20, **facts)
+    write_bank(
+        tmp_path / "bank", [images[i % 6] for i in range(60)], shard_size=20, **facts
+    )
     here = Bank(tmp_path / "bank")
     chosen = np.random.default_rng(0).permutation(60)[:30].tolist()
     with serve(tmp_path) as served:
@@ -58,7 +60,9 @@ def test_random_access_transfers_little_more_than_the_scans(
         for number in chosen:
             before = len(served.requests)
             assert np.array_equal(bank.image(number).range, here.image(number).range)
-            scans += sum(map(len, here.shard(number // 20).chunks(number % 20)[0].values()))
+            scans += sum(
+                map(len, here.shard(number // 20).chunks(number % 20)[0].values())
+            )
             opened = len(served.requests) - before
             assert opened <= (7 if layout == "before" else 4)
         assert served.bytes <= 1.3 * scans
@@ -80,27 +84,36 @@ def test_a_new_shard_takes_two_requests(tmp_path: Path) -> None:
         ]
 
 
-def test_a_url_gives_the_same_scans_as_the_folder(served: Served, tmp_path: Path) -> None:
+def test_a_url_gives_the_same_scans_as_the_folder(
+    served: Served, tmp_path: Path
+) -> None:
     near = open_scans(tmp_path / "bank")
     far = open_scans(f"{served.url}/bank")
     for a, b in zip(near, far, strict=True):
         assert (
-            a.id == b.id and np.array_equal(a.points, b.points) and np.array_equal(a.label, b.label)
+            a.id == b.id
+            and np.array_equal(a.points, b.points)
+            and np.array_equal(a.label, b.label)
         )
 
 
 @pytest.mark.slow
 def test_forked_workers_read_from_a_url(served: Served) -> None:
     bank = Bank(f"{served.url}/bank")
-    expected = sum(len(scan) for scan in bank)  # the parent process has open connections
-    loader = DataLoader(bank, batch_size=None, num_workers=2, multiprocessing_context="fork")  # type: ignore[arg-type]
+    expected = sum(
+        len(scan) for scan in bank
+    )  # the parent process has open connections
+    loader = DataLoader(
+        bank, batch_size=None, num_workers=2, multiprocessing_context="fork"
+    )  # type: ignore[arg-type]
     assert sum(len(scan) for scan in loader) == expected
 
 
 def test_a_server_without_ranges_is_refused(served: Served) -> None:
     served.ranges = False
     with pytest.raises(
-        FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+; .*a server that serves"
+        FileError,
+        match=r"shard-00000.h5 gave \d+ bytes for a range of \d+; .*a server that serves",
     ):
         Bank(f"{served.url}/bank").image(0)
 
@@ -110,7 +123,9 @@ def test_a_busy_server_costs_no_scan(served: Served, tmp_path: Path) -> None:
     near = Bank(tmp_path / "bank")
     for _ in range(8):
         far = Bank(f"{served.url}/bank")
-        assert all(np.array_equal(far.image(i).range, near.image(i).range) for i in range(5))
+        assert all(
+            np.array_equal(far.image(i).range, near.image(i).range) for i in range(5)
+        )
     assert len(served.requests) > 60
 
 
@@ -143,7 +158,14 @@ def test_redirects_end(served: Served) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["reference://a", "jupyter://a", "zip://a::http://b", "simplecache::http://a", "ftp://a"]
+    "url",
+    [
+        "reference://a",
+        "jupyter://a",
+        "zip://a::http://b",
+        "simplecache::http://a",
+        "ftp://a",
+    ],
 )
 def test_other_kinds_of_urls_are_refused(url: str) -> None:
     with pytest.raises(FileError, match=r"with scheme .*expected one of abfs"):
@@ -163,7 +185,9 @@ def test_a_failed_request_is_not_reported_as_damage(
     served.broken.clear()
     assert bank.image(0).mask.any()
     served.broken.add("shard-00000.h5")
-    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):  # an open shard
+    with pytest.raises(
+        FileError, match="shard-00000.h5 cannot be read .*500"
+    ):  # an open shard
         bank.image(1)
     (tmp_path / "bank" / "shard-00002.h5").unlink()
     with pytest.raises(FileError, match="shard-00002.h5 cannot be read"):
@@ -182,11 +206,19 @@ def test_a_truncated_shard_at_a_url_is_refused(served: Served, tmp_path: Path) -
             bank.image(2), bank.image(3)
 
 
-def test_an_index_with_exaggerated_sizes_is_refused(served: Served, tmp_path: Path) -> None:
+def test_an_index_with_exaggerated_sizes_is_refused(
+    served: Served, tmp_path: Path
+) -> None:
     bank = Bank(f"{served.url}/bank")
-    shards = tuple(replace(entry, bytes=1 << 40, scans=1 << 34) for entry in bank.index.shards)
-    (tmp_path / "bank" / "index.json").write_bytes(replace(bank.index, shards=shards).to_json())
-    with pytest.raises(FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+"):
+    shards = tuple(
+        replace(entry, bytes=1 << 40, scans=1 << 34) for entry in bank.index.shards
+    )
+    (tmp_path / "bank" / "index.json").write_bytes(
+        replace(bank.index, shards=shards).to_json()
+    )
+    with pytest.raises(
+        FileError, match=r"shard-00000.h5 gave \d+ bytes for a range of \d+"
+    ):
         Bank(f"{served.url}/bank").image(0)
 
 
@@ -197,7 +229,10 @@ def test_an_index_with_exaggerated_sizes_is_refused(served: Served, tmp_path: Pa
     reads=st.lists(st.tuples(st.integers(0, 5200), st.integers(0, 3000)), max_size=12),
 )
 def test_a_view_reads_like_the_file(
-    tmp_path_factory: pytest.TempPathFactory, size: int, head: int, reads: list[tuple[int, int]]
+    tmp_path_factory: pytest.TempPathFactory,
+    size: int,
+    head: int,
+    reads: list[tuple[int, int]],
 ) -> None:
     path = tmp_path_factory.mktemp("view") / "file"
     content = np.random.default_rng(size).integers(0, 256, size, np.uint8).tobytes()
@@ -217,7 +252,9 @@ def test_a_view_reads_like_the_file(
     assert view.seek(0, 2) == size and view.seek(-1, 1) == size - 1
 
 
-@given(st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(1, 1 << 18)), max_size=6))
+@given(
+    st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(1, 1 << 18)), max_size=6)
+)
 def test_adjacent_chunks_are_read_at_once(spans: list[tuple[int, int]]) -> None:
     places = {str(i): (start, start + size) for i, (start, size) in enumerate(spans)}
     groups = _side_by_side(places)
@@ -226,4 +263,6 @@ def test_adjacent_chunks_are_read_at_once(spans: list[tuple[int, int]]) -> None:
     ends = [max(places[name][1] for name in group) for group in groups]
     assert all(start > end + _GAP for start, end in zip(starts[1:], ends, strict=False))
     covered = sum(end - start for start, end in zip(starts, ends, strict=True))
-    assert covered <= sum(size for _, size in spans) + _GAP * max(len(spans) - len(groups), 0)
+    assert covered <= sum(size for _, size in spans) + _GAP * max(
+        len(spans) - len(groups), 0
+    )

@@ -48,11 +48,17 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({path.stem for path in BENCH.glob("*.py")} - SHARED))
+@pytest.mark.parametrize(
+    "name", sorted({path.stem for path in BENCH.glob("*.py")} - SHARED)
+)
 def test_a_benchmark_prints_its_tables(name: str, models: dict[str, Path]) -> None:
     arguments = SMALLEST[name].format(**models).split()
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     command = [sys.executable, BENCH / f"{name}.py", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, check=False
+    )
     assert done.returncode == 0, done.stderr
-    assert "|---" in done.stdout or "| ---" in done.stdout or "not measured" in done.stdout
+    assert (
+        "|---" in done.stdout or "| ---" in done.stdout or "not measured" in done.stdout
+    )

@@ -30,7 +30,9 @@ def test_a_card_names_the_sizes_and_the_licence_of_its_weights(name: str) -> Non
         for part in (generator.network, generator.autoencoder)
     ]
     assert sizes == pytest.approx([float(flow), float(autoencoder)], abs=0.05)
-    assert generator.header.provenance["licence"] == "MIT" and "**Licence.** MIT" in card
+    assert (
+        generator.header.provenance["licence"] == "MIT" and "**Licence.** MIT" in card
+    )
     # A heading and ten numbers.
     assert len(re.findall(r"^[^|\n]+ \| [^|\n]+ \|.*$", card, re.M)) == 1 + 10
 
@@ -38,7 +40,9 @@ def test_a_card_names_the_sizes_and_the_licence_of_its_weights(name: str) -> Non
 def test_the_method_has_the_timesteps_of_the_shipped_student() -> None:
     text = (ROOT / "docs/explanation/method.md").read_text()
     row = re.findall(r"`town`, selected here \| (.*)", text)[0]
-    assert [float(t) for t in row.split(",")] == list(load_generator("town").header.time_grid[1:-1])
+    assert [float(t) for t in row.split(",")] == list(
+        load_generator("town").header.time_grid[1:-1]
+    )
 
 
 def test_the_gallery_shows_exactly_the_pictures_of_its_script(
@@ -61,12 +65,16 @@ def test_a_picture_has_all_its_images_side_by_side(
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     import gallery
 
-    red, blue = (np.full((40, 60, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200)))
+    red, blue = (
+        np.full((40, 60, 3), colour, np.uint8) for colour in ((200, 0, 0), (0, 0, 200))
+    )
     gallery.save(
         tmp_path / "sub" / "one.png",
         gallery.draw([[("red", red), ("blue", blue)], [("wide", red[:10])]]),
     )
-    pixels = np.asarray(Image.open(tmp_path / "sub" / "one.png").convert("RGB")).astype(int)
+    pixels = np.asarray(Image.open(tmp_path / "sub" / "one.png").convert("RGB")).astype(
+        int
+    )
     is_red, is_blue = (
         (np.abs(pixels - colour).sum(-1) < 30) for colour in ((200, 0, 0), (0, 0, 200))
     )
@@ -75,7 +83,9 @@ def test_a_picture_has_all_its_images_side_by_side(
     assert is_blue[:, half:].mean() > 0.5
 
 
-def test_tables_of_models_show_their_names_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_of_models_show_their_names_as_text(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "research"))
     from layout_quality import line
     from model_card import BEND, CLASSES, Measured, table

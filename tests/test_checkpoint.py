@@ -38,7 +38,8 @@ def test_loading_restores_everything_that_was_saved(saved: Path) -> None:
     assert header == HEADER
     original = network()
     assert all(
-        torch.equal(v, original.state_dict()[k]) for k, v in networks[VELOCITY].state_dict().items()
+        torch.equal(v, original.state_dict()[k])
+        for k, v in networks[VELOCITY].state_dict().items()
     )
     y = torch.randn(1, 7, 8, 32)
     with torch.no_grad():
@@ -48,7 +49,9 @@ def test_loading_restores_everything_that_was_saved(saved: Path) -> None:
     assert [p.name for p in saved.parent.iterdir()] == [saved.name]
 
 
-def test_the_same_content_gives_the_same_bytes_and_hash(saved: Path, tmp_path: Path) -> None:
+def test_the_same_content_gives_the_same_bytes_and_hash(
+    saved: Path, tmp_path: Path
+) -> None:
     again = tmp_path / "again.safetensors"
     digest = save_checkpoint(again, HEADER, {VELOCITY: network()})
     assert again.read_bytes() == saved.read_bytes()
@@ -60,7 +63,9 @@ def test_the_same_content_gives_the_same_bytes_and_hash(saved: Path, tmp_path: P
     assert len({digest, other_weights, other_grid}) == 3
 
 
-def test_a_loaded_checkpoint_saves_to_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+def test_a_loaded_checkpoint_saves_to_the_same_bytes(
+    saved: Path, tmp_path: Path
+) -> None:
     header, networks, digest = load_checkpoint(saved)
     assert save_checkpoint(tmp_path / "copy.safetensors", header, networks) == digest
     assert (tmp_path / "copy.safetensors").read_bytes() == saved.read_bytes()
@@ -78,7 +83,9 @@ def test_half_precision_is_used_only_for_parameters(
     assert {t.dtype for t in half.state_dict().values()} == {torch.float32}
     for (name, a), b in zip(half.named_parameters(), whole.parameters(), strict=True):
         assert torch.equal(a, b.to(dtype).float()), name
-    assert all(torch.equal(a, b) for a, b in zip(half.buffers(), whole.buffers(), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(half.buffers(), whole.buffers(), strict=True)
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
@@ -87,7 +94,8 @@ def test_a_truncated_file_is_refused(saved: Path, share: float) -> None:
     saved.write_bytes(content[: int(share * len(content))])
     for read in (load_checkpoint, read_header):
         with pytest.raises(
-            DataError, match=r"model.safetensors is truncated, damaged or no .safetensors file"
+            DataError,
+            match=r"model.safetensors is truncated, damaged or no .safetensors file",
         ):
             read(saved)
 
@@ -108,7 +116,10 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
             f"format 'lidar-synth-checkpoint/3'; expected '{FORMAT}'",
         ),
         ({"format": None}, "format None"),
-        ({"format": "lidar-synth-checkpoint/1"}, "format 'lidar-synth-checkpoint/1'; expected"),
+        (
+            {"format": "lidar-synth-checkpoint/1"},
+            "format 'lidar-synth-checkpoint/1'; expected",
+        ),
         ({"convention": "t=0 noise"}, "convention 't=0 noise'"),
         ({"label_encoding": "one-hot"}, "label_encoding 'one-hot'"),
         ({"colour": "red"}, r"header keys \['colour'\]"),
@@ -118,22 +129,38 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
             {"sensor": SENSOR.to_dict() | {"columns": 64}},
             "a network for .7, 8, 32. channels, rows and columns",
         ),
-        ({"normalisation": {"kind": "cubic"}}, "normalisation|header with invalid values"),
+        (
+            {"normalisation": {"kind": "cubic"}},
+            "normalisation|header with invalid values",
+        ),
         ({"channels": ["range"]}, "a network for"),
         ({"channels": ["range", "colour"]}, "colour"),
         ({"time_grid": [1.0, 0.5]}, "time grid"),
         ({"time_grid": [1.0, 0.2, 0.6, 0.0]}, "time grid"),
         ({"provenance": {"data": "town"}}, "without data_licence, licence"),
         ({"networks": {}}, "networks"),
-        ({"networks": {VELOCITY: {"architecture": "vgg", "arguments": {}}}}, "architecture 'vgg'"),
         (
-            {"networks": {VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"a": 1}}}},
+            {"networks": {VELOCITY: {"architecture": "vgg", "arguments": {}}}},
+            "architecture 'vgg'",
+        ),
+        (
+            {
+                "networks": {
+                    VELOCITY: {
+                        "architecture": "hdit",
+                        "arguments": ARGUMENTS | {"a": 1},
+                    }
+                }
+            },
             "'a'",
         ),
         (
             {
                 "networks": {
-                    VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"width": 32}}
+                    VELOCITY: {
+                        "architecture": "hdit",
+                        "arguments": ARGUMENTS | {"width": 32},
+                    }
                 }
             },
             "other shapes",
@@ -141,7 +168,10 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
         (
             {
                 "networks": {
-                    VELOCITY: {"architecture": "hdit", "arguments": ARGUMENTS | {"depths": [1, 2]}}
+                    VELOCITY: {
+                        "architecture": "hdit",
+                        "arguments": ARGUMENTS | {"depths": [1, 2]},
+                    }
                 }
             },
             "missing",
@@ -151,7 +181,9 @@ def test_a_flipped_bit_in_a_weight_is_refused(saved: Path) -> None:
     ],
     ids=str,
 )
-def test_an_invalid_header_is_refused(saved: Path, changes: dict[str, Any], message: str) -> None:
+def test_an_invalid_header_is_refused(
+    saved: Path, changes: dict[str, Any], message: str
+) -> None:
     rewrite(saved, **changes)
     with pytest.raises(DataError, match=message) as caught:
         load_checkpoint(saved)
@@ -176,7 +208,10 @@ def test_one_changed_byte_is_refused_or_changes_nothing(saved: Path) -> None:
     header = 8 + struct.unpack("<Q", content[:8])[0]
     random = Random(0)
     refused = 0
-    for place in [*range(header), *(random.randrange(header, len(content)) for _ in range(50))]:
+    for place in [
+        *range(header),
+        *(random.randrange(header, len(content)) for _ in range(50)),
+    ]:
         changed = bytearray(content)
         changed[place] = random.choice(
             [changed[place] ^ (1 << random.randrange(8)), random.randrange(256)]
@@ -199,20 +234,28 @@ def test_a_changed_time_or_range_limit_is_refused(
     assert old in content
     saved.write_bytes(content.replace(old, new))
     for read in (load_checkpoint, read_header):
-        with pytest.raises(DataError, match="a header that does not match its checksum"):
+        with pytest.raises(
+            DataError, match="a header that does not match its checksum"
+        ):
             read(saved)
 
 
 def test_a_deeply_nested_header_is_refused(saved: Path) -> None:
     tensors = load_file(saved)
-    save_file(tensors, saved, {"lidar_synth": '{"format": ' + "[" * 100_000 + "]" * 100_000 + "}"})
+    save_file(
+        tensors,
+        saved,
+        {"lidar_synth": '{"format": ' + "[" * 100_000 + "]" * 100_000 + "}"},
+    )
     with pytest.raises(DataError):
         read_header(saved)
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
 def test_an_unavailable_device_is_refused(saved: Path, device: str) -> None:
-    with pytest.raises(ConfigError, match=rf"device '{device}'; expected an available one: cpu"):
+    with pytest.raises(
+        ConfigError, match=rf"device '{device}'; expected an available one: cpu"
+    ):
         load_checkpoint(saved, device)
 
 
@@ -230,7 +273,8 @@ def test_a_pickle_is_never_loaded(tmp_path: Path) -> None:
         torch.save(Evil(trace), path, _use_new_zipfile_serialization=new_format)
         for read in (load_checkpoint, read_header):
             with pytest.raises(
-                DataError, match=r"is a PyTorch pickle.*lidar-synth import .*model\.pth OUT"
+                DataError,
+                match=r"is a PyTorch pickle.*lidar-synth import .*model\.pth OUT",
             ):
                 read(path)
     assert not trace.exists()
@@ -319,22 +363,35 @@ def test_weights_that_are_not_finite_do_not_overwrite_a_checkpoint(saved: Path) 
 
 
 def test_missing_ray_angles_are_not_written(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"NaN or infinity in \['velocity.angles.cells'\]"):
+    with pytest.raises(
+        DataError, match=r"NaN or infinity in \['velocity.angles.cells'\]"
+    ):
         save_checkpoint(
-            tmp_path / "model.safetensors", HEADER, {VELOCITY: build_network("hdit", ARGUMENTS)}
+            tmp_path / "model.safetensors",
+            HEADER,
+            {VELOCITY: build_network("hdit", ARGUMENTS)},
         )
 
 
 def test_a_path_that_cannot_be_written_is_reported(tmp_path: Path, saved: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "taken.safetensors").mkdir()
-    for path in (tmp_path / "file" / "model.safetensors", tmp_path / "taken.safetensors"):
+    for path in (
+        tmp_path / "file" / "model.safetensors",
+        tmp_path / "taken.safetensors",
+    ):
         with pytest.raises(FileError, match="cannot be written"):
             save_checkpoint(path, HEADER, {VELOCITY: network()})
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", saved.name, "taken.safetensors"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "file",
+        saved.name,
+        "taken.safetensors",
+    ]
 
 
-def test_a_full_disk_keeps_the_old_checkpoint(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_old_checkpoint(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 

@@ -24,8 +24,12 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("change", [lambda t: t.double() * 1e300, lambda t: t.to(torch.complex64)])
-def test_weights_outside_the_range_of_float32_are_refused(saved: Path, change: Any) -> None:
+@pytest.mark.parametrize(
+    "change", [lambda t: t.double() * 1e300, lambda t: t.to(torch.complex64)]
+)
+def test_weights_outside_the_range_of_float32_are_refused(
+    saved: Path, change: Any
+) -> None:
     def one(tensors: dict[str, Tensor]) -> None:
         name = next(key for key, tensor in tensors.items() if tensor.ndim == 2)
         tensors[name] = change(tensors[name])

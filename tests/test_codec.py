@@ -63,7 +63,9 @@ def network(**arguments: Any) -> VQVAE:
 
 
 def tensors() -> Tensor:
-    return TENSORS.from_images([project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS])
+    return TENSORS.from_images(
+        [project(scan, SENSOR, ["reflectance", "label"]) for scan in SCANS]
+    )
 
 
 def autoencoding(
@@ -85,7 +87,9 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
 
     def right() -> float:
         return float(
-            ((net._decode(net.codebook(net._encode(x))[0])[:, 7:] > 0) == returned).float().mean()
+            ((net._decode(net.codebook(net._encode(x))[0])[:, 7:] > 0) == returned)
+            .float()
+            .mean()
         )
 
     before = right()
@@ -93,7 +97,9 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
         optimizer.zero_grad()
         training(x).backward()
         optimizer.step()
-    assert right() > before + 0.2  # a small codebook cannot reconstruct random scans much better
+    assert (
+        right() > before + 0.2
+    )  # a small codebook cannot reconstruct random scans much better
     with torch.no_grad():
         image = net.eval().decode(net.encode(x))
         bits = net._decode(net.codebook(net._encode(x))[0])[:, 7:]
@@ -106,7 +112,9 @@ def test_the_adversarial_weight_balances_two_gradients() -> None:
     """Esser et al., Eq. 7: at the decoder's last layer, the adversarial gradient equals that of the
     reconstruction."""
     x = tensors()
-    plain, balanced = (autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True))
+    plain, balanced = (
+        autoencoding(adversarial=0.6, adaptive=a).eval() for a in (False, True)
+    )
     balanced.load_state_dict(plain.state_dict())
     last = balanced.network.decoder.head.weight
     output = balanced.network(x).output
@@ -115,7 +123,8 @@ def test_the_adversarial_weight_balances_two_gradients() -> None:
     assert judge is not None
     fooled = -judge(expected(output, TENSORS)).mean()
     one, other = (
-        torch.autograd.grad(part, last, retain_graph=True)[0].norm() for part in (rec, fooled)
+        torch.autograd.grad(part, last, retain_graph=True)[0].norm()
+        for part in (rec, fooled)
     )
     difference = 0.6 * (one / (other + 1e-4) - 1) * fooled
     torch.testing.assert_close(balanced(x) - plain(x), difference, rtol=1e-4, atol=1e-5)
@@ -151,7 +160,9 @@ def test_the_codec_of_a_latent_model_is_its_autoencoder() -> None:
 
 
 def test_an_autoencoder_for_other_images_is_refused() -> None:
-    with pytest.raises(DataError, match=r"images of shape \(7, 8, 32\); expected \(2, 8, 32\)"):
+    with pytest.raises(
+        DataError, match=r"images of shape \(7, 8, 32\); expected \(2, 8, 32\)"
+    ):
         make_codec(
             network(),
             TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"]),
@@ -172,10 +183,18 @@ def test_the_loss_is_the_sum_of_its_terms() -> None:
     output = trained.network(x).output.detach()
     assert trained.eval().objective.reconstruction(logits_of(x), x) < 1e-3
     plain = trained.objective.reconstruction(output, x)
-    bits = torch.nn.functional.binary_cross_entropy_with_logits(output[:, 2:], (x[:, 2:] + 1) / 2)
-    by_hand = (output[:, 0] - x[:, 0]).abs().mean() + (output[:, 1] - x[:, 1]).abs().mean() + bits
+    bits = torch.nn.functional.binary_cross_entropy_with_logits(
+        output[:, 2:], (x[:, 2:] + 1) / 2
+    )
+    by_hand = (
+        (output[:, 0] - x[:, 0]).abs().mean()
+        + (output[:, 1] - x[:, 1]).abs().mean()
+        + bits
+    )
     assert plain.item() == pytest.approx(by_hand.item(), rel=1e-5)
-    heavy = autoencoding(commitment=0.0, weights={"label": 3.0}).objective.reconstruction(output, x)
+    heavy = autoencoding(
+        commitment=0.0, weights={"label": 3.0}
+    ).objective.reconstruction(output, x)
     assert heavy.item() == pytest.approx((by_hand + 2 * bits).item(), rel=1e-5)
     values = [
         float(autoencoding(**term).eval()(x))
@@ -195,7 +214,9 @@ def test_geometry_is_in_metres_along_the_rays() -> None:
     image = project(SCANS[0], SENSOR)
     points = image.range[..., None] * SENSOR.ray_directions()
     means = points.reshape(8, 8, 4, 3).mean(2) / SENSOR.range_max
-    assert np.allclose(trained.objective.points(x)[0].movedim(0, -1).numpy(), means, atol=1e-5)
+    assert np.allclose(
+        trained.objective.points(x)[0].movedim(0, -1).numpy(), means, atol=1e-5
+    )
 
 
 def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
@@ -207,12 +228,17 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
         trained.discriminator, output, x, torch.zeros(()), trained.objective
     ).backward()
     by_both = {
-        n: p.grad.clone() for n, p in trained.discriminator.named_parameters() if p.grad is not None
+        n: p.grad.clone()
+        for n, p in trained.discriminator.named_parameters()
+        if p.grad is not None
     }
     assert output.grad is not None and output.grad.any()
     trained.zero_grad()
     judge = trained.discriminator
-    own = torch.relu(1 - judge(x)).mean() + torch.relu(1 + judge(torch.zeros_like(x))).mean()
+    own = (
+        torch.relu(1 - judge(x)).mean()
+        + torch.relu(1 + judge(torch.zeros_like(x))).mean()
+    )
     (own / 2).backward()
     for name, parameter in judge.named_parameters():
         assert parameter.grad is not None
@@ -224,21 +250,41 @@ def test_both_sides_of_the_adversarial_term_get_their_own_gradients() -> None:
 @pytest.mark.parametrize(
     "losses", [{}, {"geometric": 1.0, "adversarial": 0.05}], ids=["plain", "all terms"]
 )
-def test_training_reduces_the_loss_and_the_reconstruction_error(losses: dict[str, float]) -> None:
-    batches = Batches(cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=1)
+def test_training_reduces_the_loss_and_the_reconstruction_error(
+    losses: dict[str, float],
+) -> None:
+    batches = Batches(
+        cache_scans(SCANS, SENSOR, TENSORS.channels, progress=False), TENSORS, seed=1
+    )
     trained = autoencoding(**losses)
-    recipe = Recipe(iterations=50, batch=4, rate=3e-3, warmup=5, metric="l1", ema_every=1)
+    recipe = Recipe(
+        iterations=50, batch=4, rate=3e-3, warmup=5, metric="l1", ema_every=1
+    )
     training = Training(trained, recipe)
-    before = reconstruction_figures(Latent(trained.network.eval(), TENSORS), tensors(), SENSOR)
+    before = reconstruction_figures(
+        Latent(trained.network.eval(), TENSORS), tensors(), SENSOR
+    )
     records = list(
-        steps(training, reconstruction_task, batches, Accelerator(cpu=True), autoencoder_loss)
+        steps(
+            training,
+            reconstruction_task,
+            batches,
+            Accelerator(cpu=True),
+            autoencoder_loss,
+        )
     )
     assert sum(r.loss for r in records[-5:]) < 0.75 * sum(r.loss for r in records[:5])
     average: Any = training.average
     # Buffers are copied, not averaged.
     assert torch.equal(average.network.scale, trained.network.scale)
     after = reconstruction_figures(Latent(average.network, TENSORS), tensors(), SENSOR)
-    assert set(after) == {"mae", "within_5cm", "drop_accuracy", "chamfer", "label_accuracy"}
+    assert set(after) == {
+        "mae",
+        "within_5cm",
+        "drop_accuracy",
+        "chamfer",
+        "label_accuracy",
+    }
     assert after["mae"] < before["mae"]
     if not losses:
         assert after["label_accuracy"] > before["label_accuracy"]
@@ -260,7 +306,9 @@ class Offset(VQVAE):
 
     def decode(self, z: Tensor, uniform_noise: Tensor | None = None) -> Tensor:
         fields = TENSORS.decode(z)
-        fields["range"] = torch.where(fields["range"] > 0, fields["range"] + self.metres, 0.0)
+        fields["range"] = torch.where(
+            fields["range"] > 0, fields["range"] + self.metres, 0.0
+        )
         fields["range"][:, : self.drop] = 0
         return logits_of(TENSORS.encode(fields))
 
@@ -279,7 +327,9 @@ def test_reconstruction_figures_measure_known_errors(metres: float, drop: int) -
     assert figures["within_5cm"] == pytest.approx(
         float(((seen - lost) / seen).mean()) if metres < 0.05 else 0, abs=1e-3
     )
-    assert figures["drop_accuracy"] == pytest.approx(float((1 - lost / 256).mean()), abs=1e-3)
+    assert figures["drop_accuracy"] == pytest.approx(
+        float((1 - lost / 256).mean()), abs=1e-3
+    )
     assert figures["label_accuracy"] == pytest.approx(1.0)
     if not drop:
         assert figures["chamfer"] == pytest.approx(metres, abs=3e-3)

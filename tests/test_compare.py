@@ -86,7 +86,9 @@ def as_sample(form: Callable[..., Any], ignored: int = -1) -> Callable[..., Any]
     """The same form from a scan."""
 
     def to_sample(scan: Scan, rng: np.random.Generator) -> Any:
-        points = np.column_stack([scan.points, scan.reflectance]).astype(np.float32)[:12]
+        points = np.column_stack([scan.points, scan.reflectance]).astype(np.float32)[
+            :12
+        ]
         assert scan.label is not None
         label = scan.label[:12].astype(np.int64)
         label[:2] = IGNORE
@@ -97,7 +99,9 @@ def as_sample(form: Callable[..., Any], ignored: int = -1) -> Callable[..., Any]
 
 @pytest.mark.parametrize("name", FORMS)
 def test_samples_of_the_same_form_are_accepted(name: str) -> None:
-    train = MixedScans.wrap(Theirs(FORMS[name]), Endless(), 0.5, to_sample=as_sample(FORMS[name]))
+    train = MixedScans.wrap(
+        Theirs(FORMS[name]), Endless(), 0.5, to_sample=as_sample(FORMS[name])
+    )
     assert len(train) == 12
 
 
@@ -110,9 +114,15 @@ def test_a_missing_label_would_cost_the_real_samples_theirs() -> None:
 
     options = {"to_sample": as_sample(without), "seed": 2}
     mixed = MixedScans.wrap(Theirs(form), Endless(), 0.5, compare=False, **options)
-    samples = sorted((mixed[i] for i in range(len(mixed))), key=lambda s: "segment" in s)
-    assert "segment" in samples[-1] and "segment" not in default_collate([samples[0], samples[-1]])
-    with pytest.raises(ConfigError, match=r"sample has no 'segment'.*to_sample.*compare=False"):
+    samples = sorted(
+        (mixed[i] for i in range(len(mixed))), key=lambda s: "segment" in s
+    )
+    assert "segment" in samples[-1] and "segment" not in default_collate(
+        [samples[0], samples[-1]]
+    )
+    with pytest.raises(
+        ConfigError, match=r"sample has no 'segment'.*to_sample.*compare=False"
+    ):
         MixedScans.wrap(Theirs(form), Endless(), 0.5, **options)
 
 
@@ -143,8 +153,16 @@ WRONG: dict[str, tuple[str, Callable[..., Any], str]] = {
         r"sample\[1\] is an array of int32",
     ),
     "tuple's length": ("tuple", lambda p, s: (p, s), "2 parts instead of 3"),
-    "kind of text": ("tuple", lambda p, s: (p, s, 7), r"sample\[2\] is an integer instead of text"),
-    "another container": ("dict", lambda p, s: (p, s), "sample is a sequence instead of a mapping"),
+    "kind of text": (
+        "tuple",
+        lambda p, s: (p, s, 7),
+        r"sample\[2\] is an integer instead of text",
+    ),
+    "another container": (
+        "dict",
+        lambda p, s: (p, s),
+        "sample is a sequence instead of a mapping",
+    ),
     "in an object": (
         "nested",
         lambda p, s: FORMS["nested"](p, s.astype(np.uint8)),
@@ -166,13 +184,21 @@ def test_another_form_is_refused(case: str) -> None:
 
 
 @pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize(("theirs", "ours"), [(-1, 255), (255, -1), (255, 254), (-100, 255)])
-def test_another_value_for_ignored_labels_is_refused(name: str, theirs: int, ours: int) -> None:
+@pytest.mark.parametrize(
+    ("theirs", "ours"), [(-1, 255), (255, -1), (255, 254), (-100, 255)]
+)
+def test_another_value_for_ignored_labels_is_refused(
+    name: str, theirs: int, ours: int
+) -> None:
     with pytest.raises(
-        ConfigError, match=f"holds {ours}, which no real sample does .*one value for ignored labels"
+        ConfigError,
+        match=f"holds {ours}, which no real sample does .*one value for ignored labels",
     ):
         MixedScans.wrap(
-            Theirs(FORMS[name], theirs), Endless(), 0.5, to_sample=as_sample(FORMS[name], ours)
+            Theirs(FORMS[name], theirs),
+            Endless(),
+            0.5,
+            to_sample=as_sample(FORMS[name], ours),
         )
 
 
@@ -187,14 +213,24 @@ def test_comparing_leaves_everything_as_it_was() -> None:
     random.seed(1), np.random.seed(1), torch.manual_seed(1)  # noqa: NPY002
     expected = random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002
     random.seed(1), np.random.seed(1), torch.manual_seed(1)  # noqa: NPY002
-    train = MixedScans.wrap(theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4)
+    train = MixedScans.wrap(
+        theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4
+    )
     assert (random.random(), np.random.rand(), torch.rand(1)) == expected  # noqa: NPY002
     assert theirs.asked == [0] and train.epoch == 0
     plain = MixedScans.wrap(
-        theirs, Endless(), 0.5, to_sample=as_sample(FORMS["dict"]), seed=4, compare=False
+        theirs,
+        Endless(),
+        0.5,
+        to_sample=as_sample(FORMS["dict"]),
+        seed=4,
+        compare=False,
     )
     assert theirs.asked == [0]
-    assert all(np.array_equal(train[i]["segment"], plain[i]["segment"]) for i in range(len(train)))
+    assert all(
+        np.array_equal(train[i]["segment"], plain[i]["segment"])
+        for i in range(len(train))
+    )
 
 
 class Ahead(Endless):
@@ -210,7 +246,11 @@ class Ahead(Endless):
 class Slow(Generated):
     """A model that takes long."""
 
-    sensor, fields, identity = Endless.sensor, frozenset({"reflectance", "label"}), "slow"  # type: ignore[assignment]
+    sensor, fields, identity = (
+        Endless.sensor,
+        frozenset({"reflectance", "label"}),
+        "slow",
+    )  # type: ignore[assignment]
 
     def __init__(self) -> None:
         pass
@@ -221,7 +261,9 @@ class Slow(Generated):
 
 @pytest.mark.parametrize("kind", [Ahead, Slow])
 def test_sources_on_demand_are_compared_by_a_made_up_scan(kind: type) -> None:
-    MixedScans.wrap(Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"]))
+    MixedScans.wrap(
+        Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"])
+    )
     with pytest.raises(ConfigError, match="no 'segment'"):
         MixedScans.wrap(
             Theirs(FORMS["dict"]),
@@ -230,7 +272,9 @@ def test_sources_on_demand_are_compared_by_a_made_up_scan(kind: type) -> None:
             to_sample=as_sample(lambda p, s: {"coord": p, "feat": p}),
         )
     with pytest.raises(ConfigError, match="holds 255"):
-        MixedScans.wrap(Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"], 255))
+        MixedScans.wrap(
+            Theirs(FORMS["dict"]), kind(), 0.5, to_sample=as_sample(FORMS["dict"], 255)
+        )
 
 
 @pytest.mark.parametrize("first", [None, ValueError("a damaged file")])
@@ -243,19 +287,28 @@ def test_a_first_sample_that_cannot_be_had_stops_nothing(
         raise first
 
     with caplog.at_level(logging.WARNING):
-        MixedScans.wrap(Theirs(form), Endless(), 0.5, to_sample=as_sample(FORMS["dict"]))
+        MixedScans.wrap(
+            Theirs(form), Endless(), 0.5, to_sample=as_sample(FORMS["dict"])
+        )
     assert ("a damaged file" in caplog.text) == (first is not None)
 
 
 def test_without_real_or_synthetic_samples_there_is_nothing_to_compare() -> None:
     MixedScans.wrap(Theirs(FORMS["dict"]), None, 0, to_sample=as_sample(FORMS["tuple"]))
-    MixedScans.wrap(None, Endless(), 1, to_sample=as_sample(FORMS["tuple"]), epoch_size=3)
+    MixedScans.wrap(
+        None, Endless(), 1, to_sample=as_sample(FORMS["tuple"]), epoch_size=3
+    )
 
 
 @pytest.mark.parametrize("name", ["hdl64e_kitti360", "hdl32e_nuscenes", "os1_128"])
 def test_a_made_up_scan_has_the_fields_of_its_source(name: str) -> None:
     sensor = presets()[name]
     scan = make_up_scan(sensor, frozenset(POINT_FIELDS))
-    assert set(scan.fields()) == set(POINT_FIELDS) and len(scan) == np.prod(sensor.shape)
+    assert set(scan.fields()) == set(POINT_FIELDS) and len(scan) == np.prod(
+        sensor.shape
+    )
     assert set(np.unique(scan.label)) == {*range(19), IGNORE}
-    assert set(make_up_scan(sensor, frozenset({"label"})).fields()) == {"reflectance", "label"}
+    assert set(make_up_scan(sensor, frozenset({"label"})).fields()) == {
+        "reflectance",
+        "label",
+    }

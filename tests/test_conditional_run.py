@@ -118,7 +118,9 @@ def test_a_latent_transformer(
     """Any velocity network lives on latents, which look where their cells look."""
     call(
         "train",
-        write_config(scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3),
+        write_config(
+            scans, tmp_path, "latent", network=TRANSFORMER, codec=str(codec), steps=3
+        ),
     )
     start = tmp_path / "latent" / "latent.safetensors"
     [image] = load_generator(start).range_images(0, [0])
@@ -137,7 +139,9 @@ def test_a_latent_transformer(
     )
     values = yaml.safe_load(config.read_text())
     config.write_text(
-        yaml.safe_dump({k: v for k, v in values.items() if k not in ("sensor", "channels")})
+        yaml.safe_dump(
+            {k: v for k, v in values.items() if k not in ("sensor", "channels")}
+        )
     )
     call("train", config)
     looking = load_generator(tmp_path / "looking" / "looking.safetensors")
@@ -180,17 +184,21 @@ def test_a_camera_model(
     call("train", config)
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
     images = sorted(kitti.rglob("*.png"))
-    given = np.asarray(Image.open(images[0]).resize((32, 16), Image.Resampling.BICUBIC)).transpose(
-        2, 0, 1
-    )
+    given = np.asarray(
+        Image.open(images[0]).resize((32, 16), Image.Resampling.BICUBIC)
+    ).transpose(2, 0, 1)
     [scan] = generator.scans(0, [0], given.copy())
-    [same] = generator.scans(0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0]))
+    [same] = generator.scans(
+        0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0])
+    )
     assert np.allclose(scan.points, same.points)
     with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
         call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
 
 
-def test_the_town_renders_the_images_of_a_camera_model(scans: Path, tmp_path: Path) -> None:
+def test_the_town_renders_the_images_of_a_camera_model(
+    scans: Path, tmp_path: Path
+) -> None:
     condition = CAMERA | {"image": [376, 1408]}
     config = write_config(
         scans,
@@ -205,10 +213,13 @@ def test_the_town_renders_the_images_of_a_camera_model(scans: Path, tmp_path: Pa
     kept = np.load(tmp_path / "camera" / "cache" / "camera.npy")
     town = Town(0, SENSOR, 2, interval=1.0)
     for i, image in enumerate(kept):
-        small = Image.fromarray(town.image(i)).resize((32, 16), Image.Resampling.BICUBIC)
+        small = Image.fromarray(town.image(i)).resize(
+            (32, 16), Image.Resampling.BICUBIC
+        )
         assert np.array_equal(image, np.asarray(small).transpose(2, 0, 1))
     with pytest.raises(
-        DataError, match=r"the town's image of \(376, 1408\) rows and columns; expected \(40, 80\)"
+        DataError,
+        match=r"the town's image of \(376, 1408\) rows and columns; expected \(40, 80\)",
     ):
         call("train", config, f"output={tmp_path / 'other'}", "condition.image=[40,80]")
 
@@ -219,21 +230,32 @@ def test_the_camera_of_another_focal_length_is_refused(
     data = {"path": str(kitti), "layout": "kitti360", "split": "all"}
     condition = CAMERA | {"focal": 552.55}
     config = write_config(
-        scans, tmp_path, "camera", network=UNET, condition=condition, codec=str(codec), data=data
+        scans,
+        tmp_path,
+        "camera",
+        network=UNET,
+        condition=condition,
+        codec=str(codec),
+        data=data,
     )
     call("train", config, "recipe.iterations=1")
     generator = load_generator(tmp_path / "camera" / "camera.safetensors")
     assert conditions_for(generator, str(kitti)) is not None
     file = kitti / "calibration" / "perspective.txt"
     for text, found in (
-        (file.read_text().replace("5.52554261", "7.21537700"), "a focal length of 721.5 pixels"),
+        (
+            file.read_text().replace("5.52554261", "7.21537700"),
+            "a focal length of 721.5 pixels",
+        ),
         (None, "no calibration"),
     ):
         other = tmp_path / found
         shutil.copytree(kitti, other)
         file = other / "calibration" / "perspective.txt"
         file.write_text(text) if text else shutil.rmtree(file.parent)
-        with pytest.raises(DataError, match=f"a camera with {found}; expected 552.5 pixels"):
+        with pytest.raises(
+            DataError, match=f"a camera with {found}; expected 552.5 pixels"
+        ):
             conditions_for(generator, str(other))
 
 
@@ -249,13 +271,22 @@ def test_what_does_not_fit_together(
                 *overrides,
             )
 
-    refuse("an autoencoder with a codec or a condition", network=CODEC_NETWORK, condition=SEMANTIC)
+    refuse(
+        "an autoencoder with a codec or a condition",
+        network=CODEC_NETWORK,
+        condition=SEMANTIC,
+    )
     refuse("decoder without init", decoder=True)
-    refuse("expected a model whose autoencoder predicts", decoder=True, init=str(teacher))
+    refuse(
+        "expected a model whose autoencoder predicts", decoder=True, init=str(teacher)
+    )
     refuse("expected a checkpoint of the same kind", decoder=True, init=str(codec))
     refuse("of a latent model", codec=str(codec), recipe={"weights": {"label": 0.5}})
     refuse(f"channels .*expected that of {codec}", codec=str(codec), channels=["range"])
-    refuse("expected the checkpoint of an autoencoder", codec=str(pixel_checkpoint(tmp_path)))
+    refuse(
+        "expected the checkpoint of an autoencoder",
+        codec=str(pixel_checkpoint(tmp_path)),
+    )
     refuse("unknown key 'condition.colour'", condition=SEMANTIC | {"colour": 1})
     refuse("one of semantic_map", condition=SEMANTIC | {"encoder": "views"})
     refuse(
@@ -271,7 +302,9 @@ def test_what_does_not_fit_together(
         network={"architecture": "hdit", "arguments": {"colour": 1}},
     )
     student = write_config(scans, tmp_path, "student", teacher=str(codec))
-    with pytest.raises(ConfigError, match="an autoencoder; expected a model that generates"):
+    with pytest.raises(
+        ConfigError, match="an autoencoder; expected a model that generates"
+    ):
         call("distill", student)
     with pytest.raises(ConfigError, match="of a latent model"):
         call("distill", student, f"teacher={teacher}", "recipe.weights={range: 2.0}")

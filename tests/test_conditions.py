@@ -17,7 +17,13 @@ from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
-from lidar_synth.generate.conditions import CONDITIONS, batch_of, blank, bridge_gaps, one_view
+from lidar_synth.generate.conditions import (
+    CONDITIONS,
+    batch_of,
+    blank,
+    bridge_gaps,
+    one_view,
+)
 from lidar_synth.generate.flow.path import guide
 from lidar_synth.generate.models import NETWORKS, build_network, encoders_of
 from lidar_synth.generate.models.encoders.calibrated_camera import SightEncoder
@@ -46,9 +52,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def picture(path: Path, size: tuple[int, int] = (40, 80), seed: int = 0) -> Path:
     """Write a PNG of the given rows and columns."""
-    Image.fromarray(np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)).save(
-        path
-    )
+    Image.fromarray(
+        np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+    ).save(path)
     return path
 
 
@@ -56,11 +62,15 @@ def some_scan(tmp_path: Path, seed: int = 0) -> Scan:
     scan = random_scan(SENSOR, 400, seed)
     scan.points[:100, 2], scan.label[:100] = -1.7, 8  # some of it is a road
     boxes = Boxes(np.float32([[12, 3, -0.9, 4, 2, 1.6, 0.4]]), ("Car",))
-    return replace(scan, boxes=boxes, image_path=picture(tmp_path / f"{seed}.png", seed=seed))
+    return replace(
+        scan, boxes=boxes, image_path=picture(tmp_path / f"{seed}.png", seed=seed)
+    )
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_path: Path) -> None:
+def test_encoders_accept_what_every_condition_reads_from_a_scan(
+    name: str, tmp_path: Path
+) -> None:
     condition = CONDITIONS[name]
     scan = some_scan(tmp_path)
     encoder = {
@@ -68,7 +78,8 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
             "semantic_map", {"resolution": (8, 32), "target": (4, 16)}
         ),
         "camera": lambda: build_network(
-            "views", {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)}
+            "views",
+            {"resolution": (32, 64), "views": 2, "channels": 5, "widths": (4, 8)},
         ),
         "layout": lambda: build_network(
             "layout", {"resolution": (8, 32), "target": (4, 16), "channels": 7}
@@ -82,7 +93,11 @@ def test_encoders_accept_what_every_condition_reads_from_a_scan(name: str, tmp_p
     encoded = encoder(given)
     assert (
         encoded.shape
-        == {"semantic": (3, 8, 4, 16), "camera": (3, 2 * 8 * 8, 5), "layout": (3, 7, 4, 16)}[name]
+        == {
+            "semantic": (3, 8, 4, 16),
+            "camera": (3, 2 * 8 * 8, 5),
+            "layout": (3, 7, 4, 16),
+        }[name]
     )
     assert (blank(name, given) == condition.blank).all()
     assert set(encoders_of(name)) <= set(NETWORKS)
@@ -92,13 +107,16 @@ def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> 
     other = replace(SENSOR, name="other", columns=64, rows=16)
     scan = random_scan(other, 3000)
     labels = CONDITIONS["semantic"].read(scan, SENSOR, SENSOR.shape, {})
-    assert np.array_equal(labels, bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"]))
+    assert np.array_equal(
+        labels, bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"])
+    )
 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
 def test_label_maps_are_encoded_by_class_and_place(method: str) -> None:
     net = build_network(
-        "semantic_map", {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method}
+        "semantic_map",
+        {"resolution": (8, 32), "target": (4, 8), "channels": 6, "method": method},
     )
     labels = torch.full((1, 8, 32), 3, dtype=torch.uint8)
     same = net(labels)
@@ -112,7 +130,9 @@ def test_label_maps_are_encoded_by_class_and_place(method: str) -> None:
 
 
 def test_all_train_ids_are_encoded_differently() -> None:
-    net = build_network("semantic_map", {"resolution": (4, 5), "target": (4, 5), "channels": 20})
+    net = build_network(
+        "semantic_map", {"resolution": (4, 5), "target": (4, 5), "channels": 20}
+    )
     ids = torch.tensor([*range(len(NAMES)), IGNORE], dtype=torch.uint8).view(1, 4, 5)
     net.mix.weight.data.copy_(torch.eye(20)[..., None, None])
     assert torch.equal(net(ids)[0].flatten(1), torch.eye(20))
@@ -146,10 +166,19 @@ def sight(sensor: Sensor = TOWN, **arguments: Any) -> SightEncoder:
 def test_the_calibration_gives_the_pixel_of_every_cell() -> None:
     points = unproject(RangeImage(np.full(TOWN.shape, 15, np.float32), TOWN, {})).points
     pixels, depth = CAMERA.pixels(points)
-    inside = (depth > 1) & (pixels > -0.5).all(1) & (pixels < np.array([1407.5, 375.5])).all(1)
+    inside = (
+        (depth > 1)
+        & (pixels > -0.5).all(1)
+        & (pixels < np.array([1407.5, 375.5])).all(1)
+    )
     places = sight(distance=15.0).pixel_coordinates().reshape(-1, 2).numpy()
-    assert np.array_equal((np.abs(places) <= 1).all(1), inside) and 0.1 < inside.mean() < 0.3
-    assert np.allclose(((places + 1) * [1408, 376] - 1)[inside] / 2, pixels[inside], atol=0.01)
+    assert (
+        np.array_equal((np.abs(places) <= 1).all(1), inside)
+        and 0.1 < inside.mean() < 0.3
+    )
+    assert np.allclose(
+        ((places + 1) * [1408, 376] - 1)[inside] / 2, pixels[inside], atol=0.01
+    )
 
 
 @torch.no_grad()
@@ -281,7 +310,9 @@ def test_scans_without_the_condition_are_refused(tmp_path: Path) -> None:
         ({"resolution": (12, 32), "target": (4, 16)}, "powers of two"),
     ],
 )
-def test_sizes_that_do_not_divide_are_refused(arguments: dict[str, Any], message: str) -> None:
+def test_sizes_that_do_not_divide_are_refused(
+    arguments: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         build_network("semantic_map", {"resolution": (8, 32)} | arguments)
 
@@ -302,12 +333,20 @@ def conditioned_batches(tmp_path: Path, name: str, **options: Any) -> Batches:
     shapes = {"camera": CAMERA_SHAPE, "layout": (5, *SENSOR.shape)}
 
     def reader(kind: str) -> Callable[[int, Scan], NDArray[np.uint8]]:
-        return lambda i, scan: CONDITIONS[kind].read(scan, SENSOR, shapes[kind], OPTIONS)
+        return lambda i, scan: CONDITIONS[kind].read(
+            scan, SENSOR, shapes[kind], OPTIONS
+        )
 
     others = {kind: Other(shape, reader(kind)) for kind, shape in shapes.items()}
-    about = {key: options.pop(key) for key in ("dropout", "reduction") if key in options}
-    cache = cache_scans(scans, SENSOR, ["range", "label"], progress=False, others=others)
-    return Batches(cache, TENSORS, 3, conditioning=Conditioning(name, views=2, **about), **options)
+    about = {
+        key: options.pop(key) for key in ("dropout", "reduction") if key in options
+    }
+    cache = cache_scans(
+        scans, SENSOR, ["range", "label"], progress=False, others=others
+    )
+    return Batches(
+        cache, TENSORS, 3, conditioning=Conditioning(name, views=2, **about), **options
+    )
 
 
 def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
@@ -325,12 +364,18 @@ def test_conditions_stay_with_their_scans(tmp_path: Path) -> None:
     assert not torch.equal(whole, moved(range(8)).cond)  # type: ignore[arg-type]
 
 
-def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(tmp_path: Path) -> None:
-    plain, flipped = (conditioned_batches(tmp_path, "camera", flip=flip) for flip in (False, True))
+def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(
+    tmp_path: Path,
+) -> None:
+    plain, flipped = (
+        conditioned_batches(tmp_path, "camera", flip=flip) for flip in (False, True)
+    )
     a = plain(range(16))
     b = flipped(range(16))
     assert a.cond is not None and b.cond is not None
-    mirrored = torch.tensor([not torch.equal(x, y) for x, y in zip(a.y0, b.y0, strict=True)])
+    mirrored = torch.tensor(
+        [not torch.equal(x, y) for x, y in zip(a.y0, b.y0, strict=True)]
+    )
     assert 0 < mirrored.sum() < 16
     for i, is_mirrored in enumerate(mirrored):
         assert torch.equal(b.cond[i], a.cond[i].flip(-1) if is_mirrored else a.cond[i])
@@ -339,7 +384,9 @@ def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_dropout_blanks_only_its_share_of_the_conditions(name: str, tmp_path: Path) -> None:
+def test_dropout_blanks_only_its_share_of_the_conditions(
+    name: str, tmp_path: Path
+) -> None:
     plain = conditioned_batches(tmp_path, name)
     dropped = conditioned_batches(tmp_path, name, dropout=0.25)
     a = plain(range(200))
@@ -364,11 +411,16 @@ def test_a_cache_with_images_resumes_and_refuses_other_images(tmp_path: Path) ->
     scans = [some_scan(tmp_path, seed) for seed in range(3)]
     others = {
         "camera": Other(
-            CAMERA_SHAPE, lambda i, s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS)
+            CAMERA_SHAPE,
+            lambda i, s: CONDITIONS["camera"].read(s, SENSOR, CAMERA_SHAPE, OPTIONS),
         )
     }
-    cache = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
-    again = cache_scans(scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others)
+    cache = cache_scans(
+        scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others
+    )
+    again = cache_scans(
+        scans, SENSOR, ["range"], tmp_path / "cache", progress=False, others=others
+    )
     assert np.array_equal(cache.fields["camera"], again.fields["camera"])
     assert again.read([1])["camera"].dtype == torch.uint8
     with pytest.raises(ConfigError, match=r"the cache of other data \(others differ\)"):
@@ -395,7 +447,9 @@ def test_guidance_extrapolates_from_the_blank_condition() -> None:
     calls.clear()
     for scale in (0.0, 1.5, 4.0):
         out = guide(velocity, scale, nothing)(y, t, cond)
-        assert torch.allclose(out, without + scale * (with_condition - without), atol=1e-5)
+        assert torch.allclose(
+            out, without + scale * (with_condition - without), atol=1e-5
+        )
     assert calls == [6, 6, 6]
     assert guide(velocity, 1.0, nothing) is velocity
 
@@ -424,7 +478,9 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """transformers and open_clip with the stand-in; the list records the loaded files."""
     asked: list[str] = []
 
-    def from_pretrained(place: str, local_files_only: bool, use_safetensors: bool) -> Tower:
+    def from_pretrained(
+        place: str, local_files_only: bool, use_safetensors: bool
+    ) -> Tower:
         assert local_files_only and use_safetensors
         asked.append(f"transformers {Path(place).name}")
         return Tower()
@@ -437,7 +493,9 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         CLIPVisionModelWithProjection=SimpleNamespace(from_pretrained=from_pretrained)
     )
     monkeypatch.setitem(sys.modules, "transformers", holder)
-    monkeypatch.setitem(sys.modules, "open_clip", SimpleNamespace(create_model=create_model))
+    monkeypatch.setitem(
+        sys.modules, "open_clip", SimpleNamespace(create_model=create_model)
+    )
     load_frozen_clip.cache_clear()
     yield asked
     load_frozen_clip.cache_clear()
@@ -445,7 +503,10 @@ def clip_libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("form", ["folder", "file"])
 def test_frozen_clip_encodes_each_view_and_only_other_layers_are_trained(
-    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clip_libraries: list[str]
+    form: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    clip_libraries: list[str],
 ) -> None:
     place = tmp_path / ("clip" if form == "folder" else "clip.safetensors")
     place.mkdir() if form == "folder" else place.write_bytes(b"")
@@ -462,7 +523,9 @@ def test_frozen_clip_encodes_each_view_and_only_other_layers_are_trained(
     tokens.square().mean().backward()
     assert all(p.grad is not None and p.grad.any() for p in net.parameters())
     assert load_frozen_clip(str(place), "cpu").training is False
-    assert not any(p.requires_grad for p in load_frozen_clip(str(place), "cpu").parameters())
+    assert not any(
+        p.requires_grad for p in load_frozen_clip(str(place), "cpu").parameters()
+    )
     assert len(clip_libraries) == 1  # loaded once
 
 

@@ -14,7 +14,13 @@ from lidar_synth.generate.codec import make_codec
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town import Town
-from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig, load_config, published
+from lidar_synth.lab.train.config import (
+    DistillConfig,
+    Run,
+    TrainConfig,
+    load_config,
+    published,
+)
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RECIPES = {one.name: one for one in published()}
@@ -32,7 +38,9 @@ def test_every_file_is_a_recipe_a_base_or_a_sensor() -> None:
     assert named == {p.stem for p in (CONFIGS / "base").iterdir()}
 
 
-@pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command in KINDS])
+@pytest.mark.parametrize(
+    "name", [n for n, one in RECIPES.items() if one.command in KINDS]
+)
 def test_every_recipe_loads_by_name_from_any_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,35 +49,49 @@ def test_every_recipe_loads_by_name_from_any_folder(
     config = load_config(kind, name)
     assert config == load_config(kind, CONFIGS / f"{name}.yaml")
     assert config.output == Path("runs") / name
-    again = kind.model_validate(yaml.safe_load(yaml.safe_dump(config.model_dump(mode="json"))))
+    again = kind.model_validate(
+        yaml.safe_load(yaml.safe_dump(config.model_dump(mode="json")))
+    )
     assert again == config  # what a run writes beside its results is the configuration
 
 
-@pytest.mark.parametrize("name", [n for n, one in RECIPES.items() if one.command == "train"])
+@pytest.mark.parametrize(
+    "name", [n for n, one in RECIPES.items() if one.command == "train"]
+)
 def test_the_listed_size_is_that_of_the_networks(name: str) -> None:
     """Where a recipe starts from a checkpoint that is not there yet, its size cannot be
     computed."""
     config = load_config(TrainConfig, name)
     if config.init is not None:
         pytest.skip("starts from a checkpoint")
-    codec = config if config.codec is None else load_config(TrainConfig, config.codec.stem)
+    codec = (
+        config if config.codec is None else load_config(TrainConfig, config.codec.stem)
+    )
     resolution = load_sensor(codec.sensor).shape
     state = (codec.tensors().size, *resolution)
     with torch.device("meta"):
         if config.codec is not None:
             autoencoder = build_network(*codec.parts(state, resolution)["codec"])
             state = make_codec(autoencoder, codec.tensors(), resolution).shape
-        networks = [build_network(*part) for part in config.parts(state, resolution).values()]
-    size = sum(weight.numel() for network in networks for weight in network.parameters())
+        networks = [
+            build_network(*part) for part in config.parts(state, resolution).values()
+        ]
+    size = sum(
+        weight.numel() for network in networks for weight in network.parameters()
+    )
     assert RECIPES[name].size == f"{size / 1e6:.1f} M"
 
 
 def test_bases_merge_and_the_recipe_takes_precedence(tmp_path: Path) -> None:
     (tmp_path / "base").mkdir()
-    (tmp_path / "base" / "a.yaml").write_text("recipe: {batch: 1, rate: 2.0}\nprecision: bf16")
+    (tmp_path / "base" / "a.yaml").write_text(
+        "recipe: {batch: 1, rate: 2.0}\nprecision: bf16"
+    )
     (tmp_path / "b.yaml").write_text("base: a\nrecipe: {rate: 3.0}\ndata: {town: 5}")
     path = tmp_path / "c.yaml"
-    path.write_text("base: [b.yaml, town]\nabout: {size: none}\ndata: {town: 7}\nsensor: mine.yaml")
+    path.write_text(
+        "base: [b.yaml, town]\nabout: {size: none}\ndata: {town: 7}\nsensor: mine.yaml"
+    )
     (tmp_path / "mine.yaml").write_text("{}")
     values = read_recipe(path)
     assert values["recipe"]["batch"] == 1
@@ -88,7 +110,9 @@ def test_bases_merge_and_the_recipe_takes_precedence(tmp_path: Path) -> None:
         ("base: c.yaml", "base 'c.yaml'; expected a file beside it"),
     ],
 )
-def test_bases_that_cannot_be_are_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_bases_that_cannot_be_are_refused(
+    text: str, message: str, tmp_path: Path
+) -> None:
     (tmp_path / "loop.yaml").write_text("base: c.yaml")
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
@@ -108,7 +132,9 @@ def test_an_unknown_name_is_refused_with_the_known_ones(
 
 def test_the_published_recipes() -> None:
     teacher = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
-    assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments["resolution"] == [
+    assert teacher.parts((2, 64, 1024), (64, 1024))["velocity"].arguments[
+        "resolution"
+    ] == [
         64,
         1024,
     ]
@@ -134,17 +160,25 @@ def test_overrides() -> None:
         "samples.every=0",
     ]
     config = load_config(TrainConfig, TINY, overrides)
-    assert (config.recipe.batch, config.data.flip, config.recipe.rate) == (4, False, 1e-3)
+    assert (config.recipe.batch, config.data.flip, config.recipe.rate) == (
+        4,
+        False,
+        1e-3,
+    )
     assert config.tensors().size == 1
     assert config.samples.every == 0
     student = CONFIGS / "kitti360_student.yaml"
-    assert [load_config(DistillConfig, student, o).precision for o in ([], ["precision=no"])] == [
+    assert [
+        load_config(DistillConfig, student, o).precision for o in ([], ["precision=no"])
+    ] == [
         "bf16",
         "no",
     ]
 
 
-def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_town_and_paths_become_sources(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     config = load_config(TrainConfig, TINY, ["data.seed=3"])
     source = config.data.open(load_sensor(config.sensor))
     assert isinstance(source, Town)
@@ -152,7 +186,8 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
     disk = load_config(TrainConfig, CONFIGS / "kitti360_teacher.yaml")
     monkeypatch.delenv("KITTI360_ROOT", raising=False)
     with pytest.raises(
-        ConfigError, match=r"data.path '\$KITTI360_ROOT'; expected variables that are set"
+        ConfigError,
+        match=r"data.path '\$KITTI360_ROOT'; expected variables that are set",
     ):
         disk.data.open(load_sensor(disk.sensor))
     monkeypatch.setenv("KITTI360_ROOT", str(tmp_path / "nowhere"))
@@ -163,7 +198,10 @@ def test_the_town_and_paths_become_sources(monkeypatch: pytest.MonkeyPatch, tmp_
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sead=1", "unknown key 'sead'; known there: output, licence, data, recipe, seed"),
+        (
+            "sead=1",
+            "unknown key 'sead'; known there: output, licence, data, recipe, seed",
+        ),
         (
             "recipe.batches=1",
             "unknown key 'recipe.batches'; known there: iterations, batch, accumulate",
@@ -233,24 +271,39 @@ def test_the_papers_latent_recipes() -> None:
     }
     for name, grid in grids.items():
         student = load_config(DistillConfig, CONFIGS / f"{name}_student.yaml")
-        assert (student.grid, student.steps, student.recipe.metric) == (grid, 10, "squared_l2")
+        assert (student.grid, student.steps, student.recipe.metric) == (
+            grid,
+            10,
+            "squared_l2",
+        )
         teacher = load_config(TrainConfig, CONFIGS / f"{name}_teacher.yaml")
         parts = teacher.parts((8, 16, 128), (64, 1024))
         assert parts["velocity"].arguments["position"] is True
         assert teacher.codec is not None
-        assert load_config(TrainConfig, CONFIGS / f"{teacher.codec.stem}.yaml").autoencodes
-        assert set(parts) == {"velocity"} | ({"condition"} if teacher.condition else set())
+        assert load_config(
+            TrainConfig, CONFIGS / f"{teacher.codec.stem}.yaml"
+        ).autoencodes
+        assert set(parts) == {"velocity"} | (
+            {"condition"} if teacher.condition else set()
+        )
         assert student.teacher.stem == f"{name}_teacher"
 
 
 @pytest.mark.parametrize("name", ["kitti360_codec", "semantic_kitti_codec"])
-def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(name: str) -> None:
+def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(
+    name: str,
+) -> None:
     """autoencoder_c2_p4.yaml: beta 0.25 of the quantiser on the codes, disc_weight 0.6,
     base_learning_rate 4.5e-6."""
     config = load_config(TrainConfig, CONFIGS / f"{name}.yaml")
     losses = config.losses
     recipe = config.recipe
-    assert (losses.commitment, losses.codebook, losses.adversarial, losses.adaptive) == (
+    assert (
+        losses.commitment,
+        losses.codebook,
+        losses.adversarial,
+        losses.adaptive,
+    ) == (
         1.0,
         0.25,
         0.6,

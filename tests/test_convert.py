@@ -1,5 +1,6 @@
 """Conversion: everything arrives, reruns do what is missing, bad scans are named."""
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
@@ -35,11 +36,15 @@ def files(root: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize("to", WRITERS)
 @pytest.mark.parametrize("layout", READERS)
-def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str) -> None:
+def test_every_layout_becomes_every_format(
+    tmp_path: Path, layout: str, to: str
+) -> None:
     MAKERS[layout](tmp_path / "in")
     source = open_scans(tmp_path / "in", layout=layout)
     if to == "kitti_object" and source[0].boxes is None:
-        with pytest.raises(DataError, match=r"has no boxes; expected .*label_2.*semantic_kitti"):
+        with pytest.raises(
+            DataError, match=r"has no boxes; expected .*label_2.*semantic_kitti"
+        ):
             convert(source, WRITERS[to](tmp_path / "out"), progress=False)
         assert set(files(tmp_path / "out")) == set()
         return
@@ -48,7 +53,9 @@ def test_every_layout_becomes_every_format(tmp_path: Path, layout: str, to: str)
     result = open_scans(tmp_path / "out")
     assert type(result) is READERS[WRITTEN_AS[to]] and len(result) == 3
     for expected, scan in zip(source, result, strict=True):
-        expected = reproject(expected, scan.sensor) if to in ("range", "png") else expected
+        expected = (
+            reproject(expected, scan.sensor) if to in ("range", "png") else expected
+        )
         atol = scan.sensor.range_max / 65535 if to == "png" else 0  # a step of 16 bits
         np.testing.assert_allclose(scan.points, expected.points, atol=atol)
         np.testing.assert_allclose(scan.reflectance, expected.reflectance, atol=atol)
@@ -64,12 +71,16 @@ def test_a_rerun_writes_only_missing_scans(tmp_path: Path) -> None:
             return super().read(index)
 
     writer = WRITERS["semantic_kitti"](tmp_path / "out")
-    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(written=3)
+    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(
+        written=3
+    )
     whole = files(tmp_path / "out")
     assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(kept=3)
     assert read == [0, 1, 2] and files(tmp_path / "out") == whole
     writer.path(1, "00/000001").unlink()
-    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(written=1, kept=2)
+    assert convert(Watched(tmp_path / "in"), writer, progress=False) == Report(
+        written=1, kept=2
+    )
     assert read == [0, 1, 2, 1] and files(tmp_path / "out") == whole
 
 
@@ -95,24 +106,30 @@ def test_a_resumed_run_writes_the_same_files(tmp_path: Path) -> None:
     assert not (
         tmp_path / "twice" / "data_poses" / "2013_05_28_drive_0000_sync" / "poses.txt"
     ).exists()
-    assert convert(source, WRITERS["kitti360"](tmp_path / "twice"), progress=False) == Report(
-        written=1, kept=2
-    )
+    assert convert(
+        source, WRITERS["kitti360"](tmp_path / "twice"), progress=False
+    ) == Report(written=1, kept=2)
     assert files(tmp_path / "twice") == files(tmp_path / "once")
     assert [
-        scan.pose is not None and scan.boxes is not None for scan in open_scans(tmp_path / "twice")
+        scan.pose is not None and scan.boxes is not None
+        for scan in open_scans(tmp_path / "twice")
     ] == [True] * 3
 
 
 @pytest.mark.slow
 def test_processes_write_the_same_files(tmp_path: Path) -> None:
-    write_all("semantic_kitti", tmp_path / "in", [some_scan(i, count=80) for i in range(12)])
+    write_all(
+        "semantic_kitti", tmp_path / "in", [some_scan(i, count=80) for i in range(12)]
+    )
     source = open_scans(tmp_path / "in")
     convert(source, WRITERS["kitti360"](tmp_path / "one"), progress=False)
-    assert convert(source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False) == Report(
-        written=12
+    assert convert(
+        source, WRITERS["kitti360"](tmp_path / "two"), jobs=2, progress=False
+    ) == Report(written=12)
+    assert (
+        files(tmp_path / "one") == files(tmp_path / "two")
+        and len(files(tmp_path / "one")) > 24
     )
-    assert files(tmp_path / "one") == files(tmp_path / "two") and len(files(tmp_path / "one")) > 24
 
 
 @pytest.mark.parametrize("fields", [(), ("reflectance", "label")])
@@ -126,12 +143,16 @@ def test_a_bank_becomes_semantic_kitti_with_a_label_file_for_every_scan(
     convert(bank, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
     for index, scan in enumerate(bank):
         raw = np.fromfile(
-            tmp_path / "out" / "sequences" / "00" / "labels" / f"{index:06d}.label", "<u4"
+            tmp_path / "out" / "sequences" / "00" / "labels" / f"{index:06d}.label",
+            "<u4",
         )
         assert len(raw) == len(scan) and (scan.label is None) == ("label" not in fields)
-        known = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
+        known = (
+            np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
+        )
         assert (
-            np.array_equal(raw, SEMANTIC_KITTI.encode(known)) and (raw[known == IGNORE] == 0).all()
+            np.array_equal(raw, SEMANTIC_KITTI.encode(known))
+            and (raw[known == IGNORE] == 0).all()
         )
         assert raw.any() == ("label" in fields)
 
@@ -142,18 +163,25 @@ def test_a_bank_has_no_boxes_for_kitti_objects(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, call)
     assert isinstance(result.exception, DataError)
     assert re.search(
-        r"scan 'small/5/0' has no boxes; .*Write it as semantic_kitti", str(result.exception)
+        r"scan 'small/5/0' has no boxes; .*Write it as semantic_kitti",
+        str(result.exception),
     )
     result = CliRunner().invoke(app, [*call, "--on-bad", "skip"])
     assert "0 scans written, 0 were there already, 3 skipped" in result.output
     assert not list(tmp_path.rglob("*.bin"))
-    writer = KITTIObjectWriter(tmp_path / "testing", part="testing")  # which has no label_2
-    assert convert(open_scans(tmp_path / "bank"), writer, progress=False) == Report(written=3)
+    writer = KITTIObjectWriter(
+        tmp_path / "testing", part="testing"
+    )  # which has no label_2
+    assert convert(open_scans(tmp_path / "bank"), writer, progress=False) == Report(
+        written=3
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("jobs", "policy"), [(1, "error"), (1, "skip"), (2, "skip")])
-def test_bad_scans_stop_the_run_or_are_named(tmp_path: Path, jobs: int, policy: str) -> None:
+def test_bad_scans_stop_the_run_or_are_named(
+    tmp_path: Path, jobs: int, policy: str
+) -> None:
     paths = MAKERS["folder"](tmp_path / "in")
     paths[0].write_bytes(b"cut")
     writer = WRITERS["npz"](tmp_path / "out")
@@ -161,23 +189,36 @@ def test_bad_scans_stop_the_run_or_are_named(tmp_path: Path, jobs: int, policy: 
     with pytest.raises(DataError, match="000000.bin is 3 bytes long"):
         convert(source, writer, progress=False)
     report = convert(source, writer, jobs=jobs, on_bad="skip", progress=False)
-    assert list(report.skipped) == ["000000"] and "is 3 bytes long" in report.skipped["000000"]
+    assert (
+        list(report.skipped) == ["000000"]
+        and "is 3 bytes long" in report.skipped["000000"]
+    )
     assert report.written == 2 and not writer.complete(0, "000000")
 
 
 def test_a_scan_that_the_format_cannot_hold_is_skipped(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(2)]
-    scans[0].raw_label, scans[0].instance = None, np.full(len(scans[0]), 1 << 17, np.int32)
+    scans[0].raw_label, scans[0].instance = (
+        None,
+        np.full(len(scans[0]), 1 << 17, np.int32),
+    )
     with pytest.raises(DataError, match="instances from 131072"):
         convert(scans, WRITERS["kitti"](tmp_path / "out"), progress=False)
-    report = convert(scans, WRITERS["kitti"](tmp_path / "out"), on_bad="skip", progress=False)
+    report = convert(
+        scans, WRITERS["kitti"](tmp_path / "out"), on_bad="skip", progress=False
+    )
     assert report.written == 1 and list(report.skipped) == ["0"]
 
 
 def test_a_full_target_stops_the_run_for_every_policy(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("in the way")
     with pytest.raises(FileError, match="cannot be written"):
-        convert([some_scan()], WRITERS["npz"](tmp_path / "out"), on_bad="skip", progress=False)
+        convert(
+            [some_scan()],
+            WRITERS["npz"](tmp_path / "out"),
+            on_bad="skip",
+            progress=False,
+        )
     with pytest.raises(ConfigError, match="0 jobs; expected at least 1"):
         convert([some_scan()], WRITERS["npz"](tmp_path / "out"), jobs=0)
 
@@ -191,7 +232,9 @@ def test_conversion_to_another_sensor(tmp_path: Path, name: str) -> None:
     expected = Transfer(sensor)(scan, keyed_rng(0, 0))
     assert read.sensor == sensor and np.array_equal(read.points, expected.points)
     assert all(
-        np.array_equal(read.fields()[k], v) for k, v in expected.fields().items() if k != "time"
+        np.array_equal(read.fields()[k], v)
+        for k, v in expected.fields().items()
+        if k != "time"
     )
     assert np.array_equal(read.pose, scan.pose) and read.boxes is not None
     assert report.seen == [Transfer(sensor).cast(scan).seen]
@@ -210,22 +253,32 @@ def test_poses_and_calibration_move_with_the_mount(tmp_path: Path, drive: Path) 
     before = open_scans(drive)
     transfer = Transfer(load_sensor("hdl32e_nuscenes"), Mount(0.3, 4.0))
     out = WRITERS["semantic_kitti"](tmp_path / "out")
-    report = convert(before, out, as_sensor=AsSensor(transfer, sweeps=1), progress=False)
+    report = convert(
+        before, out, as_sensor=AsSensor(transfer, sweeps=1), progress=False
+    )
     assert report.written == 3 and "times.txt" in report.left_out[0]
     after = open_scans(out.root)
     corners = record(before.sensor).boxes.corners()[0]
     moved = transfer.mount.points(corners)
     for a, b in zip(
-        before.calibration(0).pixels(corners), after.calibration(0).pixels(moved), strict=True
+        before.calibration(0).pixels(corners),
+        after.calibration(0).pixels(moved),
+        strict=True,
     ):
         np.testing.assert_allclose(a, b, atol=1e-2)
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(b.pose, a.pose @ transfer.mount.matrix, atol=1e-5)
     alone = convert(
-        before, WRITERS["semantic_kitti"](tmp_path / "alone"), as_sensor=transfer, progress=False
+        before,
+        WRITERS["semantic_kitti"](tmp_path / "alone"),
+        as_sensor=transfer,
+        progress=False,
     )
     assert alone.written == 3
-    assert all(len(a) < len(b) for a, b in zip(open_scans(tmp_path / "alone"), after, strict=True))
+    assert all(
+        len(a) < len(b)
+        for a, b in zip(open_scans(tmp_path / "alone"), after, strict=True)
+    )
 
 
 @pytest.fixture
@@ -263,14 +316,22 @@ WRONG = {
         ["--as-sensor", "os1_128", "--mount", "0.1"],
         "--mount 0.1; expected metres and degrees",
     ),
-    "an impossible mount": (["--as-sensor", "os1_128", "--mount", "9,0"], "at most 5 m"),
+    "an impossible mount": (
+        ["--as-sensor", "os1_128", "--mount", "9,0"],
+        "at most 5 m",
+    ),
     "fewer than no sweeps": (["--as-sensor", "os1_128", "--sweeps", "-1"], "-1 sweeps"),
-    "noise of metres": (["--as-sensor", "os1_128", "--range-noise", "2"], "range_noise=2"),
+    "noise of metres": (
+        ["--as-sensor", "os1_128", "--range-noise", "2"],
+        "range_noise=2",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_options_of_another_sensor(drive: Path, tmp_path: Path, case: str) -> None:
+def test_wrong_options_of_another_sensor(
+    drive: Path, tmp_path: Path, case: str
+) -> None:
     options, message = WRONG[case]
     with pytest.raises(ConfigError, match=message):
         CliRunner().invoke(
@@ -281,7 +342,9 @@ def test_wrong_options_of_another_sensor(drive: Path, tmp_path: Path, case: str)
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_prints_skipped_scans_with_reasons(dataset: Path, tmp_path: Path) -> None:
+def test_the_command_prints_skipped_scans_with_reasons(
+    dataset: Path, tmp_path: Path
+) -> None:
     [*_, path] = sorted(dataset.rglob("*.bin"))
     path.write_bytes(b"cut")
     result = CliRunner().invoke(
@@ -344,13 +407,16 @@ def test_other_options_of_the_reader_do_not_keep_the_old_scans(tmp_path: Path) -
     changed = WRITERS["npz"](tmp_path / "changed")
     convert(open_scans(tmp_path / "in", reflectance_max=65535), out, progress=False)
     with pytest.raises(
-        ConfigError, match="was filled with .*reflectance_max.*65535.*choose another folder"
+        ConfigError,
+        match="was filled with .*reflectance_max.*65535.*choose another folder",
     ):
         convert(open_scans(tmp_path / "in", reflectance_max=255), out, progress=False)
     target = load_sensor("vlp16")
     mistaken = open_scans(tmp_path / "in", reflectance_max=255, sensor="vlp16")
     changed.root.mkdir()
-    changed.path(0, "a").touch()  # as if it could be written: these points are no streets
+    changed.path(
+        0, "a"
+    ).touch()  # as if it could be written: these points are no streets
     convert(mistaken, changed, as_sensor=target, progress=False)
     with pytest.raises(ConfigError, match="was filled with"):
         convert(
@@ -365,7 +431,9 @@ def five_fields(folder: Path, *counts: int) -> Path:
     """Files of five numbers per point, whose sizes show it with an odd number of points."""
     folder.mkdir()
     for index, count in enumerate(counts):
-        np.tile(np.float32([9, 9, 0, 0.5, 0.1]), (count, 1)).tofile(folder / f"{index}.bin")
+        np.tile(np.float32([9, 9, 0, 0.5, 0.1]), (count, 1)).tofile(
+            folder / f"{index}.bin"
+        )
     return folder
 
 
@@ -379,7 +447,9 @@ def test_a_run_that_wrote_nothing_can_be_corrected(tmp_path: Path, policy: Any) 
     assert convert(open_scans(root, fields=5), out, progress=False) == Report(written=2)
 
 
-def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(tmp_path: Path) -> None:
+def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(
+    tmp_path: Path,
+) -> None:
     scans = [some_scan(0), some_scan(1)]
     out = WRITERS["kitti_object"](tmp_path)
     scans[1].boxes = None
@@ -387,7 +457,11 @@ def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(tmp_pat
         convert(scans, out, progress=False)
     with pytest.raises(ConfigError, match="was filled with .*KITTIObjectWriter"):
         convert(scans, WRITERS["semantic_kitti"](tmp_path), progress=False)
-    [path.unlink() for path in tmp_path.rglob("*") if path.is_file() and path.name != SETTINGS]
+    [
+        path.unlink()
+        for path in tmp_path.rglob("*")
+        if path.is_file() and path.name != SETTINGS
+    ]
     with pytest.raises(
         DataError, match="has no boxes"
     ):  # beside another run, which has not written a scan yet
@@ -395,13 +469,17 @@ def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(tmp_pat
     assert (tmp_path / SETTINGS).is_file()
 
 
-@pytest.mark.parametrize("options", [{}, {"tr": False}, {"calib": False}, {"times": False}])
+@pytest.mark.parametrize(
+    "options", [{}, {"tr": False}, {"calib": False}, {"times": False}]
+)
 def test_side_files_of_semantic_kitti_are_carried_and_never_invented(
     tmp_path: Path, options: dict[str, bool]
 ) -> None:
     given = a_sequence(tmp_path / "in", **options)
     source = open_scans(tmp_path / "in")
-    report = convert(source, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False)
+    report = convert(
+        source, WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
+    )
     there = {path.name: path.read_bytes() for path in given.glob("*.txt")}
     written = tmp_path / "out" / "sequences" / "07"
     assert {path.name: path.read_bytes() for path in written.glob("*.txt")} == there
@@ -421,17 +499,23 @@ def test_side_files_of_semantic_kitti_are_carried_and_never_invented(
         assert scan.pose is None or np.array_equal(scan.pose, expected.pose)
 
 
-def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(tmp_path: Path) -> None:
+def test_scans_that_get_other_numbers_do_not_get_side_files_of_others(
+    tmp_path: Path,
+) -> None:
     given = a_sequence(tmp_path / "in")
     given.rename(given.with_name("seven"))
     report = convert(
-        open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
+        open_scans(tmp_path / "in"),
+        WRITERS["semantic_kitti"](tmp_path / "out"),
+        progress=False,
     )
     assert report.left_out == [
         "calibration, poses and times of sequence seven: its scans are renumbered",
     ]
     assert not (tmp_path / "out" / "sequences" / "00" / "times.txt").exists()
-    assert np.allclose(open_scans(tmp_path / "out")[1].pose, open_scans(tmp_path / "in")[1].pose)
+    assert np.allclose(
+        open_scans(tmp_path / "out")[1].pose, open_scans(tmp_path / "in")[1].pose
+    )
 
 
 def test_the_command_reports_what_was_left_out(tmp_path: Path) -> None:
@@ -441,5 +525,26 @@ def test_the_command_reports_what_was_left_out(tmp_path: Path) -> None:
     )
     assert (
         result.exit_code == 0
-        and f"left out sequences/07/times.txt: {tmp_path / 'in'} has none" in result.output
+        and f"left out sequences/07/times.txt: {tmp_path / 'in'} has none"
+        in result.output
     )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="files are not locked on Windows")
+@pytest.mark.parametrize("to", ["webdataset", "kitti360"])
+def test_a_second_conversion_into_the_folder_waits_its_turn(
+    tmp_path: Path, to: str
+) -> None:
+    MAKERS["kitti360"](tmp_path / "in")
+    first = open_scans(tmp_path / "in")
+    out = tmp_path / "out"
+
+    class Meanwhile(READERS["kitti360"]):  # type: ignore[misc]
+        def read(self, index: int) -> Scan:
+            with pytest.raises(ConfigError, match="in which another process works"):
+                convert(first, WRITERS[to](out), progress=False)
+            return super().read(index)
+
+    report = convert(Meanwhile(tmp_path / "in"), WRITERS[to](out), progress=False)
+    assert report.written == 3 and len(open_scans(out)) == 3
+    assert convert(first, WRITERS[to](out), progress=False).kept == 3

@@ -25,9 +25,9 @@ def rings_of(seed: int) -> Scan:
     sensor = load_sensor("hdl64e_kitti")
     rng = np.random.default_rng(seed)
     lasers = sensor.by_beams()
-    distance = np.where(rng.random(lasers.shape) < 0.8, rng.uniform(5, 70, lasers.shape), 0).astype(
-        np.float32
-    )
+    distance = np.where(
+        rng.random(lasers.shape) < 0.8, rng.uniform(5, 70, lasers.shape), 0
+    ).astype(np.float32)
     scan = unproject(RangeImage(distance, lasers))
     row = np.nonzero(distance)[0]
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]) % (2 * np.pi)
@@ -47,14 +47,20 @@ def test_conversion_unfolds_scans(tmp_path: Path) -> None:
         assert np.array_equal(
             project(scan).sensor.row_elevations(), expected.sensor.laser_elevations
         )
-    for report in (Report(written=3), Report(kept=3)):  # points on the beams, described beside them
+    for report in (
+        Report(written=3),
+        Report(kept=3),
+    ):  # points on the beams, described beside them
         again = convert(
             open_scans(tmp_path / "in"),
             WRITERS["kitti"](tmp_path / "b"),
             unfold=True,
             progress=False,
         )
-        assert again == report and open_scans(tmp_path / "b").sensor == scans[0].sensor.by_beams()
+        assert (
+            again == report
+            and open_scans(tmp_path / "b").sensor == scans[0].sensor.by_beams()
+        )
     write_all(
         "kitti",
         tmp_path / "shuffled",
@@ -68,7 +74,11 @@ def test_conversion_unfolds_scans(tmp_path: Path) -> None:
             progress=False,
         )
     with pytest.raises(ConfigError, match="was filled with .*'unfold': True"):
-        convert(open_scans(tmp_path / "in"), WRITERS["range"](tmp_path / "out"), progress=False)
+        convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["range"](tmp_path / "out"),
+            progress=False,
+        )
 
 
 def with_bad_points(path: Path) -> np.ndarray:
@@ -80,9 +90,12 @@ def with_bad_points(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder", "nuscenes"]
+    "layout",
+    ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder", "nuscenes"],
 )
-def test_bad_points_are_dropped_with_their_labels_and_counted(tmp_path: Path, layout: str) -> None:
+def test_bad_points_are_dropped_with_their_labels_and_counted(
+    tmp_path: Path, layout: str
+) -> None:
     paths = MAKERS[layout](tmp_path / "in")
     before = open_scans(tmp_path / "in", layout=layout)[1]
     if layout == "nuscenes":
@@ -94,21 +107,29 @@ def test_bad_points_are_dropped_with_their_labels_and_counted(tmp_path: Path, la
     else:
         kept = np.flatnonzero(with_bad_points(paths[1]))
     out = tmp_path / "out"
-    with pytest.raises(DataError, match=r"points are NaN or infinite.*--on-bad drop-points"):
-        convert(open_scans(tmp_path / "in", layout=layout), WRITERS["npz"](out), progress=False)
+    with pytest.raises(
+        DataError, match=r"points are NaN or infinite.*--on-bad drop-points"
+    ):
+        convert(
+            open_scans(tmp_path / "in", layout=layout),
+            WRITERS["npz"](out),
+            progress=False,
+        )
     options = ["--to", "npz", "--on-bad", "drop-points", "--layout", layout]
     result = CliRunner().invoke(app, [str(tmp_path / "in"), str(out), *options])
     name = open_scans(tmp_path / "in", layout=layout).ids[1]
     count = len(before) - len(kept)
     assert (
         result.exit_code == 0
-        and f"dropped {count} points of {name}, which are NaN or infinite" in result.output
+        and f"dropped {count} points of {name}, which are NaN or infinite"
+        in result.output
     )
     scan = open_scans(out)[1]
     expected = before[kept]
     assert np.array_equal(scan.points, expected.points)
     assert all(
-        np.array_equal(scan.fields()[name], values) for name, values in expected.fields().items()
+        np.array_equal(scan.fields()[name], values)
+        for name, values in expected.fields().items()
     )
     source = open_scans(tmp_path / "in", layout=layout, on_bad="drop-points")
     assert len(source[1]) == len(kept) and source.dropped == {name: count}
@@ -125,17 +146,33 @@ def test_a_scan_of_bad_points_only_is_refused(tmp_path: Path) -> None:
 def test_intensities_on_another_scale(tmp_path: Path) -> None:
     """The advice of the error is what is to be typed."""
     scan = some_scan(0)
-    points = np.column_stack([scan.points, np.round(scan.reflectance * 255)]).astype("<f4")
+    points = np.column_stack([scan.points, np.round(scan.reflectance * 255)]).astype(
+        "<f4"
+    )
     (tmp_path / "in").mkdir()
     np.save(tmp_path / "in" / "a.npy", points)
-    with pytest.raises(DataError, match=r"on another scale \((--reflectance-max 255)") as error:
-        convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "no"), progress=False)
+    with pytest.raises(
+        DataError, match=r"on another scale \((--reflectance-max 255)"
+    ) as error:
+        convert(
+            open_scans(tmp_path / "in"),
+            WRITERS["kitti"](tmp_path / "no"),
+            progress=False,
+        )
     advice = re.search(r"\((--\S+ \S+),", str(error.value))
     assert advice is not None
-    arguments = [str(tmp_path / "in"), str(tmp_path / "out"), "--to", "kitti", *advice[1].split()]
+    arguments = [
+        str(tmp_path / "in"),
+        str(tmp_path / "out"),
+        "--to",
+        "kitti",
+        *advice[1].split(),
+    ]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert np.allclose(open_scans(tmp_path / "out")[0].reflectance, points[:, 3] / 255)
-    with pytest.raises(ConfigError, match=r"reflectance_max=255.* for .*--layout folder"):
+    with pytest.raises(
+        ConfigError, match=r"reflectance_max=255.* for .*--layout folder"
+    ):
         open_scans(a_sequence(tmp_path / "kitti").parents[1], reflectance_max=255)
 
 
@@ -146,7 +183,9 @@ def test_five_floats_per_point(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match="--fields 5"):
         open_scans(tmp_path / "a.bin")[0]
-    assert np.array_equal(open_scans(tmp_path / "a.bin", fields=5)[0].points, scan.points)
+    assert np.array_equal(
+        open_scans(tmp_path / "a.bin", fields=5)[0].points, scan.points
+    )
 
 
 @pytest.mark.parametrize("to", ["kitti", "npz", "pcd", "ply"])
@@ -158,28 +197,45 @@ def test_suffixes_in_capitals(tmp_path: Path, to: str) -> None:
     source = open_scans(tmp_path / "in")
     assert len(source) == 3 and np.array_equal(source[0].points, expected.points)
     assert np.array_equal(
-        open_scans(paths[0].with_suffix(paths[0].suffix.upper()))[0].points, expected.points
+        open_scans(paths[0].with_suffix(paths[0].suffix.upper()))[0].points,
+        expected.points,
     )
-    assert source[0].label is not None and np.array_equal(source[0].label, expected.label)
-    assert convert(source, WRITERS["kitti"](tmp_path / "out"), progress=False) == Report(written=3)
+    assert source[0].label is not None and np.array_equal(
+        source[0].label, expected.label
+    )
+    assert convert(
+        source, WRITERS["kitti"](tmp_path / "out"), progress=False
+    ) == Report(written=3)
 
 
 @pytest.mark.parametrize("to", ["kitti", "semantic_kitti", "kitti360", "range", "npz"])
-def test_synthetic_scans_stay_synthetic_in_every_format(tmp_path: Path, to: str) -> None:
+def test_synthetic_scans_stay_synthetic_in_every_format(
+    tmp_path: Path, to: str
+) -> None:
     bank = write_bank(tmp_path / "bank", [some_image(i) for i in range(2)])[0].parent
-    assert convert(open_scans(bank), WRITERS[to](tmp_path / "a"), progress=False).written == 2
+    assert (
+        convert(open_scans(bank), WRITERS[to](tmp_path / "a"), progress=False).written
+        == 2
+    )
     first = open_scans(tmp_path / "a")
-    assert [scan.domain for scan in first] == [SYNTHETIC] * 2 and first[0].domain == SYNTHETIC
+    assert [scan.domain for scan in first] == [SYNTHETIC] * 2 and first[
+        0
+    ].domain == SYNTHETIC
     convert(first, WRITERS["kitti"](tmp_path / "b"), progress=False)
     assert open_scans(tmp_path / "b")[0].domain == SYNTHETIC
     if to in ("semantic_kitti", "kitti360"):  # one file of it, too
-        assert open_scans(sorted((tmp_path / "a").rglob("*.bin"))[0])[0].domain == SYNTHETIC
+        assert (
+            open_scans(sorted((tmp_path / "a").rglob("*.bin"))[0])[0].domain
+            == SYNTHETIC
+        )
 
 
 def test_real_scans_stay_real(tmp_path: Path) -> None:
     MAKERS["kitti360"](tmp_path / "in")
     convert(
-        open_scans(tmp_path / "in"), WRITERS["semantic_kitti"](tmp_path / "out"), progress=False
+        open_scans(tmp_path / "in"),
+        WRITERS["semantic_kitti"](tmp_path / "out"),
+        progress=False,
     )
     assert {scan.domain for scan in open_scans(tmp_path / "out")} == {REAL}
 

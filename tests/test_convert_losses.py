@@ -40,7 +40,8 @@ def test_what_a_format_cannot_hold_is_counted_and_refused_on_request(
     assert has == set(DETAILS) - set(report.lost)
     strict = WRITERS[to](tmp_path / "strict")  # type: ignore[call-arg]
     with pytest.raises(
-        ConfigError, match=f"has .*{next(iter(report.lost))}.* cannot hold.*npz or webdataset"
+        ConfigError,
+        match=f"has .*{next(iter(report.lost))}.* cannot hold.*npz or webdataset",
     ):
         convert(scans, strict, on_bad="skip", strict=True, progress=False)
     assert not [path for path in (tmp_path / "strict").rglob("*") if path.is_file()]
@@ -63,15 +64,25 @@ def test_scans_without_labels_gain_none(to: str, tmp_path: Path) -> None:
 def test_boxes_stand_beside_clouds(to: str, tmp_path: Path) -> None:
     scan = replace(
         some_scan(),
-        boxes=replace(some_boxes(), occlusion=np.arange(5) % 3, dont_care=np.ones((2, 4))),
+        boxes=replace(
+            some_boxes(), occlusion=np.arange(5) % 3, dont_care=np.ones((2, 4))
+        ),
     )
     [path] = write_all(to, tmp_path, [scan])
     found = back(to, tmp_path)[0].boxes
     assert found is not None and scan.boxes is not None
-    assert all(same(getattr(found, name), value) for name, value in vars(scan.boxes).items())
+    assert all(
+        same(getattr(found, name), value) for name, value in vars(scan.boxes).items()
+    )
     beside = path.with_suffix(".boxes.json")
     numbered = beside.read_text().replace('"names": [', '"names": [1, ')
-    for text in ("[", "[]", '{"values": []}', numbered, '{"values": 1, "names": ["Car"]}'):
+    for text in (
+        "[",
+        "[]",
+        '{"values": []}',
+        numbered,
+        '{"values": 1, "names": ["Car"]}',
+    ):
         beside.write_text(text)
         with pytest.raises(DataError, match=r"boxes\.json"):
             open_scans(tmp_path)[0]
@@ -84,16 +95,28 @@ def test_the_command_prints_a_line_for_each_field(tmp_path: Path) -> None:
     assert isinstance(result.exception, ConfigError)
     result = CliRunner().invoke(app, call)
     for name in ("ring", "confidence", "time", "boxes", "pose"):
-        assert result.output.count(f"dropped {name} of 3 scans, which kitti cannot hold") == 1
+        assert (
+            result.output.count(f"dropped {name} of 3 scans, which kitti cannot hold")
+            == 1
+        )
 
 
-def test_boxes_in_which_the_other_sensor_sees_nothing_are_left_out(tmp_path: Path) -> None:
+def test_boxes_in_which_the_other_sensor_sees_nothing_are_left_out(
+    tmp_path: Path,
+) -> None:
     near = car(9, 2)
     far = car(11, -60)
     scan = cast([near])
     scan.boxes = Boxes(np.array([near, far]), ("Car", "Van"))
     convert(
-        [scan], WRITERS["npz"](tmp_path), as_sensor=presets()["hdl32e_nuscenes"], progress=False
+        [scan],
+        WRITERS["npz"](tmp_path),
+        as_sensor=presets()["hdl32e_nuscenes"],
+        progress=False,
     )
     found = open_scans(tmp_path)[0].boxes
-    assert found is not None and found.names == ("Car",) and np.allclose(found.values[0], near)
+    assert (
+        found is not None
+        and found.names == ("Car",)
+        and np.allclose(found.values[0], near)
+    )

@@ -32,9 +32,9 @@ BUILDING = TRAIN_ID["building"]
 
 def plain_image(seed: int) -> RangeImage:
     """Four walls on a road at random distances; each seed gives another scan."""
-    metres = np.tile(np.repeat(np.random.default_rng(seed).uniform(6, 38, 4), 8), (8, 1)).astype(
-        np.float32
-    )
+    metres = np.tile(
+        np.repeat(np.random.default_rng(seed).uniform(6, 38, 4), 8), (8, 1)
+    ).astype(np.float32)
     metres[:, seed % 32] = 0
     seen = metres > 0
     label = np.where(np.arange(8)[:, None] < 3, BUILDING, ROAD) * np.ones((1, 32))
@@ -64,9 +64,13 @@ PLANTED: dict[str, Callable[[RangeImage], object]] = {
     "range": narrow,
     "labels": lambda image: relabelled(image, TRAIN_ID["car"]),
     "empty": empty,
-    "unlabelled": lambda image: relabelled(image, np.where(np.arange(32) < 20, IGNORE, ROAD)),
+    "unlabelled": lambda image: relabelled(
+        image, np.where(np.arange(32) < 20, IGNORE, ROAD)
+    ),
     "floating": lambda image: relabelled(image, ROAD),
-    "speckle": lambda image: relabelled(image, np.where(np.arange(32) % 2, ROAD, BUILDING)),
+    "speckle": lambda image: relabelled(
+        image, np.where(np.arange(32) % 2, ROAD, BUILDING)
+    ),
     "confidence": lambda image: image.channels["confidence"].fill(0.2),
 }
 
@@ -75,7 +79,9 @@ def images_with(name: str) -> list[RangeImage]:
     """Twenty scans; number 13 is the outlier."""
     images = [plain_image(seed) for seed in range(20)]
     if name == "duplicate":
-        images[13] = replace(plain_image(4), range=plain_image(4).range * np.float32(1.002))
+        images[13] = replace(
+            plain_image(4), range=plain_image(4).range * np.float32(1.002)
+        )
     else:
         PLANTED[name](images[13])
         images[13].channels["confidence"][~images[13].mask] = 0
@@ -92,7 +98,10 @@ def test_a_planted_outlier_has_the_highest_score(name: str, tmp_path: Path) -> N
     assert list(scores.values) == list(MEANINGS)
     values = -scores.values[name] if name == "confidence" else scores.values[name]
     others = np.delete(values, 13)
-    assert values[13] > others.max() + 0.5 * (others.max() - others.min()) and values.argmax() == 13
+    assert (
+        values[13] > others.max() + 0.5 * (others.max() - others.min())
+        and values.argmax() == 13
+    )
     if name == "duplicate":
         assert scores.twin[13] == 4 and values[13] > 0.99 and scores.twin[0] == -1
 
@@ -102,7 +111,9 @@ def test_the_measures_match_their_definitions() -> None:
     scan = unproject(image)
     assert MEASURES["empty"].of(image, scan) == pytest.approx(1 / 32)
     assert MEASURES["confidence"].of(image, scan) == pytest.approx(0.9)
-    assert [MEASURES[name].of(image, scan) for name in ("unlabelled", "floating", "speckle")] == [
+    assert [
+        MEASURES[name].of(image, scan) for name in ("unlabelled", "floating", "speckle")
+    ] == [
         0,
         0,
         0,
@@ -127,13 +138,20 @@ def test_the_measures_match_their_definitions() -> None:
 def test_a_scan_without_returns_has_the_largest_distance(tmp_path: Path) -> None:
     images = [plain_image(seed) for seed in range(3)]
     images[1] = RangeImage(
-        np.zeros_like(images[1].range), SENSOR, {"label": np.full_like(images[1].label, IGNORE)}
+        np.zeros_like(images[1].range),
+        SENSOR,
+        {"label": np.full_like(images[1].label, IGNORE)},
     )
     write_bank(tmp_path, images, fields=("label",))
     values = score(Bank(tmp_path), progress=False).values
     assert set(values) == set(MEANINGS) - {"confidence"}
-    assert values["range"][1] == values["labels"][1] == FARTHEST and values["empty"][1] == 1
-    assert [values[name][1] for name in ("unlabelled", "floating", "speckle", "duplicate")] == [
+    assert (
+        values["range"][1] == values["labels"][1] == FARTHEST
+        and values["empty"][1] == 1
+    )
+    assert [
+        values[name][1] for name in ("unlabelled", "floating", "speckle", "duplicate")
+    ] == [
         0,
         0,
         0,
@@ -143,20 +161,26 @@ def test_a_scan_without_returns_has_the_largest_distance(tmp_path: Path) -> None
 
 def test_signatures_are_unit_vectors_of_the_near_returns() -> None:
     points = features(plain_image(3)).signature.astype(np.float64)
-    assert points.shape == (1024,) and np.linalg.norm(points) == pytest.approx(1, abs=1e-3)
+    assert points.shape == (1024,) and np.linalg.norm(points) == pytest.approx(
+        1, abs=1e-3
+    )
     far = plain_image(3)
     far.range[far.mask] = 79
     assert not features(far).signature[512 - 16 : 512 + 16].any()
 
 
 @settings(max_examples=20)
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 12), block=st.integers(1, 5))
-def test_the_most_similar_earlier_scan_is_found(seed: int, count: int, block: int) -> None:
+@given(
+    seed=st.integers(0, 2**32 - 1), count=st.integers(1, 12), block=st.integers(1, 5)
+)
+def test_the_most_similar_earlier_scan_is_found(
+    seed: int, count: int, block: int
+) -> None:
     rng = np.random.default_rng(seed)
     signatures = rng.random((count, 6)) * (rng.random((count, 6)) < 0.5)
-    signatures = (signatures / np.linalg.norm(signatures, axis=1).clip(1e-9)[:, None]).astype(
-        np.float16
-    )
+    signatures = (
+        signatures / np.linalg.norm(signatures, axis=1).clip(1e-9)[:, None]
+    ).astype(np.float16)
     products = signatures.astype(np.float32) @ signatures.astype(np.float32).T
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(duplicates, "BLOCK", block)
@@ -194,7 +218,9 @@ def test_scores_do_not_depend_on_processes_and_are_saved(tmp_path: Path) -> None
     assert (back.bank, back.reference) == (Bank(tmp_path).identity, "") and list(
         back.values
     ) == list(one.values)
-    assert all(np.array_equal(back.values[name], values) for name, values in one.values.items())
+    assert all(
+        np.array_equal(back.values[name], values) for name, values in one.values.items()
+    )
     (tmp_path / FILE).write_bytes((tmp_path / FILE).read_bytes()[:-100])
     with pytest.raises(DataError, match=r"scores.npz: "):
         read_scores(tmp_path / FILE)
@@ -222,7 +248,9 @@ def bank(tmp_path: Path) -> Path:
 def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
     out = tmp_path / "good"
     picture = tmp_path / "scores.png"
-    status, output = call("curate", bank, "--sort", "duplicate", "--limit", 1, "--plot", picture)
+    status, output = call(
+        "curate", bank, "--sort", "duplicate", "--limit", 1, "--plot", picture
+    )
     assert status == 0 and "0 of 20 scans match the rules" in output
     [row] = [line for line in output.splitlines() if "small/5/13" in line]
     assert row.split()[0] == "13" and row.split()[-1] == "4"
@@ -238,9 +266,13 @@ def test_the_command_lists_plots_and_drops(bank: Path, tmp_path: Path) -> None:
         in output
     )
     assert (bank / FILE).stat().st_mtime_ns == made  # scored once
-    assert names_and_points(out) == names_and_points(bank)[:13] + names_and_points(bank)[14:]
     assert (
-        "left out by 'duplicate > 0.99'" in json.loads(call("info", out, "--json")[1])["curation"]
+        names_and_points(out)
+        == names_and_points(bank)[:13] + names_and_points(bank)[14:]
+    )
+    assert (
+        "left out by 'duplicate > 0.99'"
+        in json.loads(call("info", out, "--json")[1])["curation"]
     )
     call("curate", out)
     assert len(read_scores(out / FILE).twin) == 19
@@ -254,13 +286,27 @@ def test_the_plot_counts_every_scan_and_marks_some() -> None:
     figure = histograms(values, MEANINGS, marked, "title")
     assert [axes.get_title(loc="left") for axes in figure.axes] == list(MEANINGS)
     for axes in figure.axes:
-        plain, orange = (sum(patch.get_height() for patch in bars) for bars in axes.containers)
+        plain, orange = (
+            sum(patch.get_height() for patch in bars) for bars in axes.containers
+        )
         assert (plain, orange) == ((~marked).sum(), marked.sum())
 
 
-def test_the_command_prints_json_and_takes_a_reference(bank: Path, tmp_path: Path) -> None:
+def test_the_command_prints_json_and_takes_a_reference(
+    bank: Path, tmp_path: Path
+) -> None:
     found = json.loads(
-        call("curate", bank, "--json", "--sort", "-empty", "--limit", 3, "--drop", "empty >= 0")[1]
+        call(
+            "curate",
+            bank,
+            "--json",
+            "--sort",
+            "-empty",
+            "--limit",
+            3,
+            "--drop",
+            "empty >= 0",
+        )[1]
     )
     assert (found["scans"], found["dropped"], len(found["listed"])) == (20, 20, 3)
     assert {"number", "id", "twin", "dropped", *MEANINGS} == set(found["listed"][0])
@@ -298,7 +344,10 @@ def test_scores_of_another_bank_are_not_reused(bank: Path) -> None:
     [
         (["--out", "x"], "--out x without a rule; expected --drop as well"),
         (["--plot", "x.jpg"], "--plot x.jpg; expected a file that ends in .png"),
-        (["--split", "train"], "--split train without a reference; expected --reference as well"),
+        (
+            ["--split", "train"],
+            "--split train without a reference; expected --reference as well",
+        ),
         (["--sort", "beauty"], "score 'beauty'; expected one of 'range', 'labels'"),
         (["--drop", "beauty > 1", "--out", "x"], "score 'beauty' in rule"),
         (["--drop", "empty >= 0", "--out", "x"], "all 20 scans of .* left out"),

@@ -61,7 +61,8 @@ def some_signatures(
         rng.integers(0, scenes, count)
     ]
     roots = np.sqrt(
-        profile * (scene + own * rng.standard_gamma(0.6, (count, SIGNATURE))), dtype=np.float32
+        profile * (scene + own * rng.standard_gamma(0.6, (count, SIGNATURE))),
+        dtype=np.float32,
     )
     unit: NDArray[np.float32] = roots / np.linalg.norm(roots, axis=1)[:, None]
     return unit
@@ -83,8 +84,12 @@ def planted(count: int, seed: int, each: int = 200, scenes: int = 30) -> Planted
     rng = np.random.default_rng(seed)
     signatures = some_signatures(count, rng, scenes)
     sources = rng.choice(count // 2, 2 * each, replace=False).tolist()
-    places = (count // 2 + rng.choice(count - count // 2, 2 * each, replace=False)).tolist()
-    near, copies = (dict(zip(places[k::2], sources[k::2], strict=True)) for k in range(2))
+    places = (
+        count // 2 + rng.choice(count - count // 2, 2 * each, replace=False)
+    ).tolist()
+    near, copies = (
+        dict(zip(places[k::2], sources[k::2], strict=True)) for k in range(2)
+    )
     for place, source in near.items():
         signatures[place] = like(signatures[source], 0.9902, rng)
     for place, source in copies.items():
@@ -107,7 +112,8 @@ def test_near_duplicates_are_found(scenes: int) -> None:
     signatures, near, copies = planted(8_000, scenes, scenes=scenes)
     similarity, twin = find_similar(signatures, progress=False)
     true = [
-        float(signatures[a].astype(float) @ signatures[b].astype(float)) for a, b in near.items()
+        float(signatures[a].astype(float) @ signatures[b].astype(float))
+        for a, b in near.items()
     ]
     assert min(true) > 0.9895 and max(true) < 0.9915
     assert np.mean([twin[a] == b for a, b in near.items()]) >= 0.95
@@ -130,12 +136,16 @@ def test_the_approximate_similarity_never_exceeds_the_exact_one(many: Planted) -
 
 
 @pytest.mark.slow
-def test_the_block_size_changes_nothing(many: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_block_size_changes_nothing(
+    many: Planted, monkeypatch: pytest.MonkeyPatch
+) -> None:
     expected = find_similar(many.signatures, progress=False)
     for rows in (97, 5000):
         monkeypatch.setattr(neighbours, "ROWS", rows)
         monkeypatch.setattr(neighbours, "PAIRS", 300 * rows)
-        for one, other in zip(expected, find_similar(many.signatures, progress=False), strict=True):
+        for one, other in zip(
+            expected, find_similar(many.signatures, progress=False), strict=True
+        ):
             assert np.array_equal(one, other)
 
 
@@ -158,14 +168,20 @@ def test_nearly_identical_scans_are_found(monkeypatch: pytest.MonkeyPatch) -> No
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
 def test_the_search_among_few_scans(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    signatures = rng.random((count, SIGNATURE)) * (rng.random((count, SIGNATURE)) < 0.05)
-    signatures = (signatures / np.linalg.norm(signatures, axis=1)[:, None]).astype(np.float16)
+    signatures = rng.random((count, SIGNATURE)) * (
+        rng.random((count, SIGNATURE)) < 0.05
+    )
+    signatures = (signatures / np.linalg.norm(signatures, axis=1)[:, None]).astype(
+        np.float16
+    )
     signatures[rng.random(count) < 0.3] = signatures[0]
     similarity, twin = find_similar(signatures, progress=False)
     exact, _ = compare_all(signatures, progress=False)
     assert (similarity <= exact + 1e-5).all() and (twin < np.arange(count)).all()
     for number in range(1, count):
-        if any(np.array_equal(signatures[number], signatures[i]) for i in range(number)):
+        if any(
+            np.array_equal(signatures[number], signatures[i]) for i in range(number)
+        ):
             assert np.array_equal(signatures[number], signatures[twin[number]])
 
 
@@ -196,9 +212,9 @@ def stored(folder: Path, count: int) -> Store:
     rng = np.random.default_rng(0)
     for block, start in enumerate(range(0, count, store_module.BLOCK)):
         rows = np.zeros(min(store_module.BLOCK, count - start), store.dtype)
-        rows["signature"] = rng.integers(0, 256, (len(rows), SIGNATURE), np.uint8) * np.float16(
-            1 / 4096
-        )
+        rows["signature"] = rng.integers(
+            0, 256, (len(rows), SIGNATURE), np.uint8
+        ) * np.float16(1 / 4096)
         store.write(block, rows)
     return store
 
@@ -206,7 +222,9 @@ def stored(folder: Path, count: int) -> Store:
 @pytest.mark.slow
 def test_memory_grows_slowly_with_the_number_of_scans(tmp_path: Path) -> None:
     """By at most 400 bytes per scan, although a signature has 2,048 bytes."""
-    few, more = (peak(stored(tmp_path / str(count), count)) for count in (15_000, 30_000))
+    few, more = (
+        peak(stored(tmp_path / str(count), count)) for count in (15_000, 30_000)
+    )
     assert (more - few) / 15_000 < 400
 
 
@@ -222,13 +240,18 @@ def small_files(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def bank(tmp_path: Path) -> Bank:
     write_bank(
-        tmp_path / "bank", [plain_image(seed) for seed in range(20)], shard_size=7, fields=ALL
+        tmp_path / "bank",
+        [plain_image(seed) for seed in range(20)],
+        shard_size=7,
+        fields=ALL,
     )
     return Bank(tmp_path / "bank")
 
 
 @pytest.mark.slow
-def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.FixtureRequest) -> None:
+def test_the_size_of_the_files_changes_no_score(
+    bank: Bank, request: pytest.FixtureRequest
+) -> None:
     expected = score(bank, progress=False)
     request.getfixturevalue("small_files")
     for jobs in (1, 2):
@@ -237,12 +260,15 @@ def test_the_size_of_the_files_changes_no_score(bank: Bank, request: pytest.Fixt
             parts.twin, expected.twin
         )
         assert all(
-            np.array_equal(parts.values[name], values) for name, values in expected.values.items()
+            np.array_equal(parts.values[name], values)
+            for name, values in expected.values.items()
         )
 
 
 @pytest.mark.usefixtures("small_files")
-def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_run_resumes(
+    bank: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     expected = score(bank, progress=False)
     read: list[int] = []
     image = Bank.image
@@ -260,7 +286,8 @@ def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.M
     scores = score(bank, progress=False, folder=tmp_path / "kept")
     assert read == [16, 17, 18, 19]  # two files of eight scans existed
     assert all(
-        np.array_equal(scores.values[name], values) for name, values in expected.values.items()
+        np.array_equal(scores.values[name], values)
+        for name, values in expected.values.items()
     )
     damaged = next((tmp_path / "kept").rglob("features-000001.npy"))
     damaged.write_bytes(damaged.read_bytes()[:-50])
@@ -275,11 +302,16 @@ def test_a_stopped_run_resumes(bank: Bank, tmp_path: Path, monkeypatch: pytest.M
 def test_features_of_another_bank_are_not_reused(bank: Bank, tmp_path: Path) -> None:
     score(bank, progress=False, folder=tmp_path / "kept")
     write_bank(
-        tmp_path / "other", [some_image(seed) for seed in range(20)], shard_size=7, fields=ALL
+        tmp_path / "other",
+        [some_image(seed) for seed in range(20)],
+        shard_size=7,
+        fields=ALL,
     )
     other = Bank(tmp_path / "other")
     scores = score(other, progress=False, folder=tmp_path / "kept")
-    assert np.array_equal(scores.values["empty"], score(other, progress=False).values["empty"])
+    assert np.array_equal(
+        scores.values["empty"], score(other, progress=False).values["empty"]
+    )
 
 
 def test_the_command_removes_its_features(bank: Bank) -> None:
@@ -296,7 +328,9 @@ def test_the_command_removes_its_features(bank: Bank) -> None:
 def test_a_damaged_file_of_features_is_reported(tmp_path: Path) -> None:
     store = stored(tmp_path, 10)
     np.save(tmp_path / "features-000000.npy", np.zeros(10))
-    with pytest.raises(DataError, match=r"holds \(10,\) of float64; expected what was measured"):
+    with pytest.raises(
+        DataError, match=r"holds \(10,\) of float64; expected what was measured"
+    ):
         store[np.arange(3)]
 
 
@@ -311,7 +345,9 @@ def wait_for(path: Path, pattern: str, process: subprocess.Popen[bytes]) -> None
 def test_a_killed_command_resumes(tmp_path: Path) -> None:
     """Killed as soon as one file of 4,096 scans exists."""
     root = tmp_path / "bank"
-    write_bank(root, [plain_image(seed) for seed in range(20)], shard_size=20, fields=ALL)
+    write_bank(
+        root, [plain_image(seed) for seed in range(20)], shard_size=20, fields=ALL
+    )
     _repeat(root, 220)
     command = [sys.executable, "-m", "lidar_synth", "curate", str(root), "--json"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)

@@ -36,7 +36,10 @@ def test_rules_select_scans(rule: str, selected: list[bool]) -> None:
         ("confidence < 0.5 and", "expected a score"),
         ("confidence < 0.5); print(1", "expected a score"),
         ("__import__('os') < 1", "expected a score"),
-        ("colour < 1", "score 'colour' in rule 'colour < 1'; expected one of confidence, empty"),
+        (
+            "colour < 1",
+            "score 'colour' in rule 'colour < 1'; expected one of confidence, empty",
+        ),
     ],
 )
 def test_invalid_rules_are_refused(rule: str, message: str) -> None:

@@ -76,13 +76,19 @@ def write_drives(root: Path, drives: list[int], scans: int, labelled: bool) -> N
     for drive in drives:
         for frame in range(scans):
             scan = random_scan(sensor, 50, frame)
-            kept = scan if labelled else replace(scan, label=None, raw_label=None, instance=None)
+            kept = (
+                scan
+                if labelled
+                else replace(scan, label=None, raw_label=None, instance=None)
+            )
             writer.write(kept, frame, name=f"{drive:02d}/{frame}")
     writer.finish()
 
 
 @pytest.mark.parametrize(
-    ("drives", "held_out"), [([4, 5, 0], {5}), ([4], {4})], ids=["several drives", "one drive"]
+    ("drives", "held_out"),
+    [([4, 5, 0], {5}), ([4], {4})],
+    ids=["several drives", "one drive"],
 )
 def test_labelled_scans_of_kitti360_are_split_by_place(
     demo: ModuleType, tmp_path: Path, drives: list[int], held_out: set[int]
@@ -94,7 +100,9 @@ def test_labelled_scans_of_kitti360_are_split_by_place(
     assert max(scan.id for scan in data.real) < min(scan.id for scan in data.held_out)
 
 
-def test_kitti360_without_labels_is_not_trained_on(demo: ModuleType, tmp_path: Path) -> None:
+def test_kitti360_without_labels_is_not_trained_on(
+    demo: ModuleType, tmp_path: Path
+) -> None:
     write_drives(tmp_path, [4], 4, labelled=False)
     data = demo.kitti360(str(tmp_path), 3)
     assert (
@@ -132,8 +140,12 @@ def test_a_training_depends_on_nothing_but_its_protocol(comparison: ModuleType) 
         some_scans(0, 3), synthetic, some_scans(30, 2), ratio=0.5, steps=3
     )
     again = replace(protocol, synthetic=other)
-    np.testing.assert_array_equal(protocol.train(0.0, 0), again.train(0.0, 0), "real scans only")
-    assert (protocol.train(0.5, 0) != again.train(0.5, 0)).any(), "synthetic scans are trained on"
+    np.testing.assert_array_equal(
+        protocol.train(0.0, 0), again.train(0.0, 0), "real scans only"
+    )
+    assert (protocol.train(0.5, 0) != again.train(0.5, 0)).any(), (
+        "synthetic scans are trained on"
+    )
     assert (protocol.train(0.0, 0) != protocol.train(0.0, 1)).any(), "seeds differ"
     assert protocol.train(0.0, 0).sum() == sum(
         (project(s).label < 19).sum() for s in protocol.held_out
@@ -146,7 +158,9 @@ def test_both_trainings_have_as_many_iterations_and_the_same_augmentation(
 ) -> None:
     seen = []
 
-    def train(network: object, batches: object, height: object, steps: int, progress: bool) -> None:
+    def train(
+        network: object, batches: object, height: object, steps: int, progress: bool
+    ) -> None:
         taken = [batch for _, batch in zip(range(steps), batches, strict=False)]
         seen.append(
             (
@@ -162,7 +176,12 @@ def test_both_trainings_have_as_many_iterations_and_the_same_augmentation(
         comparison, "AUGMENT", lambda scan, rng: augmented.append(scan.domain) or scan
     )
     protocol = comparison.Protocol(
-        some_scans(0, 6), some_scans(10, 4), some_scans(30, 1), ratio=0.25, steps=8, batch=2
+        some_scans(0, 6),
+        some_scans(10, 4),
+        some_scans(30, 1),
+        ratio=0.25,
+        steps=8,
+        batch=2,
     )
     for ratio in (0.0, 0.25):
         protocol.train(ratio, 0)

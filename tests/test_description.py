@@ -45,7 +45,8 @@ ORIGINS = {
     "real": Origin(),
     "town": Origin(SYNTHETIC, {"made_by": "town", "seed": 5, "interval": 0.4}),
     "model": Origin(
-        SYNTHETIC, {"made_by": "model", "model": "a b", "checkpoint": "c" * 64, "seed": 2**63 - 1}
+        SYNTHETIC,
+        {"made_by": "model", "model": "a b", "checkpoint": "c" * 64, "seed": 2**63 - 1},
     ),
 }
 
@@ -60,7 +61,9 @@ def a_scan(
 ) -> Scan:
     """A scan of this sensor and origin, with labels, boxes and pose."""
     scan = some_scan(seed, sensor.name if sensor.name in presets() else "hdl64e_kitti")
-    return replace(scan, sensor=sensor, domain=origin.domain, provenance=origin.provenance)
+    return replace(
+        scan, sensor=sensor, domain=origin.domain, provenance=origin.provenance
+    )
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -103,7 +106,10 @@ def test_conversions_keep_sensor_and_origin(tmp_path: Path, first: str) -> None:
         chain.remove("kitti_object")
     for i, to in enumerate(chain[1:]):
         source = open_scans(tmp_path / str(i))
-        assert convert(source, WRITERS[to](tmp_path / str(i + 1)), progress=False).written == 1
+        assert (
+            convert(source, WRITERS[to](tmp_path / str(i + 1)), progress=False).written
+            == 1
+        )
         read = open_scans(tmp_path / str(i + 1))
         assert read.sensor == scan.sensor and Origin.of(read[0]) == ORIGINS["town"], to
 
@@ -126,11 +132,15 @@ def test_a_bank_names_its_model_and_seed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_town_of_any_sensor_is_read_as_what_it_is(tmp_path: Path, layout: str) -> None:
+def test_a_town_of_any_sensor_is_read_as_what_it_is(
+    tmp_path: Path, layout: str
+) -> None:
     """With the layout's own sensor, an image of 128 x 1024 cells lost half of them without a
     warning."""
     sensor = Sensor("wide", 256, 0.5, 170.0, rows=48, fov_up=22.5, fov_down=-22.5)
-    export_town(Town(3, sensor, 1), tmp_path / "town", layout, camera=False, progress=False)
+    export_town(
+        Town(3, sensor, 1), tmp_path / "town", layout, camera=False, progress=False
+    )
     source = open_scans(tmp_path / "town")
     expected = Town(3, sensor, 1)[0]
     assert source.sensor == sensor and Origin.of(source[0]) == Origin.of(expected)
@@ -153,7 +163,9 @@ def test_a_scan_on_another_grid_is_refused(tmp_path: Path, to: str) -> None:
     )
 
 
-def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(
+    tmp_path: Path,
+) -> None:
     write_all("kitti", tmp_path / "out", [a_scan()])
     write_all("npz", tmp_path / "in", [a_scan(SENSORS["beams"])])
     before = files(tmp_path / "out")
@@ -166,7 +178,12 @@ def test_a_conversion_into_a_folder_of_another_grid_leaves_nothing_behind(tmp_pa
         )
     assert files(tmp_path / "out") == before
     others = open_scans(tmp_path / "in")
-    convert(others, WRITERS["kitti"](tmp_path / "out"), as_sensor=SENSORS["preset"], progress=False)
+    convert(
+        others,
+        WRITERS["kitti"](tmp_path / "out"),
+        as_sensor=SENSORS["preset"],
+        progress=False,
+    )
 
 
 def test_a_folder_of_several_origins_lists_all_of_them(tmp_path: Path) -> None:
@@ -185,7 +202,9 @@ def test_a_folder_of_several_origins_lists_all_of_them(tmp_path: Path) -> None:
 
 def test_writers_of_several_processes_add_their_origins(tmp_path: Path) -> None:
     writers = [WRITERS["kitti"](tmp_path) for _ in ORIGINS]
-    for index, (writer, origin) in enumerate(zip(writers, ORIGINS.values(), strict=True)):
+    for index, (writer, origin) in enumerate(
+        zip(writers, ORIGINS.values(), strict=True)
+    ):
         writer.require_grid(SENSORS["preset"])
         writer.write(a_scan(origin=origin), index)
     writers[0].write(a_scan(origin=ORIGINS["town"]), 3)
@@ -194,10 +213,13 @@ def test_writers_of_several_processes_add_their_origins(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", [name for name in WRITERS if name not in IMAGES])
-def test_a_sensor_that_the_user_names_is_taken_with_a_warning(tmp_path: Path, to: str) -> None:
+def test_a_sensor_that_the_user_names_is_taken_with_a_warning(
+    tmp_path: Path, to: str
+) -> None:
     write_all(to, tmp_path, [a_scan()])
     with pytest.warns(
-        UserWarning, match="are of sensor 'os1_128'; they are read as those of 'hdl64e_kitti360'"
+        UserWarning,
+        match="are of sensor 'os1_128'; they are read as those of 'hdl64e_kitti360'",
     ):
         source = open_scans(tmp_path, sensor="hdl64e_kitti360")
     assert (
@@ -213,7 +235,9 @@ def test_a_sensor_that_the_user_names_is_taken_with_a_warning(tmp_path: Path, to
 @pytest.mark.parametrize("to", IMAGES)
 def test_range_images_stay_on_their_grid(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [a_scan()])
-    with pytest.raises(DataError, match="made for sensor 'os1_128', not for 'hdl64e_kitti360'"):
+    with pytest.raises(
+        DataError, match="made for sensor 'os1_128', not for 'hdl64e_kitti360'"
+    ):
         open_scans(tmp_path, sensor="hdl64e_kitti360")[0]
 
 
@@ -229,7 +253,8 @@ HOSTILE: dict[str, Any] = {
     "sensor that is a path": GOOD | {"sensor": "/etc/passwd"},
     "sensor of a wrong type": GOOD | {"sensor": 5},
     "sensor without columns": GOOD | {"sensor": {"name": "x"}},
-    "sensor with too many cells": GOOD | {"sensor": GOOD["sensor"] | {"columns": 1 << 40}},
+    "sensor with too many cells": GOOD
+    | {"sensor": GOOD["sensor"] | {"columns": 1 << 40}},
     "another grid": GOOD | {"grid": [64, 1024]},
     "grid of a wrong type": GOOD | {"grid": {"rows": 6}},
     "origins of a wrong type": GOOD | {"origins": {"domain": "real"}},
@@ -250,7 +275,8 @@ def test_a_damaged_description_is_refused(tmp_path: Path, values: Any) -> None:
     (tmp_path / "in" / NAME).write_text(json.dumps(values))
     for options in ({}, {"sensor": "os1_128"}):
         with pytest.raises(
-            DataError, match=f"{NAME} is damaged .*; expected a description.* remove it and name"
+            DataError,
+            match=f"{NAME} is damaged .*; expected a description.* remove it and name",
         ):
             open_scans(tmp_path / "in", **options)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=f"{NAME} is damaged"):
@@ -266,7 +292,9 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("content", TEXTS.values(), ids=list(TEXTS))
-def test_a_file_that_is_no_description_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_description_is_refused(
+    tmp_path: Path, content: bytes
+) -> None:
     write_all("kitti", tmp_path, [a_scan()])
     (tmp_path / NAME).write_bytes(content)
     with pytest.raises(DataError, match=f"{NAME} is damaged"):
@@ -275,7 +303,9 @@ def test_a_file_that_is_no_description_is_refused(tmp_path: Path, content: bytes
 
 @pytest.mark.parametrize("values", HOSTILE.values(), ids=list(HOSTILE))
 @pytest.mark.parametrize(("to", "prefix"), [("pcd", "# "), ("ply", "comment ")])
-def test_a_damaged_comment_is_refused(tmp_path: Path, to: str, prefix: str, values: Any) -> None:
+def test_a_damaged_comment_is_refused(
+    tmp_path: Path, to: str, prefix: str, values: Any
+) -> None:
     [path] = write_all(to, tmp_path, [a_scan()])
     mark = f"{prefix}lidar_synth ".encode()
     lines = path.read_bytes().split(b"\n")
@@ -292,7 +322,11 @@ def test_a_damaged_comment_is_refused(tmp_path: Path, to: str, prefix: str, valu
 @pytest.mark.parametrize("to", ["pcd", "ply"])
 def test_the_lines_of_a_header_are_short(tmp_path: Path, to: str) -> None:
     [path] = write_all(to, tmp_path, [a_scan(SENSORS["beams"])])
-    header = path.read_bytes().split({"pcd": b"DATA", "ply": b"end_header"}[to])[0].split(b"\n")
+    header = (
+        path.read_bytes()
+        .split({"pcd": b"DATA", "ply": b"end_header"}[to])[0]
+        .split(b"\n")
+    )
     assert sum(b"lidar_synth" in line for line in header) > 5
     assert max(map(len, header)) <= LINE + 25 and all(line.isascii() for line in header)
 
@@ -302,7 +336,9 @@ def test_a_damaged_provenance_is_refused(
     tmp_path: Path, to: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Another program's file.
-    monkeypatch.setattr("lidar_synth.formats.writer.check_facts", lambda scan, where: None)
+    monkeypatch.setattr(
+        "lidar_synth.formats.writer.check_facts", lambda scan, where: None
+    )
     origin = Origin(SYNTHETIC, {"seed": {"nested": 1}})
     write_all(to, tmp_path, [a_scan(origin=origin)])
     with pytest.raises(DataError, match="not a short text or a number"):
@@ -323,7 +359,9 @@ def test_users_describe_their_own_folders(tmp_path: Path) -> None:
 def test_recording_again_changes_nothing(tmp_path: Path) -> None:
     record(tmp_path, SENSORS["own"], ORIGINS["town"])
     before = (tmp_path / NAME).read_bytes()
-    again = record(tmp_path, replace(SENSORS["own"], name="another name"), ORIGINS["town"])
+    again = record(
+        tmp_path, replace(SENSORS["own"], name="another name"), ORIGINS["town"]
+    )
     assert (tmp_path / NAME).read_bytes() == before and again.sensor == SENSORS["own"]
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
@@ -331,10 +369,13 @@ def test_recording_again_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", [name for name in WRITERS if name not in BESIDE])
 def test_files_that_describe_themselves_may_differ(tmp_path: Path, to: str) -> None:
     scans = [
-        a_scan(origin=origin, seed=seed) for seed, origin in enumerate(reversed(ORIGINS.values()))
+        a_scan(origin=origin, seed=seed)
+        for seed, origin in enumerate(reversed(ORIGINS.values()))
     ]
     write_all(to, tmp_path, scans)
-    assert [Origin.of(scan) for scan in open_scans(tmp_path)] == list(reversed(ORIGINS.values()))
+    assert [Origin.of(scan) for scan in open_scans(tmp_path)] == list(
+        reversed(ORIGINS.values())
+    )
 
 
 @pytest.mark.parametrize("to", ["npz", "pcd", "ply", "webdataset"])
@@ -361,18 +402,28 @@ def nested(root: Path) -> Path:
 @pytest.mark.parametrize(
     "part", ["town", "town/1", "town/1/0.bin", "002", "002/00.bin", "a/b/c/d/0.bin"]
 )
-def test_a_part_of_a_converted_folder_is_what_the_folder_is(tmp_path: Path, part: str) -> None:
+def test_a_part_of_a_converted_folder_is_what_the_folder_is(
+    tmp_path: Path, part: str
+) -> None:
     source = open_scans(nested(tmp_path / "out") / part)
-    assert source.sensor == SENSORS["preset"] and Origin.of(source[0]) == ORIGINS["town"]
+    assert (
+        source.sensor == SENSORS["preset"] and Origin.of(source[0]) == ORIGINS["town"]
+    )
 
 
 def test_the_nearest_description_counts(tmp_path: Path) -> None:
     (tmp_path / NAME).write_text(json.dumps({"format": FORMAT, "sensor": "vlp16"}))
-    assert open_scans(nested(tmp_path / "out") / "town" / "1").sensor == SENSORS["preset"]
+    assert (
+        open_scans(nested(tmp_path / "out") / "town" / "1").sensor == SENSORS["preset"]
+    )
 
 
-@pytest.mark.parametrize("layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw"])
-def test_a_description_above_a_dataset_says_nothing_about_it(tmp_path: Path, layout: str) -> None:
+@pytest.mark.parametrize(
+    "layout", ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw"]
+)
+def test_a_description_above_a_dataset_says_nothing_about_it(
+    tmp_path: Path, layout: str
+) -> None:
     nested(tmp_path)
     MAKERS[layout](tmp_path / "real")
     (tmp_path / "real" / NAME).unlink(missing_ok=True)
@@ -381,7 +432,9 @@ def test_a_description_above_a_dataset_says_nothing_about_it(tmp_path: Path, lay
         assert source.description is None and source[0].domain == REAL
 
 
-@pytest.mark.parametrize("above", ["kitti", "semantic_kitti", "kitti_object", "kitti360"])
+@pytest.mark.parametrize(
+    "above", ["kitti", "semantic_kitti", "kitti_object", "kitti360"]
+)
 def test_a_description_above_a_folder_of_other_scans_says_nothing_about_them(
     tmp_path: Path, above: str
 ) -> None:
@@ -394,7 +447,9 @@ def test_a_description_above_a_folder_of_other_scans_says_nothing_about_them(
 
 
 @pytest.mark.parametrize("content", ["[1, 2]", "{", '{"scans": 5}'])
-def test_a_file_of_another_program_above_is_no_description(tmp_path: Path, content: str) -> None:
+def test_a_file_of_another_program_above_is_no_description(
+    tmp_path: Path, content: str
+) -> None:
     write_all("kitti", tmp_path / "own", [some_scan()])
     (tmp_path / "own" / NAME).unlink()
     (tmp_path / NAME).write_text(content)

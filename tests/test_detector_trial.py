@@ -14,7 +14,13 @@ from project import ROOT
 sys.path.append(str(ROOT / "tools" / "research"))
 
 from detector.bev import CELL, CHANNELS, REACH, SLICES, Found, decode, targets, view
-from detector.scores import Truth, average_precision, footprint_ious, matched, precisions
+from detector.scores import (
+    Truth,
+    average_precision,
+    footprint_ious,
+    matched,
+    precisions,
+)
 from streets import street
 
 from lidar_synth import Boxes, Scan, load_sensor
@@ -28,7 +34,11 @@ OVERLAPS = {
     "half a side apart": (SQUARE, (0.5, 0, 0, 1, 1, 1, 0), 1 / 3),
     "turned by 45 degrees": (SQUARE, (0, 0, 0, 1, 1, 1, np.pi / 4), np.sqrt(0.5)),
     "backwards": ((3, 4, 0, 4, 2, 1, 0.3), (3, 4, 0, 4, 2, 1, 0.3 - np.pi), 1),
-    "length and width exchanged": ((3, 4, 0, 4, 2, 1, 0.3), (3, 4, 0, 2, 4, 1, 0.3), 1 / 3),
+    "length and width exchanged": (
+        (3, 4, 0, 4, 2, 1, 0.3),
+        (3, 4, 0, 2, 4, 1, 0.3),
+        1 / 3,
+    ),
     "one in the other": ((0, 0, 0, 4, 2, 1, 1), (0.2, 0.1, 0, 1, 1, 1, 2), 1 / 8),
     "apart": (SQUARE, (1.1, 0, 0, 1, 1, 1, 0), 0),
     "apart, but not their circles": ((0, 0, 0, 4, 1, 1, 0), (0, 1.5, 0, 4, 1, 1, 0), 0),
@@ -83,9 +93,9 @@ PRECISIONS = {
 @pytest.mark.parametrize("case", PRECISIONS)
 def test_average_precision_as_computed_by_hand(case: str) -> None:
     scores, hits, wanted, expected = PRECISIONS[case]
-    assert average_precision(np.array(scores), np.array(hits, int), wanted) == pytest.approx(
-        expected
-    )
+    assert average_precision(
+        np.array(scores), np.array(hits, int), wanted
+    ) == pytest.approx(expected)
 
 
 def test_a_class_without_boxes_has_no_precision() -> None:
@@ -108,14 +118,18 @@ def test_precisions_are_by_class_and_over_all_scans() -> None:
     both = Found(boxes(car, walker), np.array([0.5, 0.5]), np.array([0, 1]))
     exchanged = Found(boxes(car, walker), np.array([0.9, 0.4]), np.array([1, 1]))
     assert precisions([both, both], [truth, truth])[:2] == [1, 1]
-    assert precisions([both, exchanged], [truth, truth])[:2] == pytest.approx([0.5, 2 / 3])
+    assert precisions([both, exchanged], [truth, truth])[:2] == pytest.approx(
+        [0.5, 2 / 3]
+    )
 
 
 @pytest.mark.parametrize("pixel", [0.4, 0.8])
 def test_targets_decode_to_their_boxes(pixel: float) -> None:
     rng = np.random.default_rng(1)
     count = 30
-    grid = np.stack(np.meshgrid(np.arange(-40, 41, 10), np.arange(-40, 41, 10)), -1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.arange(-40, 41, 10), np.arange(-40, 41, 10)), -1
+    ).reshape(-1, 2)
     places = grid[rng.permutation(len(grid))[:count]] + rng.uniform(-3, 3, (count, 2))
     sizes = rng.uniform(0.4, 5, (count, 3))
     yaw = rng.uniform(-np.pi, np.pi, count)
@@ -125,9 +139,9 @@ def test_targets_decode_to_their_boxes(pixel: float) -> None:
     target = targets(np.concatenate([given, outside]), np.r_[classes, 0], pixel)
     found = decode(target.heat, target.values, least=0.99)
     assert len(found.boxes) == count
-    nearest = np.hypot(*(found.boxes[:, None, :2] - given[None, :, :2]).transpose(2, 0, 1)).argmin(
-        1
-    )
+    nearest = np.hypot(
+        *(found.boxes[:, None, :2] - given[None, :, :2]).transpose(2, 0, 1)
+    ).argmin(1)
     assert sorted(nearest) == list(range(count))
     assert np.array_equal(found.classes, classes[nearest])
     assert found.boxes[:, :6] == pytest.approx(given[nearest, :6], abs=1e-3)
@@ -141,13 +155,16 @@ def test_pixels_beside_a_centre_name_the_same_centre() -> None:
     target = targets(box, np.array([0]), 0.8)
     known = torch.nonzero(target.weight > 0)
     assert len(known) == 9
-    centres = (known + 0.5 + torch.stack([target.values[:2, i, j] for i, j in known])) * 0.8 - REACH
+    centres = (
+        known + 0.5 + torch.stack([target.values[:2, i, j] for i, j in known])
+    ) * 0.8 - REACH
     assert centres.numpy() == pytest.approx(np.repeat(box[:, :2], 9, 0), abs=1e-4)
 
 
 def test_a_view_has_each_return_in_its_pixel() -> None:
     points = np.array(
-        [(10.05, -3.25, -1.5), (10.05, -3.25, 0.4), (REACH, 0, 0), (0, 0, 9)], np.float32
+        [(10.05, -3.25, -1.5), (10.05, -3.25, 0.4), (REACH, 0, 0), (0, 0, 9)],
+        np.float32,
     )
     seen = view(points, np.full(4, 0.5, np.float32)).numpy()
     assert seen.shape == (256, 256, CHANNELS)
@@ -167,7 +184,12 @@ def test_a_view_has_each_return_in_its_pixel() -> None:
 def trial(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     import detector_trial
 
-    for name, value in {"LABELLED": 1, "TESTED": 1, "TEST_TOWNS": (8,), "SETTLING": 1}.items():
+    for name, value in {
+        "LABELLED": 1,
+        "TESTED": 1,
+        "TEST_TOWNS": (8,),
+        "SETTLING": 1,
+    }.items():
         monkeypatch.setattr(detector_trial, name, value)
     monkeypatch.setattr(detector_trial.pools, "FRAMES", (4,))
     return detector_trial
@@ -184,14 +206,19 @@ def test_a_trial_from_scans_to_table(
     monkeypatch.setattr(sys, "argv", ["trial", str(tmp_path), *options])
     trial.main()
     [result] = (tmp_path / "results-2").iterdir()
-    assert result.name == "gt_sampling-0.json" and len(json.loads(result.read_text())["ap"]) == 3
+    assert (
+        result.name == "gt_sampling-0.json"
+        and len(json.loads(result.read_text())["ap"]) == 3
+    )
     assert "| GT sampling |" in capsys.readouterr().out
     monkeypatch.setattr(trial, "run", None)  # a second run trains nothing
     trial.main()
     assert "| GT sampling |" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("arm", "shares"), [("layout_first", [8, 8, 8, 4]), ("layout_gt", [16])])
+@pytest.mark.parametrize(
+    ("arm", "shares"), [("layout_first", [8, 8, 8, 4]), ("layout_gt", [16])]
+)
 def test_synthetic_scans_come_first_or_in_half_of_each_batch(
     trial: ModuleType, arm: str, shares: list[int]
 ) -> None:
@@ -215,11 +242,15 @@ def test_layout_arms_need_a_model(
 
 def test_the_table_has_means_spreads_and_paired_differences(trial: ModuleType) -> None:
     text = trial.report(
-        {"gt_sampling": {0: [0.5, 0.2, 0.2], 1: [0.7, 0.4, 0.4]}, "real": {0: [0.4, 0.1, 0.1]}}
+        {
+            "gt_sampling": {0: [0.5, 0.2, 0.2], 1: [0.7, 0.4, 0.4]},
+            "real": {0: [0.4, 0.1, 0.1]},
+        }
     )
     rows = text.splitlines()
     assert (
-        rows[2] == "| GT sampling | 60.0 ± 14.1 | 30.0 ± 14.1 | 30.0 ± 14.1 | 40.0 ± 14.1 | - | 2 |"
+        rows[2]
+        == "| GT sampling | 60.0 ± 14.1 | 30.0 ± 14.1 | 30.0 ± 14.1 | 40.0 ± 14.1 | - | 2 |"
     )
     assert rows[3] == "| labelled scans only | 40.0 | 10.0 | 10.0 | 20.0 | -10.0 | 1 |"
 
@@ -232,7 +263,10 @@ def test_boxes_with_few_returns_or_outside_the_view_are_not_wanted() -> None:
     ]
     given = Boxes(boxes(near, truck, few, far), ("Van", "Truck", "Car", "Car"))
     scan = Scan(
-        np.concatenate(points), np.zeros(31, np.float32), load_sensor("hdl64e_lasers"), boxes=given
+        np.concatenate(points),
+        np.zeros(31, np.float32),
+        load_sensor("hdl64e_lasers"),
+        boxes=given,
     )
     truth = Truth.of(scan)
     assert truth.boxes[:, 0].tolist() == [10, 20, 60]

@@ -33,7 +33,11 @@ AT_STARTS = ("adaptive_piecewise", "uniform_piecewise", "timestep_distillation")
 
 
 def grid_of(name: str) -> tuple[float, ...]:
-    return uniform_grid(4) if name in ("uniform_piecewise", "timestep_distillation") else ADAPTIVE
+    return (
+        uniform_grid(4)
+        if name in ("uniform_piecewise", "timestep_distillation")
+        else ADAPTIVE
+    )
 
 
 def bounds(t: Tensor, grid: tuple[float, ...]) -> tuple[Tensor, Tensor]:
@@ -51,7 +55,9 @@ def bounds(t: Tensor, grid: tuple[float, ...]) -> tuple[Tensor, Tensor]:
 def test_a_straight_teacher_is_its_own_student(name: str) -> None:
     """The targets of a teacher with straight trajectories are its own velocities."""
     direction = gaussian(3, range(COUNT), (2, 3), dtype=torch.float64)
-    example = STRATEGIES[name](lambda y, t, c: direction, DATA, NOISE, U, grid_of(name), 3, None)
+    example = STRATEGIES[name](
+        lambda y, t, c: direction, DATA, NOISE, U, grid_of(name), 3, None
+    )
     assert torch.allclose(example.velocity, direction)
 
 
@@ -70,9 +76,13 @@ def test_targets_converge_to_those_of_an_exact_gaussian_teacher(name: str) -> No
         y = interpolate(DATA, NOISE, start)
         exact = (gaussian_flow(y, start, end) - y) / per_sample(end - start, y)
         errors.append((example.velocity - exact).norm().item() / exact.norm().item())
-        assert torch.allclose(example.y, y + per_sample(example.t - start, y) * example.velocity)
+        assert torch.allclose(
+            example.y, y + per_sample(example.t - start, y) * example.velocity
+        )
     assert errors[2] < 0.02
-    assert [math.log2(a / b) for a, b in pairwise(errors)] == pytest.approx([1, 1], abs=0.1)
+    assert [math.log2(a / b) for a, b in pairwise(errors)] == pytest.approx(
+        [1, 1], abs=0.1
+    )
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
@@ -135,7 +145,9 @@ def test_four_steps_of_the_student_reach_the_end_of_the_teacher() -> None:
         return slope * y + offset
 
     start = gaussian(8, range(500), (1,), dtype=torch.float64)
-    fine = np.concatenate([np.linspace(a, b, steps, endpoint=False) for a, b in pairwise(ADAPTIVE)])
+    fine = np.concatenate(
+        [np.linspace(a, b, steps, endpoint=False) for a, b in pairwise(ADAPTIVE)]
+    )
     teacher = solve(gaussian_velocity, start, [*fine.tolist(), 0.0])
     exact = gaussian_flow(start, torch.ones(500), torch.zeros(500))
     assert torch.allclose(solve(velocity, start, ADAPTIVE), teacher, atol=1e-9)
@@ -161,7 +173,10 @@ def test_every_piece_of_several_grids_leads_where_the_teacher_does() -> None:
     assert example.end is not None and torch.equal(example.cond, U.repeat(7))
     for (a, b), y, t, end, velocity in zip(
         pieces,
-        *(part.split(COUNT) for part in (example.y, example.t, example.end, example.velocity)),
+        *(
+            part.split(COUNT)
+            for part in (example.y, example.t, example.end, example.velocity)
+        ),
         strict=True,
     ):
         assert (t == a).all() and (end == b).all()
@@ -182,7 +197,9 @@ def test_times_are_rounded_as_in_r2flow(golden: Golden, name: str, k: int) -> No
     grid = uniform_grid(k)
     snapped = 1 - torch.tensor(grid)[interval_of(1 - theirs, grid)]
     assert torch.allclose(snapped, torch.floor(theirs * k) / k, atol=1e-6)
-    assert set(snapped.tolist()) <= set(vectors[f"timesteps/{name}_k{k}/values"].tolist())
+    assert set(snapped.tolist()) <= set(
+        vectors[f"timesteps/{name}_k{k}/values"].tolist()
+    )
 
 
 def test_intervals_are_closed_at_their_noisier_end() -> None:
@@ -198,14 +215,20 @@ def test_a_grid_that_is_not_uniform_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(STRATEGIES) - {"reflow"}))
-@pytest.mark.parametrize("grid", [(0.0, 0.5, 1.0), (1.0, 0.5, 0.1), (0.9, 0.45, 0.0), (1.0,)])
+@pytest.mark.parametrize(
+    "grid", [(0.0, 0.5, 1.0), (1.0, 0.5, 0.1), (0.9, 0.45, 0.0), (1.0,)]
+)
 def test_invalid_student_grids_are_refused(name: str, grid: tuple[float, ...]) -> None:
     expected = "at least two descending times|one from 1 down to 0|which is uniform"
-    with pytest.raises(ConfigError, match=rf"time grid [\[(].*; expected .*({expected})"):
+    with pytest.raises(
+        ConfigError, match=rf"time grid [\[(].*; expected .*({expected})"
+    ):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid, 2, None)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_zero_teacher_steps_are_refused(name: str) -> None:
-    with pytest.raises(ConfigError, match="0 steps of the teacher; expected at least 1"):
+    with pytest.raises(
+        ConfigError, match="0 steps of the teacher; expected at least 1"
+    ):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid_of(name), 0, None)

@@ -71,7 +71,9 @@ def _semantic_kitti(out: Path) -> None:
 
 DATASETS: dict[str, Callable[[Path], object]] = {
     "demo_out/town": _town("semantic_kitti"),
-    "demo_out/bank": lambda out: bake(make_plan(out, BakeJob(count=8, seed=1)), progress=False),
+    "demo_out/bank": lambda out: bake(
+        make_plan(out, BakeJob(count=8, seed=1)), progress=False
+    ),
     "SemanticKITTI": _semantic_kitti,
     "KITTI-360": _town("kitti360"),
     "KITTI": _town("kitti"),
@@ -101,7 +103,9 @@ def named_in(blocks: list[Block]) -> list[str]:
     """The datasets that the blocks name, without those that a command among them writes."""
     code = "\n".join(block.code for block in blocks)
     words = {
-        name for name in DATASETS if re.search(rf"(?<![\w./-]){re.escape(name)}(?![\w-])", code)
+        name
+        for name in DATASETS
+        if re.search(rf"(?<![\w./-]){re.escape(name)}(?![\w-])", code)
     }
     return sorted(
         name
@@ -118,7 +122,9 @@ class Reader:
         self.monkeypatch = monkeypatch
         self.names: dict[str, Any] = {"__name__": "__main__"}
         monkeypatch.chdir(folder)
-        monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+        monkeypatch.setenv(
+            "PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        )
 
     def read(self, page: Path, block: Block) -> None:
         """Save or run a block; check it alone where it is not run."""
@@ -149,7 +155,11 @@ class Reader:
             self.monkeypatch.chdir(os.path.expandvars(words[1]))
         elif words[0] == "export":
             self.monkeypatch.setenv(*words[1].split("=", 1))
-        elif parts == [words] and words[0] == "lidar-synth" and not set(command) & set("$*~`"):
+        elif (
+            parts == [words]
+            and words[0] == "lidar-synth"
+            and not set(command) & set("$*~`")
+        ):
             self.monkeypatch.setattr(sys, "argv", words)
             with pytest.raises(SystemExit) as stop:
                 main()
@@ -176,7 +186,9 @@ NOT_RUN = [(page, block) for page in PAGES for block in marked(page)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if "```" in page.read_text()], ids=name_of)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "```" in page.read_text()], ids=name_of
+)
 def test_the_blocks_of_a_page_run(
     page: Path,
     tmp_path: Path,
@@ -197,11 +209,15 @@ def read(page: Path, blocks: list[Block], reader: Reader) -> None:
         try:
             reader.read(page, block)
         except Exception as error:
-            raise AssertionError(f"{page.name}, line {block.line}: {error!r}") from error
+            raise AssertionError(
+                f"{page.name}, line {block.line}: {error!r}"
+            ) from error
 
 
 @pytest.mark.parametrize(
-    ("page", "block"), NOT_RUN, ids=[f"{name_of(page)}:{block.line}" for page, block in NOT_RUN]
+    ("page", "block"),
+    NOT_RUN,
+    ids=[f"{name_of(page)}:{block.line}" for page, block in NOT_RUN],
 )
 def test_a_block_that_is_not_run_says_why(page: Path, block: Block) -> None:
     """The list of these blocks: ``pytest -rs`` prints it. The test of their page checks what can be

@@ -37,12 +37,18 @@ def test_equations_become_mathml() -> None:
 
 def test_dollars_in_code_stay() -> None:
     html = rendered("`$KITTI360_ROOT` and `$HOME`\n\n```sh\ncp $A $B\n```\n")
-    assert "<math" not in html and "$KITTI360_ROOT" in html and "$A $B" in re.sub("<.*?>", "", html)
+    assert (
+        "<math" not in html
+        and "$KITTI360_ROOT" in html
+        and "$A $B" in re.sub("<.*?>", "", html)
+    )
 
 
 def test_the_api_has_every_public_name() -> None:
     listed = {
-        line.rpartition(".")[2] for line in TABLES["api"]().splitlines() if line.startswith("::: ")
+        line.rpartition(".")[2]
+        for line in TABLES["api"]().splitlines()
+        if line.startswith("::: ")
     }
     assert set(lidar_synth.__all__) - {"__version__"} <= listed
 
@@ -63,26 +69,37 @@ def test_the_command_line_has_every_command_and_no_control_characters() -> None:
         "metrics setup",
     )
     assert re.findall(r"^## (.*)$", text, re.M) == [*COMMANDS, *groups]
-    assert text.isprintable() or set(filter(lambda c: not c.isprintable(), text)) == {"\n"}
+    assert text.isprintable() or set(filter(lambda c: not c.isprintable(), text)) == {
+        "\n"
+    }
 
 
 def test_every_recipe_is_listed_with_its_time() -> None:
     text = TABLES["recipes"]()
     assert all(
-        f"{one.name}` |" in text and one.time in text for one in (*published_models(), *published())
+        f"{one.name}` |" in text and one.time in text
+        for one in (*published_models(), *published())
     )
 
 
 @pytest.mark.parametrize("section", TABLES["SECTIONS"], ids=lambda name: name or "top")
 def test_every_key_of_a_recipe_is_explained(section: str) -> None:
     for model in TABLES["SECTIONS"][section]:
-        own = {name for name in vars(model).get("__annotations__", {}) if not name.startswith("_")}
+        own = {
+            name
+            for name in vars(model).get("__annotations__", {})
+            if not name.startswith("_")
+        }
         explained = {
-            name for row in TABLES["_keys"](model) for name in row.split("`")[1].split(", ")
+            name
+            for row in TABLES["_keys"](model)
+            for name in row.split("`")[1].split(", ")
         }
         assert explained == own, model
 
 
 def test_generated_text_takes_the_place_of_its_mark() -> None:
-    page = TABLES["on_page_markdown"]("# Recipes\n\n<!-- generated: recipes -->\n\nAfter.\n")
+    page = TABLES["on_page_markdown"](
+        "# Recipes\n\n<!-- generated: recipes -->\n\nAfter.\n"
+    )
     assert "town_tiny" in page and "<!--" not in page and page.endswith("After.\n")

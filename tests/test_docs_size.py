@@ -60,13 +60,17 @@ MAIN_PATH = 8_500
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [
-    p for p in sorted((ROOT / "docs").rglob("*.md")) if not {"research", "notebooks"} & set(p.parts)
+    p
+    for p in sorted((ROOT / "docs").rglob("*.md"))
+    if not {"research", "notebooks"} & set(p.parts)
 ]
 
 
 def words(page: Path) -> int:
     """As ``wc -w`` counts them, without comments, which no reader sees."""
-    return len(re.sub(r"<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.S).split())
+    return len(
+        re.sub(r"<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.S).split()
+    )
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -75,7 +79,9 @@ def test_a_page_keeps_to_its_limit(name: str) -> None:
 
 
 def test_every_page_has_a_limit() -> None:
-    assert {page.relative_to(ROOT).as_posix() for page in PAGES} == set(LIMITS) - {"README.md"}
+    assert {page.relative_to(ROOT).as_posix() for page in PAGES} == set(LIMITS) - {
+        "README.md"
+    }
 
 
 def test_the_main_path_is_short() -> None:
@@ -90,4 +96,6 @@ def test_a_page_begins_with_what_the_reader_can_do(page: Path) -> None:
         if line and not line.startswith("<!--")
     ]
     title, first, *_ = [*lines, ""]
-    assert title.startswith("# ") and re.match(r"[\w`*\[]", first), "a title, and then a sentence"
+    assert title.startswith("# ") and re.match(r"[\w`*\[]", first), (
+        "a title, and then a sentence"
+    )

@@ -15,7 +15,14 @@ from project import PYPROJECT
 from typer.testing import CliRunner
 
 from lidar_synth.cli import diagnosis as doctor
-from lidar_synth.cli.diagnosis import DATA_ROOTS, SHARED_OBJECTS, Finding, examine, report, works
+from lidar_synth.cli.diagnosis import (
+    DATA_ROOTS,
+    SHARED_OBJECTS,
+    Finding,
+    examine,
+    report,
+    works,
+)
 from lidar_synth.cli.doctor import doctor as command
 
 app = typer.Typer(add_completion=False)
@@ -83,7 +90,9 @@ def test_an_old_library_is_told_by_its_version(importing: Callable[..., None]) -
     importing("numba", old)
     found = named(examine(), "numba")
     assert found.state == "broken"
-    assert re.match(r"0\.9\.1, older than 0\.\d\d", found.found), "numbers, not text, are compared"
+    assert re.match(r"0\.9\.1, older than 0\.\d\d", found.found), (
+        "numbers, not text, are compared"
+    )
 
 
 def test_open3d_without_its_system_libraries(
@@ -93,12 +102,16 @@ def test_open3d_without_its_system_libraries(
     importing("open3d", OSError("libusb-1.0.so.0: cannot open shared object file"))
     monkeypatch.setattr(doctor.sys, "platform", "linux")  # type: ignore[attr-defined]
     monkeypatch.setattr(
-        doctor, "_loads", lambda library: library not in ("libusb-1.0.so.0", "libEGL.so.1")
+        doctor,
+        "_loads",
+        lambda library: library not in ("libusb-1.0.so.0", "libEGL.so.1"),
     )
     findings = list(doctor._libraries())
     found = named(findings, "open3d")
     assert (found.state, found.found) == ("absent", "lacks system libraries")
-    assert found.fix.endswith("apt-get install -y --no-install-recommends libusb-1.0-0 libegl1")
+    assert found.fix.endswith(
+        "apt-get install -y --no-install-recommends libusb-1.0-0 libegl1"
+    )
     assert works(findings)
     assert found.fix in report(findings)
     assert "3-D window" in report(findings)
@@ -132,7 +145,9 @@ def test_a_projection_that_goes_wrong_is_found(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    card = SimpleNamespace(name="NVIDIA H200", total_memory=139 * 2**30, major=9, minor=0)
+    card = SimpleNamespace(
+        name="NVIDIA H200", total_memory=139 * 2**30, major=9, minor=0
+    )
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda number: card)
     [found] = doctor._cuda()
@@ -149,7 +164,11 @@ def test_the_cards_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_why_there_is_no_card(
-    monkeypatch: pytest.MonkeyPatch, driver: str | None, build: str | None, state: str, found: str
+    monkeypatch: pytest.MonkeyPatch,
+    driver: str | None,
+    build: str | None,
+    state: str,
+    found: str,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(torch.version, "cuda", build)
@@ -193,7 +212,9 @@ def test_the_command_tells_the_same_to_people_and_to_scripts() -> None:
     assert people.stdout.strip().endswith("The package works.")
 
 
-def test_the_command_fails_where_the_package_does(importing: Callable[..., None]) -> None:
+def test_the_command_fails_where_the_package_does(
+    importing: Callable[..., None],
+) -> None:
     importing("safetensors", ImportError("no version information"))
     result = CliRunner().invoke(app, ["--json"])
     assert result.exit_code == 1

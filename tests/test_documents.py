@@ -153,21 +153,36 @@ def test_the_blocks_of_a_page_share_a_folder_and_a_namespace(
 
 
 @pytest.mark.parametrize(
-    "code", ["python\n\n1 / 0", "sh\nls\nlidar-synth info no_bank", "sh\nls\ncat no_file"]
+    "code",
+    ["python\n\n1 / 0", "sh\nls\nlidar-synth info no_bank", "sh\nls\ncat no_file"],
 )
 def test_a_block_that_fails_is_named(
     code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(AssertionError, match=r"page\.md, line 2"):
-        read(Path("page.md"), blocks_of(f"```{code}\n```\n"), Reader(tmp_path, monkeypatch))
+        read(
+            Path("page.md"),
+            blocks_of(f"```{code}\n```\n"),
+            Reader(tmp_path, monkeypatch),
+        )
 
 
 def test_a_page_finds_the_town_unless_it_makes_it() -> None:
-    assert named_in([Block("python", 'open_scans("demo_out/town"), Bank("demo_out/bank")', 1)]) == [
+    assert named_in(
+        [Block("python", 'open_scans("demo_out/town"), Bank("demo_out/bank")', 1)]
+    ) == [
         "demo_out/bank",
         "demo_out/town",
     ]
     assert (
-        named_in([Block("shell", "lidar-synth town KITTI --scans 3\nlidar-synth view KITTI", 1)])
+        named_in(
+            [
+                Block(
+                    "shell",
+                    "lidar-synth town KITTI --scans 3\nlidar-synth view KITTI",
+                    1,
+                )
+            ]
+        )
         == []
     )

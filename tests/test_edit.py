@@ -45,7 +45,9 @@ def cells_of(scan: Scan, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("labelled", [True, False])
-@pytest.mark.parametrize("place", [(12, 2, 0.3), (9, -6, 1.4), (-14, 0.5, 0.1), (17, 5, 0.0)])
+@pytest.mark.parametrize(
+    "place", [(12, 2, 0.3), (9, -6, 1.4), (-14, 0.5, 0.1), (17, 5, 0.0)]
+)
 def test_behind_a_removed_car_is_what_was_there(
     place: tuple[float, float, float], labelled: bool
 ) -> None:
@@ -54,7 +56,9 @@ def test_behind_a_removed_car_is_what_was_there(
     scan = (
         full
         if labelled
-        else replace(full, label=None, instance=None, boxes=replace(full.boxes, instance=None))
+        else replace(
+            full, label=None, instance=None, boxes=replace(full.boxes, instance=None)
+        )
     )
     result = edit.remove(scan, 0)
     hole = cells_of(full, full.instance == 1)
@@ -107,7 +111,9 @@ def test_the_rays_of_a_scan_lead_to_its_points() -> None:
         there = np.flatnonzero(rays.point >= 0)
         assert np.array_equal(np.sort(rays.point[there]), np.arange(len(scan)))
         assert np.allclose(
-            rays.points(there, rays.rho[there]), scan.points[rays.point[there]], atol=1e-5
+            rays.points(there, rays.rho[there]),
+            scan.points[rays.point[there]],
+            atol=1e-5,
         )
 
 
@@ -116,7 +122,9 @@ def test_rays_of_a_grid_start_where_its_rows_do() -> None:
     scan = unproject(project(Town(seed=0, scans=1, sensor=sensor, motion=False)[0]))
     rays = rays_of_scan(replace(scan, ring=None))
     assert np.array_equal(rays.height.astype(np.float32), sensor.starts[rays.ring])
-    assert np.allclose(rays.slope, np.tan(sensor.row_elevations())[rays.ring], atol=1e-4)
+    assert np.allclose(
+        rays.slope, np.tan(sensor.row_elevations())[rays.ring], atol=1e-4
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,7 +140,11 @@ def test_a_moved_car_looks_as_the_sensor_would_see_it(old: Any, new: Any) -> Non
     before = cast([car(*old)], [BEHIND])
     pose = [v for v in new if v is not None]
     result = edit.move(before, 0, pose)
-    assert result.boxes is not None and len(result.boxes) == 1 and result.boxes.names == ("Car",)
+    assert (
+        result.boxes is not None
+        and len(result.boxes) == 1
+        and result.boxes.names == ("Car",)
+    )
     box = result.boxes.values[0]
     assert np.allclose(box[:2], new[:2], atol=1e-3)
     truth = cast([np.r_[box[:2], car(0, 0)[2:6], box[6]].astype(np.float32)], [BEHIND])
@@ -165,9 +177,13 @@ def test_a_car_beside_a_wall_returns_to_its_place() -> None:
     item = cut_out(full, 0)
     back = edit.insert(edit.remove(full, 0), item)
     assert (
-        back.boxes is not None and np.abs(back.boxes.values[0] - full.boxes.values[0]).max() < 0.12
+        back.boxes is not None
+        and np.abs(back.boxes.values[0] - full.boxes.values[0]).max() < 0.12
     )
-    assert cells_of(back, back.label == CAR).sum() > 0.9 * cells_of(full, full.label == CAR).sum()
+    assert (
+        cells_of(back, back.label == CAR).sum()
+        > 0.9 * cells_of(full, full.label == CAR).sum()
+    )
     with pytest.raises(DataError, match="other returns|no level ground"):
         edit.insert(replace(full, boxes=None), item)
 
@@ -249,7 +265,9 @@ def test_removed_objects_return_to_their_places() -> None:
             )
             inside = item.scan.boxes.contain(emptied.points)[0]
             assert GROUND[
-                emptied.label[estimated & inside & (emptied.points[:, 2] > item.ground + FLOOR)]
+                emptied.label[
+                    estimated & inside & (emptied.points[:, 2] > item.ground + FLOOR)
+                ]
             ].all()
             try:
                 back = edit.insert(emptied, item)
@@ -275,10 +293,20 @@ def test_objects_of_a_bank_are_inserted() -> None:
 
 def test_boxes_given_by_their_values_leave_the_scan() -> None:
     scan = cast([car(12, 0), car(10, 6), car(10, -6)], [BEHIND])
-    for box in (1, [1], scan.boxes[[1]], scan.boxes.values[1], scan.boxes.values[[1, 1]]):
+    for box in (
+        1,
+        [1],
+        scan.boxes[[1]],
+        scan.boxes.values[1],
+        scan.boxes.values[[1, 1]],
+    ):
         left = edit.remove(scan, box).boxes
-        assert left is not None and np.array_equal(left.values, scan.boxes.values[[0, 2]])
-    beside = edit.remove(scan, scan.boxes.values[1] + np.float32([0.1, 0, 0, 0, 0, 0, 0]))
+        assert left is not None and np.array_equal(
+            left.values, scan.boxes.values[[0, 2]]
+        )
+    beside = edit.remove(
+        scan, scan.boxes.values[1] + np.float32([0.1, 0, 0, 0, 0, 0, 0])
+    )
     assert len(beside.boxes) == 3, "a box of one's own is none of the scan's"
 
 
@@ -302,13 +330,21 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         DataError,
         "with 0 boxes.*takes a box",
     ),
-    "shape": (lambda: edit.remove(SCAN, [1.0, 2.0]), DataError, r"a box of shape \(2,\)"),
+    "shape": (
+        lambda: edit.remove(SCAN, [1.0, 2.0]),
+        DataError,
+        r"a box of shape \(2,\)",
+    ),
     "whole numbers": (
         lambda: edit.remove(SCAN, [1, 1, 0, 0, 1, 1, 0]),
         DataError,
         "each number once, or a box .* as floats",
     ),
-    "far": (lambda: edit.remove(SCAN, car(90, 0)), DataError, "90.0 m away; expected at most 80 m"),
+    "far": (
+        lambda: edit.remove(SCAN, car(90, 0)),
+        DataError,
+        "90.0 m away; expected at most 80 m",
+    ),
     "empty": (
         lambda: edit.remove(SCAN, car(-9, 0) + np.float32([0, 0, 6, 0, 0, 0, 0])),
         DataError,
@@ -325,7 +361,9 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         "expected an unconditional",
     ),
     "sensor": (
-        lambda: edit.remove(cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"),
+        lambda: edit.remove(
+            cast([car(12, 0)], sensor=load_sensor("os1_128")), 0, model="town"
+        ),
         DataError,
         "a scan of sensor 'os1_128' .* for a model of 'hdl64e_lasers'.*model=None",
     ),
@@ -334,7 +372,11 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         DataError,
         r"overlaps box 1 \(Car\); expected a free place",
     ),
-    "wall": (lambda: edit.insert(SCAN, ITEM, (24, 0)), DataError, "no level ground|other returns"),
+    "wall": (
+        lambda: edit.insert(SCAN, ITEM, (24, 0)),
+        DataError,
+        "no level ground|other returns",
+    ),
     "behind": (lambda: edit.insert(SCAN, ITEM, (30, 0)), DataError, "no level ground"),
     "out of range": (
         lambda: edit.insert(SCAN, ITEM, (95, 0)),
@@ -347,7 +389,11 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         DataError,
         "beside the side that was recorded",
     ),
-    "pose": (lambda: edit.insert(SCAN, ITEM, (1.0,)), DataError, "expected x, y in metres"),
+    "pose": (
+        lambda: edit.insert(SCAN, ITEM, (1.0,)),
+        DataError,
+        "expected x, y in metres",
+    ),
 }
 
 
@@ -449,8 +495,21 @@ def test_a_moved_object_keeps_its_box_without_pictures(tmp_path: Path) -> None:
     root = kitti(tmp_path / "kitti", 1)
     shutil.rmtree(root / "training" / "image_2")
     [scan] = open_scans(root)
-    box = int(np.argmax([returns_of(scan, scan.boxes[[i]]).sum() for i in range(len(scan.boxes))]))
-    command = ["edit", "move", str(root), str(tmp_path / "out"), "--box", str(box), "--at", "20,0"]
+    box = int(
+        np.argmax(
+            [returns_of(scan, scan.boxes[[i]]).sum() for i in range(len(scan.boxes))]
+        )
+    )
+    command = [
+        "edit",
+        "move",
+        str(root),
+        str(tmp_path / "out"),
+        "--box",
+        str(box),
+        "--at",
+        "20,0",
+    ]
     result = CliRunner().invoke(app, [*command, "--to", "kitti_object"])
     assert result.exit_code == 0, result.output + str(result.exception)
     values = open_scans(tmp_path / "out")[0].boxes.values
@@ -466,7 +525,13 @@ def test_the_command_line_edits_scans(tmp_path: Path) -> None:
         "named": ["remove", "--name", "Car"],
         "numbered": ["remove", "--box", "1"],
         "moved": ["move", "--box", "0", "--at", "14,-6"],
-        "inserted": ["insert", "--objects", str(tmp_path / "objects.npz"), "--at", "10,-9"],
+        "inserted": [
+            "insert",
+            "--objects",
+            str(tmp_path / "objects.npz"),
+            "--at",
+            "10,-9",
+        ],
     }
     counts = {}
     for name, (command, *options) in calls.items():
@@ -482,6 +547,9 @@ def test_the_command_line_edits_scans(tmp_path: Path) -> None:
         (): "expected one of the two",
     }.items():
         result = CliRunner().invoke(
-            app, ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), *options]
+            app,
+            ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), *options],
         )
-        assert isinstance(result.exception, ConfigError) and message in str(result.exception)
+        assert isinstance(result.exception, ConfigError) and message in str(
+            result.exception
+        )

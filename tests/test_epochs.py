@@ -27,7 +27,11 @@ LATE = r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before it
 def mixed(real: int = REAL, ratio: Any = 0.25, **options: Any) -> MixedScans:
     scans = Scans("r", 1) * real
     return MixedScans.wrap(
-        [f"r{i}" for i in range(len(scans))], Endless(), ratio, to_sample=name, **options
+        [f"r{i}" for i in range(len(scans))],
+        Endless(),
+        ratio,
+        to_sample=name,
+        **options,
     )
 
 
@@ -37,7 +41,9 @@ def name(scan: Any, rng: Any) -> str:
 
 def planned(train: MixedScans, epoch: int) -> list[str]:
     made = train.plan(epoch)
-    return [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
+    return [
+        f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)
+    ]
 
 
 def samples(batches: Any) -> list[str]:
@@ -65,7 +71,9 @@ def samplers(train: MixedScans) -> dict[str, dict[str, Any]]:
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("way", ["in order", "shuffled", "distributed", "random"])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_epoch_that_is_set_after_iter_raises(workers: int, way: str, persistent: bool) -> None:
+def test_an_epoch_that_is_set_after_iter_raises(
+    workers: int, way: str, persistent: bool
+) -> None:
     """In the first pass, and in a later one of persistent workers."""
     train = mixed()
     loader = DataLoader(
@@ -103,7 +111,11 @@ def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
     """It has fetched nothing yet, but the others may have."""
     train = mixed()
     loader = DataLoader(
-        train, 4, num_workers=1, collate_fn=list, worker_init_fn=lambda _: time.sleep(0.5)
+        train,
+        4,
+        num_workers=1,
+        collate_fn=list,
+        worker_init_fn=lambda _: time.sleep(0.5),
     )
     iterator = iter(loader)
     train.set_epoch(1)
@@ -112,7 +124,9 @@ def test_a_slow_worker_starts_in_the_epoch_in_which_its_pass_began() -> None:
 
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_batches_keep_the_epoch_in_which_iterating_began(workers: int, persistent: bool) -> None:
+def test_batches_keep_the_epoch_in_which_iterating_began(
+    workers: int, persistent: bool
+) -> None:
     train = mixed()
     batches = train.batches(4)
     loader = DataLoader(
@@ -141,7 +155,9 @@ def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart
     )
     kept, held = random_split(Scans("r", 20), [0.8, 0.2])  # type: ignore[arg-type]
     train = MixedScans(kept, Endless(), to_sample=name, collate=list)
-    loader = DataLoader(train, batch_sampler=train.batches(4), collate_fn=list, num_workers=workers)
+    loader = DataLoader(
+        train, batch_sampler=train.batches(4), collate_fn=list, num_workers=workers
+    )
     for epoch in range(2):
         train.set_epoch(epoch)
         seen = {sample for sample in samples(loader) if sample[0] == "r"}
@@ -150,7 +166,9 @@ def test_a_part_of_a_mixture_is_refused_and_a_part_of_its_real_scans_stays_apart
 
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("workers", [0, 1, 2])
-def test_a_stream_keeps_the_epoch_in_which_iterating_began(workers: int, endless: bool) -> None:
+def test_a_stream_keeps_the_epoch_in_which_iterating_began(
+    workers: int, endless: bool
+) -> None:
     train = mixed(40)
     stream = MixedStream(train, batch_size=4, endless=endless)
     stream.set_epoch(3)
@@ -166,7 +184,9 @@ def test_a_stream_keeps_the_epoch_in_which_iterating_began(workers: int, endless
 def test_a_streams_persistent_workers_keep_it_or_raise() -> None:
     train = mixed(40)
     stream = MixedStream(train, batch_size=4, endless=False)
-    loader = DataLoader(stream, 4, num_workers=2, collate_fn=list, persistent_workers=True)
+    loader = DataLoader(
+        stream, 4, num_workers=2, collate_fn=list, persistent_workers=True
+    )
     assert samples(loader) == planned(train, 0)
     stream.set_epoch(1)
     iterator = iter(loader)
@@ -201,10 +221,14 @@ def caught() -> Iterator[list[warnings.WarningMessage]]:
 AGAIN = "epoch 0 begins again"
 
 
-def test_a_repeated_epoch_gives_one_warning(caught: list[warnings.WarningMessage]) -> None:
+def test_a_repeated_epoch_gives_one_warning(
+    caught: list[warnings.WarningMessage],
+) -> None:
     for carried in (False, True):
         train = mixed(9)
-        how: dict[str, Any] = {"batch_sampler": train.batches(4)} if carried else {"batch_size": 4}
+        how: dict[str, Any] = (
+            {"batch_sampler": train.batches(4)} if carried else {"batch_size": 4}
+        )
         loader = DataLoader(train, collate_fn=list, **how)
         [train[i] for i in range(3)]  # a look at some samples is no pass
         list(loader)
@@ -230,23 +254,33 @@ def test_a_mixture_that_is_made_anew_for_each_epoch_is_noticed(
             train.set_epoch(epoch)
         ways: dict[str, Any] = {
             "in order": DataLoader(train, 4, collate_fn=list),
-            "batches": DataLoader(train, batch_sampler=train.batches(4), collate_fn=list),
+            "batches": DataLoader(
+                train, batch_sampler=train.batches(4), collate_fn=list
+            ),
             "stream": DataLoader(
                 MixedStream(train, batch_size=4, endless=False), 4, collate_fn=list
             ),
         }
         loader = ways[way]
         assert samples(loader) == planned(train, epoch if told else 0)
-    assert {str(w.message)[: len(AGAIN)] for w in caught} == (set() if told else {AGAIN})
+    assert {str(w.message)[: len(AGAIN)] for w in caught} == (
+        set() if told else {AGAIN}
+    )
 
 
 def show_warnings(worker: int) -> None:
     """As outside of pytest, which keeps them to itself."""
-    warnings.showwarning = lambda message, *_: print(message, file=sys.stderr, flush=True)  # type: ignore[assignment]
+    warnings.showwarning = lambda message, *_: print(
+        message, file=sys.stderr, flush=True
+    )  # type: ignore[assignment]
 
 
-def test_workers_say_that_an_epoch_comes_again(capfd: pytest.CaptureFixture[str]) -> None:
-    loader = DataLoader(mixed(20), 4, num_workers=2, collate_fn=list, worker_init_fn=show_warnings)
+def test_workers_say_that_an_epoch_comes_again(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    loader = DataLoader(
+        mixed(20), 4, num_workers=2, collate_fn=list, worker_init_fn=show_warnings
+    )
     list(loader)
     assert AGAIN not in capfd.readouterr().err
     list(loader)
@@ -254,7 +288,9 @@ def test_workers_say_that_an_epoch_comes_again(capfd: pytest.CaptureFixture[str]
     assert capfd.readouterr().err.count(AGAIN) == 1
 
 
-def test_resuming_in_an_epoch_is_no_repetition(caught: list[warnings.WarningMessage]) -> None:
+def test_resuming_in_an_epoch_is_no_repetition(
+    caught: list[warnings.WarningMessage],
+) -> None:
     for make in (
         lambda: mixed(9).batches(4),
         lambda: MixedStream(mixed(9), batch_size=4, endless=False),
@@ -272,7 +308,9 @@ def test_resuming_in_an_epoch_is_no_repetition(caught: list[warnings.WarningMess
 
 def test_a_long_plan_starts_at_once() -> None:
     """No list of all positions, steps or scans is made on the way to the first batch."""
-    train = MixedScans.wrap(range(75_000_000), Endless(), 0.25, to_sample=name, compare=False)
+    train = MixedScans.wrap(
+        range(75_000_000), Endless(), 0.25, to_sample=name, compare=False
+    )
     assert len(train) == 10**8
     loader = DataLoader(train, batch_sampler=train.batches(8), collate_fn=list)
     assert len(loader) == 10**8 // 8
@@ -300,10 +338,14 @@ def test_batches_that_are_shared_twice_are_noticed_at_the_next_pass(
         train = mixed(39)
         batches = train.batches(4, rank=0, world_size=ranks)
         sampler: Any = EverySecond(batches) if shared else batches
-        loader = DataLoader(train, batch_sampler=sampler, num_workers=workers, collate_fn=list)
+        loader = DataLoader(
+            train, batch_sampler=sampler, num_workers=workers, collate_fn=list
+        )
         list(loader)
         train.set_epoch(1)
         list(loader)
         expected = ["of 26 samples for rank 0 of 2,"] if shared and ranks == 2 else []
-        assert [str(w.message)[:30] for w in caught if "library" in str(w.message)] == expected
+        assert [
+            str(w.message)[:30] for w in caught if "library" in str(w.message)
+        ] == expected
         caught.clear()

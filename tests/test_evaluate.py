@@ -60,7 +60,9 @@ def test_every_figure_names_its_protocol_and_its_sets(
     assert apart and all(
         (s["protocol"], s["real"], s["generated"]) == (protocol, 3, 3) for s in apart
     )
-    same = json.loads(CliRunner().invoke(app, ["evaluate", real, real, *options, "--json"]).stdout)
+    same = json.loads(
+        CliRunner().invoke(app, ["evaluate", real, real, *options, "--json"]).stdout
+    )
     assert [s["metric"] for s in same] == [s["metric"] for s in apart]
     assert sum(s["value"] for s in same) < sum(s["value"] for s in apart)
     text = CliRunner().invoke(app, ["evaluate", real, fake, *options]).output
@@ -86,15 +88,23 @@ def test_the_intervals_of_few_scans_are_json(folders: tuple[Path, Path]) -> None
     )
 
 
-@pytest.mark.parametrize("protocol", [name for name, p in PROTOCOLS.items() if p.needs.generated])
-def test_fewer_scans_than_the_papers_are_refused(folders: tuple[Path, Path], protocol: str) -> None:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", protocol])
+@pytest.mark.parametrize(
+    "protocol", [name for name, p in PROTOCOLS.items() if p.needs.generated]
+)
+def test_fewer_scans_than_the_papers_are_refused(
+    folders: tuple[Path, Path], protocol: str
+) -> None:
+    result = CliRunner().invoke(
+        app, ["evaluate", *map(str, folders), "--protocol", protocol]
+    )
     assert isinstance(result.exception, DataError)
     message = rf"3 (real|generated) scans; expected \d+000?, as the {protocol} protocol .*--anyway"
     assert re.search(message, str(result.exception))
 
 
-def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path]) -> None:
+def test_the_figures_stand_beside_the_published_ones(
+    folders: tuple[Path, Path],
+) -> None:
     call = [
         "evaluate",
         *map(str, folders),
@@ -108,7 +118,10 @@ def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path])
     result = CliRunner().invoke(app, call)
     assert result.exception is None, result.output
     rows = [line for line in result.stdout.splitlines() if line.startswith("|")]
-    assert "| LiDAR-Flow | 4 | 165.31 | 12.41 | 9.46 | 32.09 | 33.43 | 0.025 | 0.34 |" in rows
+    assert (
+        "| LiDAR-Flow | 4 | 165.31 | 12.41 | 9.46 | 32.09 | 33.43 | 0.025 | 0.34 |"
+        in rows
+    )
     own = rows[-1].split("|")
     jsd = re.search(r"in its tables JSD = (\S+)", result.stdout)
     assert (
@@ -116,7 +129,9 @@ def test_the_figures_stand_beside_the_published_ones(folders: tuple[Path, Path])
         and own[1].strip() == "**these scans** (3 real, 3 generated)"
         and own[8].split()[0] == jsd[1]
     )
-    assert own[8].strip().endswith("]") and not own[3].strip()  # an interval; no weights, no FRD
+    assert (
+        own[8].strip().endswith("]") and not own[3].strip()
+    )  # an interval; no weights, no FRD
     assert "FRD: no weights of rangenet53" in result.stderr
     assert "those of training among them" in result.stderr
     for more in (["--json"], ["--judge", "squeezeseg"]):
@@ -140,18 +155,29 @@ def test_a_measure_without_a_place_in_a_table_is_left_out_by_its_title(
 def test_another_sensor_is_refused(
     folders: tuple[Path, Path], tmp_path: Path, protocol: str
 ) -> None:
-    WRITERS["npz"](tmp_path / "other").write(random_scan(presets()["hdl32e_nuscenes"], 4000), 0)
-    call = ["evaluate", str(folders[0]), str(tmp_path / "other"), "--protocol", protocol]
+    WRITERS["npz"](tmp_path / "other").write(
+        random_scan(presets()["hdl32e_nuscenes"], 4000), 0
+    )
+    call = [
+        "evaluate",
+        str(folders[0]),
+        str(tmp_path / "other"),
+        "--protocol",
+        protocol,
+    ]
     result = CliRunner().invoke(app, [*call, "--anyway"])
     assert result.exception is None, result.output
     with pytest.raises(
-        DataError, match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows"
+        DataError,
+        match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows",
     ):
         evaluate(*(open_scans(p) for p in call[1:3]), protocol, progress=False)
 
 
 def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, folders), "--protocol", "frid"])
+    result = CliRunner().invoke(
+        app, ["evaluate", *map(str, folders), "--protocol", "frid"]
+    )
     assert result.exit_code == 2
 
 
@@ -211,7 +237,9 @@ def odometry(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = WRITERS["semantic_kitti"](root)
     for sequence in ("00", "08"):
         writer.write(
-            random_scan(presets()["hdl64e_semantic_kitti"], 2000), 0, name=f"{sequence}/000003"
+            random_scan(presets()["hdl64e_semantic_kitti"], 2000),
+            0,
+            name=f"{sequence}/000003",
         )
     writer.finish()
     return root
@@ -224,7 +252,8 @@ def fake(folders: tuple[Path, Path], tmp_path: Path) -> Path:
 
 def judge(real: Path, fake: Path, *options: str) -> Result:
     return CliRunner().invoke(
-        app, ["evaluate", str(real), str(fake), "--protocol", "town", "--json", *options]
+        app,
+        ["evaluate", str(real), str(fake), "--protocol", "town", "--json", *options],
     )
 
 
@@ -247,9 +276,13 @@ def of_splits(*splits: str) -> dict[str, Any]:
 TRAINED: dict[str, dict[str, Any]] = {
     "own lidm/train": of_splits("lidm/train"),
     "own r2flow/train": of_splits("r2flow/train"),
-    "own SemanticKITTI": {"seen": frames_of("semantic_kitti", SPLITS["train"]).to_list()},
+    "own SemanticKITTI": {
+        "seen": frames_of("semantic_kitti", SPLITS["train"]).to_list()
+    },
     "imported LiDM": {"seen": lidm.seen("KITTI-360", generates=True).to_list()},
-    "imported LiDM of maps": {"seen": lidm.seen("SemanticKITTI", generates=True).to_list()},
+    "imported LiDM of maps": {
+        "seen": lidm.seen("SemanticKITTI", generates=True).to_list()
+    },
 }
 """Provenances of models."""
 
@@ -277,7 +310,9 @@ def test_overlapping_drives_are_refused(
         assert message is None
         return
     assert message is not None
-    assert all(f"KITTI-360 2013_05_28_drive_{drive}_sync" in message for drive in shared)
+    assert all(
+        f"KITTI-360 2013_05_28_drive_{drive}_sync" in message for drive in shared
+    )
     assert "not trained on" in message
     assert refused(judge(kitti360, fake, "--split", split, "--training-data")) is None
 
@@ -286,7 +321,9 @@ def test_overlapping_drives_are_refused(
 @pytest.mark.parametrize("model", TRAINED)
 def test_training_data_of_parent_checkpoints_counts(model: str, parent: str) -> None:
     own = {"seen": town(1).to_list()}
-    child = own | {f"{parent}_provenance": {"data": "?", "init_provenance": TRAINED[model]}}
+    child = own | {
+        f"{parent}_provenance": {"data": "?", "init_provenance": TRAINED[model]}
+    }
     assert seen_by(TRAINED[model])
     assert seen_by(child) == seen_by(own) | seen_by(TRAINED[model])
 
@@ -299,7 +336,12 @@ def test_sequences_are_parts_of_raw_drives(odometry: Path, fake: Path) -> None:
     assert "KITTI 2011_09_30_drive_0028 (frame 1103)" in str(
         refused(judge(odometry, fake, "--split", "val"))
     )
-    trained(["2011_09_30_drive_0028_sync/0000000003", "2011_10_03_drive_0027_sync/0000000003"])
+    trained(
+        [
+            "2011_09_30_drive_0028_sync/0000000003",
+            "2011_10_03_drive_0027_sync/0000000003",
+        ]
+    )
     assert refused(judge(odometry, fake, "--split", "val")) is None
     assert "2011_10_03_drive_0027 (frame 3)" in str(refused(judge(odometry, fake)))
     trained_on(fake, seen_by(TRAINED["imported LiDM"]))
@@ -324,30 +366,49 @@ def test_unknown_training_data_is_reported(kitti360: Path, fake: Path) -> None:
     assert result.exception is None
     assert "does not record its model's training data" in result.stderr
     (fake / NOTE).write_text(
-        json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]})
+        json.dumps(
+            {"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}
+        )
     )
-    assert "whether the two sets share frames is not known" not in judge(kitti360, fake).stderr
+    assert (
+        "whether the two sets share frames is not known"
+        not in judge(kitti360, fake).stderr
+    )
 
 
-def test_kittis_object_set_may_share_frames_with_raw_drives(odometry: Path, fake: Path) -> None:
+def test_kittis_object_set_may_share_frames_with_raw_drives(
+    odometry: Path, fake: Path
+) -> None:
     (fake / NOTE).write_text(
-        json.dumps({"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]})
+        json.dumps(
+            {"seen": [{"dataset": "KITTI object", "drives": {"training": None}}]}
+        )
     )
-    assert "whether the two sets share frames is not known" in judge(odometry, fake).stderr
+    assert (
+        "whether the two sets share frames is not known" in judge(odometry, fake).stderr
+    )
 
 
-def test_a_bank_records_the_training_data_of_its_model(kitti360: Path, tmp_path: Path) -> None:
+def test_a_bank_records_the_training_data_of_its_model(
+    kitti360: Path, tmp_path: Path
+) -> None:
     bank = tmp_path / "bank"
-    write_bank(bank, [some_image(i) for i in range(2)], provenance=TRAINED["own lidm/train"])
+    write_bank(
+        bank, [some_image(i) for i in range(2)], provenance=TRAINED["own lidm/train"]
+    )
     assert "2013_05_28_drive_0002_sync" in str(
         refused(judge(kitti360, bank, "--split", "r2flow/test"))
     )
 
 
 @pytest.mark.slow
-def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_path: Path) -> None:
+def test_a_run_records_the_frames_that_it_saw(
+    kitti360: Path, fake: Path, tmp_path: Path
+) -> None:
     """Its own and its start's; other frames of the same drive are not refused."""
-    sensor = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0).to_dict()
+    sensor = Sensor(
+        "small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0
+    ).to_dict()
     (tmp_path / "sensor.yaml").write_text(yaml.safe_dump({sensor.pop("name"): sensor}))
     network = {
         "width": 16,
@@ -367,7 +428,10 @@ def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_pa
         "samples": {"every": 0},
     }
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
-    assert CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml")]).exception is None
+    assert (
+        CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml")]).exception
+        is None
+    )
     first = tmp_path / "first" / "first.safetensors"
     drive = "2013_05_28_drive_0003_sync"
     provenance = read_header(first)[0].provenance
@@ -378,10 +442,16 @@ def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_pa
         f"output={tmp_path / 'second'}",
     ]
     assert (
-        CliRunner().invoke(app, ["train", str(tmp_path / "config.yaml"), *town]).exception is None
+        CliRunner()
+        .invoke(app, ["train", str(tmp_path / "config.yaml"), *town])
+        .exception
+        is None
     )
     second = read_header(tmp_path / "second" / "second.safetensors")[0].provenance
-    assert second["seen"] == [*provenance["seen"], {"dataset": "town", "drives": {"seed 9": None}}]
+    assert second["seen"] == [
+        *provenance["seen"],
+        {"dataset": "town", "drives": {"seed 9": None}},
+    ]
     scans = tmp_path / "scans"
     made = CliRunner().invoke(
         app,
@@ -411,8 +481,12 @@ def test_a_run_records_the_frames_that_it_saw(kitti360: Path, fake: Path, tmp_pa
 def test_a_town_is_recognised_in_every_format(tmp_path: Path) -> None:
     made = {"made_by": "town", "seed": 9, "interval": 0.4}
     for to in ("kitti", "npz", "range"):
-        write_all(to, tmp_path / to, [replace(some_scan(), domain=SYNTHETIC, provenance=made)])
-        assert recordings_of(open_scans(tmp_path / to), "folder", tmp_path / to) == town(9)
+        write_all(
+            to, tmp_path / to, [replace(some_scan(), domain=SYNTHETIC, provenance=made)]
+        )
+        assert recordings_of(
+            open_scans(tmp_path / to), "folder", tmp_path / to
+        ) == town(9)
 
 
 # --- every pair of named splits
@@ -456,16 +530,22 @@ def all_drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("all_drives")
     writer = WRITERS["kitti360"](root)
     for drive in sorted(DRIVES["all"]):
-        writer.write(random_scan(KITTI_360, 500, seed=drive), drive, name=DRIVE.format(drive, 5))
+        writer.write(
+            random_scan(KITTI_360, 500, seed=drive), drive, name=DRIVE.format(drive, 5)
+        )
     writer.finish()
     return root
 
 
 @pytest.mark.parametrize("split", DRIVES)
 @pytest.mark.parametrize("model", MODELS)
-def test_every_overlap_of_named_splits_is_found(model: str, split: str, all_drives: Path) -> None:
+def test_every_overlap_of_named_splits_is_found(
+    model: str, split: str, all_drives: Path
+) -> None:
     provenance, seen = MODELS[model]
-    reference = measured(open_scans(all_drives, split=split), "kitti360", all_drives, split)
+    reference = measured(
+        open_scans(all_drives, split=split), "kitti360", all_drives, split
+    )
     shared = {
         int(drive.split("_")[4])
         for dataset, drive in overlap(seen_by(provenance), reference).drives
@@ -475,12 +555,17 @@ def test_every_overlap_of_named_splits_is_found(model: str, split: str, all_driv
 
 
 @pytest.mark.parametrize(
-    "protocol", [name for name, p in PROTOCOLS.items() if p.reference and p.reference.training]
+    "protocol",
+    [name for name, p in PROTOCOLS.items() if p.reference and p.reference.training],
 )
-def test_each_protocols_reference_is_apart_from_its_training_data(protocol: str) -> None:
+def test_each_protocols_reference_is_apart_from_its_training_data(
+    protocol: str,
+) -> None:
     reference = PROTOCOLS[protocol].reference
     assert reference is not None and reference.training is not None
     if reference.layout == "kitti360":
         shared = DRIVES[reference.training] & DRIVES[reference.split]
-        assert bool(shared) == (protocol == "r2flow")  # whose code compares with all drives
+        assert bool(shared) == (
+            protocol == "r2flow"
+        )  # whose code compares with all drives
         assert "training" in PROTOCOLS[protocol].unverified or not shared

@@ -30,9 +30,19 @@ FURTHER = {
     "lidar_synth.integrations.accelerate": ("prepare",),
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
-    "lidar_synth.mixing": ("MixedScans.batches", "MixedScans.domain", "MixedScans.wrap"),
+    "lidar_synth.mixing": (
+        "MixedScans.batches",
+        "MixedScans.domain",
+        "MixedScans.wrap",
+    ),
     "lidar_synth.noise": ("gaussian",),
-    "lidar_synth.lab.train": ("TrainConfig", "load_config", "plan_model", "run", "train_model"),
+    "lidar_synth.lab.train": (
+        "TrainConfig",
+        "load_config",
+        "plan_model",
+        "run",
+        "train_model",
+    ),
     "lidar_synth.viz": ("write_view",),
 }
 """What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a
@@ -44,8 +54,12 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 def public_names() -> list[str]:
     """Where to find each public name; the example of ``__version__`` is the package's."""
-    package = [f"lidar_synth.{name}" for name in lidar_synth.__all__ if name != "__version__"]
-    further = [f"{module}.{name}" for module, names in FURTHER.items() for name in names]
+    package = [
+        f"lidar_synth.{name}" for name in lidar_synth.__all__ if name != "__version__"
+    ]
+    further = [
+        f"{module}.{name}" for module, names in FURTHER.items() for name in names
+    ]
     return ["lidar_synth", "lidar_synth.labels.augment", *package, *further]
 
 
@@ -72,9 +86,13 @@ def definitions() -> set[str]:
 
 def example_of(name: str) -> doctest.DocTest:
     """The example in the docstring of a public name, with nothing imported beforehand."""
-    found = doctest.DocTestFinder(recurse=False).find(resolve_name(name), name, globs={})
+    found = doctest.DocTestFinder(recurse=False).find(
+        resolve_name(name), name, globs={}
+    )
     examples = found[0].examples if found else []
-    assert any(example.want for example in examples), f"{name} has no example in its docstring"
+    assert any(example.want for example in examples), (
+        f"{name} has no example in its docstring"
+    )
     lines = sum(len(example.source.splitlines()) for example in examples)
     assert 3 <= lines <= 8, f"the example of {name} has {lines} lines"
     return found[0]
@@ -98,29 +116,45 @@ def folder(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Path:
         "kitti360": "KITTI-360",
         "kitti": "KITTI",
     }.items():
-        export_town(Town(0, "hdl64e_lasers", 3), root / out, layout, camera=False, progress=False)
+        export_town(
+            Town(0, "hdl64e_lasers", 3),
+            root / out,
+            layout,
+            camera=False,
+            progress=False,
+        )
     write_kitti_raw(root / "KITTI-raw")
     write_nuscenes(root / "nuScenes")
     write_pandaset(root / "PandaSet")
-    bake(make_plan(root / "demo_out" / "bank", BakeJob(count=4, seed=1)), progress=False)
+    bake(
+        make_plan(root / "demo_out" / "bank", BakeJob(count=4, seed=1)), progress=False
+    )
     return root
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", public_names())
-def test_the_example_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_runs(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(folder)
     assert report_of(example_of(name)) == ""
 
 
-def test_every_new_name_of_the_package_needs_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_new_name_of_the_package_needs_an_example(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(lidar_synth, "__all__", [*lidar_synth.__all__, "Noise"])
     assert "lidar_synth.Noise" in public_names()
 
 
 @pytest.mark.slow
 def test_every_name_of_the_documents_has_an_example() -> None:
-    pages = [ROOT / "README.md", *ROOT.glob("docs/start/*.md"), *ROOT.glob("docs/how-to/**/*.md")]
+    pages = [
+        ROOT / "README.md",
+        *ROOT.glob("docs/start/*.md"),
+        *ROOT.glob("docs/how-to/**/*.md"),
+    ]
     named = set().union(*(named_in(page.read_text()) for page in pages))
     assert {"MixedScans", "load_layout", "Taxonomy"} <= named
     assert named <= {name.rsplit(".", 1)[1] for name in public_names()[2:]}
@@ -144,6 +178,8 @@ def test_a_name_without_an_example_is_noticed(
         example_of("lidar_synth.Town")
 
 
-def test_an_example_that_prints_something_else_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_example_that_prints_something_else_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(Town, "__doc__", ">>> a = 1\n>>> b = 1\n>>> a + b\n3")
     assert "Expected:\n    3\nGot:\n    2" in report_of(example_of("lidar_synth.Town"))

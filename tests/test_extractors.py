@@ -21,14 +21,24 @@ from safetensors.numpy import load_file
 from typer.testing import CliRunner
 
 from lidar_synth.cli import app
-from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
+from lidar_synth.errors import (
+    ConfigError,
+    DataError,
+    FileError,
+    LibraryError,
+    LidarSynthError,
+)
 from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.evaluate import frechet_distance
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.lab.evaluate.extractors.archive import Archive
-from lidar_synth.lab.evaluate.extractors.bonnetal import POOLS, load_lidm, read_segmenter
+from lidar_synth.lab.evaluate.extractors.bonnetal import (
+    POOLS,
+    load_lidm,
+    read_segmenter,
+)
 from lidar_synth.lab.evaluate.extractors.inputs import PREPARATIONS
 from lidar_synth.lab.evaluate.extractors.liploc import picture
 from lidar_synth.lab.evaluate.extractors.rangevit import build
@@ -68,7 +78,10 @@ def scan(peer: dict[str, NDArray[np.float32]]) -> Scan:
 
 def _scan(points: NDArray[np.float32]) -> Scan:
     return Scan(
-        points[:, :3].copy(), points[:, 3].copy(), presets()["hdl64e_kitti360"], id="random"
+        points[:, :3].copy(),
+        points[:, 3].copy(),
+        presets()["hdl64e_kitti360"],
+        id="random",
     )
 
 
@@ -111,8 +124,13 @@ def test_features_and_distances_of_points_are_the_peers(
     found = extract([scan])
     assert found.shape == (1, EXTRACTORS[name].width)
     assert difference(found[0], peer[case]) < 1e-4
-    both = [extract([_scan(inputs.random_points(1000, *one))])[0] for one in inputs.two_sets()]
-    assert distance(both, inputs) == pytest.approx(float(peer[f"{case} distance"][0]), rel=1e-4)
+    both = [
+        extract([_scan(inputs.random_points(1000, *one))])[0]
+        for one in inputs.two_sets()
+    ]
+    assert distance(both, inputs) == pytest.approx(
+        float(peer[f"{case} distance"][0]), rel=1e-4
+    )
 
 
 def _timm() -> ModuleType:
@@ -142,10 +160,14 @@ def features_of(
         path = archives(name)
         if name in POOLED:
             segmenter = read_segmenter(Archive(path, "lidar-bonnetal"))
-            return lambda image: POOLS[POOLED[name]](segmenter.decode(image), image).numpy()
+            return lambda image: POOLS[POOLED[name]](
+                segmenter.decode(image), image
+            ).numpy()
         if name == "lidm_rangenet":
             given: list[NDArray[np.float32]] = []
-            changed = PREPARATIONS["lidm"]._replace(image=lambda scan, generated: given[-1])
+            changed = PREPARATIONS["lidm"]._replace(
+                image=lambda scan, generated: given[-1]
+            )
             monkeypatch.setitem(PREPARATIONS, "lidm", changed)
             extract = load_lidm(path, "lidm")
 
@@ -156,7 +178,9 @@ def features_of(
 
             return features
         network = build(yaml.safe_load((path / "config.yaml").read_text()))
-        network.load_state_dict(Archive(path, "R3DPA").weights("model.ckpt")["state_dict"])
+        network.load_state_dict(
+            Archive(path, "R3DPA").weights("model.ckpt")["state_dict"]
+        )
         network.eval()
         return lambda image: network(image[None])[0].numpy()
 
@@ -178,8 +202,13 @@ def test_features_and_distances_of_images_are_the_peers(
     of = features_of(name)
     with torch.inference_mode():
         assert difference(of(inputs.random_image(channels(name))[0]), peer[name]) < 1e-4
-        both = [of(inputs.random_image(channels(name), *one)[0]) for one in inputs.two_sets()]
-    assert distance(both, inputs) == pytest.approx(float(peer[f"{name} distance"][0]), rel=1e-4)
+        both = [
+            of(inputs.random_image(channels(name), *one)[0])
+            for one in inputs.two_sets()
+        ]
+    assert distance(both, inputs) == pytest.approx(
+        float(peer[f"{name} distance"][0]), rel=1e-4
+    )
 
 
 def distance(features: list[NDArray[np.floating]], inputs: ModuleType) -> float:
@@ -192,13 +221,17 @@ def distance(features: list[NDArray[np.floating]], inputs: ModuleType) -> float:
 def test_the_images_of_r2flow(peer: dict[str, NDArray[np.float32]], scan: Scan) -> None:
     image = PREPARATIONS["r2flow"].image(scan, False).reshape(5, -1)
     assert np.array_equal(np.flatnonzero(image[0]), peer["r2flow cells"])
-    np.testing.assert_allclose(image[:, peer["r2flow cells"]], peer["r2flow image"], rtol=1e-6)
+    np.testing.assert_allclose(
+        image[:, peer["r2flow cells"]], peer["r2flow image"], rtol=1e-6
+    )
     generated = PREPARATIONS["r2flow"].image(scan, True)
     filled = generated[0] > 0
     azimuth = -np.arctan2(generated[2], generated[1])[filled] / np.pi
     column = (azimuth + 1) / 2 * 1024
     assert abs(column - np.round(column)).max() < 1e-3  # on the left edges of the cells
-    np.testing.assert_allclose(np.linalg.norm(generated[1:4], axis=0), generated[0], atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(generated[1:4], axis=0), generated[0], atol=1e-4
+    )
 
 
 def test_the_images_of_lidm_move_the_returns_that_lidm_moves(
@@ -284,7 +317,9 @@ def _reweigh(file: str, change: Callable[[dict], object]) -> Callable[[Path], No
 
 
 def _cut(file: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / file).write_bytes((folder / file).read_bytes()[:-1000])
+    return lambda folder: (folder / file).write_bytes(
+        (folder / file).read_bytes()[:-1000]
+    )
 
 
 FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], str]] = {
@@ -294,8 +329,18 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
         DataError,
         "not tensors by",
     ),
-    "truncated": ("lidm_spvcnn", _cut("model.ckpt"), DataError, "model.ckpt is truncated"),
-    "no weights": ("lidm_spvcnn", lambda f: (f / "model.ckpt").unlink(), FileError, "model.ckpt"),
+    "truncated": (
+        "lidm_spvcnn",
+        _cut("model.ckpt"),
+        DataError,
+        "model.ckpt is truncated",
+    ),
+    "no weights": (
+        "lidm_spvcnn",
+        lambda f: (f / "model.ckpt").unlink(),
+        FileError,
+        "model.ckpt",
+    ),
     "no state": (
         "lidm_minkowski",
         _reweigh("model.ckpt", lambda c: c.pop("state_dict")),
@@ -310,13 +355,18 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
     ),
     "a weight of another shape": (
         "lidm_minkowski",
-        _reweigh("model.ckpt", lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)})),
+        _reweigh(
+            "model.ckpt",
+            lambda c: c["state_dict"].update({"stem.0.kernel": torch.ones(2)}),
+        ),
         DataError,
         r"another architecture \(it has another shape of stem.0.kernel\)",
     ),
     "a weight is not a number": (
         "lidm_minkowski",
-        _reweigh("model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)),
+        _reweigh(
+            "model.ckpt", lambda c: c["state_dict"]["stem.0.kernel"].fill_(torch.nan)
+        ),
         DataError,
         "stem.0.kernel holds values that are not finite",
     ),
@@ -340,7 +390,9 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
     ),
     "settings with code": (
         "lidm_minkowski",
-        lambda f: (f / "config.yaml").write_text("a: !!python/object/apply:os.getcwd []"),
+        lambda f: (f / "config.yaml").write_text(
+            "a: !!python/object/apply:os.getcwd []"
+        ),
         ConfigError,
         "not YAML",
     ),
@@ -376,7 +428,9 @@ FAULTS: dict[str, tuple[str, Callable[[Path], object], type[LidarSynthError], st
     ),
     "a deviation of 0": (
         "squeezeseg",
-        _edit("arch_cfg.yaml", lambda s: s["dataset"]["sensor"].update(img_stds=[0] * 5)),
+        _edit(
+            "arch_cfg.yaml", lambda s: s["dataset"]["sensor"].update(img_stds=[0] * 5)
+        ),
         ConfigError,
         "positive deviation",
     ),
@@ -406,9 +460,9 @@ def test_a_faulty_archive_is_refused_and_the_right_one_named(
     damage(path)
     with pytest.raises(error, match=message) as caught:
         load_extractor(name, path)
-    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(caught.value).replace(
-        "../", ""
-    )
+    assert EXTRACTORS[name].source in str(caught.value) and ".." not in str(
+        caught.value
+    ).replace("../", "")
 
 
 def test_what_cannot_be_extracted_is_refused(
@@ -432,7 +486,9 @@ def test_what_cannot_be_extracted_is_refused(
 
 
 @pytest.mark.slow
-def test_a_network_without_remission_is_no_judge(archives: Callable[[str], Path]) -> None:
+def test_a_network_without_remission_is_no_judge(
+    archives: Callable[[str], Path],
+) -> None:
     with pytest.raises(ConfigError, match="without remission"):
         load_archive(archives("r2flow_rangenet"))
 
@@ -449,17 +505,22 @@ def test_an_extractor_without_its_library_says_what_to_install(
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(
-        LibraryError, match="torchvision::nms does not exist.*torchvision of the same build"
+        LibraryError,
+        match="torchvision::nms does not exist.*torchvision of the same build",
     ):
         load_extractor("liploc", tmp_path)
 
 
-def test_liploc_is_the_network_of_timm(archives: Callable[[str], Path], scan: Scan) -> None:
+def test_liploc_is_the_network_of_timm(
+    archives: Callable[[str], Path], scan: Scan
+) -> None:
     timm = _timm()
     path = archives("liploc")
     network = timm.create_model("resnet50", num_classes=0, global_pool="avg").eval()
     state = torch.load(path / "model.ckpt", weights_only=True)["state_dict"]
-    network.load_state_dict({k.removeprefix("encoder_lidar.model."): v for k, v in state.items()})
+    network.load_state_dict(
+        {k.removeprefix("encoder_lidar.model."): v for k, v in state.items()}
+    )
     image = torch.from_numpy(PREPARATIONS["r3dpa"].image(scan, False)[0])
     with torch.inference_mode():
         expected = network(picture(image)[None])[0].numpy()
@@ -475,13 +536,18 @@ def test_setup_says_what_to_fetch_and_what_is_there(
     (tmp_path / "darknet53-1024.tar.gz").write_bytes(b"not a tar")
     found = json.loads(CliRunner().invoke(app, ["metrics", "setup", "--json"]).stdout)
     assert list(found) == list(EXTRACTORS)
-    assert found["lidm_minkowski"]["state"] == f"{tmp_path / 'minkowskinet'} is readable"
+    assert (
+        found["lidm_minkowski"]["state"] == f"{tmp_path / 'minkowskinet'} is readable"
+    )
     assert "its hash differs" in found["sparenet_pointnet"]["state"]
     assert (
         "is not usable" in found["rangenet53"]["state"]
         and "truncated" in found["rangenet53"]["state"]
     )
-    assert found["lidm_spvcnn"]["state"] == "missing" and found["lidm_spvcnn"]["sha256"] is None
+    assert (
+        found["lidm_spvcnn"]["state"] == "missing"
+        and found["lidm_spvcnn"]["sha256"] is None
+    )
     assert found["sparenet_pointnet"]["sha256"] == sha256(tmp_path / "cls_model_39.pth")
     known = [
         name
@@ -498,4 +564,6 @@ def test_setup_says_what_to_fetch_and_what_is_there(
     monkeypatch.delenv("LIDAR_SYNTH_METRICS")
     text = CliRunner().invoke(app, ["metrics", "setup"]).stdout
     assert "sha256" not in text and "unknown" in text
-    assert "set LIDAR_SYNTH_METRICS" in text and text.count(": missing") == len(EXTRACTORS)
+    assert "set LIDAR_SYNTH_METRICS" in text and text.count(": missing") == len(
+        EXTRACTORS
+    )

@@ -42,7 +42,9 @@ def fit_of_near_beam() -> SensorFit:
 def test_unknown_azimuth_offsets_are_named() -> None:
     fit = fit_of_near_beam()
     offsets = np.asarray(fit.sensor.azimuths, np.float64)
-    assert np.flatnonzero(np.isnan(offsets)).tolist() == [5] and np.isnan(fit.azimuths.offsets[5])
+    assert np.flatnonzero(np.isnan(offsets)).tolist() == [5] and np.isnan(
+        fit.azimuths.offsets[5]
+    )
     assert (
         f"offsets of the beams at {fit.sensor.elevations[5]:.2f} degrees are not known"
         in " ".join(fit.uncertain)
@@ -91,12 +93,16 @@ def test_returns_at_the_origin_are_left_out() -> None:
     assert fit.share == plain.share == 1 and np.allclose(
         fit.sensor.elevations, plain.sensor.elevations, atol=1e-3
     )
-    assert (fit.rings[0][::5] == -1).all() and fit.points.sum() == (fit.rings[0] >= 0).sum()
+    assert (fit.rings[0][::5] == -1).all() and fit.points.sum() == (
+        fit.rings[0] >= 0
+    ).sum()
 
 
 SPOILT = {
     "were not fitted": lambda rng, count: rng.uniform(-0.25, 0.25, (count, 3)),
-    "from every beam": lambda rng, count: rng.uniform(-20, 20, (count, 3)) * [1, 1, 0.2],
+    "from every beam": lambda rng, count: (
+        rng.uniform(-20, 20, (count, 3)) * [1, 1, 0.2]
+    ),
 }
 
 
@@ -104,9 +110,13 @@ SPOILT = {
 def test_every_unexplained_per_cent_of_points_is_a_doubt(doubt: str) -> None:
     scan = turned().scan
     count = len(scan) // 50
-    fit = fit_sensor([with_points(scan, SPOILT[doubt](np.random.default_rng(0), count))])
+    fit = fit_sensor(
+        [with_points(scan, SPOILT[doubt](np.random.default_rng(0), count))]
+    )
     [found] = [line for line in fit.uncertain if doubt in line]
-    assert float(found.split("%")[0]) == pytest.approx(100 * count / (count + len(scan)), abs=0.8)
+    assert float(found.split("%")[0]) == pytest.approx(
+        100 * count / (count + len(scan)), abs=0.8
+    )
     assert (
         len(fit.points) == 16
         and fit.points.sum() + count * ("fitted" in doubt) == len(scan) + count
@@ -117,7 +127,10 @@ def test_the_vendor_of_a_fit_is_named() -> None:
     table = vendors()["Hesai Pandar128E4X"]
     assert name_vendor(table, np.full(128, 500)) == "Hesai Pandar128E4X"
     few = np.where(np.arange(128) < 20, 3, 500)
-    assert name_vendor(table, few) == "Hesai Pandar128E4X; 20 channels had few points or none"
+    assert (
+        name_vendor(table, few)
+        == "Hesai Pandar128E4X; 20 channels had few points or none"
+    )
     assert name_vendor(table[20:], few[20:]) == name_vendor(table, few)
     assert name_vendor(np.array(BEAMS), np.full(16, 500)) == ""
     assert (
@@ -156,6 +169,8 @@ def test_near_returns_beside_a_beam_are_none() -> None:
     scan = turned().scan
     angle = np.radians(np.linspace(20, 40, 100))
     elevation = np.radians((BEAMS[13] + BEAMS[14]) / 2)
-    wall = 0.9 * np.stack([np.cos(angle), np.sin(angle), np.full(100, np.tan(elevation))], 1)
+    wall = 0.9 * np.stack(
+        [np.cos(angle), np.sin(angle), np.full(100, np.tan(elevation))], 1
+    )
     fit = fit_sensor([with_points(scan, wall)])
     assert len(fit.points) == 16

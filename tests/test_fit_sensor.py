@@ -35,12 +35,15 @@ def untimed(scans: list[Scan]) -> list[Scan]:
 
 
 def shuffled(scans: list[Scan]) -> list[Scan]:
-    return [scan[np.random.default_rng(0).permutation(len(scan))] for scan in untimed(scans)]
+    return [
+        scan[np.random.default_rng(0).permutation(len(scan))] for scan in untimed(scans)
+    ]
 
 
 def moved(scans: list[Scan], offset: np.ndarray, turn: np.ndarray) -> list[Scan]:
     return [
-        replace(scan, points=(scan.points @ turn.T + offset).astype(np.float32)) for scan in scans
+        replace(scan, points=(scan.points @ turn.T + offset).astype(np.float32))
+        for scan in scans
     ]
 
 
@@ -54,7 +57,10 @@ SCANS: dict[str, tuple[Callable[[], list[Scan]], tuple[float, ...]]] = {
     ),
     "every fourth beam": (lambda: shuffled(some(3, elevations=BEAMS[::4])), BEAMS[::4]),
     "lasers above the origin": (lambda: shuffled(some(heights=HEIGHTS)), BEAMS),
-    "motion compensated, with times": (lambda: [compensated(s, 12.0, 0.2) for s in some()], BEAMS),
+    "motion compensated, with times": (
+        lambda: [compensated(s, 12.0, 0.2) for s in some()],
+        BEAMS,
+    ),
     "motion compensated, without": (
         lambda: untimed([compensated(s, 12.0, 0.2) for s in some()]),
         BEAMS,
@@ -91,15 +97,25 @@ def test_ring_numbers_may_have_gaps(change: str) -> None:
         ]
     else:
         scans = [s[s.ring != 5] for s in scans]
-    if change == "one almost lost":  # its only returns are those of the sensor's own housing
+    if (
+        change == "one almost lost"
+    ):  # its only returns are those of the sensor's own housing
         near = np.array([[0.1, 0.0, 0.01]], np.float32)
         last = replace(scans[0][-1:], points=near, ring=np.array([5], np.int16))
-        fields = {n: np.concatenate([v, last.fields()[n]]) for n, v in scans[0].fields().items()}
-        scans[0] = replace(scans[0], points=np.concatenate([scans[0].points, near]), **fields)
+        fields = {
+            n: np.concatenate([v, last.fields()[n]])
+            for n, v in scans[0].fields().items()
+        }
+        scans[0] = replace(
+            scans[0], points=np.concatenate([scans[0].points, near]), **fields
+        )
     fit = fit_sensor(scans)
     there = BEAMS if change in ("from 1", "even") else (*BEAMS[:5], *BEAMS[6:])
     assert fit.source == "ring field" and fit.sensor.shape[0] == len(there)
-    assert np.abs(np.array(fit.sensor.elevations) - there).max() < 0.02 and fit.share > 0.99
+    assert (
+        np.abs(np.array(fit.sensor.elevations) - there).max() < 0.02
+        and fit.share > 0.99
+    )
 
 
 def test_heights_and_speeds_are_found() -> None:
@@ -108,7 +124,9 @@ def test_heights_and_speeds_are_found() -> None:
     made = turned(heights=HEIGHTS)
     found = assign_beams(made.scan, fit.sensor)
     assert np.array_equal(found.ring, made.ring) and np.abs(found.off).max() < 0.02
-    assert np.allclose(fitted("motion compensated, with times").motion[:, 0], 12.0, atol=0.3)
+    assert np.allclose(
+        fitted("motion compensated, with times").motion[:, 0], 12.0, atol=0.3
+    )
 
 
 @pytest.mark.slow
@@ -116,7 +134,10 @@ def test_the_place_of_the_sensor_on_a_vehicle_is_found() -> None:
     town = Town(0, "os1_128", 40, motion=False)
     scans = moved(shuffled([town[0], town[30]]), *MOUNT)
     fit = fit_sensor([replace(scan, ring=None) for scan in scans])
-    assert np.allclose(fit.mount[:3, 3], MOUNT[0], atol=0.02) and fit.sensor.heights is None
+    assert (
+        np.allclose(fit.mount[:3, 3], MOUNT[0], atol=0.02)
+        and fit.sensor.heights is None
+    )
     assert np.allclose(fit.mount[2, :2], MOUNT[1][2, :2], atol=1e-3)
     beams = np.degrees(load_sensor("os1_128").row_elevations())
     assert np.abs(np.array(fit.sensor.elevations) - beams).max() < 0.02
@@ -151,10 +172,14 @@ FIRINGS: dict[str, tuple[Callable[[], list[Scan]], int, str]] = {
 def test_firings_and_azimuth_offsets_are_found(name: str) -> None:
     make, firings, known = FIRINGS[name]
     fit = fit_sensor(make())
-    assert fit.azimuths.known == known and fit.sensor.firings == pytest.approx(firings, rel=0.005)
+    assert fit.azimuths.known == known and fit.sensor.firings == pytest.approx(
+        firings, rel=0.005
+    )
     wrong = np.array(fit.sensor.azimuths) - OFFSETS
     # Without times, lasers seem to fire one after the other, within the angle between two firings.
-    assert np.abs(wrong - np.median(wrong)).max() < (0.18 if name == "the order of time" else 0.1)
+    assert np.abs(wrong - np.median(wrong)).max() < (
+        0.18 if name == "the order of time" else 0.1
+    )
 
 
 def test_ranges_and_reflectance_are_described() -> None:
@@ -196,14 +221,19 @@ BAD: dict[str, tuple[Callable[[], list[Scan]], str]] = {
         lambda: [
             replace(
                 s,
-                points=np.random.default_rng(0).uniform(-20, 20, s.points.shape).astype(np.float32),
+                points=np.random.default_rng(0)
+                .uniform(-20, 20, s.points.shape)
+                .astype(np.float32),
                 time=None,
             )
             for s in some(1)
         ],
         "no beams|fewer than two",
     ),
-    "NaN": (lambda: [replace(s, points=s.points * np.float32(np.nan)) for s in some(1)], "NaN"),
+    "NaN": (
+        lambda: [replace(s, points=s.points * np.float32(np.nan)) for s in some(1)],
+        "NaN",
+    ),
 }
 
 
@@ -230,7 +260,9 @@ def test_every_point_gets_its_ring_with_the_scans_own_sensor(name: str) -> None:
     there."""
     scan = Town(seed=0, scans=1, sensor=name, motion=False)[0]
     found = assign_beams(scan)
-    assert (found.ring == scan.ring).mean() > 0.999 and np.percentile(np.abs(found.off), 99) < 0.01
+    assert (found.ring == scan.ring).mean() > 0.999 and np.percentile(
+        np.abs(found.off), 99
+    ) < 0.01
 
 
 def test_motion_compensation_is_undone_by_poses() -> None:
@@ -240,7 +272,9 @@ def test_motion_compensation_is_undone_by_poses() -> None:
     assert np.abs(published.points - scan.points).max() > 0.5
     assert np.allclose(reskew(published, path).points, scan.points, atol=1e-4)
     assert np.allclose(
-        deskew(scan, path, 0.05).points[-1], deskew(scan, path).points[-1] - [0.75, 0, 0], atol=1.5
+        deskew(scan, path, 0.05).points[-1],
+        deskew(scan, path).points[-1] - [0.75, 0, 0],
+        atol=1.5,
     )
     sensor = fit_sensor([scan]).sensor
     close = [
@@ -253,9 +287,18 @@ def test_motion_compensation_is_undone_by_poses() -> None:
 WRONG_PATHS: dict[str, tuple[Callable[[], object], str]] = {
     "one pose": (lambda: Trajectory([0.0], np.eye(4)[None]), "K >= 2"),
     "no rotation": (lambda: Trajectory([0.0, 1.0], np.ones((2, 4, 4))), "rotation"),
-    "backward": (lambda: Trajectory([1.0, 0.0], np.tile(np.eye(4), (2, 1, 1))), "increase"),
-    "another time": (lambda: reskew(turned().scan, driving(1.0), 50.0), "those of the poses"),
-    "no times": (lambda: reskew(replace(turned().scan, time=None), driving(1.0)), "has no time"),
+    "backward": (
+        lambda: Trajectory([1.0, 0.0], np.tile(np.eye(4), (2, 1, 1))),
+        "increase",
+    ),
+    "another time": (
+        lambda: reskew(turned().scan, driving(1.0), 50.0),
+        "those of the poses",
+    ),
+    "no times": (
+        lambda: reskew(replace(turned().scan, time=None), driving(1.0)),
+        "has no time",
+    ),
 }
 
 
@@ -280,7 +323,9 @@ def run(*words: object) -> int:
 def write(scans: list[Scan], folder: Path) -> Path:
     folder.mkdir()
     for number, scan in enumerate(scans):
-        np.c_[scan.points, scan.reflectance].astype("<f4").tofile(folder / f"{number:06d}.bin")
+        np.c_[scan.points, scan.reflectance].astype("<f4").tofile(
+            folder / f"{number:06d}.bin"
+        )
     return folder
 
 
@@ -290,7 +335,17 @@ def test_the_command_writes_a_sensor_and_a_picture(
     folder = write(some(azimuths=OFFSETS), tmp_path / "scans")
     out = tmp_path / "mine.yaml"
     assert (
-        run("sensor", "fit", folder, "--out", out, "--picture", tmp_path / "fit.png", "--json") == 0
+        run(
+            "sensor",
+            "fit",
+            folder,
+            "--out",
+            out,
+            "--picture",
+            tmp_path / "fit.png",
+            "--json",
+        )
+        == 0
     )
     printed = json.loads(capsys.readouterr().out)
     sensor = load_sensor(out)
@@ -304,7 +359,9 @@ def test_the_command_writes_a_sensor_and_a_picture(
     made = turned()
     bad = write([made.scan[made.ring == 12]], tmp_path / "bad")
     assert run("sensor", "fit", bad, "--out", tmp_path / "bad.yaml") == 1
-    assert "expected" in capsys.readouterr().err and not (tmp_path / "bad.yaml").exists()
+    assert (
+        "expected" in capsys.readouterr().err and not (tmp_path / "bad.yaml").exists()
+    )
     assert run("sensor", "fit", folder, "--out", tmp_path / "mine.txt") == 2
 
 
@@ -325,7 +382,12 @@ def test_the_table_of_a_real_pandar64_is_found(pandaset: Path) -> None:
             points = file["points"]
             time = file["time"]
             scans.append(
-                Scan(points, np.zeros(len(points), np.float32), load_sensor("town"), time=time)
+                Scan(
+                    points,
+                    np.zeros(len(points), np.float32),
+                    load_sensor("town"),
+                    time=time,
+                )
             )
     fit = fit_sensor(scans)
     assert (np.abs(np.array(fit.sensor.elevations) - table[:, 1]) < 0.02).sum() >= 60

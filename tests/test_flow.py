@@ -47,7 +47,9 @@ def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
     count = 20000
     y0 = 0.5 + 0.1 * gaussian(0, range(count), (1,), dtype=torch.float64)
     example = flow_matching(
-        y0, gaussian(1, range(count), (1,), dtype=torch.float64), uniform(2, range(count))
+        y0,
+        gaussian(1, range(count), (1,), dtype=torch.float64),
+        uniform(2, range(count)),
     )
     left = (example.velocity - gaussian_velocity(example.y, example.t)).flatten()
     for feature in (
@@ -56,7 +58,9 @@ def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
         example.t,
         example.y.flatten() * example.t,
     ):
-        assert abs((left * feature).mean()) < 4 * (left * feature).std() / math.sqrt(count)
+        assert abs((left * feature).mean()) < 4 * (left * feature).std() / math.sqrt(
+            count
+        )
     best = velocity_loss(gaussian_velocity, example, METRICS["squared_l2"])
     assert best.ndim == 0 and best == pytest.approx(left.square().mean().item())
     for other in (1.05, 0.95):
@@ -66,7 +70,8 @@ def test_the_flow_matching_loss_is_minimal_at_the_true_velocity() -> None:
 
 def test_the_loss_passes_the_condition_on() -> None:
     example = replace(
-        flow_matching(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.2, 0.4])), cond=3.0
+        flow_matching(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.2, 0.4])),
+        cond=3.0,
     )
     loss = velocity_loss(lambda y, t, c: c * torch.ones_like(y), example, METRICS["l1"])
     assert loss.item() == 2.0
@@ -74,7 +79,9 @@ def test_the_loss_passes_the_condition_on() -> None:
 
 def test_autoguidance_reduces_the_error_that_both_models_share() -> None:
     """Data of standard deviation 0.1, a model fitted to 0.15, and a weaker one fitted to 0.2."""
-    model, weaker = (partial(gaussian_velocity, spread=spread) for spread in (1.5 * STD, 2 * STD))
+    model, weaker = (
+        partial(gaussian_velocity, spread=spread) for spread in (1.5 * STD, 2 * STD)
+    )
     noise = gaussian(0, range(4000), (1,), dtype=torch.float64)
     grid = uniform_grid(50)
 
@@ -106,7 +113,9 @@ def test_autoguidance_passes_the_condition_on() -> None:
 def test_autoguidance_is_limited_to_its_time_interval() -> None:
     y = torch.ones(5, 2)
     t = torch.tensor([0.05, 0.1, 0.5, 0.9, 0.95])
-    out = autoguide(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(y, t, None)
+    out = autoguide(lambda y, t, c: 3 * y, lambda y, t, c: y, 2.0, within=(0.1, 0.9))(
+        y, t, None
+    )
     assert out[:, 0].tolist() == [3, 5, 5, 5, 3] and torch.equal(out[:, 0], out[:, 1])
 
 
@@ -147,7 +156,9 @@ def test_pseudo_huber_equals_that_of_r2flow(golden: Golden, case: int) -> None:
     # the machine.
     c = 0.03 * math.sqrt(v[0].numel())
     other = pseudo_huber(v, vectors["u"], 0.03).mean()
-    assert other.item() == pytest.approx(vectors["loss_coef_0.03"].item(), rel=1e-6, abs=2**-24 * c)
+    assert other.item() == pytest.approx(
+        vectors["loss_coef_0.03"].item(), rel=1e-6, abs=2**-24 * c
+    )
 
 
 @pytest.mark.parametrize("name", ["uniform", "u_shaped", "logit_normal"])
@@ -164,7 +175,9 @@ def test_distributions_of_t_equal_those_of_r2flow(golden: Golden, name: str) -> 
         assert ours.mean() == pytest.approx(
             vectors[f"timesteps/{name}/moments"][0].item(), abs=0.01
         )
-        assert ours.std() == pytest.approx(vectors[f"timesteps/{name}/moments"][1].item(), abs=0.01)
+        assert ours.std() == pytest.approx(
+            vectors[f"timesteps/{name}/moments"][1].item(), abs=0.01
+        )
 
 
 @pytest.mark.parametrize("name", TIMESTEPS)
@@ -184,12 +197,17 @@ def test_distributions_of_t_are_quantile_functions_within_0_and_1(name: str) -> 
     [
         (
             u_shaped,
-            lambda t: 4 * (torch.exp(4 * t) + torch.exp(4 * (1 - t))) / (2 * (math.exp(4) - 1)),
+            lambda t: (
+                4
+                * (torch.exp(4 * t) + torch.exp(4 * (1 - t)))
+                / (2 * (math.exp(4) - 1))
+            ),
         ),
         (
             logit_normal,
             lambda t: (
-                torch.exp(-(torch.logit(t) ** 2) / 2) / (math.sqrt(2 * math.pi) * t * (1 - t))
+                torch.exp(-(torch.logit(t) ** 2) / 2)
+                / (math.sqrt(2 * math.pi) * t * (1 - t))
             ),
         ),
     ],

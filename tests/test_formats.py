@@ -12,7 +12,14 @@ from roundtrips import back, same
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import DataError, LibraryError
-from lidar_synth.formats import KITTI360, READERS, WRITERS, KITTIObject, SemanticKITTI, open_scans
+from lidar_synth.formats import (
+    KITTI360,
+    READERS,
+    WRITERS,
+    KITTIObject,
+    SemanticKITTI,
+    open_scans,
+)
 from lidar_synth.formats.cloud import STORED
 from lidar_synth.formats.png import RangePNG
 from lidar_synth.formats.range_images import RangeImages
@@ -75,14 +82,19 @@ def test_labels_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
 def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     scan.ring = np.arange(len(scan), dtype=np.int16) % 64
-    scan.confidence = (np.arange(len(scan), dtype=np.float32) / len(scan)).astype(np.float32)
+    scan.confidence = (np.arange(len(scan), dtype=np.float32) / len(scan)).astype(
+        np.float32
+    )
     assert scan.raw_label is not None
     scan.raw_label = scan.raw_label | np.uint32(1 << 31)
     write_all(to, tmp_path, [scan])
     read = back(to, tmp_path)[0]
     assert set(read.fields()) == set(scan.fields())
     for name, values in scan.fields().items():
-        assert same(read.fields()[name], values) and read.fields()[name].dtype == values.dtype, name
+        assert (
+            same(read.fields()[name], values)
+            and read.fields()[name].dtype == values.dtype
+        ), name
 
 
 @pytest.mark.parametrize(
@@ -124,7 +136,9 @@ def test_clouds_of_other_programs(tmp_path: Path, suffix: str, header: str) -> N
         (".ply", {"write_ascii": True}),
     ],
 )
-def test_clouds_that_open3d_wrote(tmp_path: Path, suffix: str, options: dict[str, bool]) -> None:
+def test_clouds_that_open3d_wrote(
+    tmp_path: Path, suffix: str, options: dict[str, bool]
+) -> None:
     """Earlier versions of this package wrote PCD and PLY by open3d, with these names and types."""
     open3d = import_open3d()
     scan = some_scan()
@@ -139,9 +153,13 @@ def test_clouds_that_open3d_wrote(tmp_path: Path, suffix: str, options: dict[str
     open3d.t.io.write_point_cloud(str(path), cloud, **options)
     read = open_scans(path)[0]
     atol = 2e-6 if "write_ascii" in options else 0  # its decimals
-    np.testing.assert_allclose(read.points, scan.points, rtol=1e-5 if atol else 0, atol=atol)
+    np.testing.assert_allclose(
+        read.points, scan.points, rtol=1e-5 if atol else 0, atol=atol
+    )
     for name in ("reflectance", "confidence"):
-        np.testing.assert_allclose(read.fields()[name], scan.fields()[name], rtol=0, atol=atol)
+        np.testing.assert_allclose(
+            read.fields()[name], scan.fields()[name], rtol=0, atol=atol
+        )
     for name in ("label", "raw_label", "instance"):
         assert same(read.fields()[name], scan.fields()[name]), name
     path.write_bytes(path.read_bytes()[:-50])
@@ -159,7 +177,9 @@ def test_open3d_reads_our_clouds(tmp_path: Path, suffix: str) -> None:
     assert same(cloud.point["positions"].numpy(), scan.points)
     for name in ("intensity", "label", "instance"):
         expected = scan.fields()["reflectance" if name == "intensity" else name]
-        assert same(cloud.point[name].numpy()[:, 0].astype(expected.dtype), expected), name
+        assert same(cloud.point[name].numpy()[:, 0].astype(expected.dtype), expected), (
+            name
+        )
 
 
 def test_npz_preserves_all_fields(tmp_path: Path) -> None:
@@ -168,13 +188,19 @@ def test_npz_preserves_all_fields(tmp_path: Path) -> None:
     scan.id = "somewhere"
     write_all("npz", tmp_path, [scan])
     read = back("npz", tmp_path)[0]
-    assert read.sensor == scan.sensor and read.domain == 1 and same(read.pose, scan.pose)
+    assert (
+        read.sensor == scan.sensor and read.domain == 1 and same(read.pose, scan.pose)
+    )
     assert read.boxes is not None and scan.boxes is not None
     for field in fields(Boxes):
-        assert same(getattr(read.boxes, field.name), getattr(scan.boxes, field.name)), field.name
+        assert same(getattr(read.boxes, field.name), getattr(scan.boxes, field.name)), (
+            field.name
+        )
 
 
-def test_a_scan_without_labels_still_gets_a_label_file_of_semantic_kitti(tmp_path: Path) -> None:
+def test_a_scan_without_labels_still_gets_a_label_file_of_semantic_kitti(
+    tmp_path: Path,
+) -> None:
     scan = some_scan()
     scan.label = scan.raw_label = scan.instance = None
     write_all("semantic_kitti", tmp_path, [scan])
@@ -193,10 +219,14 @@ def test_range_images_are_read_back_in_every_cell(tmp_path: Path, sensor: str) -
     read = source.image(0)
     assert read.sensor == image.sensor and same(read.range, image.range)
     assert set(read.channels) == set(image.channels)
-    assert all(same(read.channels[name], values) for name, values in image.channels.items())
+    assert all(
+        same(read.channels[name], values) for name, values in image.channels.items()
+    )
     again = source[0]
     assert same(again.pose, scan.pose) and again.boxes is not None
-    assert same(project(again).mask, image.mask) and same(project(again).label, image.label)
+    assert same(project(again).mask, image.mask) and same(
+        project(again).label, image.label
+    )
 
 
 @pytest.mark.parametrize("sensor", ["hdl64e_kitti", "os1_128"])
@@ -213,9 +243,9 @@ def test_png_loses_only_what_is_documented(tmp_path: Path, sensor: str) -> None:
             and same(read.label, image.label)
         )
         half_a_step = image.sensor.range_max / 65535 / 2
-        assert np.abs(read.range - image.range).max() <= half_a_step * 1.001 + np.spacing(
-            image.range.max()
-        )
+        assert np.abs(
+            read.range - image.range
+        ).max() <= half_a_step * 1.001 + np.spacing(image.range.max())
         assert read.reflectance is not None and image.reflectance is not None
         assert np.abs(read.reflectance - image.reflectance).max() <= 8e-6
         assert same(source[0].label, project(scan).label[image.mask])  # type: ignore[index]
@@ -225,7 +255,9 @@ def test_png_loses_only_what_is_documented(tmp_path: Path, sensor: str) -> None:
 def test_range_images_with_six_values_per_cell(tmp_path: Path, convention: str) -> None:
     """As other codes keep them: x, y, z, reflectance, range and class; nuScenes' turned by a
     quarter."""
-    sensor = {"kitti": "hdl64e_semantic_kitti", "nuscenes": "hdl32e_nuscenes"}[convention]
+    sensor = {"kitti": "hdl64e_semantic_kitti", "nuscenes": "hdl32e_nuscenes"}[
+        convention
+    ]
     scan = some_scan(sensor=sensor)
     index = locate(scan.points, scan.sensor).point
     values = np.column_stack(
@@ -246,7 +278,11 @@ def test_range_images_with_six_values_per_cell(tmp_path: Path, convention: str) 
     assert same(image.mask, expected.mask) and same(
         source[0].points, scan.points[index[index >= 0]]
     )
-    assert (image.label is None) if convention == "nuscenes" else same(image.label, expected.label)
+    assert (
+        (image.label is None)
+        if convention == "nuscenes"
+        else same(image.label, expected.label)
+    )
     assert image.reflectance is not None and expected.reflectance is not None
     np.testing.assert_allclose(image.reflectance, expected.reflectance, atol=1e-6)
     stack[..., 4] += 1
@@ -259,7 +295,9 @@ def test_range_images_with_six_values_per_cell(tmp_path: Path, convention: str) 
 def test_range_images_as_plain_arrays(tmp_path: Path, shape: str) -> None:
     image = project(some_scan())
     stack = (
-        image.range if shape == "(H, W)" else np.stack([image.range, image.channels["reflectance"]])
+        image.range
+        if shape == "(H, W)"
+        else np.stack([image.range, image.channels["reflectance"]])
     )
     np.save(tmp_path / "image.npy", stack)
     source = open_scans(tmp_path, sensor="hdl64e_kitti")
@@ -267,7 +305,9 @@ def test_range_images_as_plain_arrays(tmp_path: Path, shape: str) -> None:
     assert len(source[0]) == image.mask.sum()
 
 
-def test_range_images_have_the_sensor_and_the_origin_beside_them(tmp_path: Path) -> None:
+def test_range_images_have_the_sensor_and_the_origin_beside_them(
+    tmp_path: Path,
+) -> None:
     scan = some_scan(sensor="os1_64")
     image = project(scan)
     np.save(tmp_path / "image.npy", image.range)
@@ -286,7 +326,9 @@ def test_range_images_have_the_sensor_and_the_origin_beside_them(tmp_path: Path)
 
 
 @pytest.mark.parametrize("to", ["npz", "range", "webdataset"])
-def test_fields_of_other_types_are_written_in_those_of_files(tmp_path: Path, to: str) -> None:
+def test_fields_of_other_types_are_written_in_those_of_files(
+    tmp_path: Path, to: str
+) -> None:
     """Reflectances divided by 255 in numpy are float64. Projection takes points in float32 only."""
     scan = some_scan()
     kind = np.float32 if to == "range" else np.float64
@@ -301,7 +343,9 @@ def test_fields_of_other_types_are_written_in_those_of_files(tmp_path: Path, to:
     write_all(to, tmp_path / "same", [replace(scan, raw_label=None)])
     [a], [b] = open_scans(tmp_path / "wide"), open_scans(tmp_path / "same")
     assert (
-        same(a.points, b.points) and same(a.reflectance, b.reflectance) and same(a.label, b.label)
+        same(a.points, b.points)
+        and same(a.reflectance, b.reflectance)
+        and same(a.label, b.label)
     )
     with pytest.raises(
         DataError, match="label holds 300; expected whole numbers that uint8 can hold"
@@ -311,9 +355,9 @@ def test_fields_of_other_types_are_written_in_those_of_files(tmp_path: Path, to:
 
 def test_npy_and_other_fields_in_a_folder(tmp_path: Path) -> None:
     scan = some_scan()
-    values = np.column_stack([scan.points, scan.reflectance * 255, np.zeros(len(scan))]).astype(
-        np.float32
-    )
+    values = np.column_stack(
+        [scan.points, scan.reflectance * 255, np.zeros(len(scan))]
+    ).astype(np.float32)
     (tmp_path / "npy").mkdir()
     np.save(tmp_path / "npy" / "a.npy", values)
     values.tofile(tmp_path / "b.bin")
@@ -338,7 +382,9 @@ def test_a_writer_recognises_complete_scans_and_leaves_no_other_files(
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
     writer.finish()
-    assert files == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert files == {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()
+    }
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti360"])
@@ -366,8 +412,14 @@ def test_frames_without_a_pose_are_nan_in_semantic_kitti(tmp_path: Path) -> None
     writer.finish()
     lines = np.loadtxt(tmp_path / "sequences" / "05" / "poses.txt")
     assert np.isfinite(lines).all(axis=1).tolist() == [True, False, False, False, True]
-    assert not (tmp_path / "sequences" / "05" / "times.txt").exists()  # nobody knows them
-    assert [scan.pose is None for scan in SemanticKITTI(tmp_path)] == [False, True, False]
+    assert not (
+        tmp_path / "sequences" / "05" / "times.txt"
+    ).exists()  # nobody knows them
+    assert [scan.pose is None for scan in SemanticKITTI(tmp_path)] == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_splits(tmp_path: Path) -> None:
@@ -378,13 +430,26 @@ def test_splits(tmp_path: Path) -> None:
         split: [i[:2] for i in SemanticKITTI(tmp_path, split).ids]
         for split in ("train", "val", "test", "all")
     }
-    assert found == {"train": ["00"], "val": ["08"], "test": ["11"], "all": ["00", "08", "11"]}
+    assert found == {
+        "train": ["00"],
+        "val": ["08"],
+        "test": ["11"],
+        "all": ["00", "08", "11"],
+    }
     writer = WRITERS["kitti360"](tmp_path / "kitti360")
     for drive in range(11):
-        writer.write(some_scan(count=40), 0, name=f"2013_05_28_drive_{drive:04d}_sync/0000000000")
+        writer.write(
+            some_scan(count=40), 0, name=f"2013_05_28_drive_{drive:04d}_sync/0000000000"
+        )
     by_split = {
         split: [int(i[17:21]) for i in KITTI360(tmp_path / "kitti360", split).ids]
-        for split in ("r2flow/train", "r2flow/test", "lidm/train", "lidm/val", "lidm-camera/train")
+        for split in (
+            "r2flow/train",
+            "r2flow/test",
+            "lidm/train",
+            "lidm/val",
+            "lidm-camera/train",
+        )
     }
     assert by_split == {
         "r2flow/train": [3, 4, 5, 6, 7, 9, 10],
@@ -405,7 +470,8 @@ def test_image_sets_choose_the_frames(tmp_path: Path) -> None:
 def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
     frame = "2013_05_28_drive_0003_sync/0000000042"
     found = {
-        to: WRITERS[to](tmp_path).path(7, frame).relative_to(tmp_path).as_posix() for to in WRITERS
+        to: WRITERS[to](tmp_path).path(7, frame).relative_to(tmp_path).as_posix()
+        for to in WRITERS
     }
     assert found == {
         "kitti": f"{frame}.bin",
@@ -419,10 +485,13 @@ def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
         "png": f"range/{frame.replace('/', '_')}.png",
         "webdataset": f".lidar_synth/000000007/{frame}.tar",
     }
-    assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](tmp_path).path(
-        7, frame
-    )
-    assert WRITERS["semantic_kitti"](tmp_path, sequence="21").path(7, "my_scan").stem == "000007"  # type: ignore[call-arg]
+    assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](
+        tmp_path
+    ).path(7, frame)
+    assert (
+        WRITERS["semantic_kitti"](tmp_path, sequence="21").path(7, "my_scan").stem
+        == "000007"
+    )  # type: ignore[call-arg]
 
 
 def test_a_folder_of_npz_files_has_the_sensor_stored_in_them(tmp_path: Path) -> None:

@@ -29,24 +29,31 @@ def test_the_camera_is_read_back(tmp_path: Path, to: str) -> None:
     source = back(to, tmp_path)
     read = source.calibration(0)
     assert read is not None and read.image_size == (700, 260)
-    np.testing.assert_allclose(read.image_from_sensor, camera.image_from_sensor, atol=1e-8)
+    np.testing.assert_allclose(
+        read.image_from_sensor, camera.image_from_sensor, atol=1e-8
+    )
     path = source[0].image_path
     assert path is not None
     from PIL import Image
 
     assert same(np.asarray(Image.open(path)), picture)
     # Once more, from what was read: the dataset's own matrices and the image go on as they are.
-    WRITERS[to](tmp_path / "again").write(source[0], 0, name=source.ids[0], calibration=read)
+    WRITERS[to](tmp_path / "again").write(
+        source[0], 0, name=source.ids[0], calibration=read
+    )
     again = tmp_path / "again" / path.relative_to(tmp_path)
     assert again.read_bytes() == path.read_bytes()
     for file in (f for f in (tmp_path / "again").rglob("*.txt") if "calib" in str(f)):
-        assert file.read_text() == (tmp_path / file.relative_to(tmp_path / "again")).read_text(), (
-            file
-        )
+        assert (
+            file.read_text()
+            == (tmp_path / file.relative_to(tmp_path / "again")).read_text()
+        ), file
 
 
 @pytest.mark.parametrize("to", ["semantic_kitti", "kitti_object", "kitti360"])
-def test_without_a_camera_an_ideal_forward_camera_is_written(tmp_path: Path, to: str) -> None:
+def test_without_a_camera_an_ideal_forward_camera_is_written(
+    tmp_path: Path, to: str
+) -> None:
     write_all(to, tmp_path, [some_scan()])
     camera = back(to, tmp_path).calibration(0)
     assert camera is not None
@@ -63,7 +70,9 @@ def test_without_a_camera_an_ideal_forward_camera_is_written(tmp_path: Path, to:
     st.lists(st.sampled_from(sorted(SEMANTIC_KITTI.to_train)), min_size=1, max_size=20),
     st.integers(0, 0xFFFF),
 )
-def test_all_semantic_kitti_labels_are_preserved(classes: list[int], instance: int) -> None:
+def test_all_semantic_kitti_labels_are_preserved(
+    classes: list[int], instance: int
+) -> None:
     raw = np.array(classes, np.uint32) | np.uint32(instance << 16)
     known = decode_labels(raw, SEMANTIC_KITTI, "here")
     scan = Scan(
@@ -81,8 +90,14 @@ def test_all_semantic_kitti_labels_are_preserved(classes: list[int], instance: i
     assert same(kept, expected)
 
 
-@given(arrays.arrays(np.uint8, st.integers(1, 30), elements=st.sampled_from([*range(19), IGNORE])))
-def test_labels_without_raw_values_are_written_as_static_classes(label: np.ndarray) -> None:
+@given(
+    arrays.arrays(
+        np.uint8, st.integers(1, 30), elements=st.sampled_from([*range(19), IGNORE])
+    )
+)
+def test_labels_without_raw_values_are_written_as_static_classes(
+    label: np.ndarray,
+) -> None:
     scan = Scan(
         np.ones((len(label), 3), np.float32),
         np.zeros(len(label), np.float32),
@@ -110,10 +125,16 @@ def test_kitti360_labels_in_both_encodings(tmp_path: Path) -> None:
     scan = some_scan()
     write_all("kitti360", tmp_path, [scan])
     read = back("kitti360", tmp_path)[0]
-    assert read.label is not None and scan.label is not None and scan.instance is not None
-    assert same(read.label, KITTI360_CLASSES.decode(KITTI360_CLASSES.encode(scan.label)))
+    assert (
+        read.label is not None and scan.label is not None and scan.instance is not None
+    )
+    assert same(
+        read.label, KITTI360_CLASSES.decode(KITTI360_CLASSES.encode(scan.label))
+    )
     ids = KITTI360_CLASSES.encode(scan.label)
-    assert same(read.instance, np.where(scan.instance > 0, ids * 1000 + scan.instance, 0))
+    assert same(
+        read.instance, np.where(scan.instance > 0, ids * 1000 + scan.instance, 0)
+    )
     [path] = tmp_path.glob("data_3d_semantics_scan/*/labels/*.label")
     path.unlink()
     recovered = np.where(np.arange(len(scan)) % 7 == 0, -1, ids).astype("<i2")
@@ -147,7 +168,9 @@ def test_kitti_label_lines_are_boxes_and_back(
     write_label_2(path, boxes, camera)
     text = path.read_text()
     read = read_label_2(path, camera)
-    assert ((read.image_box[:, :2] >= 0) & (read.image_box[:, 2:] <= np.array([699, 259]))).all()
+    assert (
+        (read.image_box[:, :2] >= 0) & (read.image_box[:, 2:] <= np.array([699, 259]))
+    ).all()
     assert ((read.truncation >= 0) & (read.truncation <= 1)).all()
     write_label_2(path, read, camera)
     assert path.read_text() == text
@@ -168,7 +191,9 @@ def test_a_kitti_label_line_by_hand(tmp_path: Path) -> None:
         boxes.values, [(10, -1, -2 + 0.75, 4, 1.6, 1.5, -np.pi / 2)], atol=1e-6
     )
     assert (boxes.names, boxes.truncation[0], boxes.occlusion[0]) == (("Car",), 0.25, 2)
-    assert same(boxes.image_box, [(10, 20, 30, 40)]) and boxes.alpha[0] == np.float32(-0.1)
+    assert same(boxes.image_box, [(10, 20, 30, 40)]) and boxes.alpha[0] == np.float32(
+        -0.1
+    )
 
 
 def test_pose_files_by_hand(tmp_path: Path) -> None:
@@ -183,23 +208,39 @@ def test_pose_files_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(line, [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2], atol=1e-12)
     folder = tmp_path / "kitti360" / "data_poses" / "2013_05_28_drive_0000_sync"
     np.testing.assert_allclose(
-        np.loadtxt(folder / "poses.txt"), [0, 1, 0, 0, 2, 0, -1, 0, 0, 0, 0, -1, 0], atol=1e-12
+        np.loadtxt(folder / "poses.txt"),
+        [0, 1, 0, 0, 2, 0, -1, 0, 0, 0, 0, -1, 0],
+        atol=1e-12,
     )
     camera = [0, 0, 0, 1, 2, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1]
-    np.testing.assert_allclose(np.loadtxt(folder / "cam0_to_world.txt"), camera, atol=1e-12)
+    np.testing.assert_allclose(
+        np.loadtxt(folder / "cam0_to_world.txt"), camera, atol=1e-12
+    )
 
 
 def test_kitti_object_lists_boxes_in_the_cameras_view(tmp_path: Path) -> None:
-    values = [(20, 0, -1, 4, 2, 1.5, 0), (-20, 0, -1, 4, 2, 1.5, 0), (20, 40, -1, 4, 2, 1.5, 0)]
+    values = [
+        (20, 0, -1, 4, 2, 1.5, 0),
+        (-20, 0, -1, 4, 2, 1.5, 0),
+        (20, 40, -1, 4, 2, 1.5, 0),
+    ]
     scan = some_scan()
     scan.boxes = Boxes(
-        np.array(values), ("Car", "Car", "Van"), dont_care=np.array([(1, 2, 30, 40)], np.float32)
+        np.array(values),
+        ("Car", "Car", "Van"),
+        dont_care=np.array([(1, 2, 30, 40)], np.float32),
     )
     write_all("kitti_object", tmp_path, [scan], calibration=some_camera())
     read = KITTIObject(tmp_path, "train")[0].boxes
-    assert read is not None and read.names == ("Car",) and same(read.dont_care, [(1, 2, 30, 40)])
+    assert (
+        read is not None
+        and read.names == ("Car",)
+        and same(read.dont_care, [(1, 2, 30, 40)])
+    )
     np.testing.assert_allclose(read.values[0], values[0], atol=0.02)
-    assert [scan.id for scan in KITTIObject(tmp_path, "trainval")] == ["training/000000"]
+    assert [scan.id for scan in KITTIObject(tmp_path, "trainval")] == [
+        "training/000000"
+    ]
     scan.boxes = Boxes(np.zeros((0, 7)), (), dont_care=scan.boxes.dont_care)
     write_all("kitti_object", tmp_path, [scan], calibration=some_camera())
     read = KITTIObject(tmp_path)[0].boxes
@@ -249,7 +290,9 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
         "0 -2 0 10 4 0 0 0 0 0 1.5 0 0 0 0 "
         "1</data></transform><vertices><data>{4}</data></vertices></object{0}>"
     )
-    cube = " ".join(str(v) for corner in np.ndindex(2, 2, 2) for v in np.array(corner) - 0.5)
+    cube = " ".join(
+        str(v) for corner in np.ndindex(2, 2, 2) for v in np.array(corner) - 0.5
+    )
     objects = [
         entry.format(1, "car", "<semanticId>13</semanticId>", -1, cube),
         entry.format(2, "building", "<semanticId>11</semanticId>", -1, cube),
@@ -260,17 +303,28 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
     boxes = read_boxes(path)
     assert boxes.at(600, np.eye(4), 80).names == ("Car", "Pedestrian")
     np.testing.assert_allclose(
-        boxes.at(600, np.eye(4), 80).values[0], (10, 0, 0, 4, 2, 1.5, np.pi / 2), atol=1e-6
+        boxes.at(600, np.eye(4), 80).values[0],
+        (10, 0, 0, 4, 2, 1.5, np.pi / 2),
+        atol=1e-6,
     )
     assert boxes.at(600, np.eye(4), 80).instance.tolist() == [26007, 24007]
     assert boxes.at(700 + MARGIN, np.eye(4), 80).names == ("Car",)
-    assert len(boxes.at(701 + MARGIN, np.eye(4), 80)) == len(boxes.at(600, a_pose(), 80)) == 0
+    assert (
+        len(boxes.at(701 + MARGIN, np.eye(4), 80))
+        == len(boxes.at(600, a_pose(), 80))
+        == 0
+    )
 
 
 def test_positions_of_kitti_tracklets_are_centres_of_the_floor(tmp_path: Path) -> None:
     MAKERS["kitti_raw"](tmp_path)
     first, second, third = (scan.boxes for scan in open_scans(tmp_path))
-    assert first is not None and len(first) == 0 and second is not None and third is not None
+    assert (
+        first is not None
+        and len(first) == 0
+        and second is not None
+        and third is not None
+    )
     assert third.names == ("Person_sitting",)
     np.testing.assert_allclose(
         third.values[0], (10, 1, -0.9, 0.9, 0.8, 1.2, 5 - 2 * np.pi), atol=1e-5
@@ -289,7 +343,8 @@ def test_nuscenes_labels_are_dropped_with_their_points(tmp_path: Path) -> None:
         kept = np.linalg.norm(points[:, :3], axis=1) >= 1
         assert 0 < kept.sum() < len(points)
         assert same(
-            scan.points, np.column_stack([points[kept, 1], -points[kept, 0], points[kept, 2]])
+            scan.points,
+            np.column_stack([points[kept, 1], -points[kept, 0], points[kept, 2]]),
         )
         assert same(scan.ring, 31 - points[kept, 4]) and same(
             scan.label, NUSCENES.decode(classes[kept])

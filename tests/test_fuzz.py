@@ -19,7 +19,9 @@ import pytest
 from layouts import some_scan
 
 if not Path("/proc/self/status").exists():
-    pytest.skip("limits and peaks of memory are those of Linux", allow_module_level=True)
+    pytest.skip(
+        "limits and peaks of memory are those of Linux", allow_module_level=True
+    )
 
 from fuzzing import mutators
 from fuzzing.cases import Cases, mutable, seed_files
@@ -44,7 +46,8 @@ EXEMPT: dict[str, str] = {}
 def test_mutated_files_are_read_soundly_or_refused(name: str) -> None:
     report = fuzz(name, TARGETS[name], range(CASES))
     found = "\n".join(
-        f"python tools/fuzz.py --reader {name} --case {f.number}: {f}" for f in report.flaws
+        f"python tools/fuzz.py --reader {name} --case {f.number}: {f}"
+        for f in report.flaws
     )
     assert not report.flaws, found
     assert report.cases == CASES and report.counts[REFUSED] > CASES / 8
@@ -62,12 +65,17 @@ def test_every_reader_is_fuzzed() -> None:
 def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
     def contents(cases: Cases, number: int) -> dict[str, bytes]:
         root = cases.place(number)
-        found = {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+        found = {
+            str(p.relative_to(root)): p.read_bytes()
+            for p in root.rglob("*")
+            if p.is_file()
+        }
         cases.restore()
         return found
 
     first, second, other = (
-        Cases(name, TARGETS[name], s, tmp_path / d) for s, d in ((0, "a"), (0, "b"), (1, "c"))
+        Cases(name, TARGETS[name], s, tmp_path / d)
+        for s, d in ((0, "a"), (0, "b"), (1, "c"))
     )
     assert first.files == second.files == other.files
     forwards = [contents(first, number) for number in range(8)]
@@ -79,7 +87,9 @@ def test_a_number_gives_the_same_case(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_mutators_read_the_valid_files_and_change_them(tmp_path: Path, name: str) -> None:
+def test_mutators_read_the_valid_files_and_change_them(
+    tmp_path: Path, name: str
+) -> None:
     """One that always raised would be replaced by flipped bits without a word."""
     files = seed_files(TARGETS[name], tmp_path / "valid")
     for file in mutable(TARGETS[name], files):
@@ -101,7 +111,9 @@ def only_numbers(root: Path) -> None:
 
 
 def is_valid(root: Path) -> bool:
-    return (root / "numbers.bin").is_file() and (root / "numbers.bin").read_bytes() == NUMBERS
+    return (root / "numbers.bin").is_file() and (
+        root / "numbers.bin"
+    ).read_bytes() == NUMBERS
 
 
 def refuses(root: Path) -> list[Any]:
@@ -167,18 +179,23 @@ def gives_nan(root: Path) -> list[Any]:
         (gives_nan, UNSOUND, "points up to nan m"),
     ],
 )
-def test_what_a_broken_reader_does_is_noticed(reader: Any, verdict: str, detail: str) -> None:
+def test_what_a_broken_reader_does_is_noticed(
+    reader: Any, verdict: str, detail: str
+) -> None:
     """The process is started again where a case ended it, so that every case is counted."""
     limits = Limits(seconds=1.0 if reader is sleeps else 60.0)
     report = fuzz("broken", Target(only_numbers, reader), range(3), limits=limits)
     assert report.counts == {verdict: 3}
-    assert [flaw.number for flaw in report.flaws] == ([0, 1, 2] if verdict in FLAWS else [])
+    assert [flaw.number for flaw in report.flaws] == (
+        [0, 1, 2] if verdict in FLAWS else []
+    )
     assert all(detail in flaw.detail for flaw in report.flaws)
 
 
 def test_a_harness_that_fails_is_no_verdict() -> None:
     with pytest.raises(
-        RuntimeError, match=r"broken: the harness failed \(exit status 1\)(.|\n)*KeyError"
+        RuntimeError,
+        match=r"broken: the harness failed \(exit status 1\)(.|\n)*KeyError",
     ):
         fuzz("broken", Target(only_numbers, partial(dict.__getitem__, {})), range(1))
 
@@ -231,10 +248,15 @@ def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
     printed = capsys.readouterr().out
     assert "| reader | cases | read equal |" in printed and "| bin | 4 |" in printed
     assert "| broken | 4 | 0 | 0 | 0 | 0 | 4 | 0 |" in printed
-    assert "broken --seed 0 --case [0, 1, 2]: 4 x foreign error: \"KeyError: 'x'\"" in printed
+    assert (
+        "broken --seed 0 --case [0, 1, 2]: 4 x foreign error: \"KeyError: 'x'\""
+        in printed
+    )
     assert not is_valid(tmp_path / "broken" / "0-0" / "case")
     monkeypatch.setattr(
-        sys, "argv", ["fuzz.py", "--reader", "bin", "--case", "0", "--keep", str(tmp_path)]
+        sys,
+        "argv",
+        ["fuzz.py", "--reader", "bin", "--case", "0", "--keep", str(tmp_path)],
     )
     with pytest.raises(DataError):
         tool.main()

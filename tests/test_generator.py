@@ -56,7 +56,9 @@ def test_images_are_the_solution_of_the_flow_from_the_documented_noise(
 ) -> None:
     noise = gaussian(5, [3, 9], (generator.tensors.size, *SENSOR.shape))
     with torch.inference_mode():
-        expected = generator.tensors.to_images(solve(generator.network, noise, GRID), SENSOR)
+        expected = generator.tensors.to_images(
+            solve(generator.network, noise, GRID), SENSOR
+        )
     images = generator.range_images(5, [3, 9])
     for image, other in zip(images, expected, strict=True):
         assert np.allclose(image.range, other.range, atol=1e-3)
@@ -69,7 +71,10 @@ def test_images_are_the_solution_of_the_flow_from_the_documented_noise(
 
 @pytest.mark.slow
 @settings(max_examples=10)
-@given(indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5), batch=st.integers(1, 3))
+@given(
+    indices=st.lists(st.integers(0, 2**62), min_size=1, max_size=5),
+    batch=st.integers(1, 3),
+)
 def test_a_scan_does_not_depend_on_the_others_of_its_batch(
     generator: Generator, indices: list[int], batch: int
 ) -> None:
@@ -101,7 +106,9 @@ def test_an_unknown_sampling_option_is_refused(generator: Generator) -> None:
             call(0, [0], step=2)
 
 
-def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator) -> None:
+def test_steps_and_solver_replace_the_checkpoints_own_grid(
+    generator: Generator,
+) -> None:
     noise = gaussian(0, [0], (generator.tensors.size, *SENSOR.shape))
     known = (1.0, 0.3, 0.0)
     trained = replace(generator, header=replace(generator.header, other_grids=(known,)))
@@ -116,7 +123,9 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(generator: Generator)
     ):
         [tensor] = made_by.samples(0, [0], steps=steps, solver=solver)
         with torch.inference_mode():
-            assert torch.allclose(tensor, solve(generator.network, noise, grid, solver), atol=1e-5)
+            assert torch.allclose(
+                tensor, solve(generator.network, noise, grid, solver), atol=1e-5
+            )
     with pytest.raises(ConfigError, match="0 steps"):
         generator.scans(0, [0], steps=0)
     with pytest.raises(ConfigError, match="solver 'rk4'"):
@@ -142,14 +151,18 @@ def test_lower_precision_stays_close(path: Path, generator: Generator) -> None:
 
 def label_maps(count: int) -> np.ndarray:
     return (
-        np.random.default_rng(0).choice([0, 8, 18, IGNORE], (count, *SENSOR.shape)).astype(np.uint8)
+        np.random.default_rng(0)
+        .choice([0, 8, 18, IGNORE], (count, *SENSOR.shape))
+        .astype(np.uint8)
     )
 
 
 def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(
     tmp_path: Path, generator: Generator
 ) -> None:
-    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
+    conditioned = load_generator(
+        write(tmp_path / "conditioned.safetensors", ("range",), 0.0)
+    )
     many = label_maps(3)
     same = conditioned.range_images(0, [4, 4], many[0])
     assert np.allclose(same[0].range, same[1].range, atol=1e-3)
@@ -158,7 +171,8 @@ def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(
     assert np.allclose(images[2].range, third.range, atol=1e-3)
     assert not np.allclose(images[0].range, third.range, atol=1e-3)
     with pytest.raises(
-        DataError, match=r"of shape \(8, 16\); expected \(8, 32\) for all scans, or \(1, 8, 32\)"
+        DataError,
+        match=r"of shape \(8, 16\); expected \(8, 32\) for all scans, or \(1, 8, 32\)",
     ):
         conditioned.scans(0, [0], np.zeros((8, 16), np.uint8))
     with pytest.raises(DataError, match="no condition for 'conditioned'"):
@@ -168,27 +182,43 @@ def test_arrays_tensors_and_dictionaries_are_accepted_as_conditions(
     assert (generator.condition, conditioned.condition) == (None, "semantic")
 
 
-def test_a_label_map_also_labels_the_generated_scan(tmp_path: Path, generator: Generator) -> None:
+def test_a_label_map_also_labels_the_generated_scan(
+    tmp_path: Path, generator: Generator
+) -> None:
     conditioned = load_generator(
         write(tmp_path / "conditioned.safetensors", ("range", "reflectance"), 0.0)
     )
-    assert conditioned.fields == {"reflectance", "label", "confidence"} == generator.fields
+    assert (
+        conditioned.fields == {"reflectance", "label", "confidence"} == generator.fields
+    )
     [labels] = label_maps(1)
-    [image], [scan] = conditioned.range_images(0, [1], labels), conditioned.scans(0, [1], labels)
+    [image], [scan] = (
+        conditioned.range_images(0, [1], labels),
+        conditioned.scans(0, [1], labels),
+    )
     assert image.mask.any() and not image.mask.all()
     assert np.array_equal(image.label, np.where(image.mask, labels, IGNORE))
-    assert np.array_equal(image.channels["confidence"], (image.label != IGNORE).astype(np.float32))
+    assert np.array_equal(
+        image.channels["confidence"], (image.label != IGNORE).astype(np.float32)
+    )
     assert np.array_equal(scan.label, labels[image.mask])
 
 
 def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
-    conditioned = load_generator(write(tmp_path / "conditioned.safetensors", ("range",), 0.0))
+    conditioned = load_generator(
+        write(tmp_path / "conditioned.safetensors", ("range",), 0.0)
+    )
     scans = [random_scan(SENSOR, 400, seed) for seed in range(2)]
     maps = np.stack(
-        [bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"]) for scan in scans]
+        [
+            bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"])
+            for scan in scans
+        ]
     )
     for a, b in zip(
-        conditioned.scans(0, [1, 2], scans), conditioned.scans(0, [1, 2], maps), strict=True
+        conditioned.scans(0, [1, 2], scans),
+        conditioned.scans(0, [1, 2], maps),
+        strict=True,
     ):
         assert np.array_equal(a.points, b.points)
     [a], [b] = conditioned.scans(0, [1], scans[1]), conditioned.scans(0, [1], maps[1])
@@ -198,9 +228,9 @@ def test_real_scans_provide_their_labels_as_conditions(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    labels = np.where(rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))).astype(
-        np.uint8
-    )
+    labels = np.where(
+        rng.random((8, 64)) < 0.5, IGNORE, rng.integers(0, 19, (8, 64))
+    ).astype(np.uint8)
     given = labels.copy()
     made = bridge_gaps(labels)
     assert np.array_equal(labels, given)
@@ -211,12 +241,16 @@ def test_narrow_gaps_of_a_label_map_are_closed(seed: int) -> None:
             right = ((known - i) % 64).min()
             wanted = IGNORE
             if left + right - 1 <= GAP:
-                wanted = row[(i - left) % 64] if left <= right else row[(i + right) % 64]
+                wanted = (
+                    row[(i - left) % 64] if left <= right else row[(i + right) % 64]
+                )
             assert out[i] == wanted
         assert np.array_equal(out[known], row[known])
 
 
-def test_guidance_interpolates_between_blank_and_given_condition(tmp_path: Path) -> None:
+def test_guidance_interpolates_between_blank_and_given_condition(
+    tmp_path: Path,
+) -> None:
     guided = load_generator(write(tmp_path / "guided.safetensors", ("range",), 0.1))
     maps = label_maps(2)
     [plain] = guided.samples(0, [1], maps[0], guidance=1.0)
@@ -225,7 +259,9 @@ def test_guidance_interpolates_between_blank_and_given_condition(tmp_path: Path)
     [none] = guided.samples(0, [1], maps[0], guidance=0.0)
     assert torch.allclose(none, nothing, atol=1e-4)
     assert not torch.allclose(plain, more, atol=1e-2)
-    many = torch.cat(list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0)))
+    many = torch.cat(
+        list(replace(guided, batch=2).samples(0, [1, 5], maps, guidance=2.0))
+    )
     assert torch.allclose(many[0], more[0], atol=1e-4)
     never = load_generator(write(tmp_path / "never.safetensors", ("range",), 0.0))
     with pytest.raises(
@@ -241,13 +277,15 @@ def test_models_are_found_by_shipped_name_or_by_path(
     (tmp_path / "weights").mkdir()
     monkeypatch.setattr(loading, "files", lambda package: tmp_path)
     with pytest.raises(
-        ConfigError, match=r"model 'town'; expected a shipped one \(none in this installation\)"
+        ConfigError,
+        match=r"model 'town'; expected a shipped one \(none in this installation\)",
     ):
         load_generator("town")
     (tmp_path / "weights" / "town.safetensors").write_bytes(path.read_bytes())
     assert load_generator("town").scans(0, [1])[0].id == "town/0/1"
     with pytest.raises(
-        ConfigError, match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file"
+        ConfigError,
+        match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file",
     ):
         load_generator("city")
     with pytest.raises(FileError, match="nowhere"):
@@ -314,7 +352,8 @@ def write_latent(path: Path, architecture: str) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "architecture", [name for name, cls in NETWORKS.items() if issubclass(cls, Autoencoder)]
+    "architecture",
+    [name for name, cls in NETWORKS.items() if issubclass(cls, Autoencoder)],
 )
 def test_compile_compiles_the_decoder_too(
     architecture: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -334,7 +373,9 @@ def test_compile_compiles_the_decoder_too(
     z = torch.randn(1, *eager.codec.shape)
     uniform_noise = torch.full((1, eager.codec.draws, *SENSOR.shape), 0.4)
     given = uniform_noise if eager.codec.draws else None
-    torch.testing.assert_close(compiled.codec.decode(z, given), eager.codec.decode(z, given))
+    torch.testing.assert_close(
+        compiled.codec.decode(z, given), eager.codec.decode(z, given)
+    )
     assert sum(graphs) >= 5
     before = len(graphs)
     compiled.scans(0, [0])
@@ -358,13 +399,19 @@ def test_a_damaged_shipped_checkpoint_is_refused(
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "meta", "cpu:1"])
 def test_an_unavailable_device_is_refused(path: Path, device: str) -> None:
-    with pytest.raises(ConfigError, match=rf"device '{device}'; expected an available one: cpu"):
+    with pytest.raises(
+        ConfigError, match=rf"device '{device}'; expected an available one: cpu"
+    ):
         load_generator(path, device=device)
 
 
-def test_mps_is_refused_if_it_is_unavailable(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mps_is_refused_if_it_is_unavailable(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match="device 'mps'; expected an available one: cpu"):
+    with pytest.raises(
+        ConfigError, match="device 'mps'; expected an available one: cpu"
+    ):
         load_generator(path, device="mps")
 
 
@@ -385,7 +432,9 @@ def test_a_gpu_is_refused_if_it_is_unavailable_and_in_dataloader_workers(
     path: Path, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not torch.cuda.is_available():
-        with pytest.raises(ConfigError, match="device 'cuda'; expected an available one: cpu"):
+        with pytest.raises(
+            ConfigError, match="device 'cuda'; expected an available one: cpu"
+        ):
             load_generator(path, device="cuda")
     monkeypatch.setattr(devices, "get_worker_info", lambda: SimpleNamespace(id=0))
     three_ways = r"\(A\) bake .*\(B\) a rolling .*\(C\) mix in"
@@ -411,7 +460,10 @@ def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
         make_plan(tmp_path, BakeJob(model=str(path), count=2, columns=c))
         for c in (None, SENSOR.columns // 2)
     ]
-    assert [plan.facts.sensor.columns for plan in plans] == [SENSOR.columns, SENSOR.columns // 2]
+    assert [plan.facts.sensor.columns for plan in plans] == [
+        SENSOR.columns,
+        SENSOR.columns // 2,
+    ]
     # As in banks of earlier versions.
     assert ["columns" in plan.facts.settings for plan in plans] == [
         False,

@@ -28,12 +28,18 @@ def hdl64(columns: int, low: float = 0.0, high: float = 1e6, rows: int = 64) -> 
 def lidm(columns: int, rows: int = 64) -> Sensor:
     """LiDM's grid; its range limits of 1 and 56 m are exclusive, ours are inclusive."""
     return hdl64(
-        columns, float(np.nextafter(np.float32(1), 2)), float(np.nextafter(np.float32(56), 0)), rows
+        columns,
+        float(np.nextafter(np.float32(1), 2)),
+        float(np.nextafter(np.float32(56), 0)),
+        rows,
     )
 
 
 @pytest.mark.parametrize(
-    "key", sorted(k for k in POINTS if "spherical" in k or k.startswith("synthetic/unfolding"))
+    "key",
+    sorted(
+        k for k in POINTS if "spherical" in k or k.startswith("synthetic/unfolding")
+    ),
 )
 def test_r2flow_projection_of_random_points(key: str) -> None:
     """All except the unfolding of more rings than rows, where R2Flow's behaviour is not copied."""
@@ -50,12 +56,15 @@ def test_r2flow_projection_of_random_points(key: str) -> None:
 def test_lidm_projection_of_random_points(columns: int) -> None:
     golden = np.load(HERE / "lidm_projection_synthetic.npz")
     points = POINTS["synthetic/points"]
-    image = project(Scan(points[:, :3].copy(), points[:, 3].copy(), lidm(columns, rows=16)))
+    image = project(
+        Scan(points[:, :3].copy(), points[:, 3].copy(), lidm(columns, rows=16))
+    )
     assert np.array_equal(
         np.where(image.mask, image.range, -1), golden[f"synthetic/range_16x{columns}"]
     )
     assert np.array_equal(
-        np.where(image.mask, image.reflectance, -1), golden[f"synthetic/remission_16x{columns}"]
+        np.where(image.mask, image.reflectance, -1),
+        golden[f"synthetic/remission_16x{columns}"],
     )
 
 
@@ -71,13 +80,19 @@ def test_r2flow_ray_angles(columns: int) -> None:
 
 @pytest.mark.parametrize(
     ("golden", "ours"),
-    [("logscale", "r2flow"), ("inverse", "r2flow_inverse"), ("metric", "r2flow_metric")],
+    [
+        ("logscale", "r2flow"),
+        ("inverse", "r2flow_inverse"),
+        ("metric", "r2flow_metric"),
+    ],
 )
 def test_r2flow_scales(golden: str, ours: str) -> None:
     scale = NORMALISATIONS[ours]
     depth = R2FLOW["input.depth"]
     assert torch.equal(scale.inside(depth).float(), R2FLOW["mask"])
-    assert torch.allclose(scale.encode(depth), R2FLOW[f"{golden}/normalised"], rtol=1e-5, atol=1e-6)
+    assert torch.allclose(
+        scale.encode(depth), R2FLOW[f"{golden}/normalised"], rtol=1e-5, atol=1e-6
+    )
     for given, restored in (
         (f"{golden}/normalised", f"{golden}/restored"),
         ("noise", f"{golden}/restored_of_noise"),
@@ -126,12 +141,15 @@ def test_lidm_projection_of_a_real_scan(golden: Golden, kitti_scan: Scan) -> Non
     different = np.where(image.mask, image.range, -1) != expected["range"]
     assert different.sum() <= 5
     assert np.array_equal(
-        np.where(image.mask, image.reflectance, -1)[~different], expected["remission"][~different]
+        np.where(image.mask, image.reflectance, -1)[~different],
+        expected["remission"][~different],
     )
 
 
 @pytest.mark.parametrize(("name", "offset"), [("log", 1e-4), ("linear", 0.0)])
-def test_lidm_scales_and_points(golden: Golden, kitti_scan: Scan, name: str, offset: float) -> None:
+def test_lidm_scales_and_points(
+    golden: Golden, kitti_scan: Scan, name: str, offset: float
+) -> None:
     """LiDM adds 0.1 mm before the logarithm and does not subtract it again; its rays point to cell
     corners."""
     expected = np.load(golden / "lidm_projection.npz")
@@ -144,11 +162,15 @@ def test_lidm_scales_and_points(golden: Golden, kitti_scan: Scan, name: str, off
     points = unproject(decoded, rays="corner").points[:4096]
     far = points * (1 + offset / np.linalg.norm(points, axis=1, keepdims=True))
     assert np.allclose(far, expected[f"{name}/points_first_4096"], atol=1e-4)
-    assert np.array_equal(decoded.mask, np.asarray(expected[f"{name}/mask"]).reshape(64, 1024) > 0)
+    assert np.array_equal(
+        decoded.mask, np.asarray(expected[f"{name}/mask"]).reshape(64, 1024) > 0
+    )
 
 
 def test_a_third_party_projection_of_a_semantic_kitti_scan(real_scans: Path) -> None:
-    theirs = np.load(real_scans / "semantic_kitti/range_images_64x1024/00_000000.npz")["image"]
+    theirs = np.load(real_scans / "semantic_kitti/range_images_64x1024/00_000000.npz")[
+        "image"
+    ]
     points = read_points(real_scans / "semantic_kitti/sequences/00/velodyne/000000.bin")
     image = project(Scan(points[:, :3], points[:, 3], hdl64(1024)))
     assert np.array_equal(image.range, theirs[..., 4])

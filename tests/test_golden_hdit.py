@@ -44,7 +44,9 @@ def golden_network(folder: Path, name: str) -> tuple[HDiT, dict[str, Tensor], fl
         "position": PEER_POSITIONS[config["coords_encoding"]],
     }
     weights = {
-        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+        k.removeprefix("weights."): v
+        for k, v in tensors.items()
+        if k.startswith("weights.")
     }
     net = convert(weights, NetworkSpec("hdit", arguments))
     assert isinstance(net, HDiT)
@@ -57,12 +59,16 @@ TINY = ("r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier")
 
 @pytest.mark.parametrize("grad", [False, True], ids=["inference", "training"])
 @pytest.mark.parametrize("name", TINY)
-def test_velocities_equal_those_of_r2flow(golden: Golden, name: str, grad: bool) -> None:
+def test_velocities_equal_those_of_r2flow(
+    golden: Golden, name: str, grad: bool
+) -> None:
     """v(y, t) = -u(1 - t, y): R2Flow's t = 0 is noise, and its velocity points to the data."""
     net, tensors, tolerance = golden_network(golden, name)
     with torch.set_grad_enabled(grad):
         assert (
-            distance(-net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"])
+            distance(
+                -net(tensors["input.x"], 1 - tensors["input.t"]), tensors["output"]
+            )
             < tolerance
         )
         one = -net(tensors["input.x"][:1], 1 - tensors["input.t_scalar"])
@@ -74,11 +80,15 @@ def test_velocities_equal_those_of_r2flow(golden: Golden, name: str, grad: bool)
 def test_intermediate_results_equal_those_of_r2flow(golden: Golden, name: str) -> None:
     net, tensors, tolerance = golden_network(golden, name)
     taps = {}
-    net.down[0][-1].register_forward_hook(lambda _, __, out: taps.update(down_level_0=out))
+    net.down[0][-1].register_forward_hook(
+        lambda _, __, out: taps.update(down_level_0=out)
+    )
     net.middle[-1].register_forward_hook(lambda _, __, out: taps.update(mid=out))
     net.tokenize.register_forward_hook(lambda _, __, out: taps.update(tokens=out))
     net.time.register_forward_hook(lambda _, __, out: taps.update(time_embedding=out))
-    net.position.register_forward_hook(lambda _, __, out: taps.update(spatial_embedding=out))
+    net.position.register_forward_hook(
+        lambda _, __, out: taps.update(spatial_embedding=out)
+    )
     net(tensors["input.x"], 1 - tensors["input.t"])
     assert len(taps) == 5
     for tap, value in taps.items():
@@ -108,14 +118,20 @@ def test_sampled_states_equal_those_of_r2flow(golden: Golden, name: str) -> None
 @pytest.mark.parametrize("grid", ["polar", "hdl64e"])
 @pytest.mark.parametrize("basis", sorted(BASES))
 @torch.no_grad()
-def test_position_encodings_equal_those_of_r2flow(golden: Golden, basis: str, grid: str) -> None:
+def test_position_encodings_equal_those_of_r2flow(
+    golden: Golden, basis: str, grid: str
+) -> None:
     about, tensors = read_golden(golden, "r2flow_positions")
     config = about["config"]
     coords = tensors[f"input.coords_{grid}"][0]
     expected = tensors[f"basis.{basis}/{grid}"][0].movedim(0, -1)
     torch.testing.assert_close(BASES[basis](coords), expected, rtol=1e-5, atol=2e-6)
     position = AnglePosition(
-        basis, config["resolution"], config["dim"], config["mlp_ratio"], config["mapping_depth"]
+        basis,
+        config["resolution"],
+        config["dim"],
+        config["mlp_ratio"],
+        config["mapping_depth"],
     )
     peer = f"weights.{basis}/spatial_pe."
     names = {"linear.weight": "0.linear.weight", "mapping.norms.0.weight": "1.0.scale"}
@@ -124,5 +140,7 @@ def test_position_encodings_equal_those_of_r2flow(golden: Golden, basis: str, gr
         names[f"mapping.norms.{i}.weight"] = f"1.{i}.norm.scale"
         names[f"mapping.layers.{i - 1}.expand.weight"] = f"1.{i}.gegelu.weight"
         names[f"mapping.layers.{i - 1}.contract.weight"] = f"1.{i}.linear.weight"
-    position.load_state_dict({ours: tensors[peer + theirs] for ours, theirs in names.items()})
+    position.load_state_dict(
+        {ours: tensors[peer + theirs] for ours, theirs in names.items()}
+    )
     assert distance(position(coords), tensors[f"output.{basis}/{grid}"][0]) < 1e-5

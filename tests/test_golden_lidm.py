@@ -33,7 +33,9 @@ def read_golden(
     """The description, the golden tensors and the weights of a network."""
     tensors = load_file(folder / f"{name}.safetensors")
     weights = {
-        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+        k.removeprefix("weights."): v
+        for k, v in tensors.items()
+        if k.startswith("weights.")
     }
     return json.loads((folder / f"{name}.json").read_text()), tensors, weights
 
@@ -47,7 +49,10 @@ def tolerance(figures: dict[str, float]) -> float:
 def test_the_unet_equals_that_of_lidm(golden: Golden, name: str, grad: bool) -> None:
     about, tensors, weights = read_golden(golden, name)
     parts = {VELOCITY: unet_part(about["config"], name)}
-    net = cast(DiffusionUNet, convert({UNET + k: v for k, v in weights.items()}, parts)[VELOCITY])
+    net = cast(
+        DiffusionUNet,
+        convert({UNET + k: v for k, v in weights.items()}, parts)[VELOCITY],
+    )
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
     taps = {}
     net.time.register_forward_hook(lambda _, __, out: taps.update(time_embedding=out))
@@ -56,7 +61,10 @@ def test_the_unet_equals_that_of_lidm(golden: Golden, name: str, grad: bool) -> 
         out = net.evaluate(
             tensors["input.x"], tensors["input.timesteps"], tensors.get("input.context")
         )
-    assert distance(out, tensors["output"]) < about["sensitivity"]["suggested_rel_l2_tolerance"]
+    assert (
+        distance(out, tensors["output"])
+        < about["sensitivity"]["suggested_rel_l2_tolerance"]
+    )
     assert set(taps) == {"time_embedding", "middle"}
     for tap, value in taps.items():
         assert distance(value, tensors[f"tap.{tap}"]) < 5e-5, tap
@@ -66,7 +74,10 @@ def test_the_unet_equals_that_of_lidm(golden: Golden, name: str, grad: bool) -> 
 def test_the_autoencoder_equals_that_of_lidm(golden: Golden) -> None:
     about, tensors, weights = read_golden(golden, "lidm_vqvae_tiny")
     net = cast(
-        VQVAE, convert(weights, {CODEC: codec_part(about["config"], about["size"], "")})[CODEC]
+        VQVAE,
+        convert(weights, {CODEC: codec_part(about["config"], about["size"], "")})[
+            CODEC
+        ],
     )
     assert sum(p.numel() for p in net.parameters()) == about["parameters"]
     figures = about["f32_vs_f64"]
@@ -106,7 +117,9 @@ def test_the_masked_autoencoder_equals_that_of_lidm() -> None:
     expected = {name: torch.from_numpy(value) for name, value in values.items()}
     weights = {
         key: torch.from_numpy(
-            (random.standard_normal(shape) * SPREAD.get(key.split(".")[0], 0.1)).astype(np.float32)
+            (random.standard_normal(shape) * SPREAD.get(key.split(".")[0], 0.1)).astype(
+                np.float32
+            )
         )
         for key, shape in shapes.items()
     }
@@ -122,7 +135,9 @@ def test_the_masked_autoencoder_equals_that_of_lidm() -> None:
     output = net.decode(latent)
     assert raw.shape == expected["raw"].shape == (2, 2, *size)
     assert distance(raw, expected["raw"]) < 1e-5
-    sure = expected["raw"][:, 1:].abs() > 1e-3  # rounding can change the sign of the others
+    sure = (
+        expected["raw"][:, 1:].abs() > 1e-3
+    )  # rounding can change the sign of the others
     assert output.shape == (2, 1, *size)
     assert distance(output[sure], expected["output"][sure]) < 1e-5
     assert 0.3 < (output == -1).float().mean() < 0.7

@@ -31,7 +31,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def angles(rows: int, columns: int) -> Tensor:
     """Ray angles of a grid: descending elevation, ascending azimuth."""
     grid = torch.meshgrid(
-        torch.linspace(0.05, -0.4, rows), torch.linspace(-3.1, 3.1, columns), indexing="ij"
+        torch.linspace(0.05, -0.4, rows),
+        torch.linspace(-3.1, 3.1, columns),
+        indexing="ij",
     )
     return torch.stack(grid)
 
@@ -64,8 +66,13 @@ def by_definition(
     for row in range(grid[0]):
         top = min(max(row - window[0] // 2, 0), grid[0] - window[0])
         for column in range(grid[1]):
-            columns = [(column + d) % grid[1] for d in range(-(window[1] // 2), window[1] // 2 + 1)]
-            keys = [r * grid[1] + c for r in range(top, top + window[0]) for c in columns]
+            columns = [
+                (column + d) % grid[1]
+                for d in range(-(window[1] // 2), window[1] // 2 + 1)
+            ]
+            keys = [
+                r * grid[1] + c for r in range(top, top + window[0]) for c in columns
+            ]
             token = row * grid[1] + column
             weights = torch.einsum("bhd,bnhd->bnh", q[:, token], k[:, keys]).softmax(1)
             out[:, token] = torch.einsum("bnh,bnhd->bhd", weights, v[:, keys])
@@ -79,7 +86,9 @@ def test_a_network_is_told_where_its_step_ends() -> None:
     with torch.no_grad():
         # At first the end makes no difference.
         assert torch.equal(fresh.step(torch.rand(2)), torch.zeros(2, 16))
-        ends = [trained(y, 0.8, None, end) for end in (0.0, 0.5, torch.tensor([0.0, 0.5]))]
+        ends = [
+            trained(y, 0.8, None, end) for end in (0.0, 0.5, torch.tensor([0.0, 0.5]))
+        ]
         assert distance(ends[0], ends[1]) > 0.01
         assert torch.allclose(ends[2][0], ends[0][0], atol=1e-4) and torch.allclose(
             ends[2][1], ends[1][1], atol=1e-4
@@ -97,7 +106,11 @@ def test_a_network_is_told_where_its_step_ends() -> None:
     recorded=st.booleans(),
 )
 def test_neighbourhood_attention_is_exact(
-    grid: tuple[int, int], window: tuple[int, int], tile: tuple[int, int], seed: int, recorded: bool
+    grid: tuple[int, int],
+    window: tuple[int, int],
+    tile: tuple[int, int],
+    seed: int,
+    recorded: bool,
 ) -> None:
     window = (min(window[0], (grid[0] - 1) // 2 * 2 + 1), window[1])
     torch.manual_seed(seed)
@@ -106,7 +119,9 @@ def test_neighbourhood_attention_is_exact(
         patch.setattr(attention, "TILE", tile)
         attend = NeighbourhoodAttention(grid, window)
     with torch.set_grad_enabled(recorded):
-        torch.testing.assert_close(attend(q, k, v), by_definition(q, k, v, grid, window))
+        torch.testing.assert_close(
+            attend(q, k, v), by_definition(q, k, v, grid, window)
+        )
 
 
 def test_every_query_attends_to_its_full_window() -> None:
@@ -121,7 +136,9 @@ def test_every_query_attends_to_its_full_window() -> None:
     columns=st.integers(1, 4),
     patch=st.tuples(st.integers(1, 3), st.integers(1, 4)),
 )
-def test_from_patches_inverts_to_patches(rows: int, columns: int, patch: tuple[int, int]) -> None:
+def test_from_patches_inverts_to_patches(
+    rows: int, columns: int, patch: tuple[int, int]
+) -> None:
     resolution = (rows * patch[0], columns * patch[1])
     x = torch.randn(2, *resolution, 3)
     assert torch.equal(from_patches(to_patches(x, patch), patch, resolution), x)
@@ -152,17 +169,25 @@ def test_every_position_encoding_works_at_several_resolutions(
 def test_the_network_is_equivariant_to_rotations_about_the_vertical() -> None:
     """If the angles are rotated with the image, the network has no seam at the first column."""
     net = network(position="polar_coordinates")
-    y, shift = torch.randn(1, 2, 8, 64), 16  # a token of the coarsest level has 16 columns
+    y, shift = (
+        torch.randn(1, 2, 8, 64),
+        16,
+    )  # a token of the coarsest level has 16 columns
     turned = copy.deepcopy(net)
     turned.angles.cells = net.angles.cells.roll(shift, -1)
     torch.testing.assert_close(
-        turned(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1), rtol=1e-4, atol=1e-4
+        turned(y.roll(shift, -1), 0.5),
+        net(y, 0.5).roll(shift, -1),
+        rtol=1e-4,
+        atol=1e-4,
     )
     assert distance(net(y.roll(shift, -1), 0.5), net(y, 0.5).roll(shift, -1)) > 1e-2
 
 
 @torch.no_grad()
-def test_computing_in_pieces_gives_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_computing_in_pieces_gives_the_same_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     net = network()
     y = torch.randn(3, 2, 8, 64)
     whole = net(y, 0.5)
@@ -198,7 +223,9 @@ def test_condition_tokens_change_the_velocity() -> None:
     v = net(y, 0.5, cond)
     assert v.shape == y.shape
     # The order of tokens does not matter.
-    torch.testing.assert_close(net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        net(y, 0.5, cond[:, torch.randperm(7)]), v, rtol=1e-4, atol=1e-4
+    )
     other = net(y, 0.5, torch.stack([cond[0], -cond[1]]))
     torch.testing.assert_close(other[0], v[0], rtol=1e-5, atol=1e-5)
     assert distance(other[1], v[1]) > 1e-3

@@ -49,7 +49,9 @@ def pcd(body: bytes | None = None, **changes: str) -> bytes:
 
 FALSE_PCD = {
     "many values per point": pcd(COUNT="100000 1 1 1"),
-    "many values per point, compressed": pcd(COUNT="1 1 1 100000", DATA="binary_compressed"),
+    "many values per point, compressed": pcd(
+        COUNT="1 1 1 100000", DATA="binary_compressed"
+    ),
     "many values per point, in text": pcd(COUNT="1 100000 1 1", DATA="ascii"),
     "more values than memory": pcd(COUNT="1 1 1 999999999999"),
     "more values than memory, in text": pcd(COUNT="1 1 1 999999999999", DATA="ascii"),
@@ -67,8 +69,12 @@ FALSE_PCD = {
     "fewer points": pcd(POINTS="19"),
     "fewer points everywhere": pcd(POINTS="10", WIDTH="5"),
     "fewer points everywhere, in text": pcd(POINTS="10", WIDTH="5", DATA="ascii"),
-    "fewer points everywhere, compressed": pcd(POINTS="10", WIDTH="5", DATA="binary_compressed"),
-    "more points than memory": pcd(WIDTH="999999999999", HEIGHT="1", POINTS="999999999999"),
+    "fewer points everywhere, compressed": pcd(
+        POINTS="10", WIDTH="5", DATA="binary_compressed"
+    ),
+    "more points than memory": pcd(
+        WIDTH="999999999999", HEIGHT="1", POINTS="999999999999"
+    ),
     "more points than memory, in text": pcd(
         WIDTH="999999999999", HEIGHT="1", POINTS="999999999999", DATA="ascii"
     ),
@@ -93,12 +99,15 @@ FALSE_PCD = {
         HEIGHT="1",
         POINTS="268435455",
     ),
-    "compressed, with less": pcd(BODIES["binary_compressed"][:-9], DATA="binary_compressed"),
+    "compressed, with less": pcd(
+        BODIES["binary_compressed"][:-9], DATA="binary_compressed"
+    ),
     "compressed, from before the start": pcd(
         struct.pack("<II", 6, 320) + b"\xff\xff\xff" * 2, DATA="binary_compressed"
     ),
     "compressed, a run beyond the end": pcd(
-        struct.pack("<II", 32, 320) + b"\0\0" + b"\xe0\xff\0" * 10, DATA="binary_compressed"
+        struct.pack("<II", 32, 320) + b"\0\0" + b"\xe0\xff\0" * 10,
+        DATA="binary_compressed",
     ),
 }
 
@@ -115,16 +124,20 @@ FALSE_PLY = {
     "more points than memory": PLY.replace(b"20", b"999999999999") + BODIES["binary"],
     "a field twice": PLY.replace(b" y\n", b" x\n") + BODIES["binary"],
     "a type that is none": PLY.replace(b"float y", b"flout y") + BODIES["binary"],
-    "a list of points": PLY.replace(b"float y", b"list uchar float y") + BODIES["binary"],
-    "two encodings": PLY.replace(b"element", b"format ascii 1.0\nelement") + BODIES["binary"],
-    "two vertices": PLY.replace(b"end_header", b"element vertex 3\nend_header") + BODIES["binary"],
+    "a list of points": PLY.replace(b"float y", b"list uchar float y")
+    + BODIES["binary"],
+    "two encodings": PLY.replace(b"element", b"format ascii 1.0\nelement")
+    + BODIES["binary"],
+    "two vertices": PLY.replace(b"end_header", b"element vertex 3\nend_header")
+    + BODIES["binary"],
     "a property of nothing": PLY.replace(b"element", b"property float x\nelement")
     + BODIES["binary"],
     "lists before the points": PLY.replace(
         b"element", b"element face 9\nproperty list uint int i\nelement", 1
     )
     + BODIES["binary"],
-    "text with more lines": PLY.replace(b"binary_little_endian", b"ascii") + BODIES["ascii"] * 2,
+    "text with more lines": PLY.replace(b"binary_little_endian", b"ascii")
+    + BODIES["ascii"] * 2,
 }
 
 
@@ -164,7 +177,9 @@ def test_the_same_points_in_every_encoding(tmp_path: Path, data: str) -> None:
 
 
 def with_padding() -> bytes:
-    kind = np.dtype([("pad", "u1", 3), ("points", "<f4", 4), ("pad2", "<u2", 2), ("ring", "<i4")])
+    kind = np.dtype(
+        [("pad", "u1", 3), ("points", "<f4", 4), ("pad2", "<u2", 2), ("ring", "<i4")]
+    )
     records = np.full(20, 7, kind)
     records["points"], records["ring"] = POINTS, np.arange(20)
     return records.tobytes()
@@ -177,10 +192,14 @@ def test_big_endian_ply_and_faces_after_the_points(tmp_path: Path) -> None:
     records["x"], records["rest"] = POINTS[:, 0], POINTS[:, 1:]
     for content in (
         header + records.tobytes(),
-        header.replace(b"end_header", b"element face 1\nproperty list uchar int i\nend_header")
+        header.replace(
+            b"end_header", b"element face 1\nproperty list uchar int i\nend_header"
+        )
         + records.tobytes()
         + b"\x01\0\0\0\x05",
-        PLY.replace(b"element vertex", b"element note 2\nproperty uchar n\nelement vertex")
+        PLY.replace(
+            b"element vertex", b"element note 2\nproperty uchar n\nelement vertex"
+        )
         + b"ab"
         + BODIES["binary"],
     ):
@@ -191,7 +210,9 @@ def test_big_endian_ply_and_faces_after_the_points(tmp_path: Path) -> None:
 def damaged_streams() -> None:
     """In a process of its own: compiled code that left its arrays would end it."""
     rng = np.random.default_rng(0)
-    packed = np.frombuffer(literal_lzf(POINTS.tobytes())[8:] + b"\xe0\x00\x07" * 20, np.uint8)
+    packed = np.frombuffer(
+        literal_lzf(POINTS.tobytes())[8:] + b"\xe0\x00\x07" * 20, np.uint8
+    )
     for _ in range(3000):
         stream = packed.copy()
         stream[rng.integers(0, len(stream), 5)] = rng.integers(0, 256, 5)
@@ -230,7 +251,9 @@ def picture(width: int, height: int, *chunks: bytes) -> bytes:
 
 
 def deep_tar(root: Path) -> Path:
-    tar_with(root / "scans.tar", {"0.json": DEEP.encode(), "0.points.npy": saved(POINTS)})
+    tar_with(
+        root / "scans.tar", {"0.json": DEEP.encode(), "0.points.npy": saved(POINTS)}
+    )
     return root
 
 
@@ -242,12 +265,16 @@ def listed_tar(root: Path) -> Path:
 def infinite_tar(root: Path) -> Path:
     facts = {"id": "0", "domain": 0, "sensor": {"name": "x"} | LINEAR}
     text = json.dumps(facts).replace('"domain": 0', '"domain": 1e999')
-    tar_with(root / "scans.tar", {"0.json": text.encode(), "0.points.npy": saved(POINTS)})
+    tar_with(
+        root / "scans.tar", {"0.json": text.encode(), "0.points.npy": saved(POINTS)}
+    )
     return root
 
 
 def big_array_in_a_tar(root: Path) -> Path:
-    tar_with(root / "scans.tar", {"0.json": b"{}", "0.points.npy": HOSTILE_NPY["160 GB"]})
+    tar_with(
+        root / "scans.tar", {"0.json": b"{}", "0.points.npy": HOSTILE_NPY["160 GB"]}
+    )
     return root
 
 
@@ -278,7 +305,8 @@ def sparse_tar(root: Path) -> Path:
 def twice_in_a_tar(root: Path) -> Path:
     [path, *others] = write_tars(root)
     path.write_bytes(
-        path.read_bytes()[:-10240].rstrip(b"\0").ljust(1 << 16, b"\0") + others[0].read_bytes()
+        path.read_bytes()[:-10240].rstrip(b"\0").ljust(1 << 16, b"\0")
+        + others[0].read_bytes()
     )
     tar_with(path, {"0.json": b"{}"})
     content = path.read_bytes()[:1024]
@@ -349,7 +377,9 @@ def table_of_numbers(root: Path) -> Path:
         table_of_numbers,
     ],
 )
-def test_hostile_side_files_are_refused(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+def test_hostile_side_files_are_refused(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
     assert in_limits(first_scan, make(tmp_path), seconds=30).startswith("DataError: ")
 
 

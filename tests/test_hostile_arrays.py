@@ -40,7 +40,9 @@ def read_both(path: Path) -> None:
 
 
 @given(
-    st.sampled_from(["b1", "i1", "u1", "<i4", ">i4", "<u8", "<f2", "<f4", ">f8", "<U3", ">U3"]),
+    st.sampled_from(
+        ["b1", "i1", "u1", "<i4", ">i4", "<u8", "<f2", "<f4", ">f8", "<U3", ">U3"]
+    ),
     st.lists(st.integers(0, 4), max_size=4),
     st.booleans(),
     st.booleans(),
@@ -83,7 +85,9 @@ def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> byt
     return content.getvalue()
 
 
-def patched(content: bytes, *, local: dict[int, bytes], central: dict[int, bytes]) -> bytes:
+def patched(
+    content: bytes, *, local: dict[int, bytes], central: dict[int, bytes]
+) -> bytes:
     """Other bytes in the two headers of a ZIP file's only member."""
     changed = bytearray(content)
     start = content.index(b"PK\1\2")
@@ -97,7 +101,13 @@ def hostile_npz(name: str) -> bytes:
     scan = zipped({"array.npy": saved(POINTS)})
     match name:
         case "a bomb":
-            return zipped({"points.npy": npy(described(shape="(10000000, 4)"), bytes(160_000_000))})
+            return zipped(
+                {
+                    "points.npy": npy(
+                        described(shape="(10000000, 4)"), bytes(160_000_000)
+                    )
+                }
+            )
         case "a bomb of many":
             return zipped(
                 {
@@ -106,9 +116,17 @@ def hostile_npz(name: str) -> bytes:
                 }
             )
         case "a bomb that says it is small":
-            bomb = zipped({"points.npy": npy(described(shape="(10000000, 4)"), bytes(160_000_000))})
+            bomb = zipped(
+                {
+                    "points.npy": npy(
+                        described(shape="(10000000, 4)"), bytes(160_000_000)
+                    )
+                }
+            )
             return patched(
-                bomb, local={22: struct.pack("<I", 4000)}, central={24: struct.pack("<I", 4000)}
+                bomb,
+                local={22: struct.pack("<I", 4000)},
+                central={24: struct.pack("<I", 4000)},
             )
         case "stored, and more than the file":
             size = struct.pack("<I", 0xF0000000)
@@ -176,7 +194,9 @@ def read_archive(path: Path) -> None:
 def changed(path: Path, **arrays: object) -> None:
     with np.load(path) as loaded:
         known = {name: loaded[name] for name in loaded.files}
-    np.savez(path, **(known | {name: np.asarray(value) for name, value in arrays.items()}))
+    np.savez(
+        path, **(known | {name: np.asarray(value) for name, value in arrays.items()})
+    )
 
 
 @pytest.mark.parametrize("to", ["npz", "range"])
@@ -223,7 +243,9 @@ def test_invalid_ranges_are_not_dropped_silently(tmp_path: Path, value: float) -
     changed(path, range=distance)
     np.save(tmp_path / "alone.npy", distance)
     for file in (path, tmp_path / "alone.npy"):
-        with pytest.raises(DataError, match="1 cells whose range is negative or not finite"):
+        with pytest.raises(
+            DataError, match="1 cells whose range is negative or not finite"
+        ):
             open_scans(file)[0]
 
 

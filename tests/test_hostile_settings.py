@@ -18,14 +18,25 @@ from lidar_synth.lab.train.config import TrainConfig, load_config
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-TABLE = {"columns": 64, "elevations": [2.0, 1.0, 0.0], "range_min": 1.0, "range_max": 80.0}
+TABLE = {
+    "columns": 64,
+    "elevations": [2.0, 1.0, 0.0],
+    "range_min": 1.0,
+    "range_max": 80.0,
+}
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (TABLE | {"elevations": "high"}, "elevations = 'high'; expected a list of finite numbers"),
-        (TABLE | {"elevations": []}, r"elevations = \[\]; expected a list of finite numbers"),
+        (
+            TABLE | {"elevations": "high"},
+            "elevations = 'high'; expected a list of finite numbers",
+        ),
+        (
+            TABLE | {"elevations": []},
+            r"elevations = \[\]; expected a list of finite numbers",
+        ),
         (TABLE | {"elevations": ["2", "1"]}, "a list of finite numbers"),
         (TABLE | {"elevations": [[2.0], [1.0]]}, "a list of finite numbers"),
         (TABLE | {"elevations": [2.0, float("nan")]}, "a list of finite numbers"),
@@ -44,9 +55,15 @@ TABLE = {"columns": 64, "elevations": [2.0, 1.0, 0.0], "range_min": 1.0, "range_
             "expected at most 4194304 cells",
         ),
         (LINEAR | {"rows": 10**2000}, "expected at most 4194304 cells"),
-        (LINEAR | {"range_max": float("inf")}, "range_max = inf; expected a finite number"),
+        (
+            LINEAR | {"range_max": float("inf")},
+            "range_max = inf; expected a finite number",
+        ),
         (LINEAR | {"range_max": 10**400}, "a finite number"),
-        (LINEAR | {"range_min": "near"}, "range_min = 'near'; expected a finite number"),
+        (
+            LINEAR | {"range_min": "near"},
+            "range_min = 'near'; expected a finite number",
+        ),
         (LINEAR | {"fov_up": [3.0]}, r"fov_up = \[3.0\]; expected a finite number"),
         (LINEAR | {"description": [1]}, "expected text"),
         (LINEAR | {7: 7}, r"sensor keys \[7\]"),
@@ -54,7 +71,9 @@ TABLE = {"columns": 64, "elevations": [2.0, 1.0, 0.0], "range_min": 1.0, "range_
         ("text", "holds dict; expected a mapping from a sensor's name"),
     ],
 )
-def test_invalid_sensors_are_refused(tmp_path: Path, values: object, message: str) -> None:
+def test_invalid_sensors_are_refused(
+    tmp_path: Path, values: object, message: str
+) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump({"mine": values}))
     with pytest.raises(ConfigError, match=message):
@@ -66,14 +85,18 @@ def test_invalid_sensors_are_refused(tmp_path: Path, values: object, message: st
 
 def laughs(levels: int, times: int = 9) -> str:
     lines = ["a0: &a0 [1, 1]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * times)}]" for i in range(1, levels)]
+    lines += [
+        f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * times)}]" for i in range(1, levels)
+    ]
     return "\n".join(lines)
 
 
 HOSTILE_YAML = {
     "a billion laughs": laughs(30),
     "laughs that are merged": "a0: &a0 {x: 1}\n"
-    + "\n".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)),
+    + "\n".join(
+        f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)
+    ),
     "an alias in itself": "a: &a [*a]",
     "an alias of nothing": "a: *b",
     "deep": "[" * 100_000,
@@ -118,13 +141,21 @@ def test_yaml_that_is_not_text_is_refused(tmp_path: Path) -> None:
 
 def test_anchors_in_reason_stay_possible() -> None:
     assert parse_yaml(laughs(3), "here")["a2"][8][8] == [1, 1]
-    assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}", "here")["b"] == {"x": 1, "y": 2}
+    assert parse_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}", "here")["b"] == {
+        "x": 1,
+        "y": 2,
+    }
     for path in [*CONFIGS.glob("*.yaml")]:
-        assert parse_yaml(path.read_text(), path.name) == yaml.safe_load(path.read_text())
+        assert parse_yaml(path.read_text(), path.name) == yaml.safe_load(
+            path.read_text()
+        )
 
 
 @pytest.mark.slow
-@given(st.text(max_size=60) | st.text(st.sampled_from("&*ab:- []{}!\n?|>'\"%0x_1."), max_size=60))
+@given(
+    st.text(max_size=60)
+    | st.text(st.sampled_from("&*ab:- []{}!\n?|>'\"%0x_1."), max_size=60)
+)
 def test_any_text_is_yaml_or_refused(text: str) -> None:
     with suppress(ConfigError):
         parse_yaml(text, "here")

@@ -69,7 +69,9 @@ def test_a_release_becomes_a_checkpoint(name: str, tmp_path: Path) -> None:
         56.0,
     )
     assert (header.normalisation.kind, header.normalisation.divisor) == ("linear", 56.0)
-    assert list(header.conditioning) == ([name] if name in ("semantic", "camera") else [])
+    assert list(header.conditioning) == (
+        [name] if name in ("semantic", "camera") else []
+    )
     assert header.provenance["data"] == "KITTI-360"
     seen = {part["dataset"]: part["drives"] for part in header.provenance["seen"]}
     assert "2013_05_28_drive_0002_sync" in seen["KITTI-360"]
@@ -91,7 +93,10 @@ def test_imported_models_generate(tmp_path: Path) -> None:
         folder.mkdir()
         out = folder / f"{name}.safetensors"
         run_import(
-            release(folder, config_of(MODELS[name]), random_weights(MODELS[name], folder)), out
+            release(
+                folder, config_of(MODELS[name]), random_weights(MODELS[name], folder)
+            ),
+            out,
         )
         generator = load_generator(out)
         [scan] = generator.scans(0, [1], condition, steps=3)
@@ -135,7 +140,9 @@ def test_weights_without_an_average_are_imported_unchanged(tmp_path: Path) -> No
         if not k.startswith(UNET_EMA)
     }
     _, networks = read_lidm(release(tmp_path, config_of(UNCONDITIONAL), weights))
-    assert torch.equal(networks[VELOCITY].state_dict()["head.bias"], weights[f"{UNET}out.2.bias"])
+    assert torch.equal(
+        networks[VELOCITY].state_dict()["head.bias"], weights[f"{UNET}out.2.bias"]
+    )
 
 
 # --- the published networks
@@ -155,10 +162,14 @@ def test_all_keys_of_the_published_networks_are_imported(
         if not key.startswith(UNET_EMA)
     }
     if name != "vqvae":
-        start, end = (published["config"][key] for key in ("linear_start", "linear_end"))
+        start, end = (
+            published["config"][key] for key in ("linear_start", "linear_end")
+        )
         weights |= schedule(start, end)
         for key in [k for k in weights if k.startswith(UNET)]:
-            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = weights[key]
+            weights[UNET_EMA + key.removeprefix("model.").replace(".", "")] = weights[
+                key
+            ]
         weights |= {f"{UNET_EMA}decay": zero, f"{UNET_EMA}num_updates": torch.tensor(0)}
         assert (
             sum(k.startswith(UNET_EMA) for k in weights)
@@ -167,7 +178,8 @@ def test_all_keys_of_the_published_networks_are_imported(
     config = config_of(published["config"], size=[64, 1024])
     header, networks = read_lidm(release(tmp_path, config, weights))
     count = {
-        part: sum(p.numel() for p in network.parameters()) for part, network in networks.items()
+        part: sum(p.numel() for p in network.parameters())
+        for part, network in networks.items()
     }
     if name == "vqvae":
         assert count == {CODEC: published["parameters"]}
@@ -233,13 +245,18 @@ def test_weights_that_do_not_fit_are_refused(
     ("model", "message"),
     [
         (FIRST | {"use_mask": True}, r"an autoencoder with \{'out_ch': 1\}"),
-        (FIRST | {"ddconfig": DDCONFIG | {"out_ch": 2}}, r"an autoencoder with \{'out_ch': 2\}"),
         (
-            UNCONDITIONAL | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}},
+            FIRST | {"ddconfig": DDCONFIG | {"out_ch": 2}},
+            r"an autoencoder with \{'out_ch': 2\}",
+        ),
+        (
+            UNCONDITIONAL
+            | {"unet_config": {"params": UNET_PARAMS | {"lib_name": "ldm"}}},
             "a U-Net with",
         ),
         (
-            UNCONDITIONAL | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}},
+            UNCONDITIONAL
+            | {"cond_stage_config": {"target": "x.FrozenCLIPTextEmbedder"}},
             "by FrozenCLIPTextEmbedder",
         ),
         ({"linear_start": 1}, "KeyError.'first_stage_config'"),
@@ -274,23 +291,33 @@ def test_a_bare_state_dictionary_of_a_wrapped_network_is_imported(
     tmp_path: Path, zipped: bool
 ) -> None:
     weights = random_weights(FIRST, tmp_path)
-    wanted = read_lidm(release(tmp_path, config_of(FIRST), weights))[1][CODEC].state_dict()
+    wanted = read_lidm(release(tmp_path, config_of(FIRST), weights))[1][
+        CODEC
+    ].state_dict()
     bare = {f"module._orig_mod.{name}": tensor for name, tensor in weights.items()}
-    torch.save(bare, path := tmp_path / "model.ckpt", _use_new_zipfile_serialization=zipped)
+    torch.save(
+        bare, path := tmp_path / "model.ckpt", _use_new_zipfile_serialization=zipped
+    )
     found = read_lidm(path)[1][CODEC].state_dict()
     assert found.keys() == wanted.keys()
     assert all(torch.equal(found[name], tensor) for name, tensor in wanted.items())
 
 
-def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_path: Path) -> None:
+def test_an_imported_checkpoint_gives_the_results_of_lidm(
+    golden: Golden, tmp_path: Path
+) -> None:
     """.ckpt -> import -> checkpoint -> autoencoder gives LiDM's own results."""
     about = json.loads((golden / "lidm_vqvae_tiny.json").read_text())
     tensors = load_file(golden / "lidm_vqvae_tiny.safetensors")
     weights = {
-        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+        k.removeprefix("weights."): v
+        for k, v in tensors.items()
+        if k.startswith("weights.")
     }
     out = tmp_path / "codec.safetensors"
-    run_import(release(tmp_path, config_of(about["config"], size=about["size"]), weights), out)
+    run_import(
+        release(tmp_path, config_of(about["config"], size=about["size"]), weights), out
+    )
     codec: Any = load_checkpoint(out).networks[CODEC]
     with torch.no_grad():
         error = (
@@ -300,7 +327,9 @@ def test_an_imported_checkpoint_gives_the_results_of_lidm(golden: Golden, tmp_pa
 
 
 @pytest.mark.parametrize("blocks", [2**31 - 1, "2", None, [1], 1.5, -1])
-def test_a_hostile_number_of_blocks_is_refused_soon(tmp_path: Path, blocks: Any) -> None:
+def test_a_hostile_number_of_blocks_is_refused_soon(
+    tmp_path: Path, blocks: Any
+) -> None:
     path = release(tmp_path, config_of(FIRST), random_weights(FIRST, tmp_path))
     config = config_of(FIRST)
     config["model"]["params"]["ddconfig"]["num_res_blocks"] = blocks

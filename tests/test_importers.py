@@ -64,10 +64,16 @@ def test_the_header_describes_the_model_of_r2flow(released: Path) -> None:
 @pytest.mark.parametrize(
     ("cfg", "expected"),
     [
-        (change(finetuning={"k_distil": 4}), {"time_grid": (1.0, 0.75, 0.5, 0.25, 0.0)}),
+        (
+            change(finetuning={"k_distil": 4}),
+            {"time_grid": (1.0, 0.75, 0.5, 0.25, 0.0)},
+        ),
         (change(data={"dataset": "kitti_raw"}), {"sensor.name": "hdl64e_kitti"}),
         (change(data={"data_format": "metric"}), {"normalisation.kind": "linear"}),
-        (change(data={"projection": "unfolding-1024"}), {"sensor.name": "hdl64e_kitti360/beams"}),
+        (
+            change(data={"projection": "unfolding-1024"}),
+            {"sensor.name": "hdl64e_kitti360/beams"},
+        ),
     ],
     ids=["distilled", "kitti raw", "metric", "unfolded"],
 )
@@ -91,35 +97,55 @@ def test_time_and_sign_are_folded_into_the_weights(released: Path) -> None:
         turn = 2 * math.pi * weights["timestep_pe.0.freqs"].double() * (1 - t)
         features = torch.cat((turn.cos(), turn.sin())).float()
         expected = net.time.mapping(features @ weights["timestep_pe.0.linear.weight"].T)
-        torch.testing.assert_close(net.time(torch.tensor([t]))[0], expected, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            net.time(torch.tensor([t]))[0], expected, rtol=1e-4, atol=1e-4
+        )
     assert torch.equal(net.detokenize.weight, -weights["detokenizer.1.weight"])
 
 
-def test_all_keys_of_the_released_network_are_imported(golden: Golden, tmp_path: Path) -> None:
+def test_all_keys_of_the_released_network_are_imported(
+    golden: Golden, tmp_path: Path
+) -> None:
     """80.9 M parameters by name and shape; each tensor is one expanded number, so that the file
     stays small."""
     published = json.loads((golden / "r2flow_hdit_full_keys.json").read_text())
-    weights = {key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]}
-    path = write_r2flow(tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"])
+    weights = {
+        key: torch.zeros(1).expand(shape) for key, shape, _, _ in published["keys"]
+    }
+    path = write_r2flow(
+        tmp_path / "full.pth", weights, published["checkpoint"]["cfg_defaults"]
+    )
     assert path.stat().st_size < 1 << 20
     header, networks = read_r2flow(path)
-    assert sum(p.numel() for p in networks[VELOCITY].parameters()) == published["parameters"]
+    assert (
+        sum(p.numel() for p in networks[VELOCITY].parameters())
+        == published["parameters"]
+    )
     assert header.sensor.name == "hdl64e_kitti360"
     assert header.sensor.shape == (64, 1024)
 
 
-def test_an_imported_checkpoint_gives_the_results_of_r2flow(golden: Golden, tmp_path: Path) -> None:
+def test_an_imported_checkpoint_gives_the_results_of_r2flow(
+    golden: Golden, tmp_path: Path
+) -> None:
     """.pth -> import -> checkpoint -> network gives R2Flow's own results."""
     name = "r2flow_hdit_tiny_learnable"
     about = json.loads((golden / f"{name}.json").read_text())
     tensors = load_file(golden / f"{name}.safetensors")
     config = about["config"]
     weights = {
-        k.removeprefix("weights."): v for k, v in tensors.items() if k.startswith("weights.")
+        k.removeprefix("weights."): v
+        for k, v in tensors.items()
+        if k.startswith("weights.")
     }
     model = {
         key: config[key]
-        for key in ("base_channels", "temb_channels", "num_residual_blocks", "coords_encoding")
+        for key in (
+            "base_channels",
+            "temb_channels",
+            "num_residual_blocks",
+            "coords_encoding",
+        )
     }
     path = write_r2flow(
         tmp_path / "tiny.pth",
@@ -206,7 +232,15 @@ def test_weights_that_do_not_fit_are_refused(
         ({"data": CFG["data"]}, "KeyError.'model'"),
         (change(data={"min_depth": 90.0}), "range limits 90"),
     ],
-    ids=["architecture", "position", "format", "dataset", "resolution", "groups", "limits"],
+    ids=[
+        "architecture",
+        "position",
+        "format",
+        "dataset",
+        "resolution",
+        "groups",
+        "limits",
+    ],
 )
 def test_configurations_that_do_not_fit_are_refused(
     tmp_path: Path, cfg: dict[str, Any], message: str
@@ -219,7 +253,9 @@ def test_fourier_features_other_than_octaves_are_refused() -> None:
     from lidar_synth.generate.checkpoint import NetworkSpec
 
     weights = peer_weights("fourier_features")
-    octaves = torch.tensor([[2.0**i, 0.0] for i in range(6)] + [[0.0, 2.0**i] for i in range(4)])
+    octaves = torch.tensor(
+        [[2.0**i, 0.0] for i in range(6)] + [[0.0, 2.0**i] for i in range(4)]
+    )
     weights["spatial_pe.0.embedding.freqs"] = octaves[..., None, None]
     weights["spatial_pe.0.embedding.phase"] = torch.zeros(10)
     arguments = {

@@ -33,7 +33,11 @@ from lidar_synth.integrations.mixture import (
     refuse_unlabelled,
     require_ids,
 )
-from lidar_synth.integrations.mmdet3d_lists import kitti_list, read_plane, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_lists import (
+    kitti_list,
+    read_plane,
+    semantic_kitti_list,
+)
 from lidar_synth.integrations.mmdet3d_slots import read_url
 from mixtures import SENSOR as SMALL
 from mixtures import Endless, Scans, as_is
@@ -76,7 +80,10 @@ def test_real_samples_of_a_mixture_are_numbers(tmp_path: Path) -> None:
         ({"synthetic": "bank", "rate": 0.5}, "settings .'rate'."),
         ({"ratio": 0.5}, "without synthetic scans"),
         ({"synthetic": Endless(), "ratio": 2}, "ratio 2"),
-        ({"synthetic": Endless(fields=("reflectance",))}, "a model or bank with labels"),
+        (
+            {"synthetic": Endless(fields=("reflectance",))},
+            "a model or bank with labels",
+        ),
     ],
 )
 def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> None:
@@ -90,7 +97,9 @@ def test_settings_come_from_a_file_or_the_environment(
     wanted = {"synthetic": "bank", "ratio": 0.5, "label_options": {"kind": "objects"}}
     path = tmp_path / "mix.yaml"
     path.write_text(
-        yaml.safe_dump({"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}})
+        yaml.safe_dump(
+            {"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}}
+        )
     )
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(ConfigError, match=f"{VARIABLE}=mix.yaml"):
@@ -123,14 +132,22 @@ def test_a_batch_without_a_label_is_prevented() -> None:
 @pytest.mark.parametrize(("first", "ignore"), [(0, 19), (0, -1), (1, 0)])
 def test_class_ids(first: int, ignore: int) -> None:
     table = id_table(first, ignore, np.int32)
-    assert table[:19].tolist() == list(range(first, first + 19)) and (table[19:] == ignore).all()
+    assert (
+        table[:19].tolist() == list(range(first, first + 19))
+        and (table[19:] == ignore).all()
+    )
 
 
 def test_a_map_of_classes_that_does_not_fit_is_refused() -> None:
     table = id_table(1, 0, np.uint8)
-    stock = {raw: i + 1 for i, raw in enumerate(SEMANTIC_KITTI.from_train or ())} | {0: 0, 252: 1}
+    stock = {raw: i + 1 for i, raw in enumerate(SEMANTIC_KITTI.from_train or ())} | {
+        0: 0,
+        252: 1,
+    }
     require_ids(stock, table)
-    require_ids({raw: i - 1 if i else -1 for raw, i in stock.items()}, id_table(0, -1, np.int64))
+    require_ids(
+        {raw: i - 1 if i else -1 for raw, i in stock.items()}, id_table(0, -1, np.int64)
+    )
     for wrong, said in (({10: 4}, "with 10: 4.* 10: 1"), ({0: 1}, "with 0: 1.* 0: 0")):
         with pytest.raises(ConfigError, match=said):
             require_ids(stock | wrong, table)
@@ -144,7 +161,9 @@ def test_boxes_that_a_trainer_does_not_know_are_refused() -> None:
     check_names(scan, ["Car", "Van"])
     check_names(replace(scan, boxes=None), ["Van"])
     check_names(street(0, boxes=False), ["Van"])
-    with pytest.raises(DataError, match="boxes of .'Car'. in synthetic scan .* some of Van, Truck"):
+    with pytest.raises(
+        DataError, match="boxes of .'Car'. in synthetic scan .* some of Van, Truck"
+    ):
         check_names(scan, ["Van", "Truck"])
 
 
@@ -194,7 +213,9 @@ def test_the_loader_tells_the_epoch(persistent: bool) -> None:
 def test_trainers_generators_do_not_decide_on_scans() -> None:
     """Trap: some seed their workers the same in every epoch."""
     settings = {"synthetic": Endless(), "ratio": 0.4}
-    mixed = mix_for_trainer(6, settings, lambda scan, rng: (scan.id, int(rng.integers(1 << 60))))
+    mixed = mix_for_trainer(
+        6, settings, lambda scan, rng: (scan.id, int(rng.integers(1 << 60)))
+    )
     given = []
     for seed in (0, 1):
         np.random.seed(seed)
@@ -218,7 +239,9 @@ def mixed(tmp_path: Path) -> MixedScans:
 def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
     """Trap: trainers read a missing ``.label`` as zeros, "car" for one of them: every scan has its
     own."""
-    assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 5
+    assert (
+        export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 5
+    )
     read = open_scans(tmp_path / "out", split="train")
     for i, scan in enumerate(read):
         assert np.array_equal(scan.points, mixed[i].points) and np.array_equal(
@@ -228,11 +251,22 @@ def test_a_mixture_as_semantic_kitti(mixed: MixedScans, tmp_path: Path) -> None:
     assert len(labels) == len(read) == 5
     rows = list(csv.reader((tmp_path / "out" / MANIFEST).read_text().splitlines()[1:]))
     assert [int(row[1]) for row in rows] == [mixed.domain(i) for i in range(5)]
-    assert export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
-    with pytest.raises(ConfigError, match="was filled with .*plan.* or choose another folder"):
-        export_mixture(mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False)
+    assert (
+        export_mixture(mixed, tmp_path / "out", "semantic_kitti", progress=False) == 0
+    )
+    with pytest.raises(
+        ConfigError, match="was filled with .*plan.* or choose another folder"
+    ):
+        export_mixture(
+            mixed, tmp_path / "out", "semantic_kitti", epoch=1, progress=False
+        )
     other = MixedScans(
-        mixed.real[0], mixed.synthetic[0], ratio=0.4, seed=2, to_sample=as_is, labels="none"
+        mixed.real[0],
+        mixed.synthetic[0],
+        ratio=0.4,
+        seed=2,
+        to_sample=as_is,
+        labels="none",
     )
     with pytest.raises(ConfigError, match="was filled with"):
         export_mixture(other, tmp_path / "out", "semantic_kitti", progress=False)
@@ -251,13 +285,20 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
         assert sorted(p.name for p in (root / "training" / kind).iterdir()) == [
             f"{i:06d}.{suffix}" for i in range(5)
         ]
-    assert (root / "ImageSets" / "train.txt").read_text().split() == [f"{i:06d}" for i in range(5)]
+    assert (root / "ImageSets" / "train.txt").read_text().split() == [
+        f"{i:06d}" for i in range(5)
+    ]
     for i, scan in enumerate(KITTIObject(root, "train")):
         assert scan.boxes is not None and len(scan.boxes) == 2
         seen = in_view(mixed[i], CAMERA)
         assert seen.boxes is not None
-        assert np.abs(scan.boxes.values - seen.boxes.values).max() < 0.02  # two decimals
-        assert abs(read_plane(root / "training" / "planes" / f"{i:06d}.txt")[3] - 1.73) < 0.05
+        assert (
+            np.abs(scan.boxes.values - seen.boxes.values).max() < 0.02
+        )  # two decimals
+        assert (
+            abs(read_plane(root / "training" / "planes" / f"{i:06d}.txt")[3] - 1.73)
+            < 0.05
+        )
 
 
 @pytest.mark.parametrize("layout", ["semantic_kitti", "kitti"])
@@ -268,9 +309,13 @@ def test_an_export_has_validation_apart_from_training(
     options = {"calibration": CAMERA, "validation": held, "progress": False}
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 7
     assert export_mixture(mixed, tmp_path / "out", layout, **options) == 0
-    train, val = (open_scans(tmp_path / "out", split=split) for split in ("train", "val"))
+    train, val = (
+        open_scans(tmp_path / "out", split=split) for split in ("train", "val")
+    )
     assert len(train) == 5 and len(val) == 2
-    wanted = [scan if layout == "semantic_kitti" else in_view(scan, CAMERA) for scan in held]
+    wanted = [
+        scan if layout == "semantic_kitti" else in_view(scan, CAMERA) for scan in held
+    ]
     for scan, own in zip(val, wanted, strict=True):
         assert layout == "kitti" or np.array_equal(scan.points, own.points)
         assert scan.boxes is None or len(scan.boxes) == len(own.boxes or ())
@@ -279,7 +324,9 @@ def test_an_export_has_validation_apart_from_training(
 def test_scans_without_labels_are_not_exported(tmp_path: Path) -> None:
     """Trap: KITTI-360 has no label per scan."""
     real = [replace(street(i), label=None, raw_label=None) for i in range(2)]
-    mixed = MixedScans(real, Scans("s", 3, street(0).sensor, 1), ratio=0.5, to_sample=as_is)
+    mixed = MixedScans(
+        real, Scans("s", 3, street(0).sensor, 1), ratio=0.5, to_sample=as_is
+    )
     with pytest.raises(DataError, match="has no label.*label policy"):
         export_mixture(mixed, tmp_path, "semantic_kitti", progress=False)
     with pytest.raises(ConfigError, match="to_sample"):
@@ -310,23 +357,33 @@ def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
     entries = json.loads(kitti_list(root, tmp_path / "k.json").read_text())["data_list"]
     for i, entry in enumerate(entries):
         scan = KITTIObject(root, "train")[i]
-        assert scan.boxes is not None and len(entry["instances"]) == len(scan.boxes) == 2
+        assert (
+            scan.boxes is not None and len(entry["instances"]) == len(scan.boxes) == 2
+        )
         place = np.array(entry["instances"][0]["bbox_3d"][:3])
         dims = entry["instances"][0]["bbox_3d"][3:6]
         centre = CAMERA.sensor_from_camera @ [*(place - [0, dims[1] / 2, 0]), 1]
         assert np.allclose(centre[:3], scan.boxes.values[0, :3], atol=1e-4)
         assert np.allclose(dims, scan.boxes.values[0, [3, 5, 4]], atol=1e-5)
         reduced = np.fromfile(
-            root / "training" / "velodyne_reduced" / entry["lidar_points"]["lidar_path"], "<f4"
+            root
+            / "training"
+            / "velodyne_reduced"
+            / entry["lidar_points"]["lidar_path"],
+            "<f4",
         )
-        assert np.array_equal(reduced.reshape(-1, 4)[:, :3], in_view(scan, CAMERA).points)
+        assert np.array_equal(
+            reduced.reshape(-1, 4)[:, :3], in_view(scan, CAMERA).points
+        )
     (root / "training" / "calib" / "000001.txt").unlink()
     (root / "training" / "planes" / "000001.txt").unlink()
     with pytest.raises(FileError, match="calib/000001.txt cannot be read"):
         kitti_list(root, tmp_path / "k.json")
     with pytest.raises(DataError, match="has no calibration.*calib/000001.txt"):
         write_planes(root)
-    listed = semantic_kitti_list(semantic_kitti(tmp_path / "sk", 2), tmp_path / "s.json")
+    listed = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", 2), tmp_path / "s.json"
+    )
     for entry in json.loads(listed.read_text())["data_list"]:
         assert (tmp_path / "sk" / entry["lidar_points"]["lidar_path"]).is_file()
         assert (tmp_path / "sk" / entry["pts_semantic_mask_path"]).is_file()
@@ -335,7 +392,9 @@ def test_lists_for_mmdetection3d(tmp_path: Path) -> None:
 def test_urls_of_a_folder_of_scans(tmp_path: Path) -> None:
     folder = synthetic(tmp_path / "scans", 2)
     scan = open_scans(folder)[1]
-    points = np.frombuffer(read_url(f"lsynth://{folder}/000001.bin"), "<f4").reshape(-1, 4)
+    points = np.frombuffer(read_url(f"lsynth://{folder}/000001.bin"), "<f4").reshape(
+        -1, 4
+    )
     assert np.array_equal(points, points_of(scan))
     bare = synthetic(tmp_path / "bare", 1, labels=False)
     with pytest.raises(DataError, match="no valid label"):
@@ -392,8 +451,11 @@ def test_loaders_take_a_mixture_of_plain_items() -> None:
     """Trap: collate wants the same keys in every sample, with labels, boxes and confidence or
     without."""
     real = [
-        replace(s, label=None, raw_label=None) if i % 2 else s for i, s in enumerate(Scans("r", 6))
+        replace(s, label=None, raw_label=None) if i % 2 else s
+        for i, s in enumerate(Scans("r", 6))
     ]
     mixed = MixedScans(Scans("r", 0, SMALL) or real, Endless(), ratio=0.4)
     loader = DataLoader(mixed, batch_size=5, collate_fn=mixed.collate)
-    assert [sorted(batch) for batch in loader] == [sorted(mixed.collate([mixed[0], mixed[1]]))] * 2
+    assert [sorted(batch) for batch in loader] == [
+        sorted(mixed.collate([mixed[0], mixed[1]]))
+    ] * 2

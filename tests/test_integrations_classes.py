@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from lidar_synth.integrations.mixture import id_table, take_classes, trainer_ids
 
-from lidar_synth.datasets.classes import FILE_CLASSES, IGNORE, NAMES, SEMANTIC_KITTI, TRAIN_ID
+from lidar_synth.datasets.classes import (
+    FILE_CLASSES,
+    IGNORE,
+    NAMES,
+    SEMANTIC_KITTI,
+    TRAIN_ID,
+)
 from lidar_synth.errors import ConfigError
 
 TRAIN = np.arange(len(NAMES), dtype=np.uint8)
@@ -46,9 +52,17 @@ def test_what_is_written_is_read_as_a_class_of_the_same_kind(name: str) -> None:
 
 
 def test_the_trainers_own_map_gives_the_ids() -> None:
-    ids = trainer_ids(POSS, take_classes({"classes": "semantic_poss"}), id_table(1, 0, np.uint8))
+    ids = trainer_ids(
+        POSS, take_classes({"classes": "semantic_poss"}), id_table(1, 0, np.uint8)
+    )
     named = dict(zip(NAMES, ids.tolist(), strict=False))
-    assert (named["car"], named["person"], named["bicyclist"], named["road"], named["terrain"]) == (
+    assert (
+        named["car"],
+        named["person"],
+        named["bicyclist"],
+        named["road"],
+        named["terrain"],
+    ) == (
         3,
         1,
         2,
@@ -60,8 +74,14 @@ def test_the_trainers_own_map_gives_the_ids() -> None:
 
 def test_classes_of_ones_own() -> None:
     settings: dict[str, Any] = {"ratio": 0.5, "classes": {"car": 3, "road": 7}}
-    ids = trainer_ids({0: 255, 3: 0, 7: 1}, take_classes(settings), id_table(0, 255, np.int32))
-    assert settings == {"ratio": 0.5} and ids[TRAIN_ID["car"]] == 0 and ids[TRAIN_ID["road"]] == 1
+    ids = trainer_ids(
+        {0: 255, 3: 0, 7: 1}, take_classes(settings), id_table(0, 255, np.int32)
+    )
+    assert (
+        settings == {"ratio": 0.5}
+        and ids[TRAIN_ID["car"]] == 0
+        and ids[TRAIN_ID["road"]] == 1
+    )
     assert (np.delete(ids, [TRAIN_ID["car"], TRAIN_ID["road"]]) == 255).all()
 
 
@@ -75,7 +95,9 @@ def test_classes_that_do_not_fit_are_refused() -> None:
             take_classes({"classes": wrong})
     table = id_table(1, 0, np.uint8)
     with pytest.raises(ConfigError, match=r"without \[7\].*Set classes"):
-        trainer_ids({0: 0, 3: 1}, take_classes({"classes": {"car": 3, "road": 7}}), table)
+        trainer_ids(
+            {0: 0, 3: 1}, take_classes({"classes": {"car": 3, "road": 7}}), table
+        )
     with pytest.raises(ConfigError, match="a map of classes with 10: 6"):
         trainer_ids(POSS, take_classes({}), table)
     assert take_classes({}) is SEMANTIC_KITTI

@@ -72,18 +72,29 @@ def both(made: Path) -> tuple[Any, Any]:
 
 
 def voxels(dataset: Any, augment: bool = True) -> Any:
-    options = dict.fromkeys(("flip_aug", "rotate_aug", "scale_aug", "transform_aug"), augment)
+    options = dict.fromkeys(
+        ("flip_aug", "rotate_aug", "scale_aug", "transform_aug"), augment
+    )
     return get_model_class("cylinder_dataset")(
-        dataset, [48, 36, 8], fixed_volume_space=True, ignore_label=0, return_test=True, **options
+        dataset,
+        [48, 36, 8],
+        fixed_volume_space=True,
+        ignore_label=0,
+        return_test=True,
+        **options,
     )
 
 
 def test_two_epochs_see_exactly_the_planned_scans(made: Path, points: Any) -> None:
-    loader = EpochLoader(voxels(points), batch_size=2, shuffle=True, num_workers=2, collate_fn=list)
+    loader = EpochLoader(
+        voxels(points), batch_size=2, shuffle=True, num_workers=2, collate_fn=list
+    )
     seen = []
     for epoch in (0, 1):
         indices = [sample[-1] for batch in loader for sample in batch]
-        assert sorted(indices) == list(range(REAL + EXTRA)) and points.mixed.epoch == epoch
+        assert (
+            sorted(indices) == list(range(REAL + EXTRA)) and points.mixed.epoch == epoch
+        )
         assert Counter(points.mixed.domain(i) for i in indices) == {0: REAL, 1: EXTRA}
         made_plan = points.mixed.plan(epoch)
         seen.append(set(made_plan.index[made_plan.domain].tolist()))
@@ -97,7 +108,9 @@ def test_workers_give_the_scans_of_their_epoch(made: Path, points: Any) -> None:
         made_plan = points.mixed.plan(epoch)
         for position, [(xyz, _, _)] in enumerate(loader):
             if made_plan.domain[position]:
-                assert np.array_equal(xyz, source[int(made_plan.index[position])].points)
+                assert np.array_equal(
+                    xyz, source[int(made_plan.index[position])].points
+                )
 
 
 def test_real_samples_are_the_trainers_own(made: Path, points: Any) -> None:
@@ -112,9 +125,17 @@ def test_labels_arrive_in_the_trainers_ids(made: Path, points: Any) -> None:
     for position in (i for i in range(len(points)) if points.mixed.domain(i)):
         xyz, label, strength = points[position]
         scan = source[int(points.mixed.plan().index[position])]
-        assert label.dtype == np.uint8 and label.shape == (len(scan), 1) and scan.label is not None
-        assert np.array_equal(label[:, 0], np.where(scan.label == 255, 0, scan.label + 1))
-        assert np.array_equal(xyz, scan.points) and np.array_equal(strength, scan.reflectance)
+        assert (
+            label.dtype == np.uint8
+            and label.shape == (len(scan), 1)
+            and scan.label is not None
+        )
+        assert np.array_equal(
+            label[:, 0], np.where(scan.label == 255, 0, scan.label + 1)
+        )
+        assert np.array_equal(xyz, scan.points) and np.array_equal(
+            strength, scan.reflectance
+        )
 
 
 def test_turning_in_place_does_not_reach_the_source(made: Path, points: Any) -> None:
@@ -142,12 +163,16 @@ def test_batches_go_through_its_collate(points: Any) -> None:
         assert batch[0].shape == (5, 3, 48, 36, 8) and (batch[1] > 0).any()
 
 
-def test_validation_is_the_trainers_own(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validation_is_the_trainers_own(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(VARIABLE, str(made / "mix.yaml"))
-    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to(
-        "00"
+    (made / "sk" / "sequences" / "08").exists() or (
+        made / "sk" / "sequences" / "08"
+    ).symlink_to("00")
+    val = register_once()(
+        f"{made}/sk/sequences", "val", return_ref=True, label_mapping=LABELS
     )
-    val = register_once()(f"{made}/sk/sequences", "val", return_ref=True, label_mapping=LABELS)
     assert len(val) == REAL and val.mixed is None
 
 
@@ -165,7 +190,9 @@ def test_a_map_of_classes_that_does_not_fit_is_refused(
     mapping["learning_map"][10] = 4
     (tmp_path / "merged.yaml").write_text(yaml.safe_dump(mapping))
     with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
-        register()(f"{made}/sk/sequences", "train", label_mapping=str(tmp_path / "merged.yaml"))
+        register()(
+            f"{made}/sk/sequences", "train", label_mapping=str(tmp_path / "merged.yaml")
+        )
 
 
 def test_missing_and_unlabelled_mixtures_are_refused(
@@ -191,26 +218,40 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
     validation."""
     for library in ("spconv", "torch_scatter", "strictyaml"):
         if not find_spec(library):
-            pytest.skip(f"{library}, which Cylinder3D's network needs, is not installed")
-    (made / "sk" / "sequences" / "08").exists() or (made / "sk" / "sequences" / "08").symlink_to(
-        "00"
-    )
+            pytest.skip(
+                f"{library}, which Cylinder3D's network needs, is not installed"
+            )
+    (made / "sk" / "sequences" / "08").exists() or (
+        made / "sk" / "sequences" / "08"
+    ).symlink_to("00")
     own = yaml.safe_load((ROOT / "config/semantickitti.yaml").read_text())
-    own["model_params"] |= {"output_shape": [48, 36, 16], "init_size": 4, "out_fea_dim": 32}
+    own["model_params"] |= {
+        "output_shape": [48, 36, 16],
+        "init_size": 4,
+        "out_fea_dim": 32,
+    }
     own["dataset_params"] |= {"pc_dataset_type": NAME, "label_mapping": LABELS}
     for loader in ("train_data_loader", "val_data_loader"):
         own[loader] |= {"data_path": f"{made}/sk/sequences", "num_workers": 2}
     each = (REAL + EXTRA) // 2
     model = tmp_path / "model.pt"
     own["train_params"] |= {"max_num_epochs": 2, "eval_every_n_steps": each}
-    own["train_params"] |= {"model_load_path": str(model), "model_save_path": str(model)}
+    own["train_params"] |= {
+        "model_load_path": str(model),
+        "model_save_path": str(model),
+    }
     (tmp_path / "mixed.yaml").write_text(yaml.safe_dump(own))
     arguments = ["train_cylinder_asym.py", "--config_path", tmp_path / "mixed.yaml"]
     said = launched("cylinder3d", *arguments, cwd=ROOT, mixture=made / "mix.yaml")
-    assert "provides numpy.int (removed in numpy 1.24), spconv (of spconv 1, by spconv 2)" in said
+    assert (
+        "provides numpy.int (removed in numpy 1.24), spconv (of spconv 1, by spconv 2)"
+        in said
+    )
     plan = both(made)[1].mixed.plan
     assert epochs(said) == [(e, REAL + EXTRA, EXTRA, plan(e).hash[:16]) for e in (0, 1)]
-    losses = [float(value) for value in re.findall(r"epoch \d+ iter +\d+, loss: (\S+)", said)]
+    losses = [
+        float(value) for value in re.findall(r"epoch \d+ iter +\d+, loss: (\S+)", said)
+    ]
     assert (
         len(losses) == 3
         and np.isfinite(losses).all()

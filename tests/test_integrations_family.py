@@ -72,13 +72,21 @@ class Parser:
 """
 
 
-def test_a_trainer_that_imports_its_parser_trains_on_the_mixture(tmp_path: Path) -> None:
+def test_a_trainer_that_imports_its_parser_trains_on_the_mixture(
+    tmp_path: Path,
+) -> None:
     """CENet's layout, without the names of lidar-bonnetal's packages; without a GPU nothing else
     need be set."""
     semantic_kitti(tmp_path / "sk", 6)
     synthetic(tmp_path / "synthetic", 8)
-    (tmp_path / "mix.yaml").write_text(f"synthetic: {tmp_path / 'synthetic'}\nratio: 0.4\n")
-    files = {"train.py": SCRIPT, "modules/trainer.py": TRAINER, "dataset/kitti/parser.py": PARSER}
+    (tmp_path / "mix.yaml").write_text(
+        f"synthetic: {tmp_path / 'synthetic'}\nratio: 0.4\n"
+    )
+    files = {
+        "train.py": SCRIPT,
+        "modules/trainer.py": TRAINER,
+        "dataset/kitti/parser.py": PARSER,
+    }
     for name, code in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(code)

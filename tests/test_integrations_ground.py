@@ -27,16 +27,22 @@ from lidar_synth.labels import ObjectBank
 def test_the_ground_plane(labelled: bool) -> None:
     scan = street(3)
     tilt = np.array([0.03, -0.02])
-    lifted = scan.points + np.c_[np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt].astype(
-        np.float32
+    lifted = scan.points + np.c_[
+        np.zeros((len(scan), 2)), scan.points[:, :2] @ tilt
+    ].astype(np.float32)
+    tilted = replace(
+        scan, points=lifted, label=scan.label if labelled else None, raw_label=None
     )
-    tilted = replace(scan, points=lifted, label=scan.label if labelled else None, raw_label=None)
     plane = ground_plane(tilted)
     normal = np.array([-tilt[0], -tilt[1], 1]) / np.linalg.norm([*tilt, 1])
     assert np.allclose(plane[:3], normal, atol=5e-3) and abs(plane[3] - 1.73) < 0.05
     seen = plane_in_camera(plane, CAMERA)
     assert seen[1] < -0.99 and abs(seen[3] - 1.73) < 0.05
-    on_it = tilted.points[tilted.label == 8][0] if labelled else (0, 0, -plane[3] / plane[2])
+    on_it = (
+        tilted.points[tilted.label == 8][0]
+        if labelled
+        else (0, 0, -plane[3] / plane[2])
+    )
     moved = CAMERA.camera_from_sensor @ [*on_it, 1]
     assert abs(seen @ moved) < 0.05
     with pytest.raises(DataError, match="returns of the ground"):
@@ -52,7 +58,9 @@ def test_difficulty_is_kittis() -> None:
         image_box=np.array([[0, 0, 100, 100]] * 6),
     )
     assert difficulty(boxes).tolist() == [0, 1, 2, -1, -1, -1]
-    far = replace(boxes, values=boxes.values + np.array([100, 0, 0, 0, 0, 0, 0], np.float32))
+    far = replace(
+        boxes, values=boxes.values + np.array([100, 0, 0, 0, 0, 0, 0], np.float32)
+    )
     assert difficulty(replace(far, image_box=None)).tolist() == [-1] * 6  # type: ignore[arg-type]
 
 
@@ -71,22 +79,32 @@ def test_the_object_database(tmp_path: Path, origin: Any) -> None:
             points[:, :3] + info["box3d_lidar"][:3], objects[i].scan.points, atol=1e-5
         )
         lift = 0 if origin == "gravity" else info["box3d_lidar"][5] / 2
-        assert np.isclose(info["box3d_lidar"][2] + lift, objects.boxes.values[i, 2], atol=1e-5)
+        assert np.isclose(
+            info["box3d_lidar"][2] + lift, objects.boxes.values[i, 2], atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("layout", ["kitti", "nuscenes"])
-def test_objects_of_unknown_occlusion_are_pasted_too(tmp_path: Path, layout: Any) -> None:
+def test_objects_of_unknown_occlusion_are_pasted_too(
+    tmp_path: Path, layout: Any
+) -> None:
     """Stock configurations leave out objects of difficulty -1."""
     import pickle
 
     scan = street(0)
     assert scan.boxes is not None
-    bare = replace(scan, boxes=replace(scan.boxes, occlusion=None, truncation=None, image_box=None))
+    bare = replace(
+        scan, boxes=replace(scan.boxes, occlusion=None, truncation=None, image_box=None)
+    )
     objects = ObjectBank.from_scans([bare])
     assert (objects.boxes.occlusion == -1).all()
-    path = write_gt_database(objects, tmp_path, origin="bottom", infos="infos.pkl", layout=layout)
+    path = write_gt_database(
+        objects, tmp_path, origin="bottom", infos="infos.pkl", layout=layout
+    )
     found = [
-        info["difficulty"] for infos in pickle.loads(path.read_bytes()).values() for info in infos
+        info["difficulty"]
+        for infos in pickle.loads(path.read_bytes()).values()
+        for info in infos
     ]
     assert len(found) == len(objects) and set(found) == {0}
 

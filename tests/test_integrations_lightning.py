@@ -68,7 +68,10 @@ def test_two_epochs_see_exactly_the_planned_scans() -> None:
         made = mixed.plan(epoch)
         seen = [(domain, name) for e, domain, name in model.seen if e == epoch]
         assert Counter(d for d, _ in seen) == {0: REAL, 1: 3}
-        wanted = [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
+        wanted = [
+            f"{'s' if d else 'r'}{i}"
+            for d, i in zip(made.domain, made.index, strict=True)
+        ]
         assert [name for _, name in seen] == wanted
     assert model.validated == 8
 
@@ -96,9 +99,13 @@ class OfNumbers(Generated):
 def test_synthesis_after_the_transfer_gives_the_same_batches(workers: int) -> None:
     made = OfNumbers()
     mixed = MixedScans(Scans("r", REAL), made, ratio=0.5, seed=1)
-    model = fit(module.MixedData(mixed, batch_size=4, num_workers=workers, on_device=True))
+    model = fit(
+        module.MixedData(mixed, batch_size=4, num_workers=workers, on_device=True)
+    )
     again = fit(
-        module.MixedData(MixedScans(Scans("r", REAL), Endless(), ratio=0.5, seed=1), batch_size=4)
+        module.MixedData(
+            MixedScans(Scans("r", REAL), Endless(), ratio=0.5, seed=1), batch_size=4
+        )
     )
     assert model.seen == again.seen
     assert max(map(len, made.asked)) > 1  # several at once
@@ -110,7 +117,9 @@ class Pairs(Model):
     def training_step(self, batch: Any, index: int) -> Any:
         x, y = batch
         assert (
-            x.dtype == torch.float32 and y.dtype == torch.int64 and x.shape == y.shape == (4, 8, 8)
+            x.dtype == torch.float32
+            and y.dtype == torch.int64
+            and x.shape == y.shape == (4, 8, 8)
         )
         self.validated += 1
         return self.weight.sum()
@@ -120,16 +129,21 @@ def test_batches_of_pairs_are_passed_on(tmp_path: Path) -> None:
     def pair(scan: Any, rng: Any) -> Any:
         return torch.zeros(8, 8), torch.ones(8, 8, dtype=torch.int64)
 
-    mixed = MixedScans.wrap([pair(None, None)] * REAL, Endless(), ratio=0.25, to_sample=pair)
+    mixed = MixedScans.wrap(
+        [pair(None, None)] * REAL, Endless(), ratio=0.25, to_sample=pair
+    )
     model = Pairs()
     trainer(tmp_path, 1).fit(model, module.MixedData(mixed, batch_size=4))
     assert model.validated == 3
 
 
 @pytest.mark.parametrize(
-    "options", [{"fast_dev_run": True}, {"limit_train_batches": 1}, {"overfit_batches": 1}]
+    "options",
+    [{"fast_dev_run": True}, {"limit_train_batches": 1}, {"overfit_batches": 1}],
 )
-def test_one_batch_is_no_epoch_that_grows(options: dict[str, Any], tmp_path: Path) -> None:
+def test_one_batch_is_no_epoch_that_grows(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
     model = Model()
     data = module.MixedData(
         MixedScans(Scans("r", REAL), Endless(), ratio=0.25, seed=1), batch_size=4
@@ -152,9 +166,9 @@ def test_a_checkpoint_of_another_mixture_is_refused() -> None:
     with pytest.raises(ConfigError, match="the hash of the plan"):
         data.load_state_dict({"seed": 1})
     with pytest.raises(ConfigError, match="ratio 1/4, here 1/2"):
-        module.MixedData(MixedScans(Scans("r", REAL), Endless(), 0.5, seed=1)).load_state_dict(
-            data.state_dict()
-        )
+        module.MixedData(
+            MixedScans(Scans("r", REAL), Endless(), 0.5, seed=1)
+        ).load_state_dict(data.state_dict())
 
 
 class Stop(Exception):
@@ -190,7 +204,9 @@ def trainer(root: Path, epochs: int = 3, **options: Any) -> Any:
 
 @pytest.mark.parametrize("how", ["step", "exception", "epoch"])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_checkpoint_resumes_after_its_last_batch(workers: int, how: str, tmp_path: Path) -> None:
+def test_a_checkpoint_resumes_after_its_last_batch(
+    workers: int, how: str, tmp_path: Path
+) -> None:
     """Taken after a training step, on an exception in the next one, or at an epoch's end."""
     callbacks = lightning.pytorch.callbacks
     callback = {
@@ -223,7 +239,8 @@ def test_a_checkpoint_within_an_epoch_needs_steps_of_its_size() -> None:
     state = make_state(data.train.mixture, 0, 4) | {"step": 4}
     data.load_state_dict(state)
     with pytest.raises(
-        ConfigError, match="4 samples a step, for 2 a step.*from the end of an epoch fits any"
+        ConfigError,
+        match="4 samples a step, for 2 a step.*from the end of an epoch fits any",
     ):
         data.train_dataloader()
     data.load_state_dict(make_state(data.train.mixture, 1, 0) | {"step": 4})
@@ -240,7 +257,9 @@ class Shared(Model):
     def on_train_epoch_end(self) -> None:
         path = self.out / f"{self.current_epoch}-{self.global_rank}.txt"
         path.write_text(
-            "\n".join(name for epoch, _, name in self.seen if epoch == self.current_epoch)
+            "\n".join(
+                name for epoch, _, name in self.seen if epoch == self.current_epoch
+            )
         )
 
 
@@ -273,7 +292,10 @@ def test_two_processes_see_every_sample(own: bool, tmp_path: Path) -> None:
             for name in (tmp_path / f"{epoch}-{rank}.txt").read_text().split()
         ]
         made = mixed.plan(epoch if own else 0)  # nobody tells a plain dataset the epoch
-        wanted = [f"{'s' if d else 'r'}{i}" for d, i in zip(made.domain, made.index, strict=True)]
+        wanted = [
+            f"{'s' if d else 'r'}{i}"
+            for d, i in zip(made.domain, made.index, strict=True)
+        ]
         assert sorted(seen) == sorted(wanted)
 
 
@@ -295,7 +317,9 @@ def test_lightning_does_not_share_once_more(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", module.STOLEN)
-def test_releases_that_steal_are_refused(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_releases_that_steal_are_refused(
+    version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import importlib
     import sys
 

@@ -14,12 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("mmengine", reason="mmengine is not installed: bash tools/install_mmdet3d.sh")
-pytest.importorskip("mmcv", reason="mmcv is not installed: bash tools/install_mmdet3d.sh")
+pytest.importorskip(
+    "mmengine", reason="mmengine is not installed: bash tools/install_mmdet3d.sh"
+)
+pytest.importorskip(
+    "mmcv", reason="mmcv is not installed: bash tools/install_mmdet3d.sh"
+)
 import mmcv_ext
 
 mmcv_ext.install()
-pytest.importorskip("mmdet3d", reason="mmdet3d is not installed: bash tools/install_mmdet3d.sh")
+pytest.importorskip(
+    "mmdet3d", reason="mmdet3d is not installed: bash tools/install_mmdet3d.sh"
+)
 
 import lidar_synth.integrations.mmdet3d as adapter
 import mmdet3d
@@ -63,7 +69,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("mmdet3d")
     settings = MIX | {"synthetic": synthetic(root / "synthetic", SYNTHETIC)}
     semantic_kitti_list(semantic_kitti(root / "sk", REAL), root / "sk" / "train.json")
-    write_infos(root / "seg", root / "sk" / "train.json", settings, data_root=root / "sk")
+    write_infos(
+        root / "seg", root / "sk" / "train.json", settings, data_root=root / "sk"
+    )
     kitti_list(kitti(root / "kitti", REAL), root / "kitti" / "train.json")
     write_infos(
         root / "det",
@@ -74,7 +82,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     objects = ObjectBank.from_scans(open_scans(root / "synthetic"))
     write_gt_database(
-        objects, root / "kitti", origin="bottom", folder="kitti_gt_database", infos="dbinfos.pkl"
+        objects,
+        root / "kitti",
+        origin="bottom",
+        folder="kitti_gt_database",
+        infos="dbinfos.pkl",
     )
     return root
 
@@ -85,7 +97,9 @@ def train_set(config: str) -> dict[str, Any]:
     return loaded.get("dataset", loaded).to_dict()  # type: ignore[no-any-return]
 
 
-def segmentation(made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any) -> Any:
+def segmentation(
+    made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any
+) -> Any:
     loaded = (
         train_set("minkunet_semantickitti.py")
         | {"ann_file": str(made / "seg" / "infos.json")}
@@ -96,8 +110,12 @@ def segmentation(made: Path, pipeline: list[dict[str, Any]] | None = None, **opt
     return DATASETS.build(loaded)
 
 
-def detection(made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any) -> Any:
-    loaded = train_set(DETECTION) | {"ann_file": str(made / "det" / "infos.json")} | options
+def detection(
+    made: Path, pipeline: list[dict[str, Any]] | None = None, **options: Any
+) -> Any:
+    loaded = (
+        train_set(DETECTION) | {"ann_file": str(made / "det" / "infos.json")} | options
+    )
     for step in loaded["pipeline"]:
         if step["type"] == "ObjectSample":
             step["db_sampler"] |= {
@@ -105,7 +123,10 @@ def detection(made: Path, pipeline: list[dict[str, Any]] | None = None, **option
                 "info_path": str(made / "kitti" / "dbinfos.pkl"),
                 "classes": ["Car"],
                 "sample_groups": {"Car": 5},
-                "prepare": {"filter_by_difficulty": [-1], "filter_by_min_points": {"Car": 5}},
+                "prepare": {
+                    "filter_by_difficulty": [-1],
+                    "filter_by_min_points": {"Car": 5},
+                },
             }
     if pipeline is not None:
         loaded["pipeline"] = loaded["pipeline"][:2] + pipeline
@@ -156,11 +177,16 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None
             for batch in loader
             for s in zip(batch["data_samples"], batch["inputs"]["points"], strict=True)
         ]
-        assert Counter(is_synthetic(s) for s, _ in samples) == {False: REAL, True: EXTRA}
+        assert Counter(is_synthetic(s) for s, _ in samples) == {
+            False: REAL,
+            True: EXTRA,
+        }
         planned = folder.mixed.plan(epoch)
         wanted = set(planned.index[planned.domain].tolist())
         if make is segmentation:
-            given = {ids[p[:50, 3].numpy().tobytes()] for s, p in samples if is_synthetic(s)}
+            given = {
+                ids[p[:50, 3].numpy().tobytes()] for s, p in samples if is_synthetic(s)
+            }
             assert given == wanted
         seen.append(wanted)
     assert not seen[0] & seen[1]
@@ -168,8 +194,12 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path, make: Any) -> None
 
 def test_a_loader_without_the_sampler_is_refused(made: Path) -> None:
     """Its workers would read the synthetic scans of the first epoch in every epoch."""
-    loader = DataLoader(segmentation(made, [PACK]), num_workers=1, collate_fn=pseudo_collate)
-    with pytest.raises(ConfigError, match="type='SynthSampler'.*every epoch would have"):
+    loader = DataLoader(
+        segmentation(made, [PACK]), num_workers=1, collate_fn=pseudo_collate
+    )
+    with pytest.raises(
+        ConfigError, match="type='SynthSampler'.*every epoch would have"
+    ):
         list(loader)
 
 
@@ -183,7 +213,9 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
     theirs = DATASETS.build(stock)
     for i in range(REAL):
         assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
-        mine, own = (d[i]["data_samples"].gt_pts_seg.pts_semantic_mask for d in (ours, theirs))
+        mine, own = (
+            d[i]["data_samples"].gt_pts_seg.pts_semantic_mask for d in (ours, theirs)
+        )
         assert np.array_equal(mine, own)
 
 
@@ -199,7 +231,10 @@ def test_real_boxes_are_the_trainers_own(made: Path) -> None:
     theirs = DATASETS.build(stock)
     for i in range(REAL):
         assert torch.equal(ours[i]["inputs"]["points"], theirs[i]["inputs"]["points"])
-        boxes = [d[i]["data_samples"].gt_instances_3d.bboxes_3d.tensor for d in (ours, theirs)]
+        boxes = [
+            d[i]["data_samples"].gt_instances_3d.bboxes_3d.tensor
+            for d in (ours, theirs)
+        ]
         assert torch.equal(*boxes) and len(boxes[0]) == 2
 
 
@@ -218,7 +253,9 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
 def inside(sample: Any) -> list[int]:
     """Points in each box after the trainer's transforms; its boxes are ours, by their corners."""
     boxes = sample["data_samples"].gt_instances_3d.bboxes_3d
-    ours = Boxes(np.c_[boxes.gravity_center, boxes.dims, boxes.yaw], ("Car",) * len(boxes))
+    ours = Boxes(
+        np.c_[boxes.gravity_center, boxes.dims, boxes.yaw], ("Car",) * len(boxes)
+    )
     assert np.allclose(np.sort(boxes.corners, 1), np.sort(ours.corners(), 1), atol=1e-4)
     return [int(c) for c in held(ours, sample["inputs"]["points"][:, :3].numpy())]
 
@@ -232,11 +269,15 @@ def test_boxes_hold_their_points_after_the_trainers_transforms(made: Path) -> No
     folder = open_folder(made / "det")
     for slot in range(EXTRA):
         scan = folder.scan(slot)
-        assert scan.boxes is not None and len(scan.boxes) == 2  # the third stands behind the camera
+        assert (
+            scan.boxes is not None and len(scan.boxes) == 2
+        )  # the third stands behind the camera
         sample = dataset[REAL + slot]
         counts = inside(sample)
         before = held(scan.boxes, scan.points)
-        assert before.min() >= 10 and np.abs(counts - before).max() <= 3  # those on a face
+        assert (
+            before.min() >= 10 and np.abs(counts - before).max() <= 3
+        )  # those on a face
         assert sample["data_samples"].gt_instances_3d.labels_3d.tolist() == [2, 2]
 
 
@@ -302,14 +343,19 @@ def test_scans_without_a_box_are_not_replaced(made: Path, tmp_path: Path) -> Non
     is gone."""
     settings = MIX | {"synthetic": synthetic(tmp_path / "bare", 5, boxes=False)}
     where = {"data_root": made / "kitti", "points": "training/velodyne_reduced"}
-    path = write_infos(tmp_path / "det", made / "kitti" / "train.json", settings, **where)
+    path = write_infos(
+        tmp_path / "det", made / "kitti" / "train.json", settings, **where
+    )
     dataset = detection(made, ann_file=str(path))
     samples = [dataset[i] for i in range(REAL + EXTRA)]
-    assert [len(s["data_samples"].gt_instances_3d.labels_3d) > 0 for s in samples] == [True] * (
-        REAL + EXTRA
-    )
+    assert [len(s["data_samples"].gt_instances_3d.labels_3d) > 0 for s in samples] == [
+        True
+    ] * (REAL + EXTRA)
     bare = detection(made, [PACK_BOXES], ann_file=str(path))
-    counts = [len(bare[i]["data_samples"].gt_instances_3d.labels_3d) for i in range(REAL + EXTRA)]
+    counts = [
+        len(bare[i]["data_samples"].gt_instances_3d.labels_3d)
+        for i in range(REAL + EXTRA)
+    ]
     assert [c > 0 for c in counts] == [True] * REAL + [False] * EXTRA
     with pytest.raises(ConfigError, match="filter_empty_gt=False"):
         detection(made, ann_file=str(path), filter_empty_gt=True)
@@ -327,7 +373,9 @@ def test_a_bank_is_read_by_url(made: Path) -> None:
             read_url(wrong)
 
 
-def test_scans_with_boxes_and_without_labels_serve_a_detector(made: Path, tmp_path: Path) -> None:
+def test_scans_with_boxes_and_without_labels_serve_a_detector(
+    made: Path, tmp_path: Path
+) -> None:
     unlabelled = synthetic(tmp_path / "unlabelled", SYNTHETIC, labels=False)
     root = made / "kitti"
     listed = write_infos(
@@ -340,13 +388,19 @@ def test_scans_with_boxes_and_without_labels_serve_a_detector(made: Path, tmp_pa
     loaded = train_set(DETECTION) | {"ann_file": str(listed), "pipeline": []}
     dataset = DATASETS.build(loaded)
     infos = [dataset.get_data_info(i) for i in range(len(dataset))]
-    made_up = [info for info in infos if info["lidar_points"]["lidar_path"].startswith("lsynth://")]
+    made_up = [
+        info
+        for info in infos
+        if info["lidar_points"]["lidar_path"].startswith("lsynth://")
+    ]
     assert len(made_up) == EXTRA and all(
         len(info["ann_info"]["gt_labels_3d"]) > 0 for info in made_up
     )
 
 
-def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_path: Path) -> None:
+def test_unsuitable_training_data_is_refused_before_training(
+    made: Path, tmp_path: Path
+) -> None:
     listed = made / "sk" / "train.json"
     root = {"data_root": made / "sk"}
     for labels in ("none", "ignore"):
@@ -362,11 +416,18 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
         write_infos(tmp_path / "b", listed, MIX | {"synthetic": unlabelled}, **root)
     with pytest.raises(ConfigError, match="settings .'rate'."):
         write_infos(
-            tmp_path / "d", listed, MIX | {"synthetic": made / "synthetic", "rate": 1}, **root
+            tmp_path / "d",
+            listed,
+            MIX | {"synthetic": made / "synthetic", "rate": 1},
+            **root,
         )
     (tmp_path / "old.json").write_text("[]")
     with pytest.raises(DataError, match="no 'data_list'"):
-        write_infos(tmp_path / "e", tmp_path / "old.json", MIX | {"synthetic": made / "synthetic"})
+        write_infos(
+            tmp_path / "e",
+            tmp_path / "old.json",
+            MIX | {"synthetic": made / "synthetic"},
+        )
     boxless = Path(tmp_path / "boxless")
     write_all("npz", boxless, [replace(street(i), boxes=None) for i in range(3)])
     with pytest.raises(DataError, match="no boxes.*labels='mix'"):
@@ -382,7 +443,10 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
     write_all(
         "npz",
         named,
-        [replace(street(i), boxes=replace(b, names=("car",) * 3)) for i, b in enumerate(boxes)],
+        [
+            replace(street(i), boxes=replace(b, names=("car",) * 3))
+            for i, b in enumerate(boxes)
+        ],
     )
     with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan"):
         write_infos(
@@ -394,7 +458,9 @@ def test_unsuitable_training_data_is_refused_before_training(made: Path, tmp_pat
         )
 
 
-def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: Path) -> None:
+def test_other_synthetic_scans_than_the_lists_are_noticed(
+    made: Path, tmp_path: Path
+) -> None:
     source = synthetic(tmp_path / "s", 3)
     write_infos(
         tmp_path / "seg",
@@ -410,17 +476,26 @@ def test_other_synthetic_scans_than_the_lists_are_noticed(made: Path, tmp_path: 
 def test_classes_that_do_not_fit_are_refused(made: Path) -> None:
     adapter.SynthSampler(segmentation(made, [PACK]))
     meta = train_set("minkunet_semantickitti.py")["metainfo"]
-    for changed in ({10: 4}, {252: 19, 10: 19}):  # a car that counts as another class, and as none
+    for changed in (
+        {10: 4},
+        {252: 19, 10: 19},
+    ):  # a car that counts as another class, and as none
         wrong = {**meta, "seg_label_mapping": {**meta["seg_label_mapping"], **changed}}
         with pytest.raises(ConfigError, match="SemanticKITTI's 19 classes"):
             adapter.SynthSampler(segmentation(made, [PACK], metainfo=wrong))
 
 
 def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> None:
-    stock = train_set("minkunet_semantickitti.py") | {"ann_file": str(made / "sk" / "train.json")}
-    with pytest.raises(ConfigError, match="SynthSampler with.*train.json.*write_infos wrote"):
+    stock = train_set("minkunet_semantickitti.py") | {
+        "ann_file": str(made / "sk" / "train.json")
+    }
+    with pytest.raises(
+        ConfigError, match="SynthSampler with.*train.json.*write_infos wrote"
+    ):
         adapter.SynthSampler(DATASETS.build(stock | {"data_root": str(made / "sk")}))
-    with pytest.raises(ConfigError, match="KittiDataset with a mixed list.*SynthKittiDataset"):
+    with pytest.raises(
+        ConfigError, match="KittiDataset with a mixed list.*SynthKittiDataset"
+    ):
         adapter.SynthSampler(detection(made, [PACK_BOXES], type="KittiDataset"))
     wrapped = DATASETS.build(
         {"type": "RepeatDataset", "times": 2, "dataset": segmentation(made, [PACK])}
@@ -429,7 +504,9 @@ def test_datasets_that_do_not_fit_are_refused(made: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("version", ["1.3.0", "2.0.0"])
-def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_versions_are_refused(
+    version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mmdet3d, "__version__", version)
     monkeypatch.delitem(sys.modules, adapter.__name__)
     with pytest.raises(LibraryError, match=f"mmdet3d {version}.*install_mmdet3d.sh"):
@@ -440,7 +517,8 @@ def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatc
 def test_configurations_change_data_only(path: Path) -> None:
     if path.stem.startswith("frnet"):
         pytest.importorskip(
-            "frnet", reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)"
+            "frnet",
+            reason="FRNet's repository is not on the path (PYTHONPATH and FRNET_ROOT)",
         )
     config = Config.fromfile(str(path))
     stock = path.read_text().split('_base_ = ["')[1].split('"]')[0]
@@ -451,17 +529,26 @@ def test_configurations_change_data_only(path: Path) -> None:
     if (
         stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset"
     ):  # the list itself is balanced
-        stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"]["dataset"][
+        stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"][
             "dataset"
-        ]
+        ]["dataset"]
     theirs = flat(stock_config)
-    changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(ours)
+    changed = {key for key in ours if ours[key] != theirs.get(key)} | set(theirs) - set(
+        ours
+    )
     assert all(key.startswith((".train_dataloader", ".custom")) for key in changed)
     names = {key.rpartition(".")[2] for key in changed}
-    defaults = {"backend_args", "test_mode"}  # left out where the dataset is written anew
-    assert names <= {"imports", "allow_failed_imports", "custom_hooks", *defaults, *DATA_KEYS}, (
-        changed
-    )
+    defaults = {
+        "backend_args",
+        "test_mode",
+    }  # left out where the dataset is written anew
+    assert names <= {
+        "imports",
+        "allow_failed_imports",
+        "custom_hooks",
+        *defaults,
+        *DATA_KEYS,
+    }, changed
     assert {"type": "SynthEpochHook"} in [dict(h) for h in config.custom_hooks]
 
 

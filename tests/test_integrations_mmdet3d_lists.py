@@ -45,11 +45,16 @@ def nuscenes_like(root: Path, **changes: Any) -> Path:
         ]
         for name in names:
             (root / name).parent.mkdir(parents=True, exist_ok=True)
-            (root / name).write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
+            (root / name).write_bytes(
+                five_values(as_nuscenes(scan)).astype("<f4").tobytes()
+            )
         sweep = [
             {
                 "timestamp": 9.95 - 0.05 * k,
-                "lidar_points": {"lidar_path": name, "lidar2sensor": np.eye(4).tolist()},
+                "lidar_points": {
+                    "lidar_path": name,
+                    "lidar2sensor": np.eye(4).tolist(),
+                },
             }
             for k, name in enumerate(names[1:])
         ]
@@ -94,14 +99,19 @@ def test_a_list_without_kittis_camera_is_taken(
     for real, slot in zip(entries[:REAL], entries[REAL:], strict=True):
         assert Path(real["lidar_points"]["lidar_path"]).is_file()
         assert all(
-            Path(sweep["lidar_points"]["lidar_path"]).is_file() for sweep in real["lidar_sweeps"]
+            Path(sweep["lidar_points"]["lidar_path"]).is_file()
+            for sweep in real["lidar_sweeps"]
         )
-        points = np.frombuffer(read_url(slot["lidar_points"]["lidar_path"]), "<f4").reshape(-1, 5)
-        assert points[:, 0].min() < -3 < 3 < points[:, 0].max() and points[:, 1].min() < -5, (
-            "cropped to a view"
-        )
+        points = np.frombuffer(
+            read_url(slot["lidar_points"]["lidar_path"]), "<f4"
+        ).reshape(-1, 5)
+        assert (
+            points[:, 0].min() < -3 < 3 < points[:, 0].max() and points[:, 1].min() < -5
+        ), "cropped to a view"
         assert 1 < points[:, 3].max() <= 255 and set(points[:, 4]) <= set(range(32))
-        times = [[s["timestamp"] for s in entry["lidar_sweeps"]] for entry in (real, slot)]
+        times = [
+            [s["timestamp"] for s in entry["lidar_sweeps"]] for entry in (real, slot)
+        ]
         assert times[0] == times[1]
         assert {s["lidar_points"]["lidar_path"] for s in slot["lidar_sweeps"]} <= {
             slot["lidar_points"]["lidar_path"]
@@ -123,30 +133,49 @@ def test_scans_in_nuscenes_form(tmp_path: Path) -> None:
     turned = as_nuscenes(scan)
     (tmp_path / "a.pcd.bin").write_bytes(five_values(turned).astype("<f4").tobytes())
     back = NuScenes(tmp_path, sensor=scan.sensor)[0]
-    assert np.array_equal(back.points, scan.points) and np.array_equal(back.ring, turned.ring)  # type: ignore[arg-type]
+    assert np.array_equal(back.points, scan.points) and np.array_equal(
+        back.ring, turned.ring
+    )  # type: ignore[arg-type]
     assert np.allclose(back.reflectance, scan.reflectance, atol=1e-6)
     assert turned.boxes is not None and scan.boxes is not None
     assert set(turned.boxes.names) == {"car"} and len(turned.boxes) == 3
     # Those on a face.
-    assert np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max() <= 3
+    assert (
+        np.abs(held(turned.boxes, turned.points) - held(scan.boxes, scan.points)).max()
+        <= 3
+    )
 
 
 def test_names_of_boxes_become_nuscenes_classes() -> None:
     scan = street(0)
     assert scan.boxes is not None
-    named = replace(scan, boxes=replace(scan.boxes, names=("Cyclist", "Tram", "traffic_cone")))
+    named = replace(
+        scan, boxes=replace(scan.boxes, names=("Cyclist", "Tram", "traffic_cone"))
+    )
     boxes = as_nuscenes(named).boxes
     assert (
         boxes is not None
         and boxes.names == ("bicycle", "traffic_cone")
         and set(boxes.names) <= set(CLASSES)
     )
-    rider = replace(scan, boxes=replace(scan.boxes, names=("Motorcyclist", "Car", "Van")))
-    assert (as_nuscenes(rider).boxes or named.boxes).names == ("motorcycle", "car", "car")
+    rider = replace(
+        scan, boxes=replace(scan.boxes, names=("Motorcyclist", "Car", "Van"))
+    )
+    assert (as_nuscenes(rider).boxes or named.boxes).names == (
+        "motorcycle",
+        "car",
+        "car",
+    )
     with pytest.raises(DataError, match="boxes of .'car_x'. in scan.*Rename"):
-        as_nuscenes(replace(scan, boxes=replace(scan.boxes, names=("Car", "car_x", "Car"))))
-    far = Scan(scan.points[:1] + 500, scan.reflectance[:1], scan.sensor, boxes=scan.boxes)
-    assert len(as_nuscenes(far).boxes or ()) == 0  # nuScenes' trainers drop boxes without a return
+        as_nuscenes(
+            replace(scan, boxes=replace(scan.boxes, names=("Car", "car_x", "Car")))
+        )
+    far = Scan(
+        scan.points[:1] + 500, scan.reflectance[:1], scan.sensor, boxes=scan.boxes
+    )
+    assert (
+        len(as_nuscenes(far).boxes or ()) == 0
+    )  # nuScenes' trainers drop boxes without a return
 
 
 def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) -> None:
@@ -167,28 +196,48 @@ def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) ->
 def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:
     listed = nuscenes_like(tmp_path / "n")
     settings = MIX | {"synthetic": scans}
-    with pytest.raises(FileError, match="of the first entry, does not exist.*data_prefix"):
+    with pytest.raises(
+        FileError, match="of the first entry, does not exist.*data_prefix"
+    ):
         write_infos(tmp_path / "a", listed, settings, data_root=tmp_path / "n")
-    with pytest.raises(ConfigError, match="points of 5 values for layout='kitti'.*'nuscenes' .5."):
+    with pytest.raises(
+        ConfigError, match="points of 5 values for layout='kitti'.*'nuscenes' .5."
+    ):
         write_infos(
-            tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="kitti", **WHERE
+            tmp_path / "a",
+            listed,
+            settings,
+            data_root=tmp_path / "n",
+            layout="kitti",
+            **WHERE,
         )
     with pytest.raises(ConfigError, match="layout='waymo'"):
         write_infos(
-            tmp_path / "a", listed, settings, data_root=tmp_path / "n", layout="waymo", **WHERE
+            tmp_path / "a",
+            listed,
+            settings,
+            data_root=tmp_path / "n",
+            layout="waymo",
+            **WHERE,
         )
     bare = tmp_path / "bare"
     write_all("npz", bare, [replace(street(i), boxes=None) for i in range(5)])
     with pytest.raises(DataError, match="no boxes.*labels='mix'"):
         write_infos(
-            tmp_path / "a", listed, MIX | {"synthetic": bare}, data_root=tmp_path / "n", **WHERE
+            tmp_path / "a",
+            listed,
+            MIX | {"synthetic": bare},
+            data_root=tmp_path / "n",
+            **WHERE,
         )
 
 
 @pytest.mark.parametrize("make", [semantic_kitti_list, kitti_list])
 def test_a_lists_file_is_what_its_name_says(tmp_path: Path, make: Any) -> None:
     """The stock configurations name pickles, and the trainer chooses the reader by the name."""
-    root = (semantic_kitti if make is semantic_kitti_list else kitti)(tmp_path / "real", 2)
+    root = (semantic_kitti if make is semantic_kitti_list else kitti)(
+        tmp_path / "real", 2
+    )
     content = json.loads(make(root, tmp_path / "list.json").read_text())
     pickled = make(root, tmp_path / "list.pkl").read_bytes()
     assert pickle.loads(pickled) == content
@@ -209,7 +258,9 @@ def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequenc
         return [e["sample_id"][-1] for e in entries]
 
     assert frames() == frames(order="sequential") == list("0123456789")
-    assert frames(share=0.3) == list("036") and frames(share=0.3, order="sequential") == list("012")
+    assert frames(share=0.3) == list("036") and frames(
+        share=0.3, order="sequential"
+    ) == list("012")
     assert frames(share=0.01) == frames(share=0.01, order="sequential") == ["0"]
     for wrong in ({"share": 0}, {"share": 1.5}, {"order": "random"}):
         with pytest.raises(
@@ -218,9 +269,15 @@ def test_a_share_of_semantic_kitti_is_spread_or_at_the_beginning_of_each_sequenc
             frames(**wrong)
 
 
-def test_two_runs_that_share_a_list_have_their_own_epochs(scans: Path, tmp_path: Path) -> None:
-    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
-    write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
+def test_two_runs_that_share_a_list_have_their_own_epochs(
+    scans: Path, tmp_path: Path
+) -> None:
+    real = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
+    )
+    write_infos(
+        tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk"
+    )
     runs = Folder.open(tmp_path / "m"), Folder.open(tmp_path / "m")
     before = {path: path.read_bytes() for path in (tmp_path / "m").iterdir()}
     runs[0].epoch = 0
@@ -243,19 +300,26 @@ def test_a_list_holds_schedules_and_lengths(
     scans: Path, tmp_path: Path, settings: dict[str, Any], shares: list[tuple[int, int]]
 ) -> None:
     """An epoch's entries are those of its plan, and each slot has a scan of its own."""
-    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
+    real = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
+    )
     path = write_infos(
-        tmp_path / "m", real, MIX | {"synthetic": scans} | settings, data_root=tmp_path / "sk"
+        tmp_path / "m",
+        real,
+        MIX | {"synthetic": scans} | settings,
+        data_root=tmp_path / "sk",
     )
     folder = Folder.open(tmp_path / "m")
     assert (
-        len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots and not folder.whole
+        len(json.loads(path.read_text())["data_list"]) == REAL + folder.slots
+        and not folder.whole
     )
     for epoch, (reals, slots) in enumerate(shares):
         entries = folder.entries(epoch)
         assert ((entries < REAL).sum(), (entries >= REAL).sum()) == (reals, slots)
         assert (
-            sorted(entries[entries >= REAL] - REAL) == list(range(slots)) and slots <= folder.slots
+            sorted(entries[entries >= REAL] - REAL) == list(range(slots))
+            and slots <= folder.slots
         )
         folder.epoch, plan = epoch, folder.mixed.plan(epoch)
         slot = int(entries[plan.domain][-1]) - REAL
@@ -273,8 +337,12 @@ def test_a_list_holds_schedules_and_lengths(
 
 
 def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) -> None:
-    real = semantic_kitti_list(semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json")
-    write_infos(tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk")
+    real = semantic_kitti_list(
+        semantic_kitti(tmp_path / "sk", REAL), tmp_path / "train.json"
+    )
+    write_infos(
+        tmp_path / "m", real, MIX | {"synthetic": scans}, data_root=tmp_path / "sk"
+    )
     facts = json.loads((tmp_path / "m" / "mixture.json").read_text())
     del facts["layout"]
     (tmp_path / "m" / "mixture.json").write_text(
@@ -290,12 +358,20 @@ def test_lists_of_the_first_format_stay_readable(scans: Path, tmp_path: Path) ->
 
 def test_objects_in_nuscenes_form(scans: Path, tmp_path: Path) -> None:
     objects = ObjectBank.from_scans(open_scans(scans))
-    infos = write_gt_database(objects, tmp_path, origin="bottom", infos="db.pkl", layout="nuscenes")
+    infos = write_gt_database(
+        objects, tmp_path, origin="bottom", infos="db.pkl", layout="nuscenes"
+    )
     found = pickle.loads(infos.read_bytes())
     assert set(found) == {"car"}
     for each in found["car"]:
         points = np.fromfile(tmp_path / each["path"], "<f4").reshape(-1, 5)
         length, width, height = each["box3d_lidar"][3:6]
-        assert len(each["box3d_lidar"]) == 9 and not points[:, 4].any() and points[:, 3].max() > 1
-        assert (np.hypot(points[:, 0], points[:, 1]) <= np.hypot(length, width) / 2 + 0.1).all()
+        assert (
+            len(each["box3d_lidar"]) == 9
+            and not points[:, 4].any()
+            and points[:, 3].max() > 1
+        )
+        assert (
+            np.hypot(points[:, 0], points[:, 1]) <= np.hypot(length, width) / 2 + 0.1
+        ).all()
         assert points[:, 2].min() >= -0.1 and points[:, 2].max() <= height + 0.1

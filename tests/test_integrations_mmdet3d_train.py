@@ -23,7 +23,8 @@ for module in ("mmengine", "mmcv", "mmdet3d"):
         )
 if find_spec("mmcv._ext") is None:
     pytest.skip(
-        "mmcv has no operators: bash tools/install_mmdet3d.sh VENV --ops", allow_module_level=True
+        "mmcv has no operators: bash tools/install_mmdet3d.sh VENV --ops",
+        allow_module_level=True,
     )
 
 from streets import kitti, synthetic
@@ -84,4 +85,7 @@ def test_pointpillars_trains_validates_and_resumes(tmp_path: Path) -> None:
     names = [line.split()[-1] for line in samples(whole)]
     assert {name.endswith(".bin") for name in names} == {False, True}
     load = ("--resume", "whole/iter_2.pth", "--work-dir", "resumed")
-    assert samples(typed(tmp_path, TRAIN, "pointpillars_kitti.py", *load)) == samples(whole)[2:]
+    assert (
+        samples(typed(tmp_path, TRAIN, "pointpillars_kitti.py", *load))
+        == samples(whole)[2:]
+    )

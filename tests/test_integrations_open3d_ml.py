@@ -44,7 +44,11 @@ def make(root: Path) -> Path:
 
 def build(made: Path, **options: Any) -> Any:
     mixture = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
-    given = {"mixture": mixture, "training_split": ["00"], "validation_split": ["00"]} | options
+    given = {
+        "mixture": mixture,
+        "training_split": ["00"],
+        "validation_split": ["00"],
+    } | options
     return dataset_class()(str(made / "sk"), **given)
 
 
@@ -60,11 +64,19 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
     seen = []
     data = ml3d.dataloaders.TorchDataloader(dataset=split, use_cache=False)
     loader = EpochLoader(
-        data, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list
+        data,
+        batch_size=2,
+        shuffle=True,
+        num_workers=2,
+        persistent_workers=True,
+        collate_fn=list,
     )
     for epoch in (0, 1):
         names = [sample["attr"]["name"] for batch in loader for sample in batch]
-        assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
+        assert Counter(n.startswith("synthetic_") for n in names) == {
+            False: REAL,
+            True: EXTRA,
+        }
         made_plan = split.mixed.plan(epoch)
         wanted = {f"synthetic_{n}" for n in made_plan.index[made_plan.domain]}
         assert {n for n in names if n.startswith("synthetic_")} == wanted
@@ -78,9 +90,13 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
         mine = split.get_data(position)
         theirs = own.get_data(split.mixed[position])
         assert all(
-            np.array_equal(mine[k], theirs[k]) and mine[k].dtype == theirs[k].dtype for k in theirs
+            np.array_equal(mine[k], theirs[k]) and mine[k].dtype == theirs[k].dtype
+            for k in theirs
         )
-        assert split.get_attr(position)["name"] == own.get_attr(split.mixed[position])["name"]
+        assert (
+            split.get_attr(position)["name"]
+            == own.get_attr(split.mixed[position])["name"]
+        )
 
 
 def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
@@ -118,7 +134,10 @@ def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_its_pipeline_trains_and_validates(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    made: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The documented lines: stock RandLANet with fewer points, two epochs, validation after
     each."""
@@ -132,8 +151,15 @@ def test_its_pipeline_trains_and_validates(
     config = import_module("open3d.ml.utils").Config.load_from_file(
         str(resources / "configs/randlanet_semantickitti.yml")
     )
-    model = ml3d.models.RandLANet(**config.model | {"in_channels": 4, "num_points": 4096})
-    own = config.pipeline | {"max_epoch": 1, "save_ckpt_freq": 1, "batch_size": 2, "device": "cpu"}
+    model = ml3d.models.RandLANet(
+        **config.model | {"in_channels": 4, "num_points": 4096}
+    )
+    own = config.pipeline | {
+        "max_epoch": 1,
+        "save_ckpt_freq": 1,
+        "batch_size": 2,
+        "device": "cpu",
+    }
     pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, **own)
     seen: list[list[float]] = []
     log = pipeline.save_logs
@@ -179,7 +205,9 @@ def test_a_library_that_cannot_be_used_is_explained(
         raise error
 
     monkeypatch.setattr("lidar_synth.integrations.open3d_ml.import_module", broken)
-    with pytest.raises(LibraryError, match=f"torch {torch.__version__.split('+')[0]}.*{hint}"):
+    with pytest.raises(
+        LibraryError, match=f"torch {torch.__version__.split('+')[0]}.*{hint}"
+    ):
         dataset_class.__wrapped__()
 
 

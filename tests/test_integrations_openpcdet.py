@@ -53,19 +53,33 @@ VALIDATION = 2  # further real scans
 NAME = "MixedKitti"
 
 
-def config(root: Path, synthetic_scans: Path, sampling: bool = True, **settings: Any) -> Any:
+def config(
+    root: Path, synthetic_scans: Path, sampling: bool = True, **settings: Any
+) -> Any:
     """The stock data configuration for the tests' scans."""
-    loaded = yaml.safe_load((ROOT / "tools/cfgs/dataset_configs/kitti_dataset.yaml").read_text())
+    loaded = yaml.safe_load(
+        (ROOT / "tools/cfgs/dataset_configs/kitti_dataset.yaml").read_text()
+    )
     loaded["DATA_PATH"] = str(root)
-    loaded["LIDAR_SYNTH"] = {"SYNTHETIC": str(synthetic_scans), "RATIO": 0.4, "SEED": 3, **settings}
+    loaded["LIDAR_SYNTH"] = {
+        "SYNTHETIC": str(synthetic_scans),
+        "RATIO": 0.4,
+        "SEED": 3,
+        **settings,
+    }
     augment = loaded["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"]
-    augment[0] |= {"SAMPLE_GROUPS": ["Car:3"], "PREPARE": {"filter_by_min_points": ["Car:5"]}}
+    augment[0] |= {
+        "SAMPLE_GROUPS": ["Car:3"],
+        "PREPARE": {"filter_by_min_points": ["Car:5"]},
+    }
     if not sampling:
         loaded["DATA_AUGMENTOR"]["DISABLE_AUG_LIST"] = ["gt_sampling"]
     return easydict.EasyDict(loaded)
 
 
-def build(made: Path, scans: str | Path = "synthetic", kitti: str = "kitti", **options: Any) -> Any:
+def build(
+    made: Path, scans: str | Path = "synthetic", kitti: str = "kitti", **options: Any
+) -> Any:
     register()
     loaded = config(made / kitti, made / scans, **options)
     return registered[NAME](loaded, CLASSES, training=True, root_path=made / kitti)
@@ -75,7 +89,9 @@ def both(made: Path) -> tuple[Any, Any]:
     """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
     times them."""
     loaded = config(made / "kitti", made / "synthetic")
-    return KittiDataset(loaded, CLASSES, training=True, root_path=made / "kitti"), build(made)
+    return KittiDataset(
+        loaded, CLASSES, training=True, root_path=made / "kitti"
+    ), build(made)
 
 
 @pytest.fixture(scope="module")
@@ -119,15 +135,24 @@ def test_the_class_is_registered_beside_the_trainers_own(made: Path) -> None:
 def test_two_epochs_see_exactly_the_planned_scans(made: Path, workers: int) -> None:
     dataset = build(made)
     loader = DataLoader(
-        dataset, batch_size=2, shuffle=True, num_workers=workers, collate_fn=dataset.collate_batch
+        dataset,
+        batch_size=2,
+        shuffle=True,
+        num_workers=workers,
+        collate_fn=dataset.collate_batch,
     )
-    numbers = {f"synthetic/{scan.id}": i for i, scan in enumerate(open_scans(made / "synthetic"))}
+    numbers = {
+        f"synthetic/{scan.id}": i
+        for i, scan in enumerate(open_scans(made / "synthetic"))
+    }
     seen = []
     for epoch in (0, 1):
         dataset.set_epoch(epoch)
         names = [name for batch in loader for name in batch["frame_id"]]
         assert Counter(map(is_synthetic, names)) == {False: REAL, True: EXTRA}
-        assert sorted(n for n in names if not is_synthetic(n)) == [f"{i:06d}" for i in range(REAL)]
+        assert sorted(n for n in names if not is_synthetic(n)) == [
+            f"{i:06d}" for i in range(REAL)
+        ]
         made_plan = dataset.mixed.plan()
         assert {numbers[n] for n in names if is_synthetic(n)} == set(
             made_plan.index[made_plan.domain].tolist()
@@ -148,7 +173,9 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
         own = theirs[index]
         assert set(mine) == set(own)
         for key in ("points", "gt_boxes", "voxels", "voxel_coords", "voxel_num_points"):
-            assert mine[key].dtype == own[key].dtype and np.array_equal(mine[key], own[key])
+            assert mine[key].dtype == own[key].dtype and np.array_equal(
+                mine[key], own[key]
+            )
 
 
 def test_boxes_hold_their_points_after_augmentation(made: Path) -> None:
@@ -164,7 +191,9 @@ def test_boxes_hold_their_points_after_augmentation(made: Path) -> None:
             scan = in_view(source[sample["frame_id"]], dataset._view[1])
             assert scan.boxes is not None
             before = held(scan.boxes, scan.points)
-            assert len(counts) >= 2 and np.abs(counts[:2] - before).max() <= 3  # those on a face
+            assert (
+                len(counts) >= 2 and np.abs(counts[:2] - before).max() <= 3
+            )  # those on a face
 
 
 def test_gt_sampling_places_objects_on_the_synthetic_ground(made: Path) -> None:
@@ -183,7 +212,9 @@ def test_synthetic_scans_without_boxes_are_refused_not_replaced(made: Path) -> N
     dataset = build(made, sampling=False)
     dataset.data_processor.data_processor_queue.insert(0, no_boxes)
     for position in (i for i in range(len(dataset)) if dataset.domain(i)):
-        with pytest.raises(DataError, match="synthetic scan '.*' has no box .*labels: mix"):
+        with pytest.raises(
+            DataError, match="synthetic scan '.*' has no box .*labels: mix"
+        ):
             dataset[position]
 
 
@@ -213,7 +244,9 @@ def test_the_trainers_generator_does_not_decide_on_scans(made: Path) -> None:
     for epoch in (0, 1):
         dataset.set_epoch(epoch)
         np.random.seed(666)
-        orders.append([dataset[i]["frame_id"] for i in range(len(dataset)) if dataset.domain(i)])
+        orders.append(
+            [dataset[i]["frame_id"] for i in range(len(dataset)) if dataset.domain(i)]
+        )
     assert not set(orders[0]) & set(orders[1])
 
 
@@ -222,14 +255,20 @@ def test_a_database_of_any_source_is_drawn_from(made: Path, tmp_path: Path) -> N
     write_infos(root)
     objects = ObjectBank.from_scans(open_scans(made / "synthetic"))
     write_gt_database(
-        objects, root, origin="gravity", folder="gt_town", infos="kitti_dbinfos_train.pkl"
+        objects,
+        root,
+        origin="gravity",
+        folder="gt_town",
+        infos="kitti_dbinfos_train.pkl",
     )
     register()
     loaded = config(root, made / "bare")
     loaded.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].PREPARE["filter_by_difficulty"] = [-1]
     dataset = registered[NAME](loaded, CLASSES, training=True, root_path=root)
     sampler = dataset.data_augmentor.data_augmentor_queue[0]
-    assert {info["path"].split("/")[0] for info in sampler.db_infos["Car"]} == {"gt_town"}
+    assert {info["path"].split("/")[0] for info in sampler.db_infos["Car"]} == {
+        "gt_town"
+    }
     np.random.seed(3)
     for position in (i for i in range(len(dataset)) if dataset.domain(i)):
         sample = dataset[position]
@@ -248,7 +287,9 @@ def test_invalid_settings_are_refused(made: Path) -> None:
     loaded.GET_ITEM_LIST = ["points"]
     plane = made / "kitti" / "training" / "planes" / "000003.txt"
     plane.rename(plane.with_suffix(".gone"))
-    with pytest.raises(ConfigError, match="planes without 1 scans .000003.*write_planes"):
+    with pytest.raises(
+        ConfigError, match="planes without 1 scans .000003.*write_planes"
+    ):
         registered[NAME](loaded, CLASSES, training=True, root_path=made / "kitti")
     plane.with_suffix(".gone").rename(plane)
     del loaded["LIDAR_SYNTH"]
@@ -257,7 +298,9 @@ def test_invalid_settings_are_refused(made: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["0.5.2", "1.0.0"])
-def test_other_versions_are_refused(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_versions_are_refused(
+    version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pcdet, "__version__", version)
     monkeypatch.delitem(sys.modules, adapter.__name__)
     with pytest.raises(LibraryError, match=f"OpenPCDet {version}"):
@@ -272,7 +315,9 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
     made: Path, tmp_path: Path
 ) -> None:
     scans = [street(i) for i in range(4)]
-    write_all("npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans])
+    write_all(
+        "npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans]
+    )
     boxes = [scan.boxes for scan in scans]
     renamed = [
         replace(s, boxes=replace(b, names=("car",) * 3))
@@ -281,9 +326,13 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
     ]
     write_all("npz", tmp_path / "named", renamed)
     for sampling in (True, False):
-        with pytest.raises(DataError, match="synthetic scan '.*' has no boxes.*labels: mix"):
+        with pytest.raises(
+            DataError, match="synthetic scan '.*' has no boxes.*labels: mix"
+        ):
             build(made, tmp_path / "without", sampling=sampling)
-    with pytest.raises(DataError, match="boxes of .'car'. in synthetic scan .* some of Car"):
+    with pytest.raises(
+        DataError, match="boxes of .'car'. in synthetic scan .* some of Car"
+    ):
         build(made, tmp_path / "named")
     some = [
         replace(s, boxes=replace(b, names=("Car", "car", "Car")))
@@ -296,7 +345,9 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
         match="boxes of .'car'. in synthetic scan .* OpenPCDet drops boxes of other names",
     ):
         build(made, tmp_path / "some")
-    with pytest.raises(DataError, match="no box of .'Car'., and there is no gt_sampling"):
+    with pytest.raises(
+        DataError, match="no box of .'Car'., and there is no gt_sampling"
+    ):
         build(made, "bare", sampling=False)
     calib = made / "kitti" / "training" / "calib" / "000002.txt"
     calib.rename(calib.with_suffix(".gone"))
@@ -307,14 +358,19 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
 
 def small(made: Path, folder: Path, **data: Any) -> list[str]:
     """The arguments of ``train.py`` for stock PointPillars, only smaller, with cars only."""
-    own = yaml.safe_load((ROOT / "tools/cfgs/kitti_models/pointpillar.yaml").read_text())
+    own = yaml.safe_load(
+        (ROOT / "tools/cfgs/kitti_models/pointpillar.yaml").read_text()
+    )
     own["DATA_CONFIG"] |= {
         "DATA_PATH": str(made / "kitti"),
         "POINT_CLOUD_RANGE": [0, -12.8, -3, 25.6, 12.8, 1],
     } | data
     own["DATA_CONFIG"]["DATA_PROCESSOR"][2]["VOXEL_SIZE"] = [0.4, 0.4, 4]
     sampling = own["DATA_CONFIG"]["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
-    sampling |= {"SAMPLE_GROUPS": ["Car:3"], "PREPARE": {"filter_by_min_points": ["Car:5"]}}
+    sampling |= {
+        "SAMPLE_GROUPS": ["Car:3"],
+        "PREPARE": {"filter_by_min_points": ["Car:5"]},
+    }
     own["CLASS_NAMES"] = CLASSES
     del own["MODEL"]["DENSE_HEAD"]["ANCHOR_GENERATOR_CONFIG"][1:]
     own["MODEL"]["BACKBONE_2D"] |= {
@@ -347,7 +403,9 @@ def small(made: Path, folder: Path, **data: Any) -> list[str]:
     ]
 
 
-def trained(folder: Path, output: Path, arguments: list[str]) -> tuple[list[list[str]], str]:
+def trained(
+    folder: Path, output: Path, arguments: list[str]
+) -> tuple[list[list[str]], str]:
     """The training batches of a run of ``train.py``, and all that it said."""
     said = run_script(
         SCRIPTS / "openpcdet_cpu.py",
@@ -357,7 +415,9 @@ def trained(folder: Path, output: Path, arguments: list[str]) -> tuple[list[list
         OPENPCDET_OUTPUT=str(output),
     )
     before, _, _ = said.partition("Start evaluation")
-    return [yaml.safe_load(batch) for batch in re.findall(r"batch of (\[.*\])", before)], said
+    return [
+        yaml.safe_load(batch) for batch in re.findall(r"batch of (\[.*\])", before)
+    ], said
 
 
 @pytest.mark.slow
@@ -411,7 +471,9 @@ def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(
 def test_its_own_script_refuses_scans_without_boxes_before_training(
     made: Path, tmp_path: Path
 ) -> None:
-    write_all("npz", tmp_path / "without", [replace(street(i), boxes=None) for i in range(4)])
+    write_all(
+        "npz", tmp_path / "without", [replace(street(i), boxes=None) for i in range(4)]
+    )
     arguments = small(made, tmp_path)
     (tmp_path / "mix.yaml").write_text(
         yaml.safe_dump({"synthetic": str(tmp_path / "without"), "labels": "generated"})

@@ -22,7 +22,15 @@ import yaml
 from checkouts import SCRIPTS, checkout, needs, run_script
 
 ROOT = checkout("OPENPCDET_ROOT", "OpenPCDet")
-needs("skimage", "SharedArray", "spconv", "pyquaternion", "nuscenes", "torchvision", "easydict")
+needs(
+    "skimage",
+    "SharedArray",
+    "spconv",
+    "pyquaternion",
+    "nuscenes",
+    "torchvision",
+    "easydict",
+)
 sys.path.insert(0, str(SCRIPTS))
 from openpcdet_cpu import prepare
 from openpcdet_prepare import add_camera
@@ -36,7 +44,10 @@ from lidar_synth.integrations.nuscenes import NAMES, as_nuscenes
 from lidar_synth.integrations.openpcdet import register
 from nuscenes_town import write_dataset
 from pcdet.datasets import __all__ as registered
-from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset, create_nuscenes_info
+from pcdet.datasets.nuscenes.nuscenes_dataset import (
+    NuScenesDataset,
+    create_nuscenes_info,
+)
 from pcdet.utils.common_utils import create_logger
 
 from lidar_synth.errors import ConfigError, DataError
@@ -47,7 +58,9 @@ from lidar_synth.lab.town import Town
 VERSION = "v1.0-mini"
 NAME = "MixedNuScenes"
 SWEEPS = 10
-CENTERPOINT = ROOT / "tools" / "cfgs" / "nuscenes_models" / "cbgs_voxel01_res3d_centerpoint.yaml"
+CENTERPOINT = (
+    ROOT / "tools" / "cfgs" / "nuscenes_models" / "cbgs_voxel01_res3d_centerpoint.yaml"
+)
 CLASSES = yaml.safe_load(CENTERPOINT.read_text())["CLASS_NAMES"]
 TOWN = {"Car", "Van", "Truck", "Pedestrian", "Cyclist"}
 
@@ -72,14 +85,19 @@ def add_recorded(folder: Path) -> None:
     """Add nuScenes' recorded key frame, if there is one, to the training list; it has no sweeps and
     no boxes there."""
     given = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
-    for path in sorted((Path(given) / "nuscenes/samples/LIDAR_TOP").glob("*.bin")) if given else ():
+    for path in (
+        sorted((Path(given) / "nuscenes/samples/LIDAR_TOP").glob("*.bin"))
+        if given
+        else ()
+    ):
         shutil.copy(path, folder / "samples" / "LIDAR_TOP")
         file = folder / f"nuscenes_infos_{SWEEPS}sweeps_train.pkl"
         infos = pickle.loads(file.read_bytes())
         name = f"samples/LIDAR_TOP/{path.name}"
         sweep = {"lidar_path": name, "transform_matrix": None, "time_lag": 0}
         infos.append(
-            infos[0] | {"lidar_path": name, "token": path.stem, "sweeps": [sweep] * (SWEEPS - 1)}
+            infos[0]
+            | {"lidar_path": name, "token": path.stem, "sweeps": [sweep] * (SWEEPS - 1)}
         )
         file.write_bytes(pickle.dumps(infos))
 
@@ -88,7 +106,9 @@ def config(
     made: Path, sweeps: int = SWEEPS, scans: str | Path = "synthetic", **settings: Any
 ) -> Any:
     """The stock data configuration for the tests' scans."""
-    loaded = yaml.safe_load((ROOT / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
+    loaded = yaml.safe_load(
+        (ROOT / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text()
+    )
     loaded |= {
         "DATA_PATH": str(made / "nuscenes"),
         "VERSION": VERSION,
@@ -96,8 +116,16 @@ def config(
         "BALANCED_RESAMPLING": False,
     }
     sampling = loaded["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]
-    sampling["SAMPLE_GROUPS"] = ["car:2", "pedestrian:2"]  # the town has four of the ten classes
-    loaded["LIDAR_SYNTH"] = {"SYNTHETIC": str(made / scans), "RATIO": 0.5, "SEED": 3, **settings}
+    sampling["SAMPLE_GROUPS"] = [
+        "car:2",
+        "pedestrian:2",
+    ]  # the town has four of the ten classes
+    loaded["LIDAR_SYNTH"] = {
+        "SYNTHETIC": str(made / scans),
+        "RATIO": 0.5,
+        "SEED": 3,
+        **settings,
+    }
     return easydict.EasyDict(loaded)
 
 
@@ -105,7 +133,11 @@ def build(made: Path, **options: Any) -> Any:
     register()
     loaded = config(made, **options)
     return registered[NAME](
-        loaded, CLASSES, training=True, root_path=made / "nuscenes", logger=create_logger()
+        loaded,
+        CLASSES,
+        training=True,
+        root_path=made / "nuscenes",
+        logger=create_logger(),
     )
 
 
@@ -114,7 +146,11 @@ def plain(made: Path, **options: Any) -> Any:
     loaded = config(made, **options)
     loaded.DATA_AUGMENTOR.DISABLE_AUG_LIST = ["gt_sampling"]
     return NuScenesDataset(
-        loaded, CLASSES, training=True, root_path=made / "nuscenes", logger=create_logger()
+        loaded,
+        CLASSES,
+        training=True,
+        root_path=made / "nuscenes",
+        logger=create_logger(),
     )
 
 
@@ -146,14 +182,17 @@ def test_samples_have_the_form_of_the_trainers_own(made: Path) -> None:
                 real[key].dtype == synthetic[key].dtype
                 and real[key].shape[1:] == synthetic[key].shape[1:]
             ), key
-        assert synthetic["points"].shape[1] == 5 and 100 < synthetic["points"][:, 3].max() <= 255
+        assert (
+            synthetic["points"].shape[1] == 5
+            and 100 < synthetic["points"][:, 3].max() <= 255
+        )
         assert (
             synthetic["points"][:, 4] == 0
         ).mean() > 0.9  # pasted objects have the times of their sweeps
         assert np.isfinite(synthetic["gt_boxes"]).all()
-        assert synthetic["voxel_num_points"].max() == 10 and str(synthetic["frame_id"]).startswith(
-            "synthetic/"
-        )
+        assert synthetic["voxel_num_points"].max() == 10 and str(
+            synthetic["frame_id"]
+        ).startswith("synthetic/")
 
 
 @pytest.mark.filterwarnings("ignore:MAX_SWEEPS")
@@ -166,7 +205,10 @@ def test_real_samples_are_the_trainers_own(made: Path) -> None:
         mine = ours[position]
         np.random.seed(5)
         own = theirs[ours.mixed[position]]
-        assert all(np.array_equal(mine[key], own[key]) for key in ("points", "gt_boxes", "voxels"))
+        assert all(
+            np.array_equal(mine[key], own[key])
+            for key in ("points", "gt_boxes", "voxels")
+        )
 
 
 def test_points_and_boxes_turn_together_into_nuscenes_frame(made: Path) -> None:
@@ -183,28 +225,36 @@ def test_points_and_boxes_turn_together_into_nuscenes_frame(made: Path) -> None:
         near = (np.abs(scan.boxes.values[:, :2]) < 51.2).all(1)
         assert near.any() and len(sample["gt_boxes"]) == near.sum()
         boxes = Boxes(sample["gt_boxes"][:, :7], ("car",) * near.sum())
-        inside = (np.abs(scan.points[:, :2]) < 51.2).all(1) & (np.abs(scan.points[:, 2] + 1) < 4)
+        inside = (np.abs(scan.points[:, :2]) < 51.2).all(1) & (
+            np.abs(scan.points[:, 2] + 1) < 4
+        )
         assert np.array_equal(
             boxes.contain(sample["points"][:, :3]).sum(1),
             scan.boxes[near].contain(scan.points[inside]).sum(1),
         )
         names = np.array(CLASSES)[sample["gt_boxes"][:, -1].astype(int) - 1]
-        assert names.tolist() == np.array(scan.boxes.names)[near].tolist() and set(names) <= {
-            NAMES[n] for n in TOWN
-        }
+        assert names.tolist() == np.array(scan.boxes.names)[near].tolist() and set(
+            names
+        ) <= {NAMES[n] for n in TOWN}
 
 
 def test_sweeps_that_synthetic_scans_do_not_have_are_named(made: Path) -> None:
-    with pytest.warns(UserWarning, match="MAX_SWEEPS: 10, but a synthetic scan has one sweep"):
+    with pytest.warns(
+        UserWarning, match="MAX_SWEEPS: 10, but a synthetic scan has one sweep"
+    ):
         build(made)
 
 
 @pytest.mark.filterwarnings("ignore:MAX_SWEEPS")
-def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_trained_on_is_refused_before(
+    made: Path, tmp_path: Path
+) -> None:
     from dataclasses import replace
 
     scans = list(open_scans(made / "synthetic", sensor="hdl32e_nuscenes"))
-    write_all("npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans])
+    write_all(
+        "npz", tmp_path / "without", [replace(scan, boxes=None) for scan in scans]
+    )
     with pytest.raises(DataError, match="has no boxes"):
         build(made, scans=tmp_path / "without")
     named = [
@@ -220,13 +270,19 @@ def test_what_cannot_be_trained_on_is_refused_before(made: Path, tmp_path: Path)
     loaded.POINT_FEATURE_ENCODING.src_feature_list = ["x", "y", "z", "intensity"]
     with pytest.raises(ConfigError, match="'timestamp'"):
         registered[NAME](
-            loaded, CLASSES, training=True, root_path=made / "nuscenes", logger=create_logger()
+            loaded,
+            CLASSES,
+            training=True,
+            root_path=made / "nuscenes",
+            logger=create_logger(),
         )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_centerpoint_trains_and_is_evaluated_by_nuscenes_devkit(made: Path, tmp_path: Path) -> None:
+def test_centerpoint_trains_and_is_evaluated_by_nuscenes_devkit(
+    made: Path, tmp_path: Path
+) -> None:
     """Stock CenterPoint with its sparse 3-D network and voxel head, only a coarser grid and fewer
     channels elsewhere.
 
@@ -268,14 +324,21 @@ def test_centerpoint_trains_and_is_evaluated_by_nuscenes_devkit(made: Path, tmp_
     )
     before, _, after = said.partition("Start evaluation")
     names = [
-        name for batch in re.findall(r"batch of (\[.*\])", before) for name in yaml.safe_load(batch)
+        name
+        for batch in re.findall(r"batch of (\[.*\])", before)
+        for name in yaml.safe_load(batch)
     ]
     real = len(
         pickle.loads(
-            (made / "nuscenes" / VERSION / f"nuscenes_infos_{SWEEPS}sweeps_train.pkl").read_bytes()
+            (
+                made / "nuscenes" / VERSION / f"nuscenes_infos_{SWEEPS}sweeps_train.pkl"
+            ).read_bytes()
         )
     )
-    assert Counter(name.startswith("synthetic/") for name in names) == {False: real, True: real}
+    assert Counter(name.startswith("synthetic/") for name in names) == {
+        False: real,
+        True: real,
+    }
     losses = [float(value) for value in re.findall(r"Loss: (\S+) ", before)]
     assert len(losses) == real and np.isfinite(losses).all()
     assert re.search(r"mAP: [\d.]+", after) and re.search(r"NDS: [\d.]+", after)
@@ -285,4 +348,8 @@ def plain_types(value: Any) -> Any:
     """EasyDict and tuples as YAML writes them."""
     if isinstance(value, dict):
         return {key: plain_types(each) for key, each in value.items()}
-    return [plain_types(each) for each in value] if isinstance(value, list | tuple) else value
+    return (
+        [plain_types(each) for each in value]
+        if isinstance(value, list | tuple)
+        else value
+    )

@@ -53,7 +53,12 @@ REAL = 6
 EXTRA = 4
 VALIDATION = 2
 STOCK = ROOT / "configs" / "semantic_kitti" / "semseg-spunet-v1m1-0-base.py"
-SONATA = Path(__file__).parent.parent / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
+SONATA = (
+    Path(__file__).parent.parent
+    / "configs"
+    / "pointcept"
+    / "pretrain_sonata_semantickitti.py"
+)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +69,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def make(root: Path) -> Path:
     """Real and synthetic scans."""
     for sequence in range(1, 22):
-        (root / "sk" / "dataset" / "sequences" / f"{sequence:02d}" / "velodyne").mkdir(parents=True)
+        (root / "sk" / "dataset" / "sequences" / f"{sequence:02d}" / "velodyne").mkdir(
+            parents=True
+        )
     semantic_kitti(root / "sk" / "dataset", REAL)
     scans = [street(100 + i) for i in range(VALIDATION)]
     write_all("semantic_kitti", root / "sk" / "dataset", scans, sequence="08")
@@ -72,11 +79,17 @@ def make(root: Path) -> Path:
     return root
 
 
-def build(made: Path, kind: str = "MixedSemanticKITTI", stock: bool = True, **options: Any) -> Any:
+def build(
+    made: Path, kind: str = "MixedSemanticKITTI", stock: bool = True, **options: Any
+) -> Any:
     loaded = Config.fromfile(str(STOCK))
     train = loaded.data.train.to_dict() | {"type": kind, "data_root": str(made / "sk")}
     if kind == "MixedSemanticKITTI":
-        train["mixture"] = {"synthetic": str(made / "synthetic"), "ratio": 0.4, "seed": 3}
+        train["mixture"] = {
+            "synthetic": str(made / "synthetic"),
+            "ratio": 0.4,
+            "seed": 3,
+        }
     if not stock:
         train["transform"] = []
     return build_dataset(train | options)
@@ -93,17 +106,28 @@ def test_two_epochs_see_exactly_the_planned_scans(made: Path) -> None:
     the epoch."""
     dataset = build(made, stock=False)
     loader = DataLoader(
-        dataset, batch_size=2, shuffle=True, num_workers=2, persistent_workers=True, collate_fn=list
+        dataset,
+        batch_size=2,
+        shuffle=True,
+        num_workers=2,
+        persistent_workers=True,
+        collate_fn=list,
     )
     trainer = SimpleNamespace(train_loader=loader, start_epoch=0, epoch=0)
     hook = HOOKS.build({"type": "SynthEpoch"})
     hook.trainer = trainer
     hook.before_train()
-    assert len(trainer.train_loader) == len(loader) and trainer.train_loader.batch_size == 2
+    assert (
+        len(trainer.train_loader) == len(loader)
+        and trainer.train_loader.batch_size == 2
+    )
     seen = []
     for trainer.epoch in (0, 1, 5):
         names = [sample["name"] for batch in trainer.train_loader for sample in batch]
-        assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
+        assert Counter(n.startswith("synthetic_") for n in names) == {
+            False: REAL,
+            True: EXTRA,
+        }
         made_plan = dataset.mixed.plan(trainer.epoch)
         wanted = {f"synthetic_{n:06d}" for n in made_plan.index[made_plan.domain]}
         assert {n for n in names if n.startswith("synthetic_")} == wanted
@@ -131,7 +155,9 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
     for position in (i for i in range(len(dataset)) if dataset.domain(i)):
         data = dataset[position]
         scan = source[int(dataset.mixed.plan().index[position])]
-        assert np.array_equal(data["coord"], scan.points) and data["strength"].shape == (
+        assert np.array_equal(data["coord"], scan.points) and data[
+            "strength"
+        ].shape == (
             len(scan),
             1,
         )
@@ -142,21 +168,32 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
         )
 
 
-def test_batches_of_both_kinds_through_the_trainers_transforms_and_mix3d(made: Path) -> None:
+def test_batches_of_both_kinds_through_the_trainers_transforms_and_mix3d(
+    made: Path,
+) -> None:
     """Same keys in every sample, or its collate fails; labels stay with their points after grid
     sampling."""
     dataset = build(made)
-    loader = DataLoader(dataset, batch_size=5, collate_fn=partial(point_collate_fn, mix_prob=0.8))
+    loader = DataLoader(
+        dataset, batch_size=5, collate_fn=partial(point_collate_fn, mix_prob=0.8)
+    )
     for batch in loader:
-        assert batch["feat"].shape == (len(batch["coord"]), 4) and batch["segment"].max() <= 18
-        assert (batch["segment"] >= 0).any() and len(batch["segment"]) == len(batch["coord"])
+        assert (
+            batch["feat"].shape == (len(batch["coord"]), 4)
+            and batch["segment"].max() <= 18
+        )
+        assert (batch["segment"] >= 0).any() and len(batch["segment"]) == len(
+            batch["coord"]
+        )
     walls = [dataset[i] for i in range(len(dataset)) if dataset.domain(i)]
     for sample in walls:
         road = sample["coord"][sample["segment"] == 8, 2]
         assert len(road) and road.std() < 0.1  # the road is still where it was labelled
 
 
-def test_a_synthetic_scan_without_labels_never_becomes_cars(made: Path, tmp_path: Path) -> None:
+def test_a_synthetic_scan_without_labels_never_becomes_cars(
+    made: Path, tmp_path: Path
+) -> None:
     """Trap: what has no ``.label`` is read as zeros, class car."""
     bare = synthetic(tmp_path / "bare", 3, labels=False)
     with pytest.raises(ConfigError, match="a model or bank with labels"):
@@ -198,7 +235,11 @@ def test_pretraining_takes_scans_without_labels(made: Path, tmp_path: Path) -> N
             dataset[position]["coord"]
         )
         with pytest.raises(ConfigError, match="is NaN"):
-            build(made, mixture=mixture, transform=[{"type": "Collect", "keys": "segment"}])
+            build(
+                made,
+                mixture=mixture,
+                transform=[{"type": "Collect", "keys": "segment"}],
+            )
 
 
 def test_a_map_of_classes_that_does_not_fit_is_refused(
@@ -206,7 +247,9 @@ def test_a_map_of_classes_that_does_not_fit_is_refused(
 ) -> None:
     merged = adapter.SemanticKITTIDataset.get_learning_map(-1) | {10: 4}
     monkeypatch.setattr(
-        adapter.SemanticKITTIDataset, "get_learning_map", staticmethod(lambda ignore: merged)
+        adapter.SemanticKITTIDataset,
+        "get_learning_map",
+        staticmethod(lambda ignore: merged),
     )
     with pytest.raises(ConfigError, match="a map of classes with 10: 4"):
         build(made)
@@ -291,7 +334,10 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(
     seen = samples(said)
     assert sorted(seen) == [0, 1, 2]
     for names in seen.values():
-        assert Counter(n.startswith("synthetic_") for n in names) == {False: REAL, True: EXTRA}
+        assert Counter(n.startswith("synthetic_") for n in names) == {
+            False: REAL,
+            True: EXTRA,
+        }
     # Of 11.
     assert (
         len({n for names in seen.values() for n in names if n.startswith("synthetic_")})
@@ -302,7 +348,9 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(
     # After each epoch, and the best.
     assert len(re.findall(r"Val result: mIoU/mAcc/allAcc [\d.]+/", said)) == 4
     checkpoint = tmp_path / "run" / "model" / "epoch_2.pth"
-    rest = train(made, SEGMENTATION, tmp_path, "resume=True", f"weight={checkpoint}", **values)
+    rest = train(
+        made, SEGMENTATION, tmp_path, "resume=True", f"weight={checkpoint}", **values
+    )
     assert samples(rest) == {2: seen[2]}
 
 
@@ -322,7 +370,10 @@ def test_sonata_pretrains_on_scans_without_labels(made: Path, tmp_path: Path) ->
     said = train(made, PRETRAINING, tmp_path, stock=str(SONATA), epochs=2, **values)
     seen = samples(said)
     for epoch in (0, 1):
-        assert Counter(n.startswith("synthetic_") for n in seen[epoch]) == {False: REAL, True: REAL}
+        assert Counter(n.startswith("synthetic_") for n in seen[epoch]) == {
+            False: REAL,
+            True: REAL,
+        }
     assert set(seen[0]) & set(seen[1]) == {f"00_{i:06d}" for i in range(REAL)}
     losses = [float(loss) for loss in re.findall(r" loss: (\S+) ", said)]
     assert (

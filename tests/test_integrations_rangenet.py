@@ -26,7 +26,9 @@ from streets import SENSOR, semantic_kitti, synthetic
 ROOT = checkout("RANGENET_ROOT", "lidar-bonnetal, SalsaNext or CENet")
 CENET = (ROOT / "modules/trainer.py").is_file()
 sys.path.append(str(ROOT if CENET else ROOT / "train"))
-provide("numpy.float", "imp", "tensorflow.summary", "torchvision")  # as the launcher does
+provide(
+    "numpy.float", "imp", "tensorflow.summary", "torchvision"
+)  # as the launcher does
 
 from lidar_synth.integrations.rangenet import filled, gaps, make_parser
 
@@ -38,9 +40,17 @@ from lidar_synth.generate.loading import load_generator
 REAL = 6
 EXTRA = 4
 BATCH = 2
-stock = import_module("dataset.kitti.parser" if CENET else "tasks.semantic.dataset.kitti.parser")
+stock = import_module(
+    "dataset.kitti.parser" if CENET else "tasks.semantic.dataset.kitti.parser"
+)
 SALSA = hasattr(stock, "my_collate") and not CENET
-ARCH = "senet-1024p.yml" if CENET else "salsanext.yml" if SALSA else "config/arch/squeezeseg.yaml"
+ARCH = (
+    "senet-1024p.yml"
+    if CENET
+    else "salsanext.yml"
+    if SALSA
+    else "config/arch/squeezeseg.yaml"
+)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +88,10 @@ def arguments(made: Path, **others: Any) -> dict[str, Any]:
         "train_sequences": [0],
         "valid_sequences": [0],
         "test_sequences": None,
-        **{key: labels[key] for key in ("labels", "color_map", "learning_map", "learning_map_inv")},
+        **{
+            key: labels[key]
+            for key in ("labels", "color_map", "learning_map", "learning_map_inv")
+        },
         "sensor": sensor,
         "max_points": 20000,
         "batch_size": BATCH,
@@ -95,11 +108,21 @@ def parser(made: Path, **others: Any) -> Any:
 def both(made: Path) -> tuple[Any, Any]:
     """The trainer's own training set and ours, of the same real scans; tools/bench/trainers.py
     times them."""
-    keys = ("labels", "color_map", "learning_map", "learning_map_inv", "sensor", "max_points", "gt")
+    keys = (
+        "labels",
+        "color_map",
+        "learning_map",
+        "learning_map_inv",
+        "sensor",
+        "max_points",
+        "gt",
+    )
     options = {key: arguments(made)[key] for key in keys} | (
         {"transform": True} if SALSA or CENET else {}
     )
-    return stock.SemanticKitti(str(made / "sk"), [0], **options), parser(made).train_dataset
+    return stock.SemanticKitti(str(made / "sk"), [0], **options), parser(
+        made
+    ).train_dataset
 
 
 def test_two_epochs_see_exactly_the_planned_scans(
@@ -114,7 +137,9 @@ def test_two_epochs_see_exactly_the_planned_scans(
     for epoch in (0, 1):
         loader.dataset.set_epoch(epoch)  # the launcher does
         batches = list(loader)
-        names = [(s, n) for batch in batches for s, n in zip(batch[4], batch[5], strict=True)]
+        names = [
+            (s, n) for batch in batches for s, n in zip(batch[4], batch[5], strict=True)
+        ]
         assert Counter(s for s, _ in names) == {"00": REAL, "synthetic": EXTRA}
         made_plan = loader.dataset.mixed.plan(epoch)
         wanted = {f"{n:06d}.label" for n in made_plan.index[made_plan.domain]}
@@ -127,7 +152,10 @@ def test_the_trainers_own_collate_takes_both_kinds(made: Path) -> None:
     batches = list(parser(made).get_train_set())
     assert len(batches) == (REAL + EXTRA) // BATCH
     for batch in batches:
-        assert batch[0].shape[1:] == (5, SENSOR.rows, SENSOR.columns) and batch[2].max() <= 19
+        assert (
+            batch[0].shape[1:] == (5, SENSOR.rows, SENSOR.columns)
+            and batch[2].max() <= 19
+        )
 
 
 def test_real_samples_are_the_trainers_own(made: Path) -> None:
@@ -151,10 +179,14 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
         scan = source[int(dataset.mixed.plan().index[position])]
         assert len(sample) == 15 and sample[14] == len(scan) and scan.label is not None
         labels = sample[3][: len(scan)].numpy()
-        assert np.array_equal(labels, np.where(scan.label == 255, 0, scan.label.astype(int) + 1))
+        assert np.array_equal(
+            labels, np.where(scan.label == 255, 0, scan.label.astype(int) + 1)
+        )
         assert np.array_equal(sample[11][: len(scan)].numpy(), scan.points)
         assert np.array_equal(sample[13][: len(scan)].numpy(), scan.reflectance)
-        assert {0, 9, 13, 1} >= set(np.unique(sample[2])) and (sample[2][sample[1] == 0] == 0).all()
+        assert {0, 9, 13, 1} >= set(np.unique(sample[2])) and (
+            sample[2][sample[1] == 0] == 0
+        ).all()
 
 
 def test_nothing_is_left_in_memory(
@@ -182,7 +214,10 @@ def test_scans_that_do_not_fit_are_refused_not_cut(made: Path) -> None:
 
 def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
     bare = synthetic(tmp_path / "bare", 3, labels=False)
-    for settings in ({"synthetic": str(bare)}, {"synthetic": str(bare), "labels": "none"}):
+    for settings in (
+        {"synthetic": str(bare)},
+        {"synthetic": str(bare), "labels": "none"},
+    ):
         (tmp_path / "mix.yaml").write_text(yaml.safe_dump(settings))
         with pytest.raises(ConfigError, match="labels"):
             (tmp_path / "sk").exists() or (tmp_path / "sk").symlink_to(made / "sk")
@@ -190,7 +225,9 @@ def test_unlabelled_scans_are_refused(made: Path, tmp_path: Path) -> None:
 
 
 def test_a_parser_of_another_trainer_is_refused() -> None:
-    with pytest.raises(LibraryError, match=r"without \['Parser', 'SemanticKitti', 'LaserScan'\]"):
+    with pytest.raises(
+        LibraryError, match=r"without \['Parser', 'SemanticKitti', 'LaserScan'\]"
+    ):
         make_parser(ModuleType("parserModule"), {"synthetic": "bank"})
 
 
@@ -209,14 +246,17 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def sensor_of(width: int) -> Any:
-    return arguments(Path())["sensor"] | {"img_prop": {"width": width, "height": SENSOR.rows}}
+    return arguments(Path())["sensor"] | {
+        "img_prop": {"width": width, "height": SENSOR.rows}
+    }
 
 
 def test_a_width_with_stripes_is_refused(made: Path, dense: Path) -> None:
     """At 512 columns a synthetic scan of 256 fills every second one; a real scan of 512 fills
     all."""
     with pytest.raises(
-        ConfigError, match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in"
+        ConfigError,
+        match=rf"empty cell to the right.*img_prop.width: {SENSOR.columns} in",
     ):
         parser(dense, sensor=sensor_of(2 * SENSOR.columns))
     parser(dense)  # both kinds in images of the synthetic scans' width
@@ -237,11 +277,15 @@ the model."""
 
 
 @pytest.mark.slow
-def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_scans: Path) -> None:
+def test_density_of_the_shipped_model_and_of_real_scans(
+    made: Path, labelled_scans: Path
+) -> None:
     """Both kinds are alike at the stock 64 x 2048 and at 1,024 columns."""
     dataset = parser(made).train_dataset
     dataset.sensor_img_H = 64
-    paths = sorted(labelled_scans.glob("semantic_kitti/sequences/*/velodyne/000000.bin"))
+    paths = sorted(
+        labelled_scans.glob("semantic_kitti/sequences/*/velodyne/000000.bin")
+    )
     generated = Generated(load_generator("town"))[0]
     found = {}
     for width in DENSITY:
@@ -250,7 +294,8 @@ def test_density_of_the_shipped_model_and_of_real_scans(made: Path, labelled_sca
             [dataset.image(generated, width)],
         )
         found[width] = [
-            (float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)]))) for k in kinds
+            (float(np.mean([*map(filled, k)])), float(np.mean([*map(gaps, k)])))
+            for k in kinds
         ]
         print(
             f"64 x {width}: filled and gaps of real scans {found[width][0]}, of synthetic ones "
@@ -265,7 +310,12 @@ def configure(made: Path, out: Path, epochs: int, **sensor: int) -> list[str | P
     source = next(ROOT.rglob(ARCH))
     arch = yaml.safe_load(source.read_text())
     labels = data()
-    arch["train"] |= {"max_epochs": epochs, "batch_size": BATCH, "workers": 0, "report_batch": 1}
+    arch["train"] |= {
+        "max_epochs": epochs,
+        "batch_size": BATCH,
+        "workers": 0,
+        "report_batch": 1,
+    }
     arch["dataset"]["sensor"]["img_prop"] = {
         "width": SENSOR.columns // 4,
         "height": SENSOR.rows,
@@ -290,14 +340,22 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
     if SALSA:
         (log,) = (tmp_path / "log/logs").iterdir()
         said += launched(
-            "rangenet", *configure(made, tmp_path, 2), "-p", log, cwd=cwd, mixture=made / "mix.yaml"
+            "rangenet",
+            *configure(made, tmp_path, 2),
+            "-p",
+            log,
+            cwd=cwd,
+            mixture=made / "mix.yaml",
         )
     plans = {e: parser(made).train_dataset.mixed.plan(e).hash[:16] for e in (0, 1)}
     seen = [line for line in epochs(said) if line[0] == 1][:1] + [
         line for line in epochs(said) if line[0] == 0
     ][:1]
     assert seen == [(e, REAL + EXTRA, EXTRA, plans[e]) for e in (1, 0)]
-    losses = [float(value) for value in re.findall(r"Epoch: \[\d+\]\[\d+/5\].*?Loss (\S+)", said)]
+    losses = [
+        float(value)
+        for value in re.findall(r"Epoch: \[\d+\]\[\d+/5\].*?Loss (\S+)", said)
+    ]
     assert len(losses) == 10 and np.isfinite(losses).all()
     assert said.count("Validation set:") == 2 and "IoU class 1 [car]" in said
     weights = "SENet*" if CENET else "SalsaNext" if SALSA else "segmentation_head*"
@@ -308,5 +366,10 @@ def test_its_own_script_trains_from_our_launcher(made: Path, tmp_path: Path) -> 
 def test_the_launcher_refuses_before_training(dense: Path, tmp_path: Path) -> None:
     cwd = clone(ROOT, tmp_path / "clone") / ("" if CENET else "train/tasks/semantic")
     arguments = configure(dense, tmp_path, 1, width=2 * SENSOR.columns)
-    said = launched("rangenet", *arguments, cwd=cwd, mixture=dense / "mix.yaml", status=1)
-    assert "lidar_synth: synthetic scans in images of 32 x 512" in said and "Traceback" not in said
+    said = launched(
+        "rangenet", *arguments, cwd=cwd, mixture=dense / "mix.yaml", status=1
+    )
+    assert (
+        "lidar_synth: synthetic scans in images of 32 x 512" in said
+        and "Traceback" not in said
+    )

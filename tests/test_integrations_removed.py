@@ -61,7 +61,9 @@ assert sums == {(1, 1, 3): [2, 2, 1], (1, 3, 1): [2, 1, 2]}, sums
 def test_a_removed_name_works_again(name: str, tmp_path: Path) -> None:
     if name == "spconv":
         pytest.importorskip("spconv", reason="spconv is not installed")
-    (tmp_path / "parser.py").write_text("class Parser:\n    def answer(self):\n        return 42\n")
+    (tmp_path / "parser.py").write_text(
+        "class Parser:\n    def answer(self):\n        return 42\n"
+    )
     hidden = (
         "import importlib.util as u; f = u.find_spec\nu.find_spec = lambda n, *a: None if n == "
         "'imp' else f(n, *a)\n"
@@ -72,9 +74,13 @@ def test_a_removed_name_works_again(name: str, tmp_path: Path) -> None:
     )
     ends = f"assert provide({name!r}) == []\n" if name.startswith("numpy") else ""
     command = [sys.executable, "-W", "ignore", "-c", program + USES[name] + "\n" + ends]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stdout.splitlines() if line.startswith("lidar_synth:")]
+    lines = [
+        line for line in done.stdout.splitlines() if line.startswith("lidar_synth:")
+    ]
     # The library that has the name is installed.
     real = not lines and name in (
         "tensorflow.summary",

@@ -91,9 +91,9 @@ def test_real_samples_are_the_trainers_own(mixed: Any, made: Path) -> None:
         for mine, theirs in zip(
             mixed.load_pc(position), own.load_pc(mixed.mixed[position]), strict=True
         ):
-            assert np.array_equal(mine, theirs) and getattr(mine, "dtype", None) == getattr(
-                theirs, "dtype", None
-            )
+            assert np.array_equal(mine, theirs) and getattr(
+                mine, "dtype", None
+            ) == getattr(theirs, "dtype", None)
 
 
 def test_labels_arrive_in_the_trainers_ids(mixed: Any, made: Path) -> None:
@@ -135,12 +135,22 @@ def configure(made: Path, out: Path, last: int) -> list[str | Path]:
 
     Its CutMix counts the instances of the whole dataset, so that it cannot be on here.
     """
-    config = CONFIG | {"dataloader": {"batch_size": BATCH, "num_workers": 1, "max_points": 2000}}
+    config = CONFIG | {
+        "dataloader": {"batch_size": BATCH, "num_workers": 1, "max_points": 2000}
+    }
     config["waffleiron"] = config["waffleiron"] | {"depth": 3, "nb_channels": 16}
     config["augmentations"] = config["augmentations"] | {"instance_cutmix": False}
     config["scheduler"] = config["scheduler"] | {"max_epoch": last, "epoch_warmup": 0.5}
     (out / "config.yaml").write_text(yaml.safe_dump(config))
-    arguments = ["launch_train.py", "--dataset", NAME, "--path_dataset", made / "sk", "--gpu", "0"]
+    arguments = [
+        "launch_train.py",
+        "--dataset",
+        NAME,
+        "--path_dataset",
+        made / "sk",
+        "--gpu",
+        "0",
+    ]
     return [*arguments, "--config", out / "config.yaml", "--log_path", out / "log"]
 
 
@@ -156,7 +166,10 @@ def test_its_own_script_trains_and_resumes_from_our_launcher(
         said = launched("waffleiron", *arguments, cwd=ROOT, mixture=made / "mix.yaml")
         expected = (number, REAL + EXTRA, EXTRA, mixed.mixed.plan(number).hash[:16])
         assert epochs(said)[-1] == expected
-        assert f"Validation: {number}/{number + 1} epochs" in said and "Finished Training" in said
+        assert (
+            f"Validation: {number}/{number + 1} epochs" in said
+            and "Finished Training" in said
+        )
         losses = [float(value) for value in re.findall(r"Loss = (\S+)", said)]
         assert len(losses) >= 2 and np.isfinite(losses).all()
     assert (tmp_path / "log" / "ckpt_last.pth").is_file()
@@ -172,6 +185,12 @@ def test_a_map_of_classes_that_does_not_fit_is_refused_before_training(
     merged["learning_map"][10] = 4
     labels.write_text(yaml.safe_dump(merged))
     said = launched(
-        "waffleiron", *configure(made, tmp_path, 1), cwd=tree, mixture=made / "mix.yaml", status=1
+        "waffleiron",
+        *configure(made, tmp_path, 1),
+        cwd=tree,
+        mixture=made / "mix.yaml",
+        status=1,
     )
-    assert "lidar_synth: a map of classes with 10: 4" in said and "Traceback" not in said
+    assert (
+        "lidar_synth: a map of classes with 10: 4" in said and "Traceback" not in said
+    )

@@ -46,7 +46,9 @@ WHEN: dict[str, Callable[[int, Path], bool]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are counted in /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/task").is_dir(), reason="children are counted in /proc"
+)
 @pytest.mark.parametrize("when", WHEN)
 @pytest.mark.parametrize("command", ["town", "convert"])
 def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None:
@@ -77,7 +79,8 @@ def test_control_c_with_workers(tmp_path: Path, command: str, when: str) -> None
     started = time.monotonic()
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert errors.rstrip().endswith("lidar-synth: interrupted") and "Traceback" not in errors, (
-        errors
-    )
+    assert (
+        errors.rstrip().endswith("lidar-synth: interrupted")
+        and "Traceback" not in errors
+    ), errors
     assert not list(out.rglob("*.part")) and time.monotonic() - started < 60

@@ -12,7 +12,9 @@ from lidar_synth.lab.kitti360.accumulated import read_cloud, write_cloud
 from lidar_synth.lab.kitti360.movers import Movers
 
 
-def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> None:
+def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_away() -> (
+    None
+):
     angle = np.radians(4)
     motion = np.eye(4)
     motion[:2, :2] = [(np.cos(angle), -np.sin(angle)), (np.sin(angle), np.cos(angle))]
@@ -27,7 +29,9 @@ def test_undoing_the_motion_of_the_sensor_is_exact_at_the_pose_and_half_a_turn_a
             (0, 0, 1),
         ]
     )
-    assert np.allclose(undo_ego_motion(behind, motion), behind @ half.T + motion[:3, 3] / 2)
+    assert np.allclose(
+        undo_ego_motion(behind, motion), behind @ half.T + motion[:3, 3] / 2
+    )
     assert np.array_equal(undo_ego_motion(behind, np.eye(4)), behind)
 
 
@@ -54,16 +58,28 @@ def _moving_box(
     )
 
 
-def _dynamic(points: list[tuple[float, float, float, int]], path: Path) -> NDArray[np.void]:
+def _dynamic(
+    points: list[tuple[float, float, float, int]], path: Path
+) -> NDArray[np.void]:
     x, y, z, frame = np.array(points).T
-    values = {"x": x, "y": y, "z": z, "timestamp": frame, "semantic": np.full(len(x), 26)}
-    write_cloud(path, values | {"instance": np.full(len(x), 26001), "confidence": np.ones(len(x))})
+    values = {
+        "x": x,
+        "y": y,
+        "z": z,
+        "timestamp": frame,
+        "semantic": np.full(len(x), 26),
+    }
+    write_cloud(
+        path,
+        values | {"instance": np.full(len(x), 26001), "confidence": np.ones(len(x))},
+    )
     return read_cloud(path)
 
 
 def test_points_of_a_moving_object_follow_its_box(tmp_path: Path) -> None:
     cloud = _dynamic(
-        [(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)], tmp_path / "dynamic" / "a.ply"
+        [(0.5, 0, 0, 0), (4.5, 0.9, 0, 2), (50, 0, 0, 3)],
+        tmp_path / "dynamic" / "a.ply",
     )
     movers = Movers([cloud], _moving_box(range(5), 2.0), range(5))
     points, values = movers.at(1)  # no point was measured in this frame
@@ -85,5 +101,7 @@ def test_a_box_that_stands_still_is_no_moving_object_unless_it_has_moving_points
 def test_an_instance_number_that_is_used_again_is_another_object() -> None:
     one = _moving_box(range(5), 2.0)
     other = _moving_box(range(5, 9), 2.0, start=1000.0)
-    both = WorldBoxes(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one)))
+    both = WorldBoxes(
+        *(np.concatenate([getattr(one, n), getattr(other, n)]) for n in vars(one))
+    )
     assert len(Movers([], both, range(9)).tracks) == 2

@@ -32,7 +32,12 @@ from lidar_synth.formats.kitti360_poses import (
 )
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.kitti360 import labels as kitti360_labels
-from lidar_synth.lab.kitti360.accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
+from lidar_synth.lab.kitti360.accumulated import (
+    PROPERTIES,
+    find_windows,
+    read_cloud,
+    write_cloud,
+)
 from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
 from lidar_synth.lab.kitti360.report import LabelReport
 from lidar_synth.lab.town import Town, export_town
@@ -48,13 +53,20 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("k360") / "town"
     sensor = replace(load_sensor("hdl64e_kitti360"), name="coarse", columns=256)
     export_town(
-        Town(3, sensor, SCANS), out, "kitti360", camera=False, accumulate=True, progress=False
+        Town(3, sensor, SCANS),
+        out,
+        "kitti360",
+        camera=False,
+        accumulate=True,
+        progress=False,
     )
     return out
 
 
 @pytest.fixture(scope="module")
-def labelled(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LabelReport]:
+def labelled(
+    root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, LabelReport]:
     out = tmp_path_factory.mktemp("labels")
     return out, label_scans(root, out, against=root, progress=False)
 
@@ -80,7 +92,9 @@ def shares(report: LabelReport, part: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("part", range(STEP), ids=["accumulated", "not accumulated"])
-def test_labels_of_the_town_are_recovered(labelled: tuple[Path, LabelReport], part: int) -> None:
+def test_labels_of_the_town_are_recovered(
+    labelled: tuple[Path, LabelReport], part: int
+) -> None:
     covered, right, cars_covered, cars_right = shares(labelled[1], part)
     assert covered > 0.9 and right > 0.97
     assert cars_covered > 0.9 and cars_right > 0.9 and cars_covered * cars_right > 0.9
@@ -91,8 +105,14 @@ def test_confidence_tells_wrong_labels_from_right_ones(
 ) -> None:
     confidence = []
     right = []
-    for truth, scan in zip(KITTI360(root), KITTI360(root, labels=labelled[0]), strict=True):
-        assert scan.confidence is not None and scan.label is not None and truth.label is not None
+    for truth, scan in zip(
+        KITTI360(root), KITTI360(root, labels=labelled[0]), strict=True
+    ):
+        assert (
+            scan.confidence is not None
+            and scan.label is not None
+            and truth.label is not None
+        )
         known = (scan.label != 255) & (truth.label != 255)
         confidence.append(scan.confidence[known])
         right.append((scan.label == truth.label)[known])
@@ -117,7 +137,9 @@ def test_a_segmenter_gets_only_scans_with_labels(
 
 
 @pytest.mark.slow
-def test_a_rerun_repeats_only_what_is_missing_or_changed(copy: Path, tmp_path: Path) -> None:
+def test_a_rerun_repeats_only_what_is_missing_or_changed(
+    copy: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "labels"
     first = label_scans(copy, out, progress=False)
     assert first.kept == 0 and first.labelled == {DRIVE: SCANS}
@@ -148,22 +170,31 @@ def _turned(copy: Path) -> None:
     _change_poses(
         copy,
         lambda frame, pose: (
-            pose @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
+            pose
+            @ np.array([(0.9, -0.43589, 0, 0), (0.43589, 0.9, 0, 0), *np.eye(4)[2:]])
         ),
     )
 
 
 def _beside(copy: Path) -> None:
-    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1.5]] * 2 + [[0] * 4] * 2))
+    _change_poses(
+        copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1.5]] * 2 + [[0] * 4] * 2)
+    )
 
 
 def _elsewhere(copy: Path) -> None:
-    _change_poses(copy, lambda frame, pose: pose + np.array([[0, 0, 0, 700.0]] * 2 + [[0] * 4] * 2))
+    _change_poses(
+        copy,
+        lambda frame, pose: pose + np.array([[0, 0, 0, 700.0]] * 2 + [[0] * 4] * 2),
+    )
 
 
 def _torn(copy: Path) -> None:
     _change_poses(
-        copy, lambda frame, pose: pose + np.array([[0, 0, 0, 1e5 * (frame % 2)], *[[0] * 4] * 3])
+        copy,
+        lambda frame, pose: (
+            pose + np.array([[0, 0, 0, 1e5 * (frame % 2)], *[[0] * 4] * 3])
+        ),
     )
 
 
@@ -185,7 +216,9 @@ def test_wrong_poses_are_an_error_and_write_no_labels(
     copy: Path, tmp_path: Path, change: Callable[[Path], None]
 ) -> None:
     change(copy)
-    with pytest.raises(DataError, match="do not lie on its accumulated clouds|spread over"):
+    with pytest.raises(
+        DataError, match="do not lie on its accumulated clouds|spread over"
+    ):
         label_scans(copy, tmp_path / "labels", progress=False)
     assert len(list((tmp_path / "labels").rglob("*.label"))) <= SCANS // 4
 
@@ -201,7 +234,11 @@ WRONG = {
 
 @pytest.mark.parametrize("error", WRONG)
 def test_scans_off_the_clouds_are_laid_onto_them(
-    copy: Path, root: Path, labelled: tuple[Path, LabelReport], tmp_path: Path, error: str
+    copy: Path,
+    root: Path,
+    labelled: tuple[Path, LabelReport],
+    tmp_path: Path,
+    error: str,
 ) -> None:
     _shorten(copy)
     x, y, z, yaw = WRONG[error]
@@ -219,7 +256,9 @@ def test_scans_off_the_clouds_are_laid_onto_them(
     before = [labelled[1].compared[name] for name in report.compared]
     known, covered, right = np.sum(list(report.compared.values()), axis=0)[:3]
     assert np.allclose(
-        (covered / known, right / known), np.sum(before, axis=0)[1:3] / known, atol=0.005
+        (covered / known, right / known),
+        np.sum(before, axis=0)[1:3] / known,
+        atol=0.005,
     )
 
 
@@ -227,14 +266,21 @@ def test_frames_without_window_or_pose_are_counted(copy: Path, tmp_path: Path) -
     first, _ = find_windows(copy, DRIVE)
     first.static.unlink()  # frames 0 to 7 are in no other window
     poses = copy / "data_poses" / DRIVE / "poses.txt"
-    poses.write_text("".join(line for line in poses.open() if int(line.split()[0]) not in (12, 13)))
+    poses.write_text(
+        "".join(line for line in poses.open() if int(line.split()[0]) not in (12, 13))
+    )
     plan = plan_labels(copy)
     assert (
-        plan.outside == {DRIVE: 8} and plan.without_pose == {DRIVE: 2} and plan.frames == SCANS - 10
+        plan.outside == {DRIVE: 8}
+        and plan.without_pose == {DRIVE: 2}
+        and plan.frames == SCANS - 10
     )
     report = label_scans(copy, tmp_path, progress=False)
     assert report.labelled == {DRIVE: SCANS - 10}
-    assert {int(p.stem) for p in tmp_path.rglob("*.label")} == {*range(8, SCANS)} - {12, 13}
+    assert {int(p.stem) for p in tmp_path.rglob("*.label")} == {*range(8, SCANS)} - {
+        12,
+        13,
+    }
 
 
 def test_moving_cars_without_accumulated_points_get_the_class_of_their_boxes(
@@ -256,7 +302,9 @@ def test_empty_dynamic_clouds_are_read_as_in_the_dataset(copy: Path) -> None:
     assert len(read_cloud(window.dynamic)) == 0 and window.dynamic.stat().st_size < 400
 
 
-def _skewed(points: NDArray[np.float32], motion: NDArray[np.float64]) -> NDArray[np.float32]:
+def _skewed(
+    points: NDArray[np.float32], motion: NDArray[np.float64]
+) -> NDArray[np.float32]:
     """Points as a sensor measures them that moves while it turns: the inverse of
     ``undo_ego_motion``."""
     raw = points.astype(np.float64)
@@ -291,17 +339,23 @@ def _truncated(path: Path) -> None:
 
 
 def _without_confidence(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b"float confidence", b"float visibility"))
+    path.write_bytes(
+        path.read_bytes().replace(b"float confidence", b"float visibility")
+    )
 
 
 def _unknown_class(path: Path) -> None:
-    values = {n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()}
+    values = {
+        n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()
+    }
     values["semantic"][5] = 99
     write_cloud(path, values)
 
 
 def _huge_instance(path: Path) -> None:
-    values = {n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()}
+    values = {
+        n: np.array(read_cloud(path)[n]) for n in read_cloud(path).dtype.names or ()
+    }
     values["instance"][5] = 1 << 20
     write_cloud(path, values)
 
@@ -406,7 +460,13 @@ def test_confidence_of_another_scan_is_refused(
 
 
 def test_windows_overlap_and_stay_in_their_stretch() -> None:
-    assert windows_of(Town(0, scans=45)) == [(0, 11), (8, 19), (20, 31), (28, 39), (40, 44)]
+    assert windows_of(Town(0, scans=45)) == [
+        (0, 11),
+        (8, 19),
+        (20, 31),
+        (28, 39),
+        (40, 44),
+    ]
 
 
 def test_clouds_hold_every_second_frame_within_reach(root: Path) -> None:
@@ -415,17 +475,27 @@ def test_clouds_hold_every_second_frame_within_reach(root: Path) -> None:
     for window in find_windows(root, DRIVE):
         assert window.dynamic is not None
         moving = read_cloud(window.dynamic)
-        assert set(moving["timestamp"].tolist()) <= set(range(window.first, window.last + 1, STEP))
+        assert set(moving["timestamp"].tolist()) <= set(
+            range(window.first, window.last + 1, STEP)
+        )
         static = read_cloud(window.static)
         points = np.column_stack([static[axis] for axis in "xyz"])
-        assert len(np.unique(np.floor(points / 0.02), axis=0)) > 0.98 * len(points) > 10_000
-        assert set(np.unique(static["instance"] // 1000)) <= set(np.unique(static["semantic"])) | {
-            0
-        }
+        assert (
+            len(np.unique(np.floor(points / 0.02), axis=0))
+            > 0.98 * len(points)
+            > 10_000
+        )
+        assert set(np.unique(static["instance"] // 1000)) <= set(
+            np.unique(static["semantic"])
+        ) | {0}
 
 
-@pytest.mark.parametrize(("layout", "scans"), [("semantic_kitti", 5), ("kitti360", MOST + 1)])
-def test_what_cannot_be_accumulated_is_refused(layout: str, scans: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("layout", "scans"), [("semantic_kitti", 5), ("kitti360", MOST + 1)]
+)
+def test_what_cannot_be_accumulated_is_refused(
+    layout: str, scans: int, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match="accumulated"):
         export_town(Town(0, scans=scans), tmp_path, layout, accumulate=True)
 
@@ -434,13 +504,27 @@ def test_the_command_prints_a_report(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(["label", "kitti360", str(root), str(tmp_path), "--dry-run"])
-    assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    assert f"{SCANS} scans in 2 windows" in capsys.readouterr().out and not list(
+        tmp_path.iterdir()
+    )
     run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root)])
     text = capsys.readouterr().out
     assert f"{SCANS} scans labelled" in text and "right" in text and "building" in text
-    run(["label", "kitti360", str(root), str(tmp_path), "--against", str(root), "--json"])
+    run(
+        [
+            "label",
+            "kitti360",
+            str(root),
+            str(tmp_path),
+            "--against",
+            str(root),
+            "--json",
+        ]
+    )
     report = json.loads(capsys.readouterr().out)
-    stored = json.loads((tmp_path / "data_3d_semantics_scan" / "report.json").read_text())
+    stored = json.loads(
+        (tmp_path / "data_3d_semantics_scan" / "report.json").read_text()
+    )
     assert (
         report == stored
         and report["shares"]["right"] > 0.97

@@ -61,18 +61,25 @@ class Poses:
         self.times = np.array(json.loads((folder / "timestamps.json").read_text()))
         self._places = np.array([[p["position"][k] for k in "xyz"] for p in given])
         self._turns = Slerp(
-            self.times, Rotation.from_quat([[p["heading"][k] for k in "xyzw"] for p in given])
+            self.times,
+            Rotation.from_quat([[p["heading"][k] for k in "xyzw"] for p in given]),
         )
         z = Rotation.from_euler("z", TURN[2])
-        self._mount = Rotation.from_euler("x", TURN[0]) * Rotation.from_euler("y", TURN[1]) * z
+        self._mount = (
+            Rotation.from_euler("x", TURN[0]) * Rotation.from_euler("y", TURN[1]) * z
+        )
 
     def in_world(
         self, points: NDArray[np.float64], time: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Points (N, 3) in the frame of the sensor at N times, in the world."""
         time = np.clip(time, self.times[0], self.times[-1])
-        places = np.column_stack([np.interp(time, self.times, axis) for axis in self._places.T])
-        return np.asarray(self._turns(time).apply(self._mount.apply(points) + POSITION) + places)
+        places = np.column_stack(
+            [np.interp(time, self.times, axis) for axis in self._places.T]
+        )
+        return np.asarray(
+            self._turns(time).apply(self._mount.apply(points) + POSITION) + places
+        )
 
     def at(self, frame: int) -> NDArray[np.float64]:
         """(4, 4) sensor to world at a frame."""
@@ -85,11 +92,15 @@ class Poses:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("LIDAR_SYNTH_LABELLED_SCANS" not in os.environ, reason="no labelled real scans")
+@pytest.mark.skipif(
+    "LIDAR_SYNTH_LABELLED_SCANS" not in os.environ, reason="no labelled real scans"
+)
 def test_labels_of_real_scans_are_recovered(tmp_path: Path) -> None:
     source = Path(os.environ["LIDAR_SYNTH_LABELLED_SCANS"]) / "pandaset"
     published = source / "as_published" / "002"
-    names = json.loads((published / "annotations" / "semseg" / "classes.json").read_text())
+    names = json.loads(
+        (published / "annotations" / "semseg" / "classes.json").read_text()
+    )
     ids = np.zeros(256, np.int32)
     ids[[int(k) for k in names]] = [IDS.get(name, 0) for name in names.values()]
     moving = Poses(published / "lidar")
@@ -123,11 +134,21 @@ def test_labels_of_real_scans_are_recovered(tmp_path: Path) -> None:
         "confidence": np.ones(len(x)),
     }
     name = f"{FRAMES[0]:010d}_{FRAMES[-1]:010d}.ply"
-    write_cloud(tmp_path / "data_3d_semantics" / "train" / DRIVE / "static" / name, values)
+    write_cloud(
+        tmp_path / "data_3d_semantics" / "train" / DRIVE / "static" / name, values
+    )
     write_calibration(tmp_path, CAMERA)
     write_poses(tmp_path, DRIVE, poses)
-    report = label_scans(tmp_path, tmp_path / "labels", against=tmp_path / "known", progress=False)
-    held_out = [counts for frame, counts in report.compared.items() if int(frame[-10:]) % 4]
+    report = label_scans(
+        tmp_path, tmp_path / "labels", against=tmp_path / "known", progress=False
+    )
+    held_out = [
+        counts for frame, counts in report.compared.items() if int(frame[-10:]) % 4
+    ]
     points, covered, right = np.sum(held_out, axis=0)[:3]
     print(f"covered {covered / points:.3f}, right {right / covered:.4f}")
-    assert len(held_out) == len(FRAMES) / 2 and covered > 0.75 * points and right > 0.97 * covered
+    assert (
+        len(held_out) == len(FRAMES) / 2
+        and covered > 0.75 * points
+        and right > 0.97 * covered
+    )

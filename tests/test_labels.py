@@ -78,7 +78,9 @@ def same(a: Scan, b: Scan) -> bool:
     """Bit for bit."""
     left = arrays(a)
     right = arrays(b)
-    return left.keys() == right.keys() and all(np.array_equal(left[n], right[n]) for n in left)
+    return left.keys() == right.keys() and all(
+        np.array_equal(left[n], right[n]) for n in left
+    )
 
 
 def call(name: str) -> tuple[str, dict[str, Any]]:
@@ -87,7 +89,9 @@ def call(name: str) -> tuple[str, dict[str, Any]]:
 
 def test_every_policy_and_kind_is_called_here() -> None:
     assert {name.split()[0] for name in CALLS} == set(POLICIES)
-    assert {"objects", *(c["kind"] for c in CALLS.values() if "kind" in c)} == set(KINDS)
+    assert {"objects", *(c["kind"] for c in CALLS.values() if "kind" in c)} == set(
+        KINDS
+    )
 
 
 @pytest.mark.slow
@@ -111,11 +115,17 @@ def test_a_policy_is_a_function_of_scan_and_generator(
     assert same(first, other) == (policy_name != "mix")
     for scan, held in zip((synthetic, *real), before, strict=True):
         assert all(np.array_equal(a, held[n]) for n, a in arrays(scan).items())
-    assert (first.domain, first.id, first.sensor) == (SYNTHETIC, "model/0/7", synthetic.sensor)
+    assert (first.domain, first.id, first.sensor) == (
+        SYNTHETIC,
+        "model/0/7",
+        synthetic.sensor,
+    )
     assert first.fields().keys() == other.fields().keys()
     assert (first.boxes is None) == (other.boxes is None)
     for field_name, values in first.fields().items():
-        assert values.dtype == {"label": np.uint8, "instance": np.int32}.get(field_name, np.float32)
+        assert values.dtype == {"label": np.uint8, "instance": np.int32}.get(
+            field_name, np.float32
+        )
     if first.label is not None:
         assert first.confidence is not None
         assert ((first.label < 19) | (first.label == IGNORE)).all()
@@ -124,12 +134,18 @@ def test_a_policy_is_a_function_of_scan_and_generator(
 
 def test_none_and_ignore_leave_no_label(synthetic: Scan) -> None:
     scan = replace(
-        synthetic, boxes=cast([car(9, 0)]).boxes, instance=np.ones(len(synthetic), np.int32)
+        synthetic,
+        boxes=cast([car(9, 0)]).boxes,
+        instance=np.ones(len(synthetic), np.int32),
     )
     none = make_policy("none")(scan, keyed_rng(0))
     assert none.fields().keys() == {"reflectance"} and none.boxes is None
     ignored = make_policy("ignore")(scan, keyed_rng(0))
-    assert ignored.label is not None and ignored.confidence is not None and ignored.boxes is None
+    assert (
+        ignored.label is not None
+        and ignored.confidence is not None
+        and ignored.boxes is None
+    )
     assert (ignored.label == IGNORE).all() and (ignored.confidence == 0).all()
 
 
@@ -139,31 +155,49 @@ def test_generated_labels_need_confidence(synthetic: Scan) -> None:
     assert np.array_equal(kept.label, synthetic.label) and np.array_equal(
         kept.confidence, synthetic.confidence
     )
-    sure = make_policy("generated", fields=FIELDS, threshold=0.7)(synthetic, keyed_rng(0))
+    sure = make_policy("generated", fields=FIELDS, threshold=0.7)(
+        synthetic, keyed_rng(0)
+    )
     assert np.array_equal(
         sure.label, np.where(synthetic.confidence >= 0.7, synthetic.label, IGNORE)
     )
     plain = make_policy("generated", fields=frozenset({"label"}))(
         replace(synthetic, confidence=None), keyed_rng(0)
     )
-    assert np.array_equal(plain.confidence, (synthetic.label != IGNORE).astype(np.float32))
+    assert np.array_equal(
+        plain.confidence, (synthetic.label != IGNORE).astype(np.float32)
+    )
 
 
 def test_labels_of_a_condition_are_certain(synthetic: Scan) -> None:
     scan = make_policy("condition", fields=FIELDS)(synthetic, keyed_rng(0))
     assert np.array_equal(scan.label, synthetic.label)
-    assert np.array_equal(scan.confidence, (synthetic.label != IGNORE).astype(np.float32))
+    assert np.array_equal(
+        scan.confidence, (synthetic.label != IGNORE).astype(np.float32)
+    )
 
 
 def test_a_files_own_labels_never_outlive_a_policy(real: list[Scan]) -> None:
-    for name, options in (("generated", {}), ("condition", {}), ("ignore", {}), ("none", {})):
-        assert make_policy(name, fields=FIELDS, **options)(real[0], keyed_rng(0)).raw_label is None
+    for name, options in (
+        ("generated", {}),
+        ("condition", {}),
+        ("ignore", {}),
+        ("none", {}),
+    ):
+        assert (
+            make_policy(name, fields=FIELDS, **options)(real[0], keyed_rng(0)).raw_label
+            is None
+        )
 
 
 def test_pseudo_labels_are_the_teachers_where_it_is_sure(synthetic: Scan) -> None:
     label, confidence = teacher(synthetic)
-    scan = make_policy("pseudo", teacher=teacher, threshold=0.6)(synthetic, keyed_rng(0))
-    assert np.array_equal(scan.label, np.where(confidence.astype(np.float32) >= 0.6, label, IGNORE))
+    scan = make_policy("pseudo", teacher=teacher, threshold=0.6)(
+        synthetic, keyed_rng(0)
+    )
+    assert np.array_equal(
+        scan.label, np.where(confidence.astype(np.float32) >= 0.6, label, IGNORE)
+    )
     assert scan.confidence is not None and np.allclose(scan.confidence, confidence)
 
     def whole(scan: Scan) -> Scan:
@@ -206,8 +240,12 @@ def test_a_sector_is_the_others_and_the_rest_is_kept() -> None:
         b = project(theirs)
         got = project(mixed)
         for name in ("range", "label", "reflectance"):
-            values = [i.range if name == "range" else i.channels[name] for i in (a, b, got)]
-            assert np.allclose(values[2], np.where(inside, values[1], values[0]), atol=1e-4)
+            values = [
+                i.range if name == "range" else i.channels[name] for i in (a, b, got)
+            ]
+            assert np.allclose(
+                values[2], np.where(inside, values[1], values[0]), atol=1e-4
+            )
         assert len(mixed) == got.mask.sum() and mixed.domain == SYNTHETIC
 
 
@@ -216,18 +254,26 @@ def test_objects_that_the_edge_of_a_sector_cuts_leave() -> None:
     theirs = cast([car(0, -9), car(10, 0, np.pi / 2), car(-8, -5)])
     # The right half is theirs; the edges are straight ahead and behind.
     mixed = swap_sector(ours, theirs, 512, 512)
-    assert mixed.boxes is not None and mixed.instance is not None and mixed.label is not None
+    assert (
+        mixed.boxes is not None
+        and mixed.instance is not None
+        and mixed.label is not None
+    )
     assert np.allclose(mixed.boxes.values[:, :2], [[0, 10], [0, -9], [-8, -5]])
     assert mixed.boxes.instance.tolist() == [1, 2, 3]
     for box, instance in zip(mixed.boxes.values, mixed.boxes.instance, strict=True):
-        grown = Boxes(box + np.array([0, 0, 0, 0.01, 0.01, 0.01, 0], np.float32), ("Car",))
+        grown = Boxes(
+            box + np.array([0, 0, 0, 0.01, 0.01, 0.01, 0], np.float32), ("Car",)
+        )
         own = mixed.instance == instance
         assert own.any() and np.array_equal(
             grown.contain(mixed.points)[0] & (mixed.label == CAR), own
         )
     assert ((mixed.label == CAR) == (mixed.instance > 0)).all()
     cars = mixed.points[mixed.label == CAR]
-    assert not ((cars[:, 0] > 5) & (abs(cars[:, 1]) < 3)).any()  # nor is half a car left
+    assert not (
+        (cars[:, 0] > 5) & (abs(cars[:, 1]) < 3)
+    ).any()  # nor is half a car left
 
 
 def test_boxes_of_two_scans_never_share_a_place() -> None:
@@ -249,18 +295,27 @@ def test_boxes_hold_all_returns_of_their_objects(real: list[Scan]) -> None:
     centimetres."""
     ours, theirs = real
     tight = [
-        (s.boxes[[i]], s.instance == s.boxes.instance[i]) for s in real for i in range(len(s.boxes))
+        (s.boxes[[i]], s.instance == s.boxes.instance[i])
+        for s in real
+        for i in range(len(s.boxes))
     ]
     points = [*[ours.points] * len(ours.boxes), *[theirs.points] * len(theirs.boxes)]
     assert (
-        sum((own & ~box.contain(p)[0]).sum() for (box, own), p in zip(tight, points, strict=True))
+        sum(
+            (own & ~box.contain(p)[0]).sum()
+            for (box, own), p in zip(tight, points, strict=True)
+        )
         > 20
     )
     for start in range(0, 1024, 128):
         mixed = swap_sector(ours, theirs, start, 512)
         assert mixed.boxes is not None and len(mixed.boxes)
         for number, instance in enumerate(mixed.boxes.instance):
-            assert mixed.boxes[[number]].contain(mixed.points[mixed.instance == instance]).all()
+            assert (
+                mixed.boxes[[number]]
+                .contain(mixed.points[mixed.instance == instance])
+                .all()
+            )
     before = {tuple(v[[0, 1, 2, 6]]): v[3:6] for s in real for v in s.boxes.values}
     for value in mixed.boxes.values:
         assert (value[3:6] - before[tuple(value[[0, 1, 2, 6]])] >= 0).all()
@@ -285,7 +340,9 @@ def test_a_partner_is_thinned_to_the_grid() -> None:
     thin = thin_scan(scan, SENSOR)
     assert len(thin) == project(scan).mask.sum() < len(scan)
     assert np.array_equal(project(thin).range, project(scan).range)
-    with pytest.raises(DataError, match="returns of sensor 'town' for a scan of 'os1_128'"):
+    with pytest.raises(
+        DataError, match="returns of sensor 'town' for a scan of 'os1_128'"
+    ):
         thin_scan(scan, presets()["os1_128"])
 
 
@@ -293,7 +350,10 @@ def test_a_partner_of_other_lasers_lends_no_rings() -> None:
     host = Town(1, scans=1)[0]
     other = Town(1, "os1_128", scans=1)[0]
     assert thin_scan(other, host.sensor).ring is None
-    assert thin_scan(host, replace(host.sensor, name="fewer", columns=512)).ring is not None
+    assert (
+        thin_scan(host, replace(host.sensor, name="fewer", columns=512)).ring
+        is not None
+    )
     mixed = swap_sector(host, thin_scan(other, host.sensor), 0, 512)
     assert mixed.ring.max() < 64
 
@@ -301,17 +361,31 @@ def test_a_partner_of_other_lasers_lends_no_rings() -> None:
 def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
     synthetic: Scan, real: list[Scan]
 ) -> None:
-    policy = make_policy("mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5)
+    policy = make_policy(
+        "mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5
+    )
     mixed = policy(synthetic, keyed_rng(3))
-    own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
-    assert mixed.confidence is not None and mixed.label is not None and 0.2 < own.mean() < 0.8
+    own = np.isin(
+        mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
+    )
+    assert (
+        mixed.confidence is not None
+        and mixed.label is not None
+        and 0.2 < own.mean() < 0.8
+    )
     assert (mixed.confidence[~own] == (mixed.label[~own] != IGNORE)).all()
     assert ((mixed.confidence[own] >= 0.5) | (mixed.label[own] == IGNORE)).all()
     unlabelled = replace(synthetic, label=None, confidence=None)
-    policy = make_policy("mix", real=real, fields=frozenset({"reflectance"}), kind="laser")
+    policy = make_policy(
+        "mix", real=real, fields=frozenset({"reflectance"}), kind="laser"
+    )
     mixed = policy(unlabelled, keyed_rng(3))
-    own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
-    assert (mixed.label[own] == IGNORE).all() and (mixed.label[~own] != IGNORE).mean() > 0.9
+    own = np.isin(
+        mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
+    )
+    assert (mixed.label[own] == IGNORE).all() and (
+        mixed.label[~own] != IGNORE
+    ).mean() > 0.9
 
 
 def test_polar_turns_objects_about_the_sensor() -> None:
@@ -319,7 +393,9 @@ def test_polar_turns_objects_about_the_sensor() -> None:
     policy = make_policy("mix", real=real, fields=FIELDS, kind="polar", width=0)
     mixed = policy(cast(), keyed_rng(1))
     assert mixed.boxes is not None
-    assert np.allclose(np.hypot(*mixed.boxes.values[:, :2].T), [9, np.hypot(14, 6)], atol=1e-3)
+    assert np.allclose(
+        np.hypot(*mixed.boxes.values[:, :2].T), [9, np.hypot(14, 6)], atol=1e-3
+    )
     assert abs(np.arctan2(*mixed.boxes.values[0, 1::-1])) > 0.05
     bare = [replace(real[0], boxes=None)]
     mixed = make_policy("mix", real=bare, fields=FIELDS, kind="polar", width=0)(
@@ -333,12 +409,14 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
     scan.boxes = Boxes(scan.boxes.values, ("Car", "Van"), instance=scan.boxes.instance)
     bank = ObjectBank.from_scans([scan])
     host = replace(cast([car(20, 0)]), boxes=None)
-    mixed = make_policy("mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False)(
-        host, keyed_rng(0)
-    )
+    mixed = make_policy(
+        "mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False
+    )(host, keyed_rng(0))
     assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
     assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
-    clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(host, keyed_rng(0))
+    clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(
+        host, keyed_rng(0)
+    )
     assert clear.boxes is not None and sorted(clear.boxes.names) == ["Car", "Van"]
     assert clear.boxes.contain(clear.points[clear.label == CAR]).any(0).all()
 
@@ -354,8 +432,16 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
             {"fields": plain},
             "labels='generated', but .* the synthetic scans only have.*Use labels='none'",
         ),
-        ("generated", {"fields": frozenset({"label"}), "threshold": 0.5}, "without confidence"),
-        ("generated", {"threshold": 1.5}, "threshold 1.5; expected a number from 0 to 1"),
+        (
+            "generated",
+            {"fields": frozenset({"label"}), "threshold": 0.5},
+            "without confidence",
+        ),
+        (
+            "generated",
+            {"threshold": 1.5},
+            "threshold 1.5; expected a number from 0 to 1",
+        ),
         (
             "condition",
             {"fields": plain},
@@ -372,15 +458,27 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
             "kind='cut'; expected one of 'objects', 'polar', 'laser', 'exchange'",
         ),
         ("mix", {}, "no box with 5 points in 0 scans"),
-        ("mix", {"real": bare}, "no box with 5 points in 1 scans.*ObjectBank.from_scans"),
-        ("mix", {"real": [cast([car(8, 2)])], "count": {"Tram": 1}}, "names and points"),
+        (
+            "mix",
+            {"real": bare},
+            "no box with 5 points in 1 scans.*ObjectBank.from_scans",
+        ),
+        (
+            "mix",
+            {"real": [cast([car(8, 2)])], "count": {"Tram": 1}},
+            "names and points",
+        ),
         ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
         (
             "mix",
             {"real": [cast([car(8, 2)])], "fields": plain},
             "neither labels nor boxes.*clear=False",
         ),
-        ("mix", {"real": bare, "kind": "polar"}, "kind='polar', with scans without labels"),
+        (
+            "mix",
+            {"real": bare, "kind": "polar"},
+            "kind='polar', with scans without labels",
+        ),
         ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
         ("mix", {"kind": "laser"}, "kind='laser', with none"),
         ("mix", {"real": labelled, "kind": "polar"}, "neither boxes nor instances"),
@@ -390,7 +488,9 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "message"), refusals(), ids=lambda v: v if isinstance(v, str) else ""
+    ("name", "options", "message"),
+    refusals(),
+    ids=lambda v: v if isinstance(v, str) else "",
 )
 def test_policies_that_the_sources_cannot_support_are_refused(
     name: str, options: dict[str, Any], message: str
@@ -401,7 +501,9 @@ def test_policies_that_the_sources_cannot_support_are_refused(
 
 def test_scans_that_break_their_promise_are_refused(synthetic: Scan) -> None:
     with pytest.raises(DataError, match="'model/0/7' has no labels"):
-        make_policy("generated", fields=FIELDS)(replace(synthetic, label=None), keyed_rng(0))
+        make_policy("generated", fields=FIELDS)(
+            replace(synthetic, label=None), keyed_rng(0)
+        )
     real = [cast(), replace(cast(id="second"), label=None)]
     policy = make_policy("mix", real=real, fields=FIELDS, kind="laser")
     with pytest.raises(DataError, match="scan 'second' has no labels"):
@@ -419,7 +521,9 @@ def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_mixed_scans_lose_their_times(kind: str, synthetic: Scan, real: list[Scan]) -> None:
+def test_mixed_scans_lose_their_times(
+    kind: str, synthetic: Scan, real: list[Scan]
+) -> None:
     """PandaSet's scans have times; those of two scans count from different moments."""
     timed = [
         replace(scan, time=np.linspace(0, 0.1, len(scan), dtype=np.float32))
@@ -432,7 +536,9 @@ def test_mixed_scans_lose_their_times(kind: str, synthetic: Scan, real: list[Sca
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic: Scan) -> None:
+def test_real_scans_as_the_labelled_side(
+    kind: str, real_scans: Path, synthetic: Scan
+) -> None:
     source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")
     if kind == "objects":
         source = KITTIObject(real_scans / "kitti_object")
@@ -442,9 +548,13 @@ def test_real_scans_as_the_labelled_side(kind: str, real_scans: Path, synthetic:
     for seed in range(3):
         mixed = policy(synthetic, keyed_rng(seed))
         assert (
-            mixed.domain == SYNTHETIC and mixed.label is not None and mixed.confidence is not None
+            mixed.domain == SYNTHETIC
+            and mixed.label is not None
+            and mixed.confidence is not None
         )
-        own = np.isin(mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel())
+        own = np.isin(
+            mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
+        )
         assert (~own).sum() > (50 if kind == "objects" else 5000) and own.sum() > 5000
         assert (mixed.confidence[~own & (mixed.label != IGNORE)] == 1).all()
         cells = locate(mixed.points, mixed.sensor).cell

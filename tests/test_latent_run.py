@@ -49,7 +49,9 @@ def test_an_autoencoder_is_a_checkpoint_without_a_flow(codec: Path) -> None:
     assert set(networks) == {CODEC}
     assert header.channels == ("range", "reflectance", "label")
     assert float(networks[CODEC].scale.mean()) != 1  # type: ignore[arg-type, union-attr]  # the latents' statistics
-    with pytest.raises(DataError, match="is an autoencoder; expected a model that generates"):
+    with pytest.raises(
+        DataError, match="is an autoencoder; expected a model that generates"
+    ):
         load_generator(codec)
 
 
@@ -107,7 +109,10 @@ def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     assert len(scan) > 0
     call("distill", config, "--resume", "recipe.iterations=10")
     assert (
-        read_header(tmp_path / "student" / "student.safetensors")[0].provenance["iterations"] == 10
+        read_header(tmp_path / "student" / "student.safetensors")[0].provenance[
+            "iterations"
+        ]
+        == 10
     )
 
 
@@ -117,7 +122,9 @@ def test_a_student_learns_the_autoguided_teacher(
     small = UNET | {"arguments": UNET["arguments"] | {"width": 8}}  # type: ignore[dict-item]
     call(
         "train",
-        write_config(scans, tmp_path, "weak", codec=str(codec), network=small, condition=SEMANTIC),
+        write_config(
+            scans, tmp_path, "weak", codec=str(codec), network=small, condition=SEMANTIC
+        ),
     )
     weaker = tmp_path / "weak" / "weak.safetensors"
     values = {
@@ -126,7 +133,9 @@ def test_a_student_learns_the_autoguided_teacher(
         "strategy": "uniform_piecewise",
         "steps": 2,
     }
-    config = write_config(scans, tmp_path, "student", **values, guidance=2.5, within=[0.1, 0.5])
+    config = write_config(
+        scans, tmp_path, "student", **values, guidance=2.5, within=[0.1, 0.5]
+    )
     call("distill", config)
     header, _ = read_header(tmp_path / "student" / "student.safetensors")
     assert header.provenance["weaker"] == load_checkpoint(weaker).hash
@@ -134,7 +143,9 @@ def test_a_student_learns_the_autoguided_teacher(
 
     strong = load_checkpoint(teacher)
     weak = load_checkpoint(weaker)
-    flow, _ = target_flow(load_config(DistillConfig, config), strong, torch.device("cpu"))
+    flow, _ = target_flow(
+        load_config(DistillConfig, config), strong, torch.device("cpu")
+    )
     y = torch.randn(2, 4, 4, 8)
     t = torch.tensor([0.3, 0.8])
     maps = torch.randint(0, 19, (2, *SENSOR.shape), dtype=torch.uint8)
@@ -146,7 +157,10 @@ def test_a_student_learns_the_autoguided_teacher(
     for changes, message in (
         (["guidance=1"], "weak.safetensors with guidance 1; expected a guidance scale"),
         (["within=[0.9,0.1]"], r"within \(0.9, 0.1\); expected two increasing times"),
-        ([f"weaker={codec}"], "codec.safetensors, an autoencoder; expected a model that generates"),
+        (
+            [f"weaker={codec}"],
+            "codec.safetensors, an autoencoder; expected a model that generates",
+        ),
         (
             [f"teacher={without_condition(teacher, tmp_path)}"],
             "of another conditioning; expected those of",
@@ -163,7 +177,9 @@ def test_a_student_learns_the_autoguided_teacher(
 def without_condition(path: Path, folder: Path) -> Path:
     """A model whose header says nothing of the condition that it takes."""
     header, networks, _ = load_checkpoint(path)
-    save_checkpoint(out := folder / "alone.safetensors", replace(header, conditioning={}), networks)
+    save_checkpoint(
+        out := folder / "alone.safetensors", replace(header, conditioning={}), networks
+    )
     return out
 
 
@@ -179,7 +195,9 @@ def with_other_codec(path: Path, folder: Path) -> Path:
 def test_guidance_of_an_unconditional_teacher_asks_for_a_weaker_one(
     scans: Path, codec: Path, tmp_path: Path
 ) -> None:
-    call("train", write_config(scans, tmp_path, "plain", codec=str(codec), network=UNET))
+    call(
+        "train", write_config(scans, tmp_path, "plain", codec=str(codec), network=UNET)
+    )
     plain = tmp_path / "plain" / "plain.safetensors"
     config = write_config(scans, tmp_path, "student", teacher=str(plain), guidance=2.0)
     with pytest.raises(
@@ -189,7 +207,9 @@ def test_guidance_of_an_unconditional_teacher_asks_for_a_weaker_one(
 
 
 @pytest.mark.slow
-def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_path: Path) -> None:
+def test_runs_go_on_as_if_nothing_had_happened(
+    scans: Path, codec: Path, tmp_path: Path
+) -> None:
     """A codebook of moving averages, a discriminator and a condition's encoder are part of what is
     saved."""
     kinds = {
@@ -206,12 +226,14 @@ def test_runs_go_on_as_if_nothing_had_happened(scans: Path, codec: Path, tmp_pat
         call("train", parts, "--minutes", "0")
         call("train", parts, "--resume")
         a, b = (
-            load_checkpoint(tmp_path / p.stem / f"{p.stem}.safetensors") for p in (whole, parts)
+            load_checkpoint(tmp_path / p.stem / f"{p.stem}.safetensors")
+            for p in (whole, parts)
         )
         for part, network in a.networks.items():
             other = b.networks[part].state_dict()
             assert all(
-                torch.equal(value, other[key]) for key, value in network.state_dict().items()
+                torch.equal(value, other[key])
+                for key, value in network.state_dict().items()
             ), (name, part)
 
 
@@ -233,7 +255,12 @@ class Fixed(nn.Module):
 
 SURFACES = {
     "architecture": "surfaces",
-    "arguments": {"encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
+    "arguments": {
+        "encoder_widths": [8, 8],
+        "widths": [8, 8],
+        "reaches": [1],
+        "depth": 1,
+    },
 }
 
 
@@ -243,7 +270,9 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(
 ) -> None:
     call(
         "train",
-        write_config(scans, tmp_path, "codec", network=SURFACES, samples={"every": 8, "count": 2}),
+        write_config(
+            scans, tmp_path, "codec", network=SURFACES, samples={"every": 8, "count": 2}
+        ),
     )
     hdit = {
         "architecture": "hdit",
@@ -252,7 +281,9 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(
     values = {"codec": str(tmp_path / "codec" / "codec.safetensors"), "network": hdit}
     data = {"latents": True, "cache": str(tmp_path / "cache")}
     call("train", write_config(scans, tmp_path, "teacher", data=data, **values))
-    assert [p.name[:8] for p in (tmp_path / "cache").glob("latents*.npy")] == ["latents-"]
+    assert [p.name[:8] for p in (tmp_path / "cache").glob("latents*.npy")] == [
+        "latents-"
+    ]
     generator = load_generator(tmp_path / "teacher" / "teacher.safetensors")
     [scan] = generator.scans(0, [3])
     assert len(scan) and scan.label is not None and scan.confidence is not None
@@ -280,7 +311,10 @@ def test_a_decoder_goes_on_alone(
     }
     given = {"condition": condition} if condition else {}
     codec = str(tmp_path / "codec" / "codec.safetensors")
-    call("train", write_config(scans, tmp_path, "teacher", codec=codec, network=hdit, **given))
+    call(
+        "train",
+        write_config(scans, tmp_path, "teacher", codec=codec, network=hdit, **given),
+    )
     start = tmp_path / "teacher" / "teacher.safetensors"
     config = write_config(
         scans, tmp_path, "more", losses={"noise": 0.1}, samples={"every": 8, "count": 2}
@@ -306,7 +340,9 @@ def test_a_decoder_goes_on_alone(
     assert not [name for name in moved if any(part in name for part in STILL)]
     assert {f"{CODEC}.from_latent.weight", f"{CODEC}.head.weight"} <= moved
     cond = np.zeros((8, 32), np.uint8) if condition else None
-    assert len(load_generator(tmp_path / "more" / "more.safetensors").scans(0, [3], cond)[0])
+    assert len(
+        load_generator(tmp_path / "more" / "more.safetensors").scans(0, [3], cond)[0]
+    )
 
 
 def test_fine_tuning_a_latent_model(
@@ -326,7 +362,9 @@ def test_fine_tuning_a_latent_model(
     assert end.header.conditioning == start.header.conditioning
     for part in start.networks:
         for a, b in zip(
-            start.networks[part].parameters(), end.networks[part].parameters(), strict=True
+            start.networks[part].parameters(),
+            end.networks[part].parameters(),
+            strict=True,
         ):
             assert torch.allclose(a, b, atol=1e-6)
     with pytest.raises(ConfigError, match="expected a checkpoint of the same kind"):
@@ -339,12 +377,21 @@ def test_a_network_that_takes_its_condition_among_its_channels_is_no_start(
     call(
         "train",
         write_config(
-            scans, tmp_path, "blind", network=UNET, codec=str(codec), recipe={"iterations": 1}
+            scans,
+            tmp_path,
+            "blind",
+            network=UNET,
+            codec=str(codec),
+            recipe={"iterations": 1},
         ),
     )
-    config = write_config(scans, tmp_path, "looking", condition=SEMANTIC, codec=str(codec))
+    config = write_config(
+        scans, tmp_path, "looking", condition=SEMANTIC, codec=str(codec)
+    )
     values = {
-        key: value for key, value in yaml.safe_load(config.read_text()).items() if key != "codec"
+        key: value
+        for key, value in yaml.safe_load(config.read_text()).items()
+        if key != "codec"
     }
     config.write_text(
         yaml.safe_dump(values | {"init": str(tmp_path / "blind" / "blind.safetensors")})

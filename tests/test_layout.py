@@ -23,7 +23,12 @@ from lidar_synth.labels.boxes import turn_boxes, widen_boxes
 
 SMALL = Sensor("small", 64, 1.45, 80.0, rows=16, fov_up=3.0, fov_down=-25.0)
 LASERS = Sensor(
-    "lasers", 64, 1.45, 80.0, elevations=tuple(np.linspace(2, -24, 16)), heights=(0.2,) * 16
+    "lasers",
+    64,
+    1.45,
+    80.0,
+    elevations=tuple(np.linspace(2, -24, 16)),
+    heights=(0.2,) * 16,
 )
 NAMES = (
     "Car",
@@ -48,18 +53,23 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         size = rng.uniform((0.5, 0.5, 1.0), (8, 2.5, 3))
         height = -1.7 + size[2] / 2 + rng.uniform(-0.1, 0.3)
         place = (distance * np.cos(azimuth), distance * np.sin(azimuth), height)
-        more = np.concatenate([rows, [(*place, *size, rng.uniform(-np.pi, np.pi))]]).astype(
-            np.float32
-        )
+        more = np.concatenate(
+            [rows, [(*place, *size, rng.uniform(-np.pi, np.pi))]]
+        ).astype(np.float32)
         boxes = Boxes(more, ("Car",) * len(more))
         if (
             not overlaps(boxes, 0.0)
-            and not Boxes(widen_boxes(more, 1.0), boxes.names).contain(np.zeros((1, 3), "f4")).any()
+            and not Boxes(widen_boxes(more, 1.0), boxes.names)
+            .contain(np.zeros((1, 3), "f4"))
+            .any()
         ):
             rows = more
     outlines = [
         Outline(
-            "building", np.float32([(-40, 18), (5, 20), (40, 15)]), -1.9, np.float32([6, 4, 9])
+            "building",
+            np.float32([(-40, 18), (5, 20), (40, 15)]),
+            -1.9,
+            np.float32([6, 4, 9]),
         ),
         Outline("vegetation", np.float32([(10, -12), (14, -9), (20, -12)]), 0.3, 4.0),
         Outline("fence", np.float32([(-15, -20), (-15, 5)]), -2.0, -0.7),
@@ -68,7 +78,9 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         ),  # lower than the building behind it
     ]
     names = tuple(rng.choice(NAMES, count).tolist())
-    return Layout(Boxes(rows, names), (-1.7, 0.01, -0.02), outlines if walls else (), reach=60.0)
+    return Layout(
+        Boxes(rows, names), (-1.7, 0.01, -0.02), outlines if walls else (), reach=60.0
+    )
 
 
 def marched(
@@ -137,7 +149,10 @@ def test_the_image_is_that_of_walking_along_the_rays(seed: int, sensor: Sensor) 
 def test_the_ground_hides_no_box() -> None:
     layout = some_layout(1, walls=False)
     sensor = load_sensor("hdl64e_lasers")
-    boxed = [layout_image(replace(layout, ground=(z, 0.0, 0.0)), sensor)[0] for z in (-2.5, -1.2)]
+    boxed = [
+        layout_image(replace(layout, ground=(z, 0.0, 0.0)), sensor)[0]
+        for z in (-2.5, -1.2)
+    ]
     assert (boxed[0] >= CODES["Car"]).sum() > 5000
     assert np.array_equal(boxed[0] >= CODES["Car"], boxed[1] >= CODES["Car"])
 
@@ -153,18 +168,24 @@ def test_the_cells_of_a_box_look_at_points_of_its_surface(seed: int) -> None:
     seen = image[0] >= CODES["Car"]
     assert seen.sum() > 5000
     larger = replace(
-        layout.boxes, values=layout.boxes.values + np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0])
+        layout.boxes,
+        values=layout.boxes.values + np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0]),
     )
     smaller = replace(
-        layout.boxes, values=layout.boxes.values - np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0])
+        layout.boxes,
+        values=layout.boxes.values - np.float32([0, 0, 0, 0.01, 0.01, 0.01, 0]),
     )
-    around, within = (b.contain(points[seen].astype(np.float32)) for b in (larger, smaller))
+    around, within = (
+        b.contain(points[seen].astype(np.float32)) for b in (larger, smaller)
+    )
     assert around.any(0).all() and not within.any()
     # The class is that of the box, and the way along the ray ends inside it.
     first = around.argmax(0)
     single = around.sum(0) == 1
     assert (layout.codes()[first] == image[0][seen])[single].all()
-    deeper = points[seen] + sensor.ray_directions()[seen] * (image[3][seen, None] * 0.1 / 2)
+    deeper = points[seen] + sensor.ray_directions()[seen] * (
+        image[3][seen, None] * 0.1 / 2
+    )
     assert (
         larger.contain(deeper.astype(np.float32))[first, np.arange(len(first))]
         | (image[3][seen] == 0)
@@ -185,7 +206,11 @@ def test_nothing_is_known_beyond_the_depths_of_an_image() -> None:
     sensor = load_sensor("vls128")
     image = layout_image(Layout(trucks), sensor)
     seen = image[0] == CODES["Truck"]
-    assert sensor.range_max > 160 and seen.any() and 122 < depth_of(image)[seen].max() < 131.07
+    assert (
+        sensor.range_max > 160
+        and seen.any()
+        and 122 < depth_of(image)[seen].max() < 131.07
+    )
     assert not seen[:, sensor.columns // 2 - 50 : sensor.columns // 2 + 50].any()
 
 
@@ -195,13 +220,16 @@ def test_turning_rolls_and_mirroring_flips() -> None:
     image = layout_image(layout, sensor)
     columns = 300
     rolled = layout_image(
-        replace(layout, boxes=turn_boxes(layout.boxes, 2 * np.pi * columns / 2048)), sensor
+        replace(layout, boxes=turn_boxes(layout.boxes, 2 * np.pi * columns / 2048)),
+        sensor,
     )
     assert (np.roll(rolled, columns, -1) == image).all(
         0
     ).mean() > 0.99  # turned to the left, back to the right
     mirrored = layout.boxes.values * np.float32([1, -1, 1, 1, 1, 1, -1])
-    flipped = layout_image(replace(layout, boxes=replace(layout.boxes, values=mirrored)), sensor)
+    flipped = layout_image(
+        replace(layout, boxes=replace(layout.boxes, values=mirrored)), sensor
+    )
     assert (flipped[..., ::-1] == image).all(0).mean() > 0.999
 
 
@@ -217,17 +245,24 @@ def test_the_layout_of_a_scan_shows_what_the_scan_does(town: Any) -> None:
     layout = layout_of(town)
     seen = project(town, town.sensor, ["label"])
     image = layout_image(layout, town.sensor)
-    assert set(layout.boxes.names) == set(town.boxes.names) and abs(layout.ground[0] + 1.73) < 0.3
+    assert (
+        set(layout.boxes.names) == set(town.boxes.names)
+        and abs(layout.ground[0] + 1.73) < 0.3
+    )
     for name, classes, least in (
         ("ground", ("road", "sidewalk", "terrain", "parking", "other-ground"), 0.85),
         ("building", ("building",), 0.4),
         ("vegetation", ("vegetation", "trunk"), 0.5),
     ):
-        cells = np.isin(seen.label, [TRAIN_ID[c] for c in classes]) & (image[0] == CODES[name])
+        cells = np.isin(seen.label, [TRAIN_ID[c] for c in classes]) & (
+            image[0] == CODES[name]
+        )
         there = np.isin(seen.label, [TRAIN_ID[c] for c in classes])
         assert cells.sum() > least * there.sum(), name
         assert np.median(np.abs(depth_of(image) - seen.range)[cells]) < 0.6, name
-    boxed = np.isin(seen.label, [TRAIN_ID["car"], TRAIN_ID["truck"], TRAIN_ID["person"]])
+    boxed = np.isin(
+        seen.label, [TRAIN_ID["car"], TRAIN_ID["truck"], TRAIN_ID["person"]]
+    )
     assert (image[0][boxed] >= CODES["Car"]).mean() > 0.9
 
 
@@ -245,9 +280,13 @@ def test_the_layout_of_a_scan_has_the_boxes_within_the_range(town: Any) -> None:
 def test_only_boxes_that_overlap_a_kept_one_are_dropped(town: Any) -> None:
     """The second of three in a row overlaps both others, which stand apart."""
     row = Boxes(
-        np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32), ("Car",) * 3
+        np.array([(x, 0, -1, 4, 2, 1.5, 0) for x in (10, 13, 16)], np.float32),
+        ("Car",) * 3,
     )
-    assert select_known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [10, 16]
+    assert select_known_boxes(replace(town, boxes=row)).values[:, 0].tolist() == [
+        10,
+        16,
+    ]
 
 
 def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
@@ -255,9 +294,10 @@ def test_a_scan_without_labels_has_ground_and_outlines(town: Any) -> None:
     layout = layout_of(bare)
     known = layout_of(town)
     assert abs(layout.ground[0] - known.ground[0]) < 0.15
-    assert {outline.kind for outline in layout.outlines} <= {"building", "vegetation"} and len(
-        layout.outlines
-    ) > 20
+    assert {outline.kind for outline in layout.outlines} <= {
+        "building",
+        "vegetation",
+    } and len(layout.outlines) > 20
     with pytest.raises(DataError, match="has no boxes"):
         layout_of(replace(town, boxes=None))
     with pytest.raises(DataError, match="returns of the ground"):
@@ -268,7 +308,9 @@ def test_a_scan_agrees_with_its_own_layout_and_not_with_another(town: Any) -> No
     layout = layout_of(town)
     found = layout_agreement([town], [layout], [town])
     assert found.inside_share > 0.99 and found.kept_share == 1 and found.points > 100
-    assert 0.5 < found.filled_share <= 1 and 0 < found.seen <= found.boxes <= len(layout.boxes)
+    assert 0.5 < found.filled_share <= 1 and 0 < found.seen <= found.boxes <= len(
+        layout.boxes
+    )
     turned_away = replace(layout, boxes=turn_boxes(layout.boxes, np.pi / 2))
     other = layout_agreement([town], [turned_away], [town])
     assert other.inside_share < 0.5 and other.points == found.points
@@ -276,7 +318,11 @@ def test_a_scan_agrees_with_its_own_layout_and_not_with_another(town: Any) -> No
         layout_agreement([replace(town, label=None)], [layout], [town])
     image = layout_image(layout, town.sensor)
     assert (
-        abs(rays_of_boxes(layout, town.sensor).sum() / (image[0] >= CODES["Car"]).sum() - 1) < 0.05
+        abs(
+            rays_of_boxes(layout, town.sensor).sum() / (image[0] >= CODES["Car"]).sum()
+            - 1
+        )
+        < 0.05
     )
 
 
@@ -299,16 +345,21 @@ def test_a_file_is_the_layout_that_it_describes(tmp_path: Path) -> None:
     layout = load_layout(path)
     assert layout.boxes.names == ("Van", "Cyclist", "Misc") and layout.id == "behind"
     assert np.allclose(
-        layout.boxes.values[1], (16.5, 0.4, -1.7 + 0.85, 1.8, 0.6, 1.7, -np.pi), atol=1e-4
+        layout.boxes.values[1],
+        (16.5, 0.4, -1.7 + 0.85, 1.8, 0.6, 1.7, -np.pi),
+        atol=1e-4,
     )
     assert np.allclose(
-        layout.boxes.values[2], (-20, 8, -1.6 + 3.05 / 2, 11.8, 2.55, 3.05, 0), atol=1e-4
+        layout.boxes.values[2],
+        (-20, 8, -1.6 + 3.05 / 2, 11.8, 2.55, 3.05, 0),
+        atol=1e-4,
     )
     assert layout.outlines[1].low[0] == np.float32(0.3) and layout.reach == 20  # type: ignore[index]
     image = layout_image(layout, load_sensor("hdl64e_lasers"))
-    assert {0, *(CODES[n] for n in ("ground", "building", "vegetation", "Van", "Misc"))} == set(
-        np.unique(image[0])
-    )
+    assert {
+        0,
+        *(CODES[n] for n in ("ground", "building", "vegetation", "Van", "Misc")),
+    } == set(np.unique(image[0]))
 
 
 BAD = {
@@ -322,7 +373,10 @@ BAD = {
         ConfigError,
         r"objects\.0\.colour: Extra inputs",
     ),
-    "objects: [{class: Car, at: [9, 0], size: [4, 0, 1]}]": (ConfigError, r"objects\.0\.size\.1"),
+    "objects: [{class: Car, at: [9, 0], size: [4, 0, 1]}]": (
+        ConfigError,
+        r"objects\.0\.size\.1",
+    ),
     "outlines: [{kind: sea, line: [[1, 2], [2, 3]], height: 3}]": (
         ConfigError,
         r"outlines\.0\.kind",
@@ -353,7 +407,9 @@ def test_an_invalid_file_is_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_an_unknown_class_is_refused() -> None:
-    with pytest.raises(DataError, match="boxes of 'Bicycle'; expected classes of Car, Van"):
+    with pytest.raises(
+        DataError, match="boxes of 'Bicycle'; expected classes of Car, Van"
+    ):
         Layout(Boxes(np.float32([[9, 0, -1, 1, 1, 1, 0]]), ("Bicycle",)))
 
 
@@ -363,7 +419,11 @@ def test_the_classes_with_boxes_are_those_of_the_boxes_of_detectors() -> None:
 
 def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:
     rows = np.float32(
-        [[9, 0, -1, 4, 2, 1.5, 0.3], [9, 2.0, -1, 4, 2, 1.5, 0.3], [9, 0, 3, 4, 2, 1.5, 0]]
+        [
+            [9, 0, -1, 4, 2, 1.5, 0.3],
+            [9, 2.0, -1, 4, 2, 1.5, 0.3],
+            [9, 0, 3, 4, 2, 1.5, 0],
+        ]
     )
     assert overlaps(Boxes(rows, ("Car",) * 3)) == []
     rows[1, 1] = 1.2

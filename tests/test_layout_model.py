@@ -57,7 +57,9 @@ LAYOUTS = {
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(
-        tmp_path_factory.mktemp("model") / "laid.safetensors", dropout=0.1, condition="layout"
+        tmp_path_factory.mktemp("model") / "laid.safetensors",
+        dropout=0.1,
+        condition="layout",
     )
 
 
@@ -90,9 +92,14 @@ def test_the_boxes_of_a_scan_are_those_of_its_layout_that_hold_points(
     for index, (layout, scan) in enumerate(
         zip(layouts, generator.scans(0, [0, 1, 2], layouts), strict=True)
     ):
-        assert scan.boxes is not None and scan.instance is not None and scan.label is not None
+        assert (
+            scan.boxes is not None
+            and scan.instance is not None
+            and scan.label is not None
+        )
         wide = replace(
-            layout.boxes, values=layout.boxes.values + np.float32([0, 0, 0, 0.2, 0.2, 0.2, 0])
+            layout.boxes,
+            values=layout.boxes.values + np.float32([0, 0, 0, 0.2, 0.2, 0.2, 0]),
         )
         inside = wide.contain(scan.points) & ~np.isin(scan.label, [8, 9, 10, 11, 16])
         held = inside.any(1)
@@ -112,8 +119,14 @@ def test_a_crossing_has_no_streaks_of_bicycles(tmp_path: Path) -> None:
     places = ((8, -3), (8, -1), (8.5, 1), (9, 3), (10, 0), (10, -2))
     people = "".join(f"  - {{class: Pedestrian, at: [{x}, {y}]}}\n" for x, y in places)
     (tmp_path / "crossing.yaml").write_text("objects:\n" + people)
-    [scan] = load_generator("town-layout").scans(0, [0], load_layout(tmp_path / "crossing.yaml"))
-    assert scan.boxes is not None and scan.label is not None and len(scan.boxes) == len(places)
+    [scan] = load_generator("town-layout").scans(
+        0, [0], load_layout(tmp_path / "crossing.yaml")
+    )
+    assert (
+        scan.boxes is not None
+        and scan.label is not None
+        and len(scan.boxes) == len(places)
+    )
     moving = scan.label <= TRAIN_ID["motorcyclist"]
     assert moving.sum() > 1000 and (scan.label[moving] == TRAIN_ID["person"]).all()
     assert scan.boxes.enlarged(0.1).contain(scan.points[moving]).any(0).all()
@@ -141,11 +154,13 @@ def test_a_layout_of_another_sensor_or_out_of_range_is_refused(model: Path) -> N
     shape = (5, *SENSOR.shape)
     options = {"height": 1.73}
     with pytest.raises(
-        DataError, match=r"box 0 at 99\.0 m; expected boxes within the sensor's range of 80 m"
+        DataError,
+        match=r"box 0 at 99\.0 m; expected boxes within the sensor's range of 80 m",
     ):
         batch_of("layout", far, 1, SENSOR, shape, options)
     with pytest.raises(
-        DataError, match=r"layout 'lorry' of a sensor 2\.40 m above the ground; expected 1\.73 m"
+        DataError,
+        match=r"layout 'lorry' of a sensor 2\.40 m above the ground; expected 1\.73 m",
     ):
         batch_of("layout", tall, 1, SENSOR, shape, options)
 
@@ -153,11 +168,15 @@ def test_a_layout_of_another_sensor_or_out_of_range_is_refused(model: Path) -> N
 def test_a_reduced_condition_knows_boxes_and_the_ground_nearby_alone() -> None:
     wall = Outline("building", np.float32([(-50, 8), (50, 8)]), -1.7, 5)
     layout = Layout(
-        Boxes(np.float32([[12, 0, -1, 4, 2, 1.5, 0]]), ("Car",)), outlines=[wall], reach=70
+        Boxes(np.float32([[12, 0, -1, 4, 2, 1.5, 0]]), ("Car",)),
+        outlines=[wall],
+        reach=70,
     )
     image = layout_image(layout, replace(SENSOR, columns=256, rows=32))
     values = torch.from_numpy(image).expand(3, *image.shape)
-    less = CONDITIONS["layout"].reduced(values, torch.tensor([0.0, 0.5, 1.0]), 1).numpy()
+    less = (
+        CONDITIONS["layout"].reduced(values, torch.tensor([0.0, 0.5, 1.0]), 1).numpy()
+    )
     for one, reach in zip(less, (5, 20, 80), strict=True):
         kept = (image[0] >= CODES["Car"]) | (
             (image[0] == CODES["ground"]) & (depth_of(image) < reach)
@@ -166,18 +185,28 @@ def test_a_reduced_condition_knows_boxes_and_the_ground_nearby_alone() -> None:
     assert (less[0, 0] > 0).sum() < (less[1, 0] > 0).sum() < (less[2, 0] > 0).sum()
 
 
-def test_a_bank_keeps_boxes_and_instances(bank: Path, model: Path, folder: Path) -> None:
+def test_a_bank_keeps_boxes_and_instances(
+    bank: Path, model: Path, folder: Path
+) -> None:
     opened, (generator, layouts) = Bank(bank), generated(model, folder)
-    assert opened.index.sources[0].format == BOXED_FORMAT and opened.fields >= {"boxes", "instance"}
+    assert opened.index.sources[0].format == BOXED_FORMAT and opened.fields >= {
+        "boxes",
+        "instance",
+    }
     assert [opened.condition(i) for i in range(4)] == ["none", "one", "two", "none"]
     assert (
         not verify(bank, progress=False)
         and min(regenerate(bank, str(model), progress=False).values()) > 0.9
     )
     for number in range(COUNT):
-        scan, [made] = opened[number], generator.scans(4, [number], [layouts[number % 3]])
+        scan, [made] = (
+            opened[number],
+            generator.scans(4, [number], [layouts[number % 3]]),
+        )
         assert scan.boxes is not None and made.boxes is not None
-        assert scan.boxes.names == made.boxes.names and np.array_equal(scan.instance, made.instance)  # type: ignore[arg-type]
+        assert scan.boxes.names == made.boxes.names and np.array_equal(
+            scan.instance, made.instance
+        )  # type: ignore[arg-type]
         assert np.abs(scan.boxes.values - made.boxes.values).max(initial=0) < 1e-4
     assert any(len(opened[i].boxes) for i in range(COUNT))  # type: ignore[arg-type]
 
@@ -187,7 +216,9 @@ def test_banks_with_boxes_are_split_merged_and_repaired(
 ) -> None:
     opened = Bank(bank)
     split(opened, {tmp_path / "a": 0.5, tmp_path / "b": 0.5}, progress=False)
-    merge([Bank(tmp_path / "a"), Bank(tmp_path / "b")], tmp_path / "both", progress=False)
+    merge(
+        [Bank(tmp_path / "a"), Bank(tmp_path / "b")], tmp_path / "both", progress=False
+    )
     head(opened, 4, tmp_path / "head", progress=False)
     for name, count in (("both", COUNT), ("head", 4)):
         again = Bank(tmp_path / name)
@@ -218,7 +249,9 @@ def test_changed_layouts_are_refused_when_a_bake_resumes_or_is_repaired(
     bake(plan_in(tmp_path / "bank", model, condition=str(own)), progress=False)
     (tmp_path / "bank" / "shard-00000.h5").unlink()
     (own / "one.yaml").write_text(LAYOUTS["two"])
-    with pytest.raises(ConfigError, match="which have changed since the bank was begun"):
+    with pytest.raises(
+        ConfigError, match="which have changed since the bank was begun"
+    ):
         repair(tmp_path / "bank", str(model), progress=False)
     with pytest.raises(ConfigError, match="was filled with .*condition_content"):
         bake(plan_in(tmp_path / "bank", model, condition=str(own)), progress=False)
@@ -234,11 +267,19 @@ def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(
     generator, layouts = generated(model, folder)
     for source in (Bank(bank), Generated(generator, seed=4, condition=layouts)):
         mixed = MixedScans(
-            None, source, 1.0, labels="boxes", epoch_size=6, unboxed="keep", compare=False
+            None,
+            source,
+            1.0,
+            labels="boxes",
+            epoch_size=6,
+            unboxed="keep",
+            compare=False,
         )
         batches = list(DataLoader(mixed, batch_size=3, collate_fn=mixed.collate))
         assert sum(len(batch["boxes"]) for batch in batches) > 0
-        assert {name for batch in batches for names in batch["names"] for name in names} <= {
+        assert {
+            name for batch in batches for names in batch["names"] for name in names
+        } <= {
             "Truck",
             "Car",
             "Tram",
@@ -246,14 +287,21 @@ def test_a_detector_gets_boxes_from_the_bank_and_from_the_generator(
 
 
 def test_a_bank_without_boxes_is_refused_for_a_detector(tmp_path: Path) -> None:
-    bake(plan_in(tmp_path / "plain", write(tmp_path / "plain.safetensors")), progress=False)
+    bake(
+        plan_in(tmp_path / "plain", write(tmp_path / "plain.safetensors")),
+        progress=False,
+    )
     with pytest.raises(ConfigError, match="labels='boxes', but besides points"):
         make_policy("boxes", fields=Bank(tmp_path / "plain").fields)
 
 
-def test_the_command_line_takes_a_layout(model: Path, folder: Path, tmp_path: Path) -> None:
+def test_the_command_line_takes_a_layout(
+    model: Path, folder: Path, tmp_path: Path
+) -> None:
     def call(*words: Any) -> Any:
-        return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=True)
+        return CliRunner().invoke(
+            app, [str(word) for word in words], catch_exceptions=True
+        )
 
     done = call(
         "sample",
@@ -271,7 +319,12 @@ def test_the_command_line_takes_a_layout(model: Path, folder: Path, tmp_path: Pa
     assert open_scans(tmp_path / "out")[0].boxes.names == ("Tram",)  # type: ignore[union-attr]
     semantic = write(tmp_path / "semantic.safetensors", dropout=0.1)
     refused = call(
-        "sample", tmp_path / "no", "--model", semantic, "--condition", folder / "two.yaml"
+        "sample",
+        tmp_path / "no",
+        "--model",
+        semantic,
+        "--condition",
+        folder / "two.yaml",
     )
     assert refused.exit_code == 1 and "layouts for model 'semantic'" in str(
         refused.exception or refused.output
@@ -283,7 +336,9 @@ def test_rows_of_boxes_are_encoded_and_refused() -> None:
     values = rng.uniform(
         (-80, -80, -3, 0.1, 0.1, 0.1, -np.pi), (80, 80, 3, 30, 4, 5, np.pi), (50, 7)
     ).astype(np.float32)
-    boxes = Boxes(values, ("Cyclist", "Car") * 25, instance=np.arange(1, 51, dtype=np.int32))
+    boxes = Boxes(
+        values, ("Cyclist", "Car") * 25, instance=np.arange(1, 51, dtype=np.int32)
+    )
     rows = encode_boxes(boxes)
     again = decode_boxes(rows)
     assert (
@@ -313,7 +368,9 @@ def test_rows_of_boxes_are_encoded_and_refused() -> None:
         with pytest.raises(DataError, match="boxes"):
             encode_boxes(bad)
     image = RangeImage(
-        np.zeros(SENSOR.shape, np.float32), SENSOR, {"instance": np.zeros(SENSOR.shape, np.int32)}
+        np.zeros(SENSOR.shape, np.float32),
+        SENSOR,
+        {"instance": np.zeros(SENSOR.shape, np.int32)},
     )
     with pytest.raises(DataError, match=r"without \['boxes'\]"):
         Encoding(SENSOR, {"instance", "boxes"}).encode(image)
@@ -328,14 +385,20 @@ def test_ground_in_a_box_belongs_to_no_object() -> None:
     )
     image = RangeImage(distance, SENSOR, {"label": label})
     made = add_boxes(
-        image, Boxes(np.float32([[10, 0, 0, 4, 4, 4, 0], [-30, 0, 0, 1, 1, 1, 0]]), ("Car", "Car"))
+        image,
+        Boxes(
+            np.float32([[10, 0, 0, 4, 4, 4, 0], [-30, 0, 0, 1, 1, 1, 0]]),
+            ("Car", "Car"),
+        ),
     )
     scan = unproject(made)
     assert scan.boxes is not None and len(scan.boxes) == 1 and scan.instance is not None
     assert (scan.instance > 0).any() and (scan.label[scan.instance > 0] == 0).all()  # type: ignore[index]
 
 
-def test_a_reduced_layout_keeps_its_boxes_and_stays_with_its_scan(tmp_path: Path) -> None:
+def test_a_reduced_layout_keeps_its_boxes_and_stays_with_its_scan(
+    tmp_path: Path,
+) -> None:
     plain, less = (
         conditioned_batches(tmp_path, "layout", reduction=r, flip=True, roll=True)
         for r in (0.0, 0.5)

@@ -40,7 +40,9 @@ def test_a_scan_is_known_by_its_hash_in_every_layout(tmp_path: Path, to: str) ->
     write_all(to, tmp_path, scans)
     for known, found in ((scans[1], True), (some(1, seed=9)[0], False)):
         seen = contents([content_of(known)])
-        reference = measured(open_scans(tmp_path), layout_of(tmp_path), tmp_path, None, seen)
+        reference = measured(
+            open_scans(tmp_path), layout_of(tmp_path), tmp_path, None, seen
+        )
         assert bool(overlap(seen, reference)) == found
 
 
@@ -49,10 +51,15 @@ def test_scans_are_not_read_for_a_model_without_hashes(
 ) -> None:
     write_all("semantic_kitti", tmp_path, some(2))
     monkeypatch.setattr(
-        "lidar_synth.lab.evaluate.leakage.content_of", lambda scan: pytest.fail("a scan was hashed")
+        "lidar_synth.lab.evaluate.leakage.content_of",
+        lambda scan: pytest.fail("a scan was hashed"),
     )
     measured(
-        open_scans(tmp_path), "semantic_kitti", tmp_path, None, all_frames("KITTI-360", ["a drive"])
+        open_scans(tmp_path),
+        "semantic_kitti",
+        tmp_path,
+        None,
+        all_frames("KITTI-360", ["a drive"]),
     )
 
 
@@ -69,7 +76,9 @@ def test_a_damaged_note_is_an_error_that_names_it(tmp_path: Path, text: str) -> 
 
 
 def generated(folder: Path, to: str, note: dict[str, object] | None = None) -> Path:
-    made = [replace(scan, domain=SYNTHETIC, provenance=MADE) for scan in some(3, seed=5)]
+    made = [
+        replace(scan, domain=SYNTHETIC, provenance=MADE) for scan in some(3, seed=5)
+    ]
     write_all(to, folder, made)
     if note is not None:
         (folder / NOTE).write_text(json.dumps(note))
@@ -85,21 +94,24 @@ def test_scans_of_an_unknown_model_are_compared_with_a_note(tmp_path: Path) -> N
         assert "does not record its model's training data" in result.stderr
     write_all("npz", tmp_path / "others", some(3, seed=5))
     assert (
-        "does not record" not in CliRunner().invoke(app, [*call, str(tmp_path / "others")]).stderr
+        "does not record"
+        not in CliRunner().invoke(app, [*call, str(tmp_path / "others")]).stderr
     )
 
 
 @pytest.mark.parametrize("first", ["sampled", "baked"])
-def test_converted_scans_keep_what_their_model_has_seen(tmp_path: Path, first: str) -> None:
+def test_converted_scans_keep_what_their_model_has_seen(
+    tmp_path: Path, first: str
+) -> None:
     known = {"data": "?", "seen": contents([content_of(some(1)[0])]).to_list()}
     if first == "sampled":
         start = generated(
             tmp_path / "0", "npz", {"trained_on": "?", "seed": 3, "seen": known["seen"]}
         )
     else:
-        start = write_bank(tmp_path / "0", [some_image(i) for i in range(3)], provenance=known)[
-            0
-        ].parent
+        start = write_bank(
+            tmp_path / "0", [some_image(i) for i in range(3)], provenance=known
+        )[0].parent
     for number, to in enumerate(["kitti", "webdataset", "semantic_kitti"]):
         convert(
             open_scans(tmp_path / str(number)),
@@ -110,11 +122,12 @@ def test_converted_scans_keep_what_their_model_has_seen(tmp_path: Path, first: s
     assert seen_by_model_of(start)
     write_all("semantic_kitti", tmp_path / "real", some(3))
     result = CliRunner().invoke(
-        app, ["evaluate", str(tmp_path / "real"), str(tmp_path / "3"), "--protocol", "town"]
+        app,
+        ["evaluate", str(tmp_path / "real"), str(tmp_path / "3"), "--protocol", "town"],
     )
-    assert isinstance(result.exception, ConfigError) and "was trained on content" in str(
-        result.exception
-    )
+    assert isinstance(
+        result.exception, ConfigError
+    ) and "was trained on content" in str(result.exception)
     (tmp_path / "3" / MODELS).write_text('{"models": [5]}')
     with pytest.raises(DataError, match=MODELS):
         seen_by_model_of(tmp_path / "3")
@@ -122,5 +135,10 @@ def test_converted_scans_keep_what_their_model_has_seen(tmp_path: Path, first: s
 
 def test_scans_that_no_model_made_get_no_note(tmp_path: Path) -> None:
     write_all("npz", tmp_path / "in", some(1))
-    convert(open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "out"), progress=False)
-    assert not (tmp_path / "out" / MODELS).exists() and seen_by_model_of(tmp_path / "out") is None
+    convert(
+        open_scans(tmp_path / "in"), WRITERS["kitti"](tmp_path / "out"), progress=False
+    )
+    assert (
+        not (tmp_path / "out" / MODELS).exists()
+        and seen_by_model_of(tmp_path / "out") is None
+    )

@@ -24,7 +24,9 @@ WORKERS = [
     pytest.param({"num_workers": 0}, id="0 workers"),
     pytest.param({"num_workers": 2}, id="2 workers", marks=pytest.mark.slow),
     pytest.param(
-        {"num_workers": 2, "persistent_workers": True}, id="2 that persist", marks=pytest.mark.slow
+        {"num_workers": 2, "persistent_workers": True},
+        id="2 that persist",
+        marks=pytest.mark.slow,
     ),
 ]
 SCHEDULED = pytest.mark.parametrize("schedule", SCHEDULES)
@@ -43,7 +45,9 @@ def number(scan: Scan, rng: Any) -> torch.Tensor:
 def mixed(schedule: str) -> MixedScans:
     """20 samples an epoch."""
     real = Scans("r", 10)
-    return MixedScans(real, Endless(), SCHEDULES[schedule], to_sample=number, collate=torch.stack)
+    return MixedScans(
+        real, Endless(), SCHEDULES[schedule], to_sample=number, collate=torch.stack
+    )
 
 
 def planned(train: MixedScans, epoch: int, start: int = 0) -> list[int]:
@@ -56,11 +60,15 @@ def read(batches: Any) -> list[int]:
     return [int(x) for batch in batches for x in batch]
 
 
-def make_loader(train: MixedScans, form: str, kind: Any = DataLoader, **workers: Any) -> Any:
+def make_loader(
+    train: MixedScans, form: str, kind: Any = DataLoader, **workers: Any
+) -> Any:
     if form == "stream":
         stream = MixedStream(train, batch_size=4, endless=False)
         return kind(stream, 4, **workers)
-    return kind(train, batch_sampler=train.batches(4), collate_fn=train.collate, **workers)
+    return kind(
+        train, batch_sampler=train.batches(4), collate_fn=train.collate, **workers
+    )
 
 
 def begin(train: MixedScans, loader: DataLoader[Any], start: str) -> None:
@@ -68,14 +76,18 @@ def begin(train: MixedScans, loader: DataLoader[Any], start: str) -> None:
     epoch, position = STARTS[start]
     if position:
         order: Any = (
-            loader.dataset if isinstance(loader.dataset, MixedStream) else loader.batch_sampler
+            loader.dataset
+            if isinstance(loader.dataset, MixedStream)
+            else loader.batch_sampler
         )
         order.load_state_dict(make_state(train.mixture, epoch, position))
     elif epoch:
         train.set_epoch(epoch)
 
 
-def check_passes(train: MixedScans, loader: Any, start: str, ordered: bool = True) -> None:
+def check_passes(
+    train: MixedScans, loader: Any, start: str, ordered: bool = True
+) -> None:
     """The rest of the first epoch, and two whole ones."""
     first, position = STARTS[start]
     for epoch in range(first, first + 3):
@@ -90,7 +102,9 @@ def check_passes(train: MixedScans, loader: Any, start: str, ordered: bool = Tru
 @STARTED
 @FORMS
 @WORKED
-def test_a_data_loader(workers: dict[str, Any], form: str, start: str, schedule: str) -> None:
+def test_a_data_loader(
+    workers: dict[str, Any], form: str, start: str, schedule: str
+) -> None:
     train = mixed(schedule)
     loader = make_loader(train, form, **workers)
     begin(train, loader, start)
@@ -100,7 +114,9 @@ def test_a_data_loader(workers: dict[str, Any], form: str, start: str, schedule:
 def make_shards(train: MixedScans, kind: Any, **workers: Any) -> list[Any]:
     """Loaders of two ranks by torch's own sampler."""
     samplers = [DistributedSampler(train, 2, rank) for rank in range(2)]
-    return [kind(train, 4, sampler=s, collate_fn=train.collate, **workers) for s in samplers]
+    return [
+        kind(train, 4, sampler=s, collate_fn=train.collate, **workers) for s in samplers
+    ]
 
 
 def make_chained(train: MixedScans, kind: Any, **workers: Any) -> list[Any]:
@@ -157,7 +173,9 @@ def test_a_stream_is_in_no_sampler_and_no_concatenation() -> None:
         DistributedSampler(stream, 2, 0)
     with pytest.raises(ValueError, match="expected unspecified sampler"):
         DataLoader(stream, 4, sampler=DistributedSampler(mixed("rising"), 2, 0))
-    with pytest.raises(AssertionError, match="ConcatDataset does not support IterableDataset"):
+    with pytest.raises(
+        AssertionError, match="ConcatDataset does not support IterableDataset"
+    ):
         ConcatDataset([stream, mixed("rising")])
 
 
@@ -229,7 +247,9 @@ def fit(tmp_path: Path) -> Any:
     return train
 
 
-def make_model(stop: tuple[int, int] = (9, 9), begin: Callable[[int], None] = print) -> Any:
+def make_model(
+    stop: tuple[int, int] = (9, 9), begin: Callable[[int], None] = print
+) -> Any:
     """A Lightning module that keeps what it has seen.
 
     Args:
@@ -285,7 +305,9 @@ def test_lightning(
         options = {"ckpt_path": tmp_path / "last.ckpt"}
     model = make_model()
     fit(model, make_data(), **options)
-    assert seen + model.seen == [x for e in range(first, first + 3) for x in planned(train, e)]
+    assert seen + model.seen == [
+        x for e in range(first, first + 3) for x in planned(train, e)
+    ]
 
 
 @SCHEDULED
@@ -299,7 +321,9 @@ def test_lightning_with_a_stream(
 
     train = mixed(schedule)
     stream = MixedStream(train, batch_size=4, endless=False)
-    with pytest.raises(ConfigError, match=r"train=MixedStream.*MixedData\(stream.scans\)"):
+    with pytest.raises(
+        ConfigError, match=r"train=MixedStream.*MixedData\(stream.scans\)"
+    ):
         MixedData(stream)  # type: ignore[arg-type]
     first, _ = STARTS[start]
     train.set_epoch(first)

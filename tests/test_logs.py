@@ -21,7 +21,9 @@ def town_of(name: str) -> list[Scan]:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(name: str, tmp_path: Path) -> None:
+def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(
+    name: str, tmp_path: Path
+) -> None:
     folder = tmp_path / "logs"
     fitted = tmp_path / "mine.yaml"
     scans = town_of(name)
@@ -37,7 +39,11 @@ def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(name: str, tmp_path: Pat
     sensor = load_sensor(fitted)
     read = real[0]
     own = scans[0]
-    there = np.ones(len(own), bool) if name != "ouster" else LOGS[name].columns(own)["range"] > 0
+    there = (
+        np.ones(len(own), bool)
+        if name != "ouster"
+        else LOGS[name].columns(own)["range"] > 0
+    )
     beams = np.degrees(own.sensor.row_elevations())
     assert np.abs(np.array(sensor.elevations) - beams).max() < 0.02
     assert np.array_equal(read.points, own.points[there]) and np.array_equal(
@@ -45,12 +51,16 @@ def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(name: str, tmp_path: Pat
     )
     assert np.allclose(read.reflectance, own.reflectance[there], atol=0.5 / 255 + 1e-6)
     since = turn_time(own)[there] - turn_time(own)[there].min()
-    assert read.time is not None and np.allclose(read.time - read.time.min(), since, atol=1e-6)
+    assert read.time is not None and np.allclose(
+        read.time - read.time.min(), since, atol=1e-6
+    )
 
 
 def test_channels_and_files_without_a_sensor_are_read(tmp_path: Path) -> None:
     scan = town_of("velodyne")[0]
-    write_log(tmp_path / "a.pcd", {**axes(scan), "channel": scan.ring.astype(np.uint16)})
+    write_log(
+        tmp_path / "a.pcd", {**axes(scan), "channel": scan.ring.astype(np.uint16)}
+    )
     source = open_scans(tmp_path / "a.pcd")
     source.skip_sensor_check()
     assert np.array_equal(source[0].ring, scan.ring)
@@ -72,5 +82,19 @@ def test_plain_files_are_fitted_with_the_options_of_convert(
     assert f"--reflectance-max {highest}" in capsys.readouterr().err
     given = ("--fields", 5, "--layout", "folder", "--reflectance-max", 1999)
     assert run("sensor", "fit", tmp_path, *given, "--out", out) == 0
-    assert run("view", tmp_path, *given, "--sensor", out, "--out", tmp_path / "a.png") == 0
-    assert run("convert", tmp_path, tmp_path / "out", "--to", "npz", *given, "--sensor", out) == 0
+    assert (
+        run("view", tmp_path, *given, "--sensor", out, "--out", tmp_path / "a.png") == 0
+    )
+    assert (
+        run(
+            "convert",
+            tmp_path,
+            tmp_path / "out",
+            "--to",
+            "npz",
+            *given,
+            "--sensor",
+            out,
+        )
+        == 0
+    )

@@ -36,9 +36,9 @@ def streets(seed: int) -> list[Scan]:
 
 def arrays_of(scan: Scan) -> Arrays:
     assert scan.label is not None
-    return np.column_stack([scan.points, scan.reflectance]).astype(np.float32), scan.label.astype(
-        np.int64
-    )
+    return np.column_stack([scan.points, scan.reflectance]).astype(
+        np.float32
+    ), scan.label.astype(np.int64)
 
 
 def pointcept(points: np.ndarray, label: np.ndarray) -> Any:
@@ -118,7 +118,10 @@ def numbered(
     change: Callable[[np.ndarray], np.ndarray],
 ) -> Callable[[np.ndarray, np.ndarray], Arrays]:
     """Other numbers of the classes; "ignore" stays."""
-    return lambda points, label: (points, np.where(label == IGNORE, IGNORE, change(label)))
+    return lambda points, label: (
+        points,
+        np.where(label == IGNORE, IGNORE, change(label)),
+    )
 
 
 def raw_ids(label: np.ndarray) -> np.ndarray:
@@ -128,7 +131,10 @@ def raw_ids(label: np.ndarray) -> np.ndarray:
 
 
 MISTAKES: dict[str, tuple[Callable[[np.ndarray, np.ndarray], Arrays], str]] = {
-    "classes too high": (numbered(lambda k: k + 1), "class 9 looks like your 8.*off by one"),
+    "classes too high": (
+        numbered(lambda k: k + 1),
+        "class 9 looks like your 8.*off by one",
+    ),
     "classes too low": (
         numbered(lambda k: np.maximum(k - 1, 0)),
         "class 7 looks like your 8.*off by one",
@@ -152,7 +158,9 @@ MISTAKES: dict[str, tuple[Callable[[np.ndarray, np.ndarray], Arrays], str]] = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_named(mistake: str) -> None:
     wrong, message = MISTAKES[mistake]
-    with pytest.raises(ConfigError, match=f"mean something else.*{message}.*compare=False"):
+    with pytest.raises(
+        ConfigError, match=f"mean something else.*{message}.*compare=False"
+    ):
         wrapped("tuple", wrong, streets(1), streets(2))
 
 
@@ -166,12 +174,16 @@ def test_scans_of_another_street_are_accepted_in_every_trainers_form(
 
 @pytest.mark.parametrize("form", [form for form in FORMS if form != "openpcdet"])
 def test_mistakes_are_found_in_every_trainers_form(form: str) -> None:
-    for mistake in ("raw ids", "centimetres") if form != "open3d-ml" else ("centimetres",):
+    for mistake in (
+        ("raw ids", "centimetres") if form != "open3d-ml" else ("centimetres",)
+    ):
         with pytest.raises(ConfigError, match=MISTAKES[mistake][1]):
             wrapped(form, MISTAKES[mistake][0], streets(1), streets(2))
 
 
-def test_the_ground_a_little_lower_is_only_reported(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_ground_a_little_lower_is_only_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     def lower(points: np.ndarray, label: np.ndarray) -> Arrays:
         return points - np.float32([0, 0, 0.7, 0]), label
 
@@ -206,16 +218,20 @@ def test_check_mix_shows_both_and_names_mistakes(tmp_path: Path) -> None:
     ):
         assert line in done.output
     upside_down = [
-        replace(scan, points=scan.points * np.float32([1, 1, -1])) for scan in streets(2)
+        replace(scan, points=scan.points * np.float32([1, 1, -1]))
+        for scan in streets(2)
     ]
     settings.write_text(f"synthetic: {write_folder(upside_down, tmp_path / 'wrong')}\n")
     done = CliRunner().invoke(app, arguments)
-    assert isinstance(done.exception, ConfigError) and "z points down" in str(done.exception)
+    assert isinstance(done.exception, ConfigError) and "z points down" in str(
+        done.exception
+    )
 
 
 def real_sources(real: Path, labelled: Path) -> dict[str, Any]:
     roots = {
-        name: real / name for name in ("kitti360", "semantic_kitti", "kitti_object", "nuscenes")
+        name: real / name
+        for name in ("kitti360", "semantic_kitti", "kitti_object", "nuscenes")
     }
     roots |= {
         "raw": real / "kitti_raw" / "2011_09_26",
@@ -229,7 +245,8 @@ def test_no_real_dataset_is_refused_beside_another_or_the_town(
 ) -> None:
     sources = real_sources(real_scans, labelled_scans)
     scans = {
-        name: [source[i] for i in range(min(len(source), 4))] for name, source in sources.items()
+        name: [source[i] for i in range(min(len(source), 4))]
+        for name, source in sources.items()
     }
     scans["town"] = streets(2)
     measured = {
@@ -238,14 +255,20 @@ def test_no_real_dataset_is_refused_beside_another_or_the_town(
     }
     for name, ours in measured.items():
         for other, theirs in measured.items():
-            assert not [each for each in contradictions(ours, theirs) if each.certain], (
+            assert not [
+                each for each in contradictions(ours, theirs) if each.certain
+            ], (
                 name,
                 other,
             )
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_named_beside_real_scans(mistake: str, labelled_scans: Path) -> None:
+def test_mistakes_are_named_beside_real_scans(
+    mistake: str, labelled_scans: Path
+) -> None:
     source = open_scans(labelled_scans / "semantic_kitti_consecutive")
     with pytest.raises(ConfigError, match=MISTAKES[mistake][1]):
-        wrapped("tuple", MISTAKES[mistake][0], [source[i] for i in range(4)], streets(2))
+        wrapped(
+            "tuple", MISTAKES[mistake][0], [source[i] for i in range(4)], streets(2)
+        )

@@ -64,7 +64,9 @@ def test_reset_forgets_the_generated_scans_and_real_ones_on_request() -> None:
 
 def test_merged_metrics_are_one() -> None:
     parts = [Metric("town"), Metric("town")]
-    for metric, real, fake in zip(parts, (REAL[:2], REAL[2:]), (FAKE[:3], FAKE[3:]), strict=True):
+    for metric, real, fake in zip(
+        parts, (REAL[:2], REAL[2:]), (FAKE[:3], FAKE[3:]), strict=True
+    ):
         metric.update(real, real=True)
         metric.update(fake, real=False)
     parts[0].merge(parts[1])
@@ -81,7 +83,9 @@ def of_a_rank(rank: int, store: str, out: str) -> None:
     metric.update(REAL[rank::2], real=True)
     metric.update(FAKE[rank::2], real=False)
     values = metric.compute()
-    assert metric.compute() == values  # what was gathered is not collected a second time
+    assert (
+        metric.compute() == values
+    )  # what was gathered is not collected a second time
     Path(out, str(rank)).write_text(repr(sorted(values.items())))
     torch.distributed.destroy_process_group()
 
@@ -90,7 +94,9 @@ def of_a_rank(rank: int, store: str, out: str) -> None:
 def test_processes_compute_one_value_together(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     ranks = [
-        context.Process(target=of_a_rank, args=(r, str(tmp_path / "store"), str(tmp_path)))
+        context.Process(
+            target=of_a_rank, args=(r, str(tmp_path / "store"), str(tmp_path))
+        )
         for r in range(2)
     ]
     for process in ranks:
@@ -107,18 +113,29 @@ def test_processes_compute_one_value_together(tmp_path: Path) -> None:
         {"moments": moments},
         progress=False,
     )
-    for (name, value), score in zip(eval(one), sorted(alone, key=lambda s: s.metric), strict=True):
+    for (name, value), score in zip(
+        eval(one), sorted(alone, key=lambda s: s.metric), strict=True
+    ):
         assert name == score.metric and value == pytest.approx(score.value, rel=1e-9)
 
 
 def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> None:
-    many = [[random_scan(SENSOR, 300, first + i) for i in range(30)] for first in (0, 50)]
+    many = [
+        [random_scan(SENSOR, 300, first + i) for i in range(30)] for first in (0, 50)
+    ]
     scores = evaluate(
-        *many, "town", {"moments": moments}, progress=False, replicates=40, extended=True
+        *many,
+        "town",
+        {"moments": moments},
+        progress=False,
+        replicates=40,
+        extended=True,
     )
     by_name = {s.metric: s for s in scores}
     assert all(
-        s.low is not None and s.low <= s.high for s in scores if "infinitely" not in s.metric
+        s.low is not None and s.low <= s.high
+        for s in scores
+        if "infinitely" not in s.metric
     )
     assert 0 <= by_name["precision of moments"].value <= 1
     same = evaluate(
@@ -130,15 +147,28 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
         replicates=40,
         extended=True,
     )
-    shares = [s for s in same if s.metric.startswith(("precision", "recall", "coverage"))]
+    shares = [
+        s for s in same if s.metric.startswith(("precision", "recall", "coverage"))
+    ]
     assert len(shares) == 3 and all(s.high is not None and s.high <= 1 for s in shares)
-    assert {"recall of moments", "density of moments", "coverage of moments"} <= by_name.keys()
+    assert {
+        "recall of moments",
+        "density of moments",
+        "coverage of moments",
+    } <= by_name.keys()
     frechet, unbiased = (
-        by_name[f"Frechet distance of moments{end}"] for end in ("", ", infinitely many samples")
+        by_name[f"Frechet distance of moments{end}"]
+        for end in ("", ", infinitely many samples")
     )
     assert unbiased.value < frechet.value
     few = evaluate(
-        REAL, FAKE, "town", {"moments": moments}, progress=False, replicates=40, extended=True
+        REAL,
+        FAKE,
+        "town",
+        {"moments": moments},
+        progress=False,
+        replicates=40,
+        extended=True,
     )
     # 4 scans, 6 features.
     assert next(s for s in few if s.metric == "Frechet distance of moments").low is None
@@ -151,15 +181,29 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
 
 def test_features_that_are_not_finite_name_their_scan() -> None:
     broken = lambda scans: np.where([[s.id == REAL[1].id] for s in scans], np.nan, 1.0)  # noqa: E731
-    with pytest.raises(DataError, match=f"scan {REAL[1].id!r}: features that are not finite"):
+    with pytest.raises(
+        DataError, match=f"scan {REAL[1].id!r}: features that are not finite"
+    ):
         evaluate(REAL, FAKE, "town", {"broken": broken}, progress=False)
-    with pytest.raises(DataError, match=r"features of shape \(6,\) of 6 scans; expected \(6, D\)"):
-        evaluate(REAL, FAKE, "town", {"flat": lambda scans: np.ones(len(scans))}, progress=False)
+    with pytest.raises(
+        DataError, match=r"features of shape \(6,\) of 6 scans; expected \(6, D\)"
+    ):
+        evaluate(
+            REAL,
+            FAKE,
+            "town",
+            {"flat": lambda scans: np.ones(len(scans))},
+            progress=False,
+        )
 
 
 def test_one_scan_has_no_frechet_distance() -> None:
-    assert evaluate(REAL[:1], FAKE[:1], "town", progress=False)  # histograms can be compared
-    with pytest.raises(DataError, match="features of 1 and 4 scans; expected at least two of each"):
+    assert evaluate(
+        REAL[:1], FAKE[:1], "town", progress=False
+    )  # histograms can be compared
+    with pytest.raises(
+        DataError, match="features of 1 and 4 scans; expected at least two of each"
+    ):
         evaluate(REAL[:1], FAKE, "town", {"moments": moments}, progress=False)
     with pytest.raises(
         DataError, match="1 real and 4 generated samples; expected at least two of each"
@@ -239,7 +283,9 @@ def test_a_damaged_file_is_made_again(tmp_path: Path) -> None:
     count = Counting()
     cached = Cached(count, tmp_path, "weights")
     cached(REAL[:2])
-    for file, content in zip(sorted(tmp_path.rglob("*.npz")), (b"", b"PK broken"), strict=True):
+    for file, content in zip(
+        sorted(tmp_path.rglob("*.npz")), (b"", b"PK broken"), strict=True
+    ):
         file.write_bytes(content)
     assert np.array_equal(cached(REAL[:2]), moments(REAL[:2])) and len(count.seen) == 4
     cached(REAL[:2])
@@ -251,7 +297,10 @@ def test_weights_are_told_apart_by_content(tmp_path: Path) -> None:
         (tmp_path / name / "deep").mkdir(parents=True)
         (tmp_path / name / "deep" / "weights").write_text(content)
     a, b, c = (weights_hash(tmp_path / name) for name in "abc")
-    assert a == b != c and weights_hash(tmp_path / "c" / "deep" / "weights") not in (a, c)
+    assert a == b != c and weights_hash(tmp_path / "c" / "deep" / "weights") not in (
+        a,
+        c,
+    )
 
 
 def make_cached(folder: Path) -> Cached:
@@ -261,10 +310,16 @@ def make_cached(folder: Path) -> Cached:
 @pytest.mark.slow
 def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
     both = extract_all(partial(make_cached, tmp_path), REAL, processes=2, batch=2)
-    assert np.array_equal(both, moments(REAL)) and len(list(tmp_path.rglob("*.npz"))) == len(REAL)
-    unused = Cached(lambda scans: pytest.fail("not from the cache"), tmp_path, "weights")
+    assert np.array_equal(both, moments(REAL)) and len(
+        list(tmp_path.rglob("*.npz"))
+    ) == len(REAL)
+    unused = Cached(
+        lambda scans: pytest.fail("not from the cache"), tmp_path, "weights"
+    )
     assert np.array_equal(extract_all(lambda: unused, REAL), both)
-    with pytest.raises(ConfigError, match="2 processes without a cache; expected a folder"):
+    with pytest.raises(
+        ConfigError, match="2 processes without a cache; expected a folder"
+    ):
         evaluate(REAL, FAKE, "town", progress=False, processes=2)
 
 
@@ -275,7 +330,11 @@ def test_published_weights_are_measured_and_kept(
     from random_archives import write
 
     write("sparenet_pointnet", tmp_path / "weights")
-    options = {"weights": tmp_path / "weights", "cache": tmp_path / "cache", "progress": False}
+    options = {
+        "weights": tmp_path / "weights",
+        "cache": tmp_path / "cache",
+        "progress": False,
+    }
     left_out: dict[str, str] = {}
     first = evaluate(REAL[:2], FAKE[:2], "r2flow", left_out=left_out, **options)
     assert [s.table for s in first] == ["JSD", "MMD", "FPD"] and set(left_out) == {
@@ -287,7 +346,9 @@ def test_published_weights_are_measured_and_kept(
     files = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")}
     assert len(files) == 4
     assert evaluate(REAL[:2], FAKE[:2], "r2flow", **options) == first
-    assert files == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")}
+    assert files == {
+        p: p.stat().st_mtime_ns for p in (tmp_path / "cache").rglob("*.npz")
+    }
     assert first[-1].value > 0
 
 
@@ -355,7 +416,17 @@ def test_published_figures_name_their_protocol_and_source() -> None:
 
 def test_own_figures_stand_in_the_scale_of_the_table() -> None:
     scores = [
-        Score("BEV minimum matching distance", 8.72e-5, "r3dpa", 1000, 2000, "MMD", 1e5, 8e-5, 9e-5)
+        Score(
+            "BEV minimum matching distance",
+            8.72e-5,
+            "r3dpa",
+            1000,
+            2000,
+            "MMD",
+            1e5,
+            8e-5,
+            9e-5,
+        )
     ]
     shown = compare_published(scores)
     assert (

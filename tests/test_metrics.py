@@ -31,7 +31,11 @@ from lidar_synth.lab.evaluate.measures import KINDS
 from lidar_synth.lab.evaluate.protocols import FEATURES
 
 SENSOR = presets()["hdl64e_kitti360"]
-PAIRS = [("real", "fake", ""), ("real", "real", "_self"), ("dense_real", "dense_fake", "_dense")]
+PAIRS = [
+    ("real", "fake", ""),
+    ("real", "real", "_self"),
+    ("dense_real", "dense_fake", "_dense"),
+]
 Vectors = dict[str, np.ndarray]
 
 
@@ -50,10 +54,12 @@ def scans(count: int, seed: int, scale: float = 1.0) -> list[Scan]:
     label = np.random.default_rng(9).integers(0, 19, 3000).astype(np.uint8)
     made = []
     for i in range(count):
-        points = (street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)).astype(
-            np.float32
+        points = (
+            street + np.random.default_rng([seed, i]).normal(0, 0.02, street.shape)
+        ).astype(np.float32)
+        made.append(
+            Scan(points, np.zeros(3000, np.float32), SENSOR, label, id=f"{seed}-{i}")
         )
-        made.append(Scan(points, np.zeros(3000, np.float32), SENSOR, label, id=f"{seed}-{i}"))
     return made
 
 
@@ -63,7 +69,9 @@ def compared(protocol: str, name: str, real: list, fake: list) -> float:
     kind = KINDS[measure.kind]
     sides = [
         [
-            kind.describe(Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options)
+            kind.describe(
+                Scan(c, np.zeros(len(c), np.float32), SENSOR), measure.options
+            )
             for c in side
         ]
         for side in (real, fake)
@@ -93,10 +101,15 @@ def test_lidm_cells(vectors: Vectors) -> None:
         np.bincount(lidm.find_occupied(c, lidm.FINE), minlength=2000**2)
         for c in clouds(vectors, "real")
     )
-    assert np.array_equal(np.argwhere(counts.reshape(2000, 2000)), vectors["lidm/bev_sum_nonzero"])
+    assert np.array_equal(
+        np.argwhere(counts.reshape(2000, 2000)), vectors["lidm/bev_sum_nonzero"]
+    )
     assert np.array_equal(counts[counts > 0], vectors["lidm/bev_sum_values"])
     coarse = (
-        np.stack(np.divmod(lidm.find_occupied(clouds(vectors, "real")[0], lidm.COARSE), 200), 1)
+        np.stack(
+            np.divmod(lidm.find_occupied(clouds(vectors, "real")[0], lidm.COARSE), 200),
+            1,
+        )
         / 200
     )
     assert {tuple(c) for c in coarse.astype(np.float32)} == {
@@ -121,13 +134,19 @@ def test_lidm_figures(vectors: Vectors, real: str, fake: str, suffix: str) -> No
 def test_figures_of_features(vectors: Vectors) -> None:
     a = vectors["features_a"]
     b = vectors["features_b"]
-    assert frechet_distance(a, b) == pytest.approx(vectors["r2flow/frechet"][0], rel=1e-9)
+    assert frechet_distance(a, b) == pytest.approx(
+        vectors["r2flow/frechet"][0], rel=1e-9
+    )
     assert frechet_distance(b, a) == pytest.approx(vectors["lidm/frechet"][0], rel=1e-9)
     rng = np.random.RandomState(6003)
-    assert squared_mmd(a, b, rng) == pytest.approx(vectors["r2flow/squared_mmd"][0], rel=1e-9)
+    assert squared_mmd(a, b, rng) == pytest.approx(
+        vectors["r2flow/squared_mmd"][0], rel=1e-9
+    )
     rng = np.random.RandomState(6003)
     few = squared_mmd(a, b, rng, subsets=10, size=100)
-    assert few == pytest.approx(vectors["r2flow/squared_mmd_subsets10_size100"][0], rel=1e-9)
+    assert few == pytest.approx(
+        vectors["r2flow/squared_mmd_subsets10_size100"][0], rel=1e-9
+    )
 
 
 def test_squared_mmd_by_hand() -> None:
@@ -138,12 +157,16 @@ def test_squared_mmd_by_hand() -> None:
     within = (1 + 1) / 2 + (27 + 27) / 2
     across = (1 + 1 + 8 + 27) / 4
     assert squared_mmd(a, b, subsets=3) == pytest.approx(within - 2 * across)
-    assert squared_mmd(a, a, subsets=3) == pytest.approx((1 + 1) - 2 * (1 + 1 + 1 + 8) / 4)  # -3.5
+    assert squared_mmd(a, a, subsets=3) == pytest.approx(
+        (1 + 1) - 2 * (1 + 1 + 1 + 8) / 4
+    )  # -3.5
     # All pairs of disjoint halves of one set: 0 on average.
     everything = np.arange(6.0)[:, None] / 3
     halves = [list(chosen) for chosen in combinations(range(6), 3)]
     pairs = [(h, [i for i in range(6) if i not in h]) for h in halves]
-    three = [squared_mmd(everything[h], everything[rest], subsets=1) for h, rest in pairs]
+    three = [
+        squared_mmd(everything[h], everything[rest], subsets=1) for h, rest in pairs
+    ]
     assert np.mean(three) == pytest.approx(0, abs=1e-9)
 
 
@@ -152,7 +175,9 @@ def test_frechet_distance_by_hand() -> None:
     a = rng.normal(size=(50, 6))
     b = rng.normal(1, 2, (40, 6)) @ rng.normal(size=(6, 6))
     root = sqrtm(np.cov(a.T) @ np.cov(b.T)).real
-    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(np.cov(a.T) + np.cov(b.T) - 2 * root)
+    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(
+        np.cov(a.T) + np.cov(b.T) - 2 * root
+    )
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
     assert frechet_distance(a, a) == pytest.approx(0, abs=1e-9)
     assert frechet_distance(a, a + 3) == pytest.approx(6 * 9)
@@ -175,7 +200,11 @@ def test_jensen_shannon_distance_is_scipys(data: st.DataObject, bins: int) -> No
 @pytest.mark.parametrize("side", [40, 200])
 def test_distance_maps_are_exact(side: int) -> None:
     rng = np.random.default_rng(0)
-    for cells in (rng.choice(side**2, 300, replace=False), np.array([0]), np.arange(side)):
+    for cells in (
+        rng.choice(side**2, 300, replace=False),
+        np.array([0]),
+        np.arange(side),
+    ):
         mask = np.zeros((side, side), bool)
         mask.flat[cells] = True
         ours = lidm._distance_map(np.sort(cells).astype(np.int32), side)
@@ -190,18 +219,25 @@ def test_minimum_matching_distance_by_nearest_neighbours(
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((5, 1), (3, 2)))
     side = lidm.cells_along(cell)
     grids = [
-        [np.stack(np.divmod(lidm.find_occupied(p, cell), side), 1) / side for p in points]
+        [
+            np.stack(np.divmod(lidm.find_occupied(p, cell), side), 1) / side
+            for p in points
+        ]
         for points in (real, fake)
     ]
 
     def chamfer(a: np.ndarray, b: np.ndarray) -> float:
-        return ((cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()) / 2
+        return (
+            (cKDTree(b).query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean()
+        ) / 2
 
     expected = np.mean([min(chamfer(r, f) for f in grids[1]) for r in grids[0]])
     assert compared(protocol, "mmd", real, fake) == pytest.approx(expected, rel=1e-5)
 
 
-def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maximum_mean_discrepancy_by_its_definition(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(statistics, "_NUMBERS", 0)  # blocks of 16
     real, fake = ([s.points for s in scans(n, seed)] for n, seed in ((40, 1), (18, 2)))
     p, q = (
@@ -219,9 +255,12 @@ def test_maximum_mean_discrepancy_by_its_definition(monkeypatch: pytest.MonkeyPa
 def test_each_protocol_tells_near_from_far(name: str) -> None:
     real = scans(8, 0)
     same, near, far = (
-        evaluate(real, s, name, progress=False) for s in (real, scans(6, 1), scans(6, 2, 0.8))
+        evaluate(real, s, name, progress=False)
+        for s in (real, scans(6, 1), scans(6, 2, 0.8))
     )
-    assert len(same) == sum(m.kind != FEATURES for m in PROTOCOLS[name].measures.values())
+    assert len(same) == sum(
+        m.kind != FEATURES for m in PROTOCOLS[name].measures.values()
+    )
     for zero, small, large in zip(same, near, far, strict=True):
         # The two sets are made differently.
         apart = PROTOCOLS[name].prepare.real != PROTOCOLS[name].prepare.generated
@@ -234,17 +273,22 @@ def test_each_protocol_tells_near_from_far(name: str) -> None:
 def test_the_clouds_of_the_protocols() -> None:
     scan = random_scan(SENSOR, 5000)
     own = {tuple(p) for p in scan.points}
-    real, fake = (PROTOCOLS["r2flow"].cloud(scan, generated) for generated in (False, True))
+    real, fake = (
+        PROTOCOLS["r2flow"].cloud(scan, generated) for generated in (False, True)
+    )
     assert (
         len(real) == len(fake)
         and {tuple(p) for p in real} <= own
         and not {tuple(p) for p in fake} & own
     )
     assert np.allclose(
-        np.sort(np.linalg.norm(real, axis=1)), np.sort(np.linalg.norm(fake, axis=1)), rtol=1e-5
+        np.sort(np.linalg.norm(real, axis=1)),
+        np.sort(np.linalg.norm(fake, axis=1)),
+        rtol=1e-5,
     )
     assert (
-        np.linalg.norm(real, axis=1).min() >= 1.45 and 60 < np.linalg.norm(real, axis=1).max() < 63
+        np.linalg.norm(real, axis=1).min() >= 1.45
+        and 60 < np.linalg.norm(real, axis=1).max() < 63
     )
     corners = SENSOR.column_azimuths("corner")
     for name in ("lidm", "r3dpa"):
@@ -260,7 +304,9 @@ def test_the_clouds_of_the_protocols() -> None:
     small = Sensor("small", 64, 1.0, 90.0, rows=8, fov_up=5.0, fov_down=-20.0)
     assert len(PROTOCOLS["town"].cloud(random_scan(small), False)) <= 64 * 8
     edge = Scan(
-        np.array([(1, 0, 0), (56, 0, 0), (2, 0, 0)], np.float32), np.zeros(3, np.float32), SENSOR
+        np.array([(1, 0, 0), (56, 0, 0), (2, 0, 0)], np.float32),
+        np.zeros(3, np.float32),
+        SENSOR,
     )
     assert len(PROTOCOLS["lidm"].cloud(edge, False)) == 1  # both limits are exclusive
 
@@ -274,7 +320,9 @@ def test_extractors_add_frechet_distances_over_all_batches() -> None:
 
     real = scans(5, 0)
     fake = scans(4, 1)
-    scores = evaluate(real, fake, "town", {"moments": mean_and_spread}, batch=3, progress=False)
+    scores = evaluate(
+        real, fake, "town", {"moments": mean_and_spread}, batch=3, progress=False
+    )
     assert seen == [3, 2, 3, 1]
     by_name = {s.metric: s.value for s in scores}
     a = mean_and_spread(real)
@@ -285,7 +333,8 @@ def test_extractors_add_frechet_distances_over_all_batches() -> None:
 
 def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
     measures = {
-        k: m.model_copy(update={"real": 3}) for k, m in PROTOCOLS["r2flow"].measures.items()
+        k: m.model_copy(update={"real": 3})
+        for k, m in PROTOCOLS["r2flow"].measures.items()
     }
     limited = PROTOCOLS["r2flow"].model_copy(update={"measures": measures})
     asked = []
@@ -301,7 +350,11 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
     assert asked == [4, 2, 1]  # random.Random(0).shuffle of 6 numbers, the first 3
     assert (score.real, score.generated) == (3, 4)
     everything = evaluate(
-        real, fake, limited, {"moments": lambda some: np.ones((len(some), 2))}, progress=False
+        real,
+        fake,
+        limited,
+        {"moments": lambda some: np.ones((len(some), 2))},
+        progress=False,
     )
     # Features are of all scans, as R2Flow takes them.
     assert everything[0] == score and everything[-1].real == 6
@@ -310,19 +363,29 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
 def test_bad_input() -> None:
     good = scans(2, 0)
     with pytest.raises(
-        ConfigError, match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town"
+        ConfigError,
+        match="protocol 'jsd'; expected one of .*lidm, r2flow, r3dpa, spiral, town",
     ):
         evaluate(good, good, "jsd")
     with pytest.raises(DataError, match="no generated scans; expected at least one"):
         evaluate(good, [], "lidm", progress=False)
-    empty = Scan(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), SENSOR, id="blank")
-    for name, area in (("r2flow", "3 m to 70 m"), ("lidm", r"\+-50 m"), ("town", "3 m to 70 m")):
+    empty = Scan(
+        np.zeros((0, 3), np.float32), np.zeros(0, np.float32), SENSOR, id="blank"
+    )
+    for name, area in (
+        ("r2flow", "3 m to 70 m"),
+        ("lidm", r"\+-50 m"),
+        ("town", "3 m to 70 m"),
+    ):
         with pytest.raises(
-            DataError, match=f"generated scan 'blank': a cloud of 0 points with none .*{area}"
+            DataError,
+            match=f"generated scan 'blank': a cloud of 0 points with none .*{area}",
         ):
             evaluate(good, [good[0], empty], name, progress=False)
     features = np.ones((3, 4))
-    with pytest.raises(DataError, match="features of 3 and 1 scans; expected at least two of each"):
+    with pytest.raises(
+        DataError, match="features of 3 and 1 scans; expected at least two of each"
+    ):
         frechet_distance(features, features[:1])
     for a, b in ((features, features[:, :3]), (features[0], features)):
         with pytest.raises(
@@ -331,7 +394,12 @@ def test_bad_input() -> None:
             frechet_distance(a, b)
     with pytest.raises(DataError, match="features that are not finite"):
         squared_mmd(features, np.full((3, 4), np.nan))
-    for p, q in (([0, 0], [1, 1]), ([1, -1], [1, 1]), ([1, 1], [1, 1, 1]), ([np.nan, 1], [1, 1])):
+    for p, q in (
+        ([0, 0], [1, 1]),
+        ([1, -1], [1, 1]),
+        ([1, 1], [1, 1, 1]),
+        ([np.nan, 1], [1, 1]),
+    ):
         with pytest.raises(DataError, match="two non-negative histograms of one shape"):
             jensen_shannon_distance(np.array(p), np.array(q))
 

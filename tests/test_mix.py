@@ -16,7 +16,9 @@ from lidar_synth.mixing import Linear, MixedScans
 
 THEIRS = Sensor("theirs", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 WORKERS = pytest.mark.parametrize(
-    "workers", [0, pytest.param(2, marks=pytest.mark.slow)], ids=["0 workers", "2 workers"]
+    "workers",
+    [0, pytest.param(2, marks=pytest.mark.slow)],
+    ids=["0 workers", "2 workers"],
 )
 
 
@@ -52,7 +54,9 @@ def test_two_folders_are_mixed_by_their_paths(tmp_path: Path) -> None:
 def test_synthetic_scans_come_out_on_the_sensor_of_the_real_ones() -> None:
     real = Scans("r", 4, sensor=THEIRS)
     town = lidar_synth.Town(seed=0, scans=2, sensor=SENSOR)
-    train = lidar_synth.mix(real, town, ratio=0.5, to_sample=lambda scan, rng: scan.sensor.shape)
+    train = lidar_synth.mix(
+        real, town, ratio=0.5, to_sample=lambda scan, rng: scan.sensor.shape
+    )
     assert [train[i] for i in range(len(train))] == [THEIRS.shape] * 8
     with pytest.raises(ConfigError, match="8 x 64"):
         lidar_synth.mix(real, town, ratio=0.5, as_sensor=None)
@@ -74,7 +78,9 @@ def test_each_pass_of_a_loader_is_the_next_epoch(workers: int) -> None:
 
 @WORKERS
 @pytest.mark.parametrize("done", [1, 3, None], ids=["early", "late", "whole"])
-def test_a_loader_resumes_after_the_latest_batch(workers: int, done: int | None) -> None:
+def test_a_loader_resumes_after_the_latest_batch(
+    workers: int, done: int | None
+) -> None:
     loader = mixture().loader(batch_size=4, num_workers=workers, drop_last=False)
     loader.set_epoch(2)
     seen = ids(islice(loader, done))
@@ -98,9 +104,9 @@ def test_a_pass_that_is_left_early_is_begun_again() -> None:
 def test_a_pass_of_counted_batches_is_followed_by_the_next_epoch() -> None:
     loader = mixture().loader(batch_size=4)
     for epoch in range(3):
-        assert ids(batch for _, batch in zip(range(len(loader)), loader, strict=False)) == in_order(
-            epoch
-        )
+        assert ids(
+            batch for _, batch in zip(range(len(loader)), loader, strict=False)
+        ) == in_order(epoch)
         assert loader.state_dict()["epoch"] == loader.epoch == epoch + 1
 
 
@@ -110,7 +116,10 @@ def test_the_epoch_of_the_mixture_counts() -> None:
     ids(islice(loader, 2))
     for epoch in (5, 2):
         train.set_epoch(epoch)
-        assert (loader.state_dict()["epoch"], loader.state_dict()["position"]) == (epoch, 0)
+        assert (loader.state_dict()["epoch"], loader.state_dict()["position"]) == (
+            epoch,
+            0,
+        )
         assert ids(loader) == in_order(epoch)
     loader.set_epoch(2)
     assert ids(loader) == in_order(2)

@@ -37,18 +37,23 @@ def test_the_items_of_an_epoch() -> None:
     assert len(train) == 15
     items = [train[i] for i in range(15)]
     assert len({tuple(item) for item in items}) == 1
-    assert sorted(i["id"] for i in items) == sorted([*real, *(f"s{i}" for i in range(6))])
+    assert sorted(i["id"] for i in items) == sorted(
+        [*real, *(f"s{i}" for i in range(6))]
+    )
     for i, item in enumerate(items):
         assert item["domain"] == train.domain(i) == (item["id"][0] == "s")
         if item["domain"] == 0:
             scan = real[item["id"]]
             assert (
-                item["points"].numpy().tobytes() == np.c_[scan.points, scan.reflectance].tobytes()
+                item["points"].numpy().tobytes()
+                == np.c_[scan.points, scan.reflectance].tobytes()
             )
             assert np.array_equal(item["label"], scan.label)
             assert np.array_equal(item["confidence"], scan.label != IGNORE)
     assert train[-1]["id"] == items[-1]["id"]
-    assert [item["id"] for item in train] == [item["id"] for item in items]  # iterating ends
+    assert [item["id"] for item in train] == [
+        item["id"] for item in items
+    ]  # iterating ends
     train.set_epoch(1)
     twice = [item["points"] for item in (*items, *train) if item["id"] == "s1"]
     assert not torch.equal(*twice)  # a scan that is given again is augmented anew
@@ -71,15 +76,20 @@ def test_random_numbers_of_a_sample_depend_only_on_seed_epoch_and_position() -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("persistent", [False, True])
 @pytest.mark.parametrize("workers", WORKERS)
-def test_the_number_of_workers_does_not_change_batches(workers: int, persistent: bool) -> None:
+def test_the_number_of_workers_does_not_change_batches(
+    workers: int, persistent: bool
+) -> None:
     train = mixed()
     alone = mixed()
-    load = loader(train, workers, batch_size=4, persistent_workers=persistent and workers > 0)
+    load = loader(
+        train, workers, batch_size=4, persistent_workers=persistent and workers > 0
+    )
     for epoch in (0, 1, 5):
         train.set_epoch(epoch)
         alone.set_epoch(epoch)
         expected = [
-            alone.collate([alone[i] for i in range(s, min(s + 4, 15))]) for s in range(0, 15, 4)
+            alone.collate([alone[i] for i in range(s, min(s + 4, 15))])
+            for s in range(0, 15, 4)
         ]
         assert [plain(batch) for batch in load] == [plain(batch) for batch in expected]
 
@@ -88,7 +98,13 @@ def test_the_number_of_workers_does_not_change_batches(workers: int, persistent:
 def test_persistent_workers_that_were_spawned_see_the_epoch() -> None:
     train = mixed()
     alone = mixed()
-    load = loader(train, 1, batch_size=15, persistent_workers=True, multiprocessing_context="spawn")
+    load = loader(
+        train,
+        1,
+        batch_size=15,
+        persistent_workers=True,
+        multiprocessing_context="spawn",
+    )
     for epoch in (0, 3):
         train.set_epoch(epoch)
         alone.set_epoch(epoch)
@@ -103,10 +119,16 @@ def gathered(rank: int, ranks: int, port: int) -> None:
         train = mixed()
         batches = train.batches(2)
         assert (batches.rank, batches.world_size) == (rank, ranks)
-        load = loader(train, rank % 2, batch_sampler=batches, persistent_workers=rank % 2 > 0)
+        load = loader(
+            train, rank % 2, batch_sampler=batches, persistent_workers=rank % 2 > 0
+        )
         for epoch in (0, 1):
             batches.set_epoch(epoch)
-            mine = [item["points"].numpy().tobytes() for batch in load for item in _apart(batch)]
+            mine = [
+                item["points"].numpy().tobytes()
+                for batch in load
+                for item in _apart(batch)
+            ]
             every: list[Any] = [None] * ranks
             dist.all_gather_object(every, (len(batches), mine))
             assert len({steps for steps, _ in every}) == 1
@@ -162,7 +184,9 @@ def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(
             again = mixed(13)
             sampler = again.batches(3, rank=rank, world_size=later)
             sampler.load_state_dict(state)
-            again.set_epoch(state["epoch"])  # as a training loop does at the head of an epoch
+            again.set_epoch(
+                state["epoch"]
+            )  # as a training loop does at the head of an epoch
             for batch in loader(again, (done + later) % 3, batch_sampler=sampler):
                 rest += batch["id"]
         if state["epoch"] == 1:
@@ -236,14 +260,20 @@ def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
     assert not hasattr(train, "__getitems__")
     with pytest.raises(AttributeError, match="no_such_thing"):
         train.no_such_thing  # noqa: B018
-    batches = list(DataLoader(train, batch_size=5, num_workers=2, collate_fn=train.collate))
-    assert [name for batch in batches for name in batch["name"]] == [s["name"] for s in samples]
+    batches = list(
+        DataLoader(train, batch_size=5, num_workers=2, collate_fn=train.collate)
+    )
+    assert [name for batch in batches for name in batch["name"]] == [
+        s["name"] for s in samples
+    ]
 
 
 def test_seeds_and_weights_may_be_numpys() -> None:
     sources = Endless(), Endless(name="t")
     given, plain = (
-        MixedScans(Scans("r", 6), Sources(*sources, weights=weights), ratio=0.5, seed=seed)
+        MixedScans(
+            Scans("r", 6), Sources(*sources, weights=weights), ratio=0.5, seed=seed
+        )
         for weights, seed in ((np.array([3, 1]), np.int64(1)), ([3, 1], 1))
     )
     assert ids(given) == ids(plain) and given.plan(0).hash == plain.plan(0).hash
@@ -259,8 +289,16 @@ def test_several_sources() -> None:
         s.id for s in [*Scans("a", 4), *Scans("b", 8)]
     )
     assert sorted(n for n in names if n[0] == "x") == [f"x{i}" for i in range(8)]
-    assert sorted(n for n in names if n[0] == "h") == ["held0", "held0", "held1", "held2"]
-    assert all(train.domain(i) == train[i]["domain"] == (n[0] in "xh") for i, n in enumerate(names))
+    assert sorted(n for n in names if n[0] == "h") == [
+        "held0",
+        "held0",
+        "held1",
+        "held2",
+    ]
+    assert all(
+        train.domain(i) == train[i]["domain"] == (n[0] in "xh")
+        for i, n in enumerate(names)
+    )
 
 
 @pytest.mark.parametrize("labels", ["none", "ignore", "generated"])
@@ -283,7 +321,9 @@ def test_a_batch_without_a_valid_label_is_refused() -> None:
     message = r"without any valid label or box \(scans .*'s0'.*balanced=True.*unlabelled='allow'"
     with pytest.raises(DataError, match=message):
         synthetic_only(labels="ignore")
-    assert (synthetic_only(labels="ignore", unlabelled="allow")["label"] == IGNORE).all()
+    assert (
+        synthetic_only(labels="ignore", unlabelled="allow")["label"] == IGNORE
+    ).all()
     assert (synthetic_only(labels="none")["label"] == IGNORE).all()
     assert (synthetic_only(labels="generated")["label"] != IGNORE).any()
 
@@ -297,7 +337,9 @@ def test_a_loader_without_collate_fn_is_told_which(form: str, workers: int) -> N
     with pytest.raises(ConfigError, match=r"collate_fn=train\.collate"):
         next(iter(DataLoader(dataset, 2, num_workers=workers)))
     one = next(iter(DataLoader(dataset, 1, num_workers=workers)))
-    assert one["points"].shape == (1, *train[0]["points"].shape) and one["id"] == [train[0]["id"]]
+    assert one["points"].shape == (1, *train[0]["points"].shape) and one["id"] == [
+        train[0]["id"]
+    ]
 
 
 def test_forms_of_batches() -> None:
@@ -335,7 +377,9 @@ def test_fewer_samples_than_ranks_gives_a_warning() -> None:
     assert "1 samples left for 2 ranks" in str(caught[0].message)
 
 
-def test_the_rank_is_known_before_the_process_group_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rank_is_known_before_the_process_group_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("RANK", "2")
     monkeypatch.setenv("WORLD_SIZE", "3")
     batches = mixed().batches(2)

@@ -35,7 +35,8 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Generator:
 
 def test_exchanged_arguments_are_named(generator: Generator) -> None:
     with pytest.raises(
-        ConfigError, match=r"real=Generator, which has no length; expected real scans first"
+        ConfigError,
+        match=r"real=Generator, which has no length; expected real scans first",
     ):
         MixedScans(generator, Scans("r", 4, GENERATED_SENSOR), 0.5)
 
@@ -44,7 +45,9 @@ def test_exchanged_arguments_are_named(generator: Generator) -> None:
 def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> None:
     real = Scans("r", 4, GENERATED_SENSOR)
     train = MixedScans(real, generator, 0.5, seed=11)
-    expected = {f"tiny/11/{i}": scan for i, scan in enumerate(generator.scans(11, range(4)))}
+    expected = {
+        f"tiny/11/{i}": scan for i, scan in enumerate(generator.scans(11, range(4)))
+    }
     for workers in (0, 2):
         items = [
             item
@@ -57,7 +60,9 @@ def test_the_generator_in_workers_makes_the_same_scans(generator: Generator) -> 
             scan = expected[item["id"]]
             assert np.allclose(item["points"][:, :3], scan.points, atol=1e-3)
             assert np.array_equal(item["label"], scan.label)
-    assert train.mixture.synthetic[0].identity.startswith(f"generated:{generator.hash}:11:")
+    assert train.mixture.synthetic[0].identity.startswith(
+        f"generated:{generator.hash}:11:"
+    )
 
 
 def test_generators_that_differ_have_different_plans() -> None:
@@ -78,7 +83,10 @@ def test_sources_that_differ_have_different_plans() -> None:
         Town(0, scans=50, interval=2.0),
         Town(0, scans=49),
     ]
-    transfers = [Transfer(load_sensor("vlp16")), Transfer(load_sensor("vlp16"), Mount(0.5))]
+    transfers = [
+        Transfer(load_sensor("vlp16")),
+        Transfer(load_sensor("vlp16"), Mount(0.5)),
+    ]
     seen = [
         SeenAs(towns[0], transfers[0]),
         SeenAs(towns[1], transfers[0]),
@@ -96,11 +104,15 @@ def test_sources_that_differ_have_different_plans() -> None:
 
 
 @pytest.mark.slow
-def test_a_cache_keeps_the_latest(generator: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_keeps_the_latest(
+    generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made: list[int] = []
     scans = Generator.scans
     monkeypatch.setattr(
-        Generator, "scans", lambda self, seed, n, *a, **k: made.extend(n) or scans(self, seed, n)
+        Generator,
+        "scans",
+        lambda self, seed, n, *a, **k: made.extend(n) or scans(self, seed, n),
     )
     source = Generated(generator, cache=2)
     assert source[0] is source[0]
@@ -117,12 +129,15 @@ def test_a_conditional_model_takes_its_conditions_in_turn(
         Generated(generator, condition=["a map"])
     monkeypatch.setattr(Generator, "condition", "semantic")
     with pytest.raises(
-        ConfigError, match=r"no conditions for 'tiny'; expected .*\(semantic\).*condition=real"
+        ConfigError,
+        match=r"no conditions for 'tiny'; expected .*\(semantic\).*condition=real",
     ):
         MixedScans(Scans("r", 2, GENERATED_SENSOR), generator)
     calls: list[Any] = []
     monkeypatch.setattr(
-        Generator, "scans", lambda self, *given, **options: calls.append((given, options)) or [None]
+        Generator,
+        "scans",
+        lambda self, *given, **options: calls.append((given, options)) or [None],
     )
     source = Generated(generator, 3, condition=["a", "b"], steps=2)
     [source[n] for n in (0, 3)]
@@ -140,7 +155,8 @@ def test_a_gpu_in_a_worker_is_refused(
     train = MixedScans(Scans("r", 2, GENERATED_SENSOR), generator, 0.5)
     monkeypatch.setattr(Generator, "device", torch.device("cuda"))
     with pytest.raises(
-        ConfigError, match=r"inside a DataLoader worker.*\(A\) bake .*\(B\) .*\(C\) mix in"
+        ConfigError,
+        match=r"inside a DataLoader worker.*\(A\) bake .*\(B\) .*\(C\) mix in",
     ):
         list(loader(train, 1, batch_size=4))
 
@@ -172,7 +188,9 @@ def test_upcoming_scans_are_announced_to_a_source_that_works_ahead() -> None:
     assert (source.epochs, source.expected) == ([0, 1], asked(range(12)))
     sampler = train.batches(2, rank=1, world_size=2)
     list(sampler)
-    assert source.expected == [n for start in (2, 6, 10) for n in asked(range(start, start + 2))]
+    assert source.expected == [
+        n for start in (2, 6, 10) for n in asked(range(start, start + 2))
+    ]
 
 
 def test_the_plan_is_logged(caplog: pytest.LogCaptureFixture) -> None:
@@ -199,7 +217,10 @@ def test_real_scans_are_untouched(real_scans: Path) -> None:
                     item["points"].numpy().tobytes()
                     == np.c_[scan.points, scan.reflectance].tobytes()
                 )
-                assert item["label"].numpy().astype(np.uint8).tobytes() == scan.label.tobytes()
+                assert (
+                    item["label"].numpy().astype(np.uint8).tobytes()
+                    == scan.label.tobytes()
+                )
                 seen.add(item["id"])
     assert seen == set(expected)
     pool = MixedScans(KITTI360(real_scans / "kitti360"), synth, 0.5, labels="none")
@@ -230,7 +251,11 @@ def wrong_labels() -> Any:
             r"epoch 1 of a ratio schedule for 1 epochs",
         ),
         (lambda: mixed(real=0), DataError, r"a source without scans \(Scans:0:"),
-        (lambda: mixed(labels="gessed"), ConfigError, r"labels='gessed'; expected one of"),
+        (
+            lambda: mixed(labels="gessed"),
+            ConfigError,
+            r"labels='gessed'; expected one of",
+        ),
         (lambda: mixed(collate="voxels"), ConfigError, r"form='voxels' of batches"),
         (lambda: mixed(unlabelled="skip"), ConfigError, r"unlabelled='skip'"),
         (lambda: mixed()[15], IndexError, r"sample 15 of 15"),

@@ -20,7 +20,13 @@ from lidar_synth import load_generator
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.generate.checkpoint import load_checkpoint, read_header
 from lidar_synth.generate.loading import shipped_models
-from lidar_synth.lab.train import DistillConfig, TrainConfig, models, plan_model, train_model
+from lidar_synth.lab.train import (
+    DistillConfig,
+    TrainConfig,
+    models,
+    plan_model,
+    train_model,
+)
 from lidar_synth.lab.train.config import (
     find_model_file,
     find_recipe,
@@ -41,7 +47,12 @@ HDIT = {
 }
 SURFACES = {
     "architecture": "surfaces",
-    "arguments": {"encoder_widths": [8, 8], "widths": [8, 8], "reaches": [1], "depth": 1},
+    "arguments": {
+        "encoder_widths": [8, 8],
+        "widths": [8, 8],
+        "reaches": [1],
+        "depth": 1,
+    },
 }
 CODEC = "codec: {recipe: codec.yaml, minutes: 1}\n"
 
@@ -50,16 +61,21 @@ CODEC = "codec: {recipe: codec.yaml, minutes: 1}\n"
 def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
     settings = load_model(find_model_file(name) or Path())
     plan = plan_model(name)
-    assert list(plan.stages) == list(settings.stages), "every stage is needed for the last one"
+    assert list(plan.stages) == list(settings.stages), (
+        "every stage is needed for the last one"
+    )
     assert plan.out == Path("runs", name, f"{name}.safetensors")
     made: set[Path] = set()
     for stage, planned in plan.stages.items():
         assert find_recipe(planned.recipe).is_file()
         alone = load_config(type(planned.config), planned.recipe)
         changed = {"output", "recipe", *settings.stages[stage].needs}
-        assert planned.config.model_dump(exclude=changed) == alone.model_dump(exclude=changed)
+        assert planned.config.model_dump(exclude=changed) == alone.model_dump(
+            exclude=changed
+        )
         assert all(
-            start in made or key in planned.of_others for key, start in planned.starts.items()
+            start in made or key in planned.of_others
+            for key, start in planned.starts.items()
         )
         made.add(plan.runs.checkpoint(stage))
     assert sum(plan.runs.budgets(plan.minutes).values()) == pytest.approx(plan.minutes)
@@ -70,23 +86,31 @@ def test_a_published_model_plans_the_recipes_of_its_file(name: str) -> None:
 def test_the_listed_size_is_that_of_its_parts(name: str) -> None:
     """Models from another one's teacher have that one's autoencoder."""
     plan = plan_model(name)
-    [(model, _, _)] = [s.partition("/") for s in plan.stages["teacher"].of_others.values()] or [
-        (name, "", "")
-    ]
+    [(model, _, _)] = [
+        s.partition("/") for s in plan.stages["teacher"].of_others.values()
+    ] or [(name, "", "")]
     recipes = (plan_model(model).stages["codec"].recipe, plan.stages["student"].recipe)
-    assert MODELS[name].size == f"{sum(float(RECIPES[r].size.split()[0]) for r in recipes):.1f} M"
+    assert (
+        MODELS[name].size
+        == f"{sum(float(RECIPES[r].size.split()[0]) for r in recipes):.1f} M"
+    )
 
 
 @pytest.mark.parametrize("name", shipped_models())
 def test_a_shipped_model_has_stages_and_says_how_it_was_made(name: str) -> None:
     assert name in MODELS
-    assert {"recipe", "data", "licence"} <= set(read_header(shipped_models()[name])[0].provenance)
+    assert {"recipe", "data", "licence"} <= set(
+        read_header(shipped_models()[name])[0].provenance
+    )
 
 
 def test_models_are_listed_and_printed_as_recipes_are() -> None:
     listed = call("recipes")
     assert all(f"{name} " in listed for name in [*MODELS, *RECIPES])
-    assert yaml.safe_load(call("recipes", "town"))["stages"]["codec"]["recipe"] == "town_codec"
+    assert (
+        yaml.safe_load(call("recipes", "town"))["stages"]["codec"]["recipe"]
+        == "town_codec"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +140,9 @@ def tiny(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa
         if name == "decoder":  # its checkpoint says what these are
             kept = yaml.safe_load(path.read_text())
             path.write_text(
-                yaml.safe_dump({k: v for k, v in kept.items() if k not in ("sensor", "channels")})
+                yaml.safe_dump(
+                    {k: v for k, v in kept.items() if k not in ("sensor", "channels")}
+                )
             )
     needs = {
         "teacher": {"codec": "codec"},
@@ -128,7 +154,9 @@ def tiny(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa
         name: {"recipe": f"{name}.yaml", "minutes": 1, "needs": needs.get(name, {})}
         for name in recipes
     }
-    (folder / "tiny.yaml").write_text(yaml.safe_dump({"stages": stages}, sort_keys=False))
+    (folder / "tiny.yaml").write_text(
+        yaml.safe_dump({"stages": stages}, sort_keys=False)
+    )
     return folder / "tiny.yaml"
 
 
@@ -158,9 +186,12 @@ def test_a_model_is_made_by_all_its_stages_each_with_its_state(made: Path) -> No
     facts = generator.header.provenance
     assert facts["model"] == "tiny" and list(facts["stages"]) == sorted(names)
     assert {
-        Path(stage["recipe"]).stem: stage["iterations"] for stage in facts["stages"].values()
+        Path(stage["recipe"]).stem: stage["iterations"]
+        for stage in facts["stages"].values()
     } == dict.fromkeys(names, 5)
-    hashes = {name: load_checkpoint(made / name / f"{name}.safetensors") for name in names}
+    hashes = {
+        name: load_checkpoint(made / name / f"{name}.safetensors") for name in names
+    }
     assert facts["init"] == hashes["student"].hash
     assert hashes["student"].header.provenance["weaker"] == hashes["weaker"].hash
     assert hashes["teacher"].header.provenance["codec"] == hashes["codec"].hash
@@ -177,7 +208,9 @@ def test_large_weights_are_stored_in_half_precision(
     train_model(plan)
     half = load_checkpoint(path)
     for name, network in full.networks.items():
-        for a, b in zip(network.parameters(), half.networks[name].parameters(), strict=True):
+        for a, b in zip(
+            network.parameters(), half.networks[name].parameters(), strict=True
+        ):
             assert torch.equal(a.half().float(), b)
     assert path.stat().st_size < size
     monkeypatch.undo()
@@ -211,7 +244,8 @@ def test_a_killed_model_is_resumed_by_the_same_command(
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     codec, teacher = (
-        tmp_path / "tiny" / name / f"{name}.safetensors" for name in ("codec", "teacher")
+        tmp_path / "tiny" / name / f"{name}.safetensors"
+        for name in ("codec", "teacher")
     )
     assert not (teacher.parent / DONE).exists(), "it was killed too late"
     before = codec.stat().st_mtime_ns
@@ -223,7 +257,9 @@ def test_a_killed_model_is_resumed_by_the_same_command(
     )
 
 
-def test_a_stage_with_a_limit_of_time_lets_its_rate_fall(tiny: Path, tmp_path: Path) -> None:
+def test_a_stage_with_a_limit_of_time_lets_its_rate_fall(
+    tiny: Path, tmp_path: Path
+) -> None:
     """The iterations follow from the steps at the constant rate; a stage that was stopped as it
     fell keeps them."""
     words = (
@@ -269,7 +305,8 @@ def test_a_given_checkpoint_replaces_the_stages_that_made_it(tiny: Path) -> None
         "the weaker teacher needs it"
     )
     plan = plan_model(
-        tiny, ["student.weaker=null", "teacher.init=mine.safetensors", "teacher.codec=null"]
+        tiny,
+        ["student.weaker=null", "teacher.init=mine.safetensors", "teacher.codec=null"],
     )
     assert list(plan.stages) == ["teacher", "student", "decoder"]
     assert list(plan_model(tiny, until="teacher").stages) == ["codec", "teacher"]
@@ -283,7 +320,12 @@ def test_a_given_checkpoint_replaces_the_stages_that_made_it(tiny: Path) -> None
 def test_overrides_reach_one_stage_or_all() -> None:
     plan = plan_model(
         "town",
-        ["seed=7", "teacher.recipe.batch=16", "teacher.seed=8", "student.recipe.iterations=9"],
+        [
+            "seed=7",
+            "teacher.recipe.batch=16",
+            "teacher.seed=8",
+            "student.recipe.iterations=9",
+        ],
     )
     assert {name: stage.config.seed for name, stage in plan.stages.items()} == {
         "codec": 7,
@@ -361,9 +403,15 @@ def test_wrong_calls_are_refused_before_anything_is_written(
 
 FILES: dict[str, tuple[str, str]] = {
     "no stages": ("stages: {}", r"stages = {}: Dictionary should have at least 1 item"),
-    "an unknown key": (f"stages:\n  {CODEC}steps: 4", r"unknown key 'steps'; known there: stages"),
+    "an unknown key": (
+        f"stages:\n  {CODEC}steps: 4",
+        r"unknown key 'steps'; known there: stages",
+    ),
     "no recipe": ("stages: {codec: {minutes: 3}}", r"'stages.codec.recipe' is missing"),
-    "no time": ("stages: {codec: {recipe: codec.yaml, minutes: 0}}", r"stages.codec.minutes = 0"),
+    "no time": (
+        "stages: {codec: {recipe: codec.yaml, minutes: 0}}",
+        r"stages.codec.minutes = 0",
+    ),
     "a later stage": (
         f"stages:\n  teacher: {{recipe: a, minutes: 1, needs: {{codec: codec}}}}\n  {CODEC}",
         r"teacher.needs with the stage 'codec'; expected an earlier one \(none\)",
@@ -401,7 +449,10 @@ def test_a_missing_file_and_a_recipe_are_no_models(tmp_path: Path) -> None:
 
 
 def _of_the_codec(folder: Path) -> None:
-    shutil.copy(folder / "student" / "student.safetensors", folder / "codec" / "codec.safetensors")
+    shutil.copy(
+        folder / "student" / "student.safetensors",
+        folder / "codec" / "codec.safetensors",
+    )
 
 
 CHANGES: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
@@ -424,7 +475,9 @@ CHANGES: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize(("overrides", "change", "message"), CHANGES.values(), ids=list(CHANGES))
+@pytest.mark.parametrize(
+    ("overrides", "change", "message"), CHANGES.values(), ids=list(CHANGES)
+)
 def test_done_stages_of_another_making_are_refused(
     overrides: list[str],
     change: Callable[[Path], object],

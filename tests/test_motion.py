@@ -8,7 +8,9 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.motion import FARTHEST, from_world, interpolate_poses
 
 
-def some_poses(count: int = 6, seed: int = 0, angle: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+def some_poses(
+    count: int = 6, seed: int = 0, angle: float = 0.3
+) -> tuple[np.ndarray, np.ndarray]:
     """(P,) times at uneven distances and (P, 4, 4) poses that turn about any axis."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_rotvec(rng.normal(size=(count, 3)) * angle)
@@ -29,7 +31,9 @@ def test_poses_between_are_those_of_scipy() -> None:
     # The times have seven digits after the point.
     assert np.abs(found[:, :3, :3] - expected).max() < 1e-6
     for axis in range(3):
-        assert np.allclose(found[:, axis, 3], np.interp(at, times, poses[:, axis, 3]), atol=1e-9)
+        assert np.allclose(
+            found[:, axis, 3], np.interp(at, times, poses[:, axis, 3]), atol=1e-9
+        )
     assert (found[:, 3] == (0, 0, 0, 1)).all()
 
 
@@ -43,7 +47,9 @@ def test_motion_continues_before_and_after() -> None:
     times, poses = some_poses(2)
     step = times[1] - times[0]
     turn = poses[0, :3, :3].T @ poses[1, :3, :3]
-    before, after = interpolate_poses(times, poses, np.array([times[0] - step, times[1] + step]))
+    before, after = interpolate_poses(
+        times, poses, np.array([times[0] - step, times[1] + step])
+    )
     assert np.allclose(before[:3, :3], poses[0, :3, :3] @ turn.T, atol=1e-6)
     assert np.allclose(after[:3, :3], poses[1, :3, :3] @ turn, atol=1e-6)
     assert np.allclose(after[:3, 3], 2 * poses[1, :3, 3] - poses[0, :3, 3], atol=1e-6)
@@ -53,7 +59,10 @@ def test_points_are_in_the_frame_of_their_pose() -> None:
     _, poses = some_poses(400)
     local = np.random.default_rng(2).normal(size=(400, 3)) * 30
     world = np.array(
-        [pose[:3, :3] @ point + pose[:3, 3] for pose, point in zip(poses, local, strict=True)]
+        [
+            pose[:3, :3] @ point + pose[:3, 3]
+            for pose, point in zip(poses, local, strict=True)
+        ]
     )
     assert np.allclose(from_world(world, poses), local)
     assert np.allclose(
@@ -73,7 +82,9 @@ def test_what_cannot_be_interpolated_is_refused() -> None:
         with pytest.raises(DataError, match="two or more poses with increasing times"):
             interpolate_poses(*given, times)
     for time in (times[0] - FARTHEST - 0.1, times[-1] + FARTHEST + 0.1, np.nan):
-        with pytest.raises(DataError, match=r"s after the first pose; expected -1 s to [\d.]+ s"):
+        with pytest.raises(
+            DataError, match=r"s after the first pose; expected -1 s to [\d.]+ s"
+        ):
             interpolate_poses(times, poses, np.array([time]))
     half = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
     with pytest.raises(DataError, match="turn by half a circle"):

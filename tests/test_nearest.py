@@ -31,7 +31,9 @@ def test_the_vote_is_that_of_a_search_through_all_points(radius: float) -> None:
         near = np.argsort(distance)[:3]
         near = near[distance[near] < radius]
         if not len(near):
-            assert vote.value[i] == 0 and vote.share[i] == 0 and np.isinf(vote.distance[i])
+            assert (
+                vote.value[i] == 0 and vote.share[i] == 0 and np.isinf(vote.distance[i])
+            )
             continue
         weights = 1 / (distance[near] + 0.02)
         trust = {
@@ -41,8 +43,12 @@ def test_the_vote_is_that_of_a_search_through_all_points(radius: float) -> None:
         best = max(trust, key=lambda v: trust[v])
         assert vote.value[i] == best
         own = index.values[near] == best
-        assert vote.share[i] == pytest.approx(trust[best] / sum(trust.values()), rel=1e-3)
-        assert vote.trust[i] == pytest.approx(trust[best] / weights[own].sum(), rel=1e-3)
+        assert vote.share[i] == pytest.approx(
+            trust[best] / sum(trust.values()), rel=1e-3
+        )
+        assert vote.trust[i] == pytest.approx(
+            trust[best] / weights[own].sum(), rel=1e-3
+        )
         assert vote.distance[i] == pytest.approx(
             distance[near][index.values[near] == best].min(), rel=1e-3
         )
@@ -52,7 +58,8 @@ def test_a_cloud_in_parts_gives_the_same_index() -> None:
     whole = cloud(3000)
     parts = cloud(3000, chunks=7)
     assert all(
-        np.array_equal(getattr(whole, n), getattr(parts, n)) for n in ("starts", "points", "values")
+        np.array_equal(getattr(whole, n), getattr(parts, n))
+        for n in ("starts", "points", "values")
     )
 
 
@@ -64,8 +71,12 @@ def test_points_of_one_class_in_one_cube_become_one_and_other_classes_stay() -> 
 
 
 def test_points_outside_the_volume_and_nan_are_left_out() -> None:
-    points = np.array([(1, 1, 1), (-1, 1, 1), (1, SIZE + 1, 1), (1, 1, np.nan)], np.float64)
-    index = index_cloud([(points, np.ones(4, np.uint32), np.ones(4, np.float32))], LOW, HIGH)
+    points = np.array(
+        [(1, 1, 1), (-1, 1, 1), (1, SIZE + 1, 1), (1, 1, np.nan)], np.float64
+    )
+    index = index_cloud(
+        [(points, np.ones(4, np.uint32), np.ones(4, np.float32))], LOW, HIGH
+    )
     assert len(index) == 1
 
 

@@ -48,9 +48,15 @@ class PointwiseCodec(Autoencoder):
     """An autoencoder whose latents are the image's own cells, mixed; it takes the name of the
     normalisation."""
 
-    derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
+    derived_arguments: ClassVar[tuple[str, ...]] = (
+        "resolution",
+        "channels",
+        "normalisation",
+    )
 
-    def __init__(self, resolution: Sequence[int], channels: int, normalisation: str) -> None:
+    def __init__(
+        self, resolution: Sequence[int], channels: int, normalisation: str
+    ) -> None:
         super().__init__()
         self.channels = channels
         self.resolution = tuple(resolution)
@@ -103,7 +109,12 @@ def test_a_new_velocity_network_with_a_new_encoder_is_trained_saved_and_sampled(
     condition = {"kind": "semantic", "encoder": "presence", "dropout": 0.1}
     assert "presence" in encoders_of("semantic")
     config = write_config(
-        scans, tmp_path, "flow", network={"architecture": "pointwise"}, condition=condition, steps=2
+        scans,
+        tmp_path,
+        "flow",
+        network={"architecture": "pointwise"},
+        condition=condition,
+        steps=2,
     )
     call("train", config)
     checkpoint = load_checkpoint(tmp_path / "flow" / "flow.safetensors")
@@ -119,16 +130,25 @@ def test_a_new_velocity_network_with_a_new_encoder_is_trained_saved_and_sampled(
 def test_a_new_autoencoder_is_trained_saved_and_used_by_a_latent_model(
     scans: Path, tmp_path: Path
 ) -> None:
-    call("train", write_config(scans, tmp_path, "codec", network={"architecture": "cells"}))
+    call(
+        "train",
+        write_config(scans, tmp_path, "codec", network={"architecture": "cells"}),
+    )
     codec = tmp_path / "codec" / "codec.safetensors"
     assert load_checkpoint(codec).networks[CODEC].normalisation == "r2flow"
     call(
         "train",
         write_config(
-            scans, tmp_path, "latent", network={"architecture": "pointwise"}, codec=str(codec)
+            scans,
+            tmp_path,
+            "latent",
+            network={"architecture": "pointwise"},
+            codec=str(codec),
         ),
     )
-    [scan] = load_generator(tmp_path / "latent" / "latent.safetensors").scans(0, [0], steps=2)
+    [scan] = load_generator(tmp_path / "latent" / "latent.safetensors").scans(
+        0, [0], steps=2
+    )
     assert scan.label is not None
 
 
@@ -136,21 +156,33 @@ def test_an_argument_that_follows_from_the_run_cannot_be_set_again(
     scans: Path, tmp_path: Path
 ) -> None:
     network = {"architecture": "cells", "arguments": {"normalisation": "lidm"}}
-    with pytest.raises(ConfigError, match=r"network.arguments with \['normalisation'\]"):
+    with pytest.raises(
+        ConfigError, match=r"network.arguments with \['normalisation'\]"
+    ):
         call("train", write_config(scans, tmp_path, "codec", network=network))
 
 
-def test_an_unknown_architecture_is_named_with_the_known_ones(scans: Path, tmp_path: Path) -> None:
+def test_an_unknown_architecture_is_named_with_the_known_ones(
+    scans: Path, tmp_path: Path
+) -> None:
     with pytest.raises(
         ConfigError, match="architecture 'resnet'; expected one of hdit, denoiser, unet"
     ):
         network_class("resnet")
-    with pytest.raises(ConfigError, match="architecture 'resnet'; expected one of hdit"):
-        call("train", write_config(scans, tmp_path, "flow", network={"architecture": "resnet"}))
     with pytest.raises(
-        ConfigError, match=r"condition.encoder 'views'; expected one of semantic_map, presence"
+        ConfigError, match="architecture 'resnet'; expected one of hdit"
     ):
         call(
             "train",
-            write_config(scans, tmp_path, "flow", condition=SEMANTIC | {"encoder": "views"}),
+            write_config(scans, tmp_path, "flow", network={"architecture": "resnet"}),
+        )
+    with pytest.raises(
+        ConfigError,
+        match=r"condition.encoder 'views'; expected one of semantic_map, presence",
+    ):
+        call(
+            "train",
+            write_config(
+                scans, tmp_path, "flow", condition=SEMANTIC | {"encoder": "views"}
+            ),
         )

@@ -51,14 +51,21 @@ def test_philox_gives_the_published_test_vectors(
 
 
 @given(counter=st.tuples(WORD, WORD, WORD, WORD), seed=st.integers(0, 2**64 - 1))
-def test_philox_on_tensors_equals_philox_on_integers(counter: tuple[int, ...], seed: int) -> None:
-    assert philox(torch.tensor(counter), seed).tolist() == philox_by_integers(counter, seed)
+def test_philox_on_tensors_equals_philox_on_integers(
+    counter: tuple[int, ...], seed: int
+) -> None:
+    assert philox(torch.tensor(counter), seed).tolist() == philox_by_integers(
+        counter, seed
+    )
 
 
 def test_numbers_follow_the_documented_counter_layout() -> None:
     seed = 2**63 + 5
     index = 2**40 + 7
-    words = [philox_by_integers((block, index % 2**32, index >> 32, 0), seed) for block in range(3)]
+    words = [
+        philox_by_integers((block, index % 2**32, index >> 32, 0), seed)
+        for block in range(3)
+    ]
     expected = []
     for w in words:
         for a, b in (w[:2], w[2:]):
@@ -74,7 +81,10 @@ def test_numbers_follow_the_documented_counter_layout() -> None:
 
 def test_gaussian_numbers_never_change() -> None:
     """If these numbers change, every scan of every seed changes."""
-    expected = [[0.991137683391571, -0.9246625900268555], [1.1363673210144043, -0.6758829951286316]]
+    expected = [
+        [0.991137683391571, -0.9246625900268555],
+        [1.1363673210144043, -0.6758829951286316],
+    ]
     assert torch.allclose(gaussian(0, [0, 1], (2,)), torch.tensor(expected), atol=1e-7)
 
 
@@ -95,7 +105,9 @@ def test_a_sample_depends_on_neither_its_batch_nor_its_shape(
 
 def test_all_bits_of_seed_and_index_matter() -> None:
     draws = [
-        gaussian(s, [i], (8,)) for s in (0, 1, 2**32, 2**63) for i in (0, 1, 2**31, 2**32, 2**62)
+        gaussian(s, [i], (8,))
+        for s in (0, 1, 2**32, 2**63)
+        for i in (0, 1, 2**31, 2**32, 2**62)
     ]
     assert len({tuple(d.flatten().tolist()) for d in draws}) == 20
 
@@ -119,10 +131,14 @@ def test_gaussian_numbers_are_normal_and_independent() -> None:
         "elements": (x[:, :-1], x[:, 1:]),
         "pairs of one transform": (x[:, 0::2], x[:, 1::2]),
         "indices": (x[:-1], x[1:]),
-        "seeds": (x, gaussian(12, range(100), (2, 16, 64)).double().numpy().reshape(100, -1)),
+        "seeds": (
+            x,
+            gaussian(12, range(100), (2, 16, 64)).double().numpy().reshape(100, -1),
+        ),
         "streams": (
             x,
-            uniform(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1) - 0.5,
+            uniform(11, range(100), (2, 16, 64)).double().numpy().reshape(100, -1)
+            - 0.5,
         ),
     }
     for name, (a, b) in neighbours.items():
@@ -163,7 +179,8 @@ def test_arguments_out_of_range_are_refused(
 
 
 @given(
-    st.lists(st.integers(0, 2**64 - 1), max_size=4), st.lists(st.integers(0, 2**64 - 1), max_size=4)
+    st.lists(st.integers(0, 2**64 - 1), max_size=4),
+    st.lists(st.integers(0, 2**64 - 1), max_size=4),
 )
 def test_keyed_generators_depend_only_on_their_key(a: list[int], b: list[int]) -> None:
     def first(key: list[int]) -> int:

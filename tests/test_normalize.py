@@ -37,9 +37,13 @@ def test_decode_inverts_encode_inside_the_limits_and_drops_the_rest(
     d = torch.from_numpy(distances)
     x = scale.encode(d)
     assert x.abs().max() <= 1
-    near_limit = (d / scale.range_min - 1).abs().minimum((d / scale.range_max - 1).abs()) < 1e-5
+    near_limit = (d / scale.range_min - 1).abs().minimum(
+        (d / scale.range_max - 1).abs()
+    ) < 1e-5
     expected = torch.where(scale.inside(d), d, 0)
-    assert torch.allclose(scale.decode(x)[~near_limit], expected[~near_limit], rtol=2e-5)
+    assert torch.allclose(
+        scale.decode(x)[~near_limit], expected[~near_limit], rtol=2e-5
+    )
     assert Normalisation(**scale.to_dict()) == scale
 
 
@@ -63,20 +67,34 @@ def test_reflectance_is_decoded_and_clamped() -> None:
 
 
 @given(noise=st.floats(-0.45, 0.45), seed=st.integers(0, 100))
-def test_labels_are_decoded_correctly_under_noise_below_half_a_bit(noise: float, seed: int) -> None:
-    label = torch.cat([torch.arange(19), torch.tensor([IGNORE])]).to(torch.uint8).view(1, 4, 5)
+def test_labels_are_decoded_correctly_under_noise_below_half_a_bit(
+    noise: float, seed: int
+) -> None:
+    label = (
+        torch.cat([torch.arange(19), torch.tensor([IGNORE])])
+        .to(torch.uint8)
+        .view(1, 4, 5)
+    )
     bits = encode_labels(label)
-    signs = torch.randint(0, 2, bits.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    signs = (
+        torch.randint(0, 2, bits.shape, generator=torch.Generator().manual_seed(seed))
+        * 2
+        - 1
+    )
     decoded, confidence = decode_labels(bits + noise * signs)
     assert torch.equal(decoded, label)
-    assert torch.allclose(confidence, torch.full_like(confidence, 1 - abs(noise)), atol=1e-6)
+    assert torch.allclose(
+        confidence, torch.full_like(confidence, 1 - abs(noise)), atol=1e-6
+    )
 
 
 def test_labels_have_five_bits_highest_first_and_unlabelled_is_19() -> None:
     bits = encode_labels(torch.tensor([[[0, 18, IGNORE]]], dtype=torch.uint8))
     assert bits[0, :, 0].T.tolist() == [[-1] * 5, [1, -1, -1, 1, -1], [1, -1, -1, 1, 1]]
     assert decode_labels(torch.zeros(1, 5, 1, 1))[1].item() == 0
-    label, confidence = decode_labels(torch.ones(1, 5, 1, 1))  # 31 is no class; 15 is one bit away
+    label, confidence = decode_labels(
+        torch.ones(1, 5, 1, 1)
+    )  # 31 is no class; 15 is one bit away
     assert (label.item(), confidence.item()) == (15, 0)
 
 
@@ -89,8 +107,12 @@ def test_invalid_input_is_refused() -> None:
         Normalisation("log", 5, 2)
 
 
-@pytest.mark.parametrize("channels", [("range",), ("reflectance", "range"), tuple(CHANNELS)])
-def test_a_range_image_is_unchanged_by_encoding_and_decoding(channels: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "channels", [("range",), ("reflectance", "range"), tuple(CHANNELS)]
+)
+def test_a_range_image_is_unchanged_by_encoding_and_decoding(
+    channels: tuple[str, ...],
+) -> None:
     sensor = presets()["town"]
     image = project(random_scan(sensor))
     tensors = TensorFormat(channels, NORMALISATIONS["r2flow"])
@@ -126,7 +148,9 @@ def test_a_cell_without_a_return_has_no_label_reflectance_or_confidence() -> Non
 
 def test_invalid_tensors_and_formats_are_refused() -> None:
     tensors = TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"])
-    with pytest.raises(DataError, match=r"shape \(1, 3, 4, 4\); expected \(B, 2, H, W\)"):
+    with pytest.raises(
+        DataError, match=r"shape \(1, 3, 4, 4\); expected \(B, 2, H, W\)"
+    ):
         tensors.decode(torch.zeros(1, 3, 4, 4))
     with pytest.raises(DataError, match="NaN or infinity"):
         tensors.decode(torch.full((1, 2, 4, 4), torch.nan))
@@ -141,7 +165,9 @@ def test_invalid_tensors_and_formats_are_refused() -> None:
 @pytest.mark.parametrize("value", ["x", math.nan, math.inf, -1.0, [1], 10**400])
 def test_impossible_numbers_are_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError):
-        Normalisation(**({"kind": "log", "range_min": 1.0, "range_max": 80.0} | {key: value}))
+        Normalisation(
+            **({"kind": "log", "range_min": 1.0, "range_max": 80.0} | {key: value})
+        )
 
 
 @pytest.mark.parametrize("name", [["hdit"], {}, None, "x"])

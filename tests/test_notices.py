@@ -22,7 +22,9 @@ class Dense(Scans):
 
 
 def twice(scan: Scan) -> Scan:
-    fields = {name: np.concatenate([values, values]) for name, values in scan.fields().items()}
+    fields = {
+        name: np.concatenate([values, values]) for name, values in scan.fields().items()
+    }
     return replace(scan, points=np.concatenate([scan.points, scan.points]), **fields)
 
 
@@ -31,7 +33,11 @@ def logged(train: MixedScans, caplog: pytest.LogCaptureFixture) -> list[str]:
         train.set_epoch(epoch)
         for i in range(len(train)):
             train[i]
-    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    return [
+        record.getMessage()
+        for record in caplog.records
+        if record.levelno >= logging.WARNING
+    ]
 
 
 def test_another_density_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -50,7 +56,8 @@ def test_a_like_density_or_range_images_are_not_reported(
 def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     MixedScans(Scans("r", 28), Scans("s", 6), 0.9)
     assert (
-        "the 6 scans of a synthetic source" in caplog.text and "come 42 times each" in caplog.text
+        "the 6 scans of a synthetic source" in caplog.text
+        and "come 42 times each" in caplog.text
     )
     caplog.clear()
     MixedScans(Scans("r", 28), Scans("s", 6), 0.4)
@@ -64,7 +71,9 @@ def test_unlabelled_real_scans_are_reported_once(
 ) -> None:
     real = Scans("r", 12)
     for i in (3, 5):
-        real[i] = replace(real[i], label=np.full(len(real[i]), 255, np.uint8) if ignored else None)
+        real[i] = replace(
+            real[i], label=np.full(len(real[i]), 255, np.uint8) if ignored else None
+        )
     messages = logged(MixedScans(real, Endless(), 0.5), caplog)
     assert (
         len(messages) == 1

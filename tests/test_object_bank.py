@@ -18,7 +18,13 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank, instances_of, objects_of, paste
-from lidar_synth.labels.boxes import box_frame, find_overlapping, grow_box, join_boxes, turn_boxes
+from lidar_synth.labels.boxes import (
+    box_frame,
+    find_overlapping,
+    grow_box,
+    join_boxes,
+    turn_boxes,
+)
 from lidar_synth.labels.ground import ground_under
 
 
@@ -45,12 +51,20 @@ def test_objects_are_their_instances(scans: list[Scan], bank: ObjectBank) -> Non
     for index in range(len(bank)):
         found = bank[index]
         [scan] = [s for s in scans if s.id == found.scan.id]
-        assert scan.boxes is not None and scan.instance is not None and found.scan.boxes is not None
+        assert (
+            scan.boxes is not None
+            and scan.instance is not None
+            and found.scan.boxes is not None
+        )
         box = scan.boxes.values[bank.number[index]]
         instance = scan.instance == scan.boxes.instance[bank.number[index]]
         assert found.scan.boxes.contain(found.scan.points).all()
-        assert (found.box[3:6] >= box[3:6]).all() and (found.box[3:6] - box[3:6]).max() < 0.35
-        assert np.isin(found.scan.points[:, 0].round(3), scan.points[instance][:, 0].round(3)).all()
+        assert (found.box[3:6] >= box[3:6]).all() and (
+            found.box[3:6] - box[3:6]
+        ).max() < 0.35
+        assert np.isin(
+            found.scan.points[:, 0].round(3), scan.points[instance][:, 0].round(3)
+        ).all()
         assert len(found.scan) >= 0.7 * instance.sum()
 
 
@@ -105,7 +119,8 @@ def test_a_bank_survives_the_disk(bank: ObjectBank, tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", points=np.zeros(3))
     for name in ("cut", "other"):
         with pytest.raises(
-            DataError, match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)"
+            DataError,
+            match=rf"{name}\.npz.*a bank of objects \(lidar-synth-objects/1\)",
         ):
             ObjectBank.load(tmp_path / f"{name}.npz")
     with pytest.raises(FileError, match="nowhere"):
@@ -129,7 +144,10 @@ def test_a_bank_needs_boxes_and_one_sensor() -> None:
 def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
     scan = cast([car(9, 3)])
     scan.boxes.values[0, 3:6] += 0.4  # as people draw them, with some road
-    for bare in (replace(scan, instance=None), replace(scan, instance=None, label=None)):
+    for bare in (
+        replace(scan, instance=None),
+        replace(scan, instance=None, label=None),
+    ):
         [found] = objects_of(bare).values()
         assert (found.scan.label == CAR).all()
         above = scan.points[scan.instance == 1][:, 2] > -HEIGHT + 0.1
@@ -143,7 +161,9 @@ def test_without_instances_an_object_is_what_stands_in_its_box() -> None:
 def test_instances_serve_where_there_are_no_boxes() -> None:
     scan = replace(cast([car(9, 3), car(14, -5), car(40, 20)]), boxes=None)
     found = instances_of(scan, least=20)
-    assert [len(o.scan) for o in found] == [(scan.instance == i).sum() for i in (1, 2, 3)]
+    assert [len(o.scan) for o in found] == [
+        (scan.instance == i).sum() for i in (1, 2, 3)
+    ]
     pasted = paste(cast(), [o.turned(1.0) for o in found])
     assert pasted.boxes is not None and len(pasted.boxes) == 3
     assert_nothing_shares_a_ray(pasted, 1)
@@ -156,15 +176,22 @@ def test_instances_serve_where_there_are_no_boxes() -> None:
 def test_town_objects_in_a_town_scan(town: Town, bank: ObjectBank, bare: bool) -> None:
     host = town[32]
     if bare:
-        host = replace(host, label=None, instance=None, boxes=None, raw_label=None, ring=None)
+        host = replace(
+            host, label=None, instance=None, boxes=None, raw_label=None, ring=None
+        )
     rng = np.random.default_rng(5)
     first = (
-        1 if host.boxes is None else int(max(host.instance.max(), host.boxes.instance.max())) + 1
+        1
+        if host.boxes is None
+        else int(max(host.instance.max(), host.boxes.instance.max())) + 1
     )
     angles = rng.uniform(-np.pi, np.pi, len(bank))
     pasted = paste(
         host,
-        [bank[i].turned(a) for i, a in zip(rng.permutation(len(bank)), angles, strict=True)],
+        [
+            bank[i].turned(a)
+            for i, a in zip(rng.permutation(len(bank)), angles, strict=True)
+        ],
         count=12,
     )
     assert pasted.boxes is not None and (pasted.boxes.instance >= first).sum() >= 4
@@ -184,10 +211,13 @@ def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
     } | {IGNORE}
     placed = 0
     for index in (5, 32):
-        host = replace(town[index], boxes=None, instance=None, raw_label=None, ring=None)
+        host = replace(
+            town[index], boxes=None, instance=None, raw_label=None, ring=None
+        )
         rng = np.random.default_rng(index)
         pasted = paste(
-            host, [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))]
+            host,
+            [bank[i].turned(rng.uniform(-3, 3)) for i in rng.permutation(len(bank))],
         )
         assert pasted.boxes is not None
         assert_nothing_shares_a_ray(pasted, 1)
@@ -197,7 +227,9 @@ def test_real_objects_in_town_scans(real_scans: Path, town: Town) -> None:
 
 def test_real_instances_in_town_scans(real_scans: Path, town: Town) -> None:
     scan = SemanticKITTI(real_scans / "semantic_kitti", split="train")[0]
-    pasted = paste(replace(town[5], boxes=None), [o.turned(0.5) for o in instances_of(scan, 20)])
+    pasted = paste(
+        replace(town[5], boxes=None), [o.turned(0.5) for o in instances_of(scan, 20)]
+    )
     assert pasted.boxes is not None and len(pasted.boxes) >= 2
     assert_nothing_shares_a_ray(pasted, int(town[5].instance.max()) + 1)
 
@@ -213,9 +245,9 @@ def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
         rng.uniform(-4, 4, 5),
     ]
     values = values.astype(np.float32)
-    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1).reshape(
-        -1, 2
-    )
+    grid = np.stack(
+        np.meshgrid(np.linspace(-8, 8, 161), np.linspace(-8, 8, 161)), -1
+    ).reshape(-1, 2)
     inside = Boxes(values, ("Car",) * 5).contain(
         np.c_[grid, np.zeros(len(grid))].astype(np.float32)
     )

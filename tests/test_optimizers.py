@@ -11,9 +11,16 @@ from lidar_synth.lab.train import OPTIMIZERS
 
 def transformer() -> nn.Module:
     torch.manual_seed(0)
-    small = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 4]}
+    small = {
+        "width": 16,
+        "time_width": 16,
+        "depths": [1],
+        "heads": [2],
+        "patch": [2, 4],
+    }
     return build_network(
-        "hdit", {"resolution": (8, 32), "channels": 3, "angles": torch.zeros(2, 8, 32)} | small
+        "hdit",
+        {"resolution": (8, 32), "channels": 3, "angles": torch.zeros(2, 8, 32)} | small,
     )
 
 
@@ -39,7 +46,9 @@ def test_muon_computes_in_float32_where_bfloat16_is_slower(
 ) -> None:
     """Beside the polynomial of its five iterations (Jordan et al. 2024), applied to the singular
     values in float64."""
-    monkeypatch.setattr("lidar_synth.lab.train.optimizers.faster_in_bfloat16", lambda: half)
+    monkeypatch.setattr(
+        "lidar_synth.lab.train.optimizers.faster_in_bfloat16", lambda: half
+    )
     muon = OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)[0]
     weight = muon.param_groups[0]["params"][0]
     before = weight.detach().clone()
@@ -54,9 +63,15 @@ def test_muon_computes_in_float32_where_bfloat16_is_slower(
     assert error / 100 < difference < error
 
 
-def test_muon_refuses_a_network_without_matrices_to_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="optimizer 'muon' for Conv2d; expected a transformer"):
+def test_muon_refuses_a_network_without_matrices_to_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(
+        ConfigError, match="optimizer 'muon' for Conv2d; expected a transformer"
+    ):
         OPTIMIZERS["muon"](nn.Conv2d(3, 3, 1), 0.1, (0.9, 0.99), 0.0)
     monkeypatch.delattr(torch.optim, "Muon")
-    with pytest.raises(LibraryError, match=r"expected torch >= 2\.9\. Or optimizer: adamw"):
+    with pytest.raises(
+        LibraryError, match=r"expected torch >= 2\.9\. Or optimizer: adamw"
+    ):
         OPTIMIZERS["muon"](transformer(), 0.1, (0.9, 0.99), 0.0)

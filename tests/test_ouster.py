@@ -60,7 +60,12 @@ def test_both_forms_are_read(tmp_path: Path, flat: bool) -> None:
     assert sensor.elevations == tuple(beams["beam_altitude_angles"])
     assert sensor.azimuths == tuple(beams["beam_azimuth_angles"])
     assert sensor.heights == (LIFT / 1000,) * 8
-    assert (sensor.range_min, sensor.range_max, sensor.range_step, sensor.reflectance_levels) == (
+    assert (
+        sensor.range_min,
+        sensor.range_max,
+        sensor.range_step,
+        sensor.reflectance_levels,
+    ) == (
         0.5,
         200,
         0.001,
@@ -75,9 +80,15 @@ def test_the_directions_are_those_of_the_sdk(tmp_path: Path) -> None:
     points = sdk_points(metadata, 40.0) - (0, 0, LIFT / 1000)
     clockwise = -np.arctan2(points[..., 1], points[..., 0])
     half = np.pi / 1024  # a column's azimuth is that of its middle
-    assert np.allclose(np.sin(sensor.firing_azimuths() - half - clockwise), 0, atol=1e-9)
-    assert np.allclose(np.cos(sensor.firing_azimuths() - half - clockwise), 1, atol=1e-9)
-    assert np.allclose(np.arcsin(points[..., 2] / 40)[:, 0], sensor.laser_elevations, atol=1e-6)
+    assert np.allclose(
+        np.sin(sensor.firing_azimuths() - half - clockwise), 0, atol=1e-9
+    )
+    assert np.allclose(
+        np.cos(sensor.firing_azimuths() - half - clockwise), 1, atol=1e-9
+    )
+    assert np.allclose(
+        np.arcsin(points[..., 2] / 40)[:, 0], sensor.laser_elevations, atol=1e-6
+    )
 
 
 def test_points_of_the_sdk_keep_their_rows(tmp_path: Path) -> None:
@@ -97,10 +108,18 @@ def test_points_of_the_sdk_keep_their_rows(tmp_path: Path) -> None:
     [
         (lambda m: m["lidar_data_format"].pop("columns_per_frame"), {"columns": 1024}),
         (lambda m: m["config_params"].update(lidar_mode="2048x10"), {"columns": 1024}),
-        (lambda m: m.update(lidar_data_format="error: Command not recognized."), {"columns": 1024}),
-        (lambda m: m["lidar_data_format"].update(columns_per_frame=4096), {"columns": 4096}),
         (
-            lambda m: m["lidar_data_format"].update(udp_profile_lidar="RNG15_RFL8_NIR8"),
+            lambda m: m.update(lidar_data_format="error: Command not recognized."),
+            {"columns": 1024},
+        ),
+        (
+            lambda m: m["lidar_data_format"].update(columns_per_frame=4096),
+            {"columns": 4096},
+        ),
+        (
+            lambda m: m["lidar_data_format"].update(
+                udp_profile_lidar="RNG15_RFL8_NIR8"
+            ),
             {"range_step": 0.008},
         ),
         (
@@ -112,7 +131,9 @@ def test_points_of_the_sdk_keep_their_rows(tmp_path: Path) -> None:
         (lambda m: m.pop("lidar_intrinsics"), {"heights": None}),
     ],
 )
-def test_what_a_file_says_and_lacks(tmp_path: Path, change: Any, expected: dict[str, Any]) -> None:
+def test_what_a_file_says_and_lacks(
+    tmp_path: Path, change: Any, expected: dict[str, Any]
+) -> None:
     metadata = ouster_metadata()
     change(metadata)
     sensor = load_sensor(written(tmp_path, metadata))
@@ -124,7 +145,9 @@ def test_channels_that_the_sensor_lacks_are_left_out(tmp_path: Path) -> None:
     metadata = ouster_metadata(flat=True, rows=16)
     for key in ("beam_altitude_angles", "beam_azimuth_angles"):
         metadata[key] = [
-            value for pair in zip([0] * 16, metadata[key], strict=True) for value in pair
+            value
+            for pair in zip([0] * 16, metadata[key], strict=True)
+            for value in pair
         ]
     sensor = load_sensor(written(tmp_path, metadata))
     assert sensor.elevations == tuple(
@@ -138,7 +161,10 @@ def test_rows_are_sorted_with_their_azimuths(tmp_path: Path) -> None:
         metadata[key] = metadata[key][::-1]
     upright = load_sensor(written(tmp_path, ouster_metadata(), "a.json"))
     turned = load_sensor(written(tmp_path, metadata, "b.json"))
-    assert (turned.elevations, turned.azimuths) == (upright.elevations, upright.azimuths)
+    assert (turned.elevations, turned.azimuths) == (
+        upright.elevations,
+        upright.azimuths,
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,7 +197,9 @@ def test_files_that_describe_no_sensor_are_refused(tmp_path: Path, change: Any) 
 def test_text_that_is_no_json_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.json"
     path.write_text("{")
-    with pytest.raises(LidarSynthError, match=r"mine.json is not JSON.*metadata JSON of an Ouster"):
+    with pytest.raises(
+        LidarSynthError, match=r"mine.json is not JSON.*metadata JSON of an Ouster"
+    ):
         load_sensor(path)
     path.write_text("[" * (1 << 21))
     with pytest.raises(LidarSynthError, match=r"mine.json is longer than"):
@@ -188,10 +216,13 @@ def test_scans_of_another_sensor_in_semantic_kittis_layout(tmp_path: Path) -> No
     own = np.arange(len(scan), dtype="<u4") % 3
     own.tofile(labels)
     with pytest.raises(
-        LidarSynthError, match=r"unknown class ids \[2\]; expected class ids of SemanticKITTI"
+        LidarSynthError,
+        match=r"unknown class ids \[2\]; expected class ids of SemanticKITTI",
     ):
         open_scans(tmp_path / "data", sensor=path)[0]
     mine = Taxonomy("mine", {0: IGNORE, 1: TRAIN_ID["person"], 2: TRAIN_ID["car"]})
     scan = SemanticKITTI(tmp_path / "data", sensor=path, taxonomy=mine)[0]
-    assert np.array_equal(scan.label, np.array([IGNORE, TRAIN_ID["person"], TRAIN_ID["car"]])[own])
+    assert np.array_equal(
+        scan.label, np.array([IGNORE, TRAIN_ID["person"], TRAIN_ID["car"]])[own]
+    )
     assert np.array_equal(scan.raw_label, own)

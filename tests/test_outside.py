@@ -83,7 +83,9 @@ def test_nothing_lands_outside(tmp_path: Path, out: Path, to: str, name: str) ->
 
 
 @pytest.mark.parametrize("to", WRITERS)
-def test_a_bank_and_a_tar_with_names_that_lead_out(tmp_path: Path, out: Path, to: str) -> None:
+def test_a_bank_and_a_tar_with_names_that_lead_out(
+    tmp_path: Path, out: Path, to: str
+) -> None:
     write_bank(tmp_path / "bank", [some_image()], model="../../x")
     [path, *others] = write_tars(tmp_path / "tar")
     for other in others:
@@ -101,19 +103,25 @@ def test_a_bank_and_a_tar_with_names_that_lead_out(tmp_path: Path, out: Path, to
     for number, source in enumerate(sources):
         if to == "kitti_object" and number == 0:
             continue  # a bank has no boxes
-        report = convert(source, WRITERS[to](out / str(number)), on_bad="skip", progress=False)
-        assert (report.written == 0) == (to in ("kitti", "npz", "range", "pcd", "ply", "png")), (
-            report
+        report = convert(
+            source, WRITERS[to](out / str(number)), on_bad="skip", progress=False
         )
+        assert (report.written == 0) == (
+            to in ("kitti", "npz", "range", "pcd", "ply", "png")
+        ), report
     assert everything(tmp_path, out) == before
 
 
 @pytest.mark.parametrize("to", WRITERS)
-def test_a_link_in_the_folder_that_leads_out(tmp_path: Path, out: Path, to: str) -> None:
+def test_a_link_in_the_folder_that_leads_out(
+    tmp_path: Path, out: Path, to: str
+) -> None:
     """Whichever folder of a layout it is, side files and images included."""
     convert(Named("good/0"), WRITERS[to](tmp_path / "model"), progress=False)
     folders = [
-        p.relative_to(tmp_path / "model") for p in (tmp_path / "model").rglob("*") if p.is_dir()
+        p.relative_to(tmp_path / "model")
+        for p in (tmp_path / "model").rglob("*")
+        if p.is_dir()
     ]
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -137,7 +145,10 @@ def test_a_file_is_never_written_through_a_link(tmp_path: Path) -> None:
     for link in (path, path.with_name(f".file.{os.getpid()}.part")):
         link.symlink_to(tmp_path / "target")
     write_file(path, b"after")
-    assert path.read_bytes() == b"after" and (tmp_path / "target").read_bytes() == b"before"
+    assert (
+        path.read_bytes() == b"after"
+        and (tmp_path / "target").read_bytes() == b"before"
+    )
 
 
 COLLISIONS = {
@@ -155,18 +166,29 @@ COLLISIONS = {
 def test_two_scans_never_share_a_file(out: Path, to: str) -> None:
     for number, ids in enumerate(COLLISIONS[to]):
         folder = out / str(number)
-        with pytest.raises(DataError, match=r"scan 1 is called .*that no earlier scan has"):
+        with pytest.raises(
+            DataError, match=r"scan 1 is called .*that no earlier scan has"
+        ):
             convert(Named(*ids), WRITERS[to](folder / "a"), progress=False)
         for expected in (Report(written=1), Report(kept=1)):
-            report = convert(Named(*ids), WRITERS[to](folder / "b"), on_bad="skip", progress=False)
+            report = convert(
+                Named(*ids), WRITERS[to](folder / "b"), on_bad="skip", progress=False
+            )
             assert (report.written, report.kept) == (expected.written, expected.kept)
             assert list(report.skipped) == [f"{ids[1]} (scan 1)"]
         [scan] = open_scans(folder / "b", layout=WRITTEN_AS[to])
         [alone] = Named(ids[0])
-        assert len(scan) == len(alone) or to in ("png", "range")  # the first, not the second
+        assert len(scan) == len(alone) or to in (
+            "png",
+            "range",
+        )  # the first, not the second
 
 
-@given(st.lists(st.text(st.sampled_from("ab./\\~%: \x00_é"), max_size=8), min_size=2, max_size=2))
+@given(
+    st.lists(
+        st.text(st.sampled_from("ab./\\~%: \x00_é"), max_size=8), min_size=2, max_size=2
+    )
+)
 def test_names_stay_inside_and_apart(names: list[str]) -> None:
     root = Path("/somewhere/out")
     found = {}
@@ -209,4 +231,6 @@ def test_keys_keep_what_their_names_were(tmp_path: Path) -> None:
             info.size = len(content)
             tar.addfile(info, BytesIO(content))
     scans = open_scans(tmp_path)
-    assert scans.ids == ("000000",) and np.array_equal(scans[0].points, some_scan(0).points)
+    assert scans.ids == ("000000",) and np.array_equal(
+        scans[0].points, some_scan(0).points
+    )

@@ -27,14 +27,19 @@ def test_every_package_and_data_file_is_listed() -> None:
     data = {
         p.relative_to(ROOT / "lidar_synth").as_posix()
         for p in (ROOT / "lidar_synth").rglob("*")
-        if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts and p.name[0] != "."
+        if p.is_file()
+        and p.suffix != ".py"
+        and "__pycache__" not in p.parts
+        and p.name[0] != "."
     }
     listed = set()
     for package in setuptools["package-data"].keys() - MAPPED.keys():
         patterns = setuptools["package-data"][package]
         base = ROOT / package.replace(".", "/")
         listed |= {
-            m.relative_to(ROOT / "lidar_synth").as_posix() for g in patterns for m in base.glob(g)
+            m.relative_to(ROOT / "lidar_synth").as_posix()
+            for g in patterns
+            for m in base.glob(g)
         }
     assert listed == data
 
@@ -43,7 +48,9 @@ def test_every_recipe_is_listed() -> None:
     patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["lidar_synth.recipes"]
     listed = {path for pattern in patterns for path in (ROOT / "configs").glob(pattern)}
     there = {
-        p for p in (ROOT / "configs").rglob("*.*") if p.is_file() and "__pycache__" not in p.parts
+        p
+        for p in (ROOT / "configs").rglob("*.*")
+        if p.is_file() and "__pycache__" not in p.parts
     }
     assert there - listed == {ROOT / "configs" / "__init__.py"}
 
@@ -59,10 +66,20 @@ def build(folder: Path) -> Path:
     rubbish = shutil.ignore_patterns(
         ".*", "__pycache__", "*.egg-info", "build", "dist", "runs", "demo_out"
     )
-    shutil.copytree(ROOT, folder / "checkout", ignore=rubbish, copy_function=shutil.copy)
+    shutil.copytree(
+        ROOT, folder / "checkout", ignore=rubbish, copy_function=shutil.copy
+    )
     shutil.copytree(ROOT / ".ci", folder / "checkout" / ".ci")
     run(
-        [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "checkout"],
+        [
+            sys.executable,
+            "-m",
+            "build",
+            "--no-isolation",
+            "--outdir",
+            folder,
+            folder / "checkout",
+        ],
         folder,
     )
     return folder
@@ -76,8 +93,21 @@ def environment_with(what: list[str | Path], folder: Path) -> Path:
     # Paths that a .pth file adds are not searched for further .pth files: this checkout stays out
     # of sight.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
-    pip = [sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install", "--quiet"]
-    options = ["--disable-pip-version-check", "--no-deps", "--no-index", "--no-build-isolation"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        folder / "bin" / "python",
+        "install",
+        "--quiet",
+    ]
+    options = [
+        "--disable-pip-version-check",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+    ]
     run([*pip, *options, *what], folder)
     return folder / "bin"
 
@@ -85,7 +115,12 @@ def environment_with(what: list[str | Path], folder: Path) -> Path:
 def run(command: list[str | Path], folder: Path) -> str:
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, check=False, env=environment
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -96,7 +131,8 @@ def test_the_wheel_works_from_any_folder(built: Path, tmp_path: Path) -> None:
     [wheel] = built.glob("*.whl")
     bare = environment_with([wheel], built / "environment")
     where = run(
-        [bare / "python", "-c", "import lidar_synth; print(lidar_synth.__file__)"], tmp_path
+        [bare / "python", "-c", "import lidar_synth; print(lidar_synth.__file__)"],
+        tmp_path,
     )
     assert Path(where.strip()).is_relative_to(bare.parent)
     command = bare / "lidar-synth"
@@ -157,14 +193,18 @@ def test_the_versions_agree() -> None:
 
 
 def test_the_workflow_runs_the_command_of_the_readme_on_every_python() -> None:
-    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "tests.yml").read_text())
+    workflow = yaml.safe_load(
+        (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+    )
     job = workflow["jobs"]["tests"]
     named = PYPROJECT["project"]["classifiers"]
     pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(named))
     assert job["strategy"]["matrix"]["python"] == pythons
     systems = {name.split("-")[0] for name in job["strategy"]["matrix"]["os"]}
     assert systems == {"ubuntu", "macos", "windows"}
-    [command] = [step["run"] for step in job["steps"] if step.get("run", "").startswith("make")]
+    [command] = [
+        step["run"] for step in job["steps"] if step.get("run", "").startswith("make")
+    ]
     assert command == "make test PYTHON=python"
     assert "\nmake test " in (ROOT / "README.md").read_text()
 
@@ -173,12 +213,18 @@ def test_the_lock_file_has_the_pinned_versions_and_a_hash_for_each_package() -> 
     """``make lock`` writes it."""
     text = (ROOT / "requirements-dev.txt").read_text()
     found = re.findall(
-        r"^([\w-]+)==(\S+)([^\n]*\n(?: +--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.M
+        r"^([\w-]+)==(\S+)([^\n]*\n(?: +--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)",
+        text,
+        re.M,
     )
     locked = {name: version for name, version, _ in found}
     assert len(found) == len(re.findall(r"^\w", text, re.M))
-    pins = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.M)
-    assert {plain_name(name): version for name, version in pins}.items() <= locked.items()
+    pins = re.findall(
+        r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.M
+    )
+    assert {
+        plain_name(name): version for name, version in pins
+    }.items() <= locked.items()
     project = PYPROJECT["project"]
     wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
     assert set(names_of(wanted)) - set(locked) == {"tomli"}, "which is for Python 3.10"
@@ -190,7 +236,9 @@ def names_of(requirements: list[str]) -> Iterator[str]:
         [(name, extras)] = re.findall(r"^([\w.-]+)(?:\[([\w,]+)\])?", text)
         if name == "lidar_synth":
             for extra in extras.split(","):
-                yield from names_of(PYPROJECT["project"]["optional-dependencies"][extra])
+                yield from names_of(
+                    PYPROJECT["project"]["optional-dependencies"][extra]
+                )
         else:
             yield plain_name(name)
 
@@ -225,7 +273,11 @@ def test_the_command_line_starts_without_the_heavy_libraries(args: list[str]) ->
 
 
 def test_every_shipped_yaml_loads_safely() -> None:
-    files = [p for folder in ("lidar_synth", "configs") for p in (ROOT / folder).rglob("*.yaml")]
+    files = [
+        p
+        for folder in ("lidar_synth", "configs")
+        for p in (ROOT / folder).rglob("*.yaml")
+    ]
     assert files
     for path in files:
         assert isinstance(yaml.safe_load(path.read_text()), dict), path
@@ -240,7 +292,10 @@ def test_what_a_script_imports_from_the_package_is_there(script: Path) -> None:
     import importlib
 
     for node in ast.walk(ast.parse(script.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "lidar_synth":
+        if (
+            isinstance(node, ast.ImportFrom)
+            and (node.module or "").split(".")[0] == "lidar_synth"
+        ):
             if "integrations" in (node.module or ""):
                 continue
             module = importlib.import_module(str(node.module))

@@ -60,16 +60,23 @@ def test_the_published_form_is_read_in_every_protocol(
     found = read(tmp_path / "x.pkl")
     for name, values in COLUMNS.items():
         assert (
-            found[name].dtype == values.dtype and found[name].tolist()[:-1] == values.tolist()[:-1]
+            found[name].dtype == values.dtype
+            and found[name].tolist()[:-1] == values.tolist()[:-1]
         )
     assert read(tmp_path / "x.pkl", "yaw").keys() == {"yaw"}
-    assert read_table(tmp_path / "x.pkl", ("yaw",), ("d", "missing")).keys() == {"yaw", "d"}
+    assert read_table(tmp_path / "x.pkl", ("yaw",), ("d", "missing")).keys() == {
+        "yaw",
+        "d",
+    }
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda content: content[:-200], r"is truncated; expected a pickled pandas table"),
+        (
+            lambda content: content[:-200],
+            r"is truncated; expected a pickled pandas table",
+        ),
         (
             lambda content: content[:10] + b"?" + content[11:],
             r"is damaged \(Error -3|is truncated|damaged pickle",
@@ -81,7 +88,10 @@ def test_the_published_form_is_read_in_every_protocol(
         (lambda content: b"", "truncated or damaged pickle"),
         (lambda content: b"hello", "truncated or damaged pickle|would call"),
         (lambda content: gzip.compress(dump({"a": 1})), "holds another table"),
-        (lambda content: gzip.compress(dump(array(np.zeros(3)))), "holds another table"),
+        (
+            lambda content: gzip.compress(dump(array(np.zeros(3)))),
+            "holds another table",
+        ),
     ],
 )
 def test_damaged_tables_are_named(
@@ -98,7 +108,9 @@ def test_missing_files_and_columns_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"x.pkl cannot be read .*pickled pandas table"):
         read(path)
     path.write_bytes(dump(table(COLUMNS)))
-    with pytest.raises(DataError, match="x.pkl has no column z; expected a table with x, z"):
+    with pytest.raises(
+        DataError, match="x.pkl has no column z; expected a table with x, z"
+    ):
         read(path, "x", "z")
 
 
@@ -140,8 +152,12 @@ def many_blocks() -> bytes:
     tree = table({"x": np.zeros(3)})
     saved = tree.state["_data"].state[3]["0.14.1"]
     state = (*array(np.zeros(3)).state[:4], Call("_codecs.encode", (text, "latin1")))
-    values = Call("numpy.core.multiarray._reconstruct", (), (1, (1, 2_000_000), *state[2:]))
-    saved["blocks"] = [{"values": values, "mgr_locs": Call("builtins.slice", (0, 1, 1))}] * 500
+    values = Call(
+        "numpy.core.multiarray._reconstruct", (), (1, (1, 2_000_000), *state[2:])
+    )
+    saved["blocks"] = [
+        {"values": values, "mgr_locs": Call("builtins.slice", (0, 1, 1))}
+    ] * 500
     return dump(tree)
 
 
@@ -163,7 +179,9 @@ CODE: dict[str, Callable[[], bytes]] = {
 
 
 @pytest.mark.parametrize("name", CODE)
-def test_no_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_no_code_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     made = tmp_path / "made.npy"
     monkeypatch.setenv(FLAG, str(made))
     content = CODE[name]()
@@ -202,7 +220,9 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     # Calls and states of what is no call
     "a call of text": lambda: b"\x80\x04\x8c\x01x)R.",
     "a call without a tuple": lambda: b"\x80\x04cnumpy\nndarray\n]R.",
-    "a state for a class": lambda: b"\x80\x04cnumpy\nndarray\n}\x8c\x04__doc__\x8c\x01xsb.",
+    "a state for a class": lambda: (
+        b"\x80\x04cnumpy\nndarray\n}\x8c\x04__doc__\x8c\x01xsb."
+    ),
     "a state twice": lambda: b"\x80\x04cnumpy\nndarray\n)R}b}b.",
     "items for a tuple": lambda: b"\x80\x04)\x8c\x01xK\x01s.",
     "a key that is no text": lambda: b"\x80\x04}]K\x01s.",
@@ -220,14 +240,18 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "a frame of 8 EB": lambda: b"\x80\x04\x95" + b"\xff" * 7 + b"\x7fN.",
     "many opcodes": lambda: repeated(b"N", MOST_STEPS),
     "deep tuples": lambda: b"\x80\x04)" + b"\x85" * (MOST_STEPS - 10) + b".",
-    "deep lists": lambda: b"\x80\x04" + b"](" * (MOST_STEPS // 4) + b"e" * (MOST_STEPS // 4) + b".",
+    "deep lists": lambda: (
+        b"\x80\x04" + b"](" * (MOST_STEPS // 4) + b"e" * (MOST_STEPS // 4) + b"."
+    ),
     "a list in itself": lambda: b"\x80\x04]q\x00h\x00a.",
     "twice as many, sixty times": lambda: b"\x80\x04]" + b"2\x86" * 60 + b".",
     "a bomb": lambda: gzip.compress(bytes(MOST_BYTES + 1), 1),
     "arrays of 16 MB, 500 times": many_blocks,
     # Tables
     "an array of 8 TB": lambda: frame(array(np.zeros(3), shape=(10**12, 1))),
-    "an array of more than bits": lambda: frame(array(np.zeros(3), shape=(2**62, 2**62))),
+    "an array of more than bits": lambda: frame(
+        array(np.zeros(3), shape=(2**62, 2**62))
+    ),
     "an array of objects by number": lambda: frame(array(np.zeros(3), dtype="O8")),
     "numbers as objects": lambda: frame(array(np.array([1, "a"], object), dtype="i8")),
     "a structure": lambda: frame(array(np.zeros(3), dtype="V8")),
@@ -239,15 +263,25 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     "no axis": lambda: frame(array(np.zeros(()))),
     "fewer values": lambda: frame(array(np.zeros(2), shape=(1, 3))),
     "lists in cells": lambda: frame(array(np.array([[1], None, "a"], object))),
-    "names in cells": lambda: frame(array(np.array([Name("numpy.ndarray"), None, "a"], object))),
+    "names in cells": lambda: frame(
+        array(np.array([Name("numpy.ndarray"), None, "a"], object))
+    ),
     "another class as an array": lambda: frame(Call("pandas.StringDtype", ("python",))),
-    "an array without a state": lambda: frame(Call("numpy.core.multiarray._reconstruct", ())),
+    "an array without a state": lambda: frame(
+        Call("numpy.core.multiarray._reconstruct", ())
+    ),
     "a slice of text": lambda: frame(
         array(np.zeros((1, 3))), placement=Call("builtins.slice", ("a",))
     ),
-    "no slice": lambda: frame(array(np.zeros((1, 3))), placement=Call("builtins.slice", (0, 1, 0))),
-    "places outside": lambda: frame(array(np.zeros((1, 3))), placement=array(np.array([7]))),
-    "half a place": lambda: frame(array(np.zeros((1, 3))), placement=array(np.array([0.5]))),
+    "no slice": lambda: frame(
+        array(np.zeros((1, 3))), placement=Call("builtins.slice", (0, 1, 0))
+    ),
+    "places outside": lambda: frame(
+        array(np.zeros((1, 3))), placement=array(np.array([7]))
+    ),
+    "half a place": lambda: frame(
+        array(np.zeros((1, 3))), placement=array(np.array([0.5]))
+    ),
     "a million places": lambda: frame(
         array(np.zeros((1, 3))), placement=array(np.zeros(10**6, "i8"))
     ),
@@ -287,7 +321,15 @@ def test_names_that_are_known_are_not_imported() -> None:
     assert (tree.name, tree.args, tree.state) == ("nowhere.at.all", (1, "a"), None)
     assert all(
         name.split(".")[0]
-        in ("numpy", "pandas", "builtins", "__builtin__", "_codecs", "copyreg", "copy_reg")
+        in (
+            "numpy",
+            "pandas",
+            "builtins",
+            "__builtin__",
+            "_codecs",
+            "copyreg",
+            "copy_reg",
+        )
         for name in KNOWN
     )
     assert not {"builtins.eval", "builtins.exec", "numpy.load"} & KNOWN
@@ -302,4 +344,7 @@ def test_plain_values_are_those_of_pythons_own_reader() -> None:
         assert parse_pickle(pickle.dumps(values, protocol), (), "x", "y") == values
     file = io.BytesIO()
     pickle.Pickler(file, 2).dump({"a": [1, "b", 2.5], "c": None})
-    assert parse_pickle(file.getvalue(), (), "x", "y") == {"a": [1, "b", 2.5], "c": None}
+    assert parse_pickle(file.getvalue(), (), "x", "y") == {
+        "a": [1, "b", 2.5],
+        "c": None,
+    }

@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pandaset_files import CUBOIDS, drive, measured, write_pandaset, write_table, write_track
+from pandaset_files import (
+    CUBOIDS,
+    drive,
+    measured,
+    write_pandaset,
+    write_table,
+    write_track,
+)
 
 from lidar_synth.datasets.classes import IGNORE, NAMES, PANDASET
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -44,7 +51,10 @@ def test_compensated_points_are_in_the_frame_of_the_pose(root: Path) -> None:
         scan.ring, measured_scan.ring
     )
     far = np.linalg.norm(scan.points - measured_scan.points, axis=1)
-    assert far[abs(scan.time) < 0.001].max() < 0.3 and 1 < far[scan.time < -0.09].max() < 15
+    assert (
+        far[abs(scan.time) < 0.001].max() < 0.3
+        and 1 < far[scan.time < -0.09].max() < 15
+    )
     at_the_end = np.argmin(abs(scan.time))
     world = scan.pose[:3, :3] @ scan.points[at_the_end] + scan.pose[:3, 3]
     assert np.linalg.norm(world - drive(3)[1][1][:3, 3]) < 200
@@ -52,7 +62,9 @@ def test_compensated_points_are_in_the_frame_of_the_pose(root: Path) -> None:
 
 def test_rings_are_the_nearest_beams(root: Path) -> None:
     scan = PandaSet(root)[0]
-    elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1)))
+    elevation = np.degrees(
+        np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1))
+    )
     beams = np.array(scan.sensor.elevations)
     assert (
         np.array_equal(scan.ring, abs(elevation[:, None] - beams).argmin(1))
@@ -76,8 +88,13 @@ def test_labels_belong_to_their_points(root: Path, sensor: str) -> None:
 
 def test_every_class_is_mapped() -> None:
     assert set(PANDASET.to_train) == set(range(43))
-    names = {i: "" if train == IGNORE else NAMES[train] for i, train in PANDASET.to_train.items()}
-    assert [names[i] for i in (5, 6, 7, 10, 12, 13, 14, 23, 25, 26, 31, 36, 39, 41)] == [
+    names = {
+        i: "" if train == IGNORE else NAMES[train]
+        for i, train in PANDASET.to_train.items()
+    }
+    assert [
+        names[i] for i in (5, 6, 7, 10, 12, 13, 14, 23, 25, 26, 31, 36, 39, 41)
+    ] == [
         "vegetation",
         "terrain",
         "road",
@@ -110,7 +127,8 @@ def test_every_class_is_mapped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "names"), [("pandar64", ("Car", "Pedestrian")), ("pandar_gt", ("Cyclist", "Truck"))]
+    ("sensor", "names"),
+    [("pandar64", ("Car", "Pedestrian")), ("pandar_gt", ("Cyclist", "Truck"))],
 )
 def test_boxes_are_those_that_the_sensor_saw(
     root: Path, sensor: str, names: tuple[str, ...]
@@ -121,15 +139,21 @@ def test_boxes_are_those_that_the_sensor_saw(
         and len(set(boxes.instance)) == len(names)
         and boxes.instance.min() >= 0
     )
-    assert np.array_equal(boxes.instance, PandaSet(root, sensor=sensor)[2].boxes.instance)
+    assert np.array_equal(
+        boxes.instance, PandaSet(root, sensor=sensor)[2].boxes.instance
+    )
 
 
 @pytest.mark.parametrize("motion_compensated", [False, True])
-def test_boxes_stand_where_they_do_in_the_world(root: Path, motion_compensated: bool) -> None:
+def test_boxes_stand_where_they_do_in_the_world(
+    root: Path, motion_compensated: bool
+) -> None:
     """The front of a box, by its corners: PandaSet's boxes have their length along y before they
     are turned."""
     scan = PandaSet(root, motion_compensated=motion_compensated)[1]
-    corners = scan.boxes.corners().astype(np.float64) @ scan.pose[:3, :3].T + scan.pose[:3, 3]
+    corners = (
+        scan.boxes.corners().astype(np.float64) @ scan.pose[:3, :3].T + scan.pose[:3, 3]
+    )
     for i, index in enumerate((0, 1)):
         row = {key: values[index] for key, values in CUBOIDS.items()}
         centre = np.array([row[f"position.{axis}"] for axis in "xyz"])
@@ -145,7 +169,9 @@ def test_boxes_stand_where_they_do_in_the_world(root: Path, motion_compensated: 
 def test_boxes_without_the_columns_of_some_sequences(tmp_path: Path) -> None:
     write_pandaset(tmp_path, 2)
     columns = {
-        k: v for k, v in CUBOIDS.items() if "." not in k or k.startswith(("position", "dimensions"))
+        k: v
+        for k, v in CUBOIDS.items()
+        if "." not in k or k.startswith(("position", "dimensions"))
     }
     write_table(tmp_path / "007/annotations/cuboids/00.pkl.gz", columns)
     assert PandaSet(tmp_path)[0].boxes.names == ("Car", "Pedestrian", "Misc", "Truck")
@@ -159,9 +185,23 @@ def test_boxes_without_the_columns_of_some_sequences(tmp_path: Path) -> None:
 
 
 def test_classes_of_boxes_have_names_of_kitti() -> None:
-    kitti = {"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", None}
+    kitti = {
+        "Car",
+        "Van",
+        "Truck",
+        "Pedestrian",
+        "Person_sitting",
+        "Cyclist",
+        "Tram",
+        "Misc",
+        None,
+    }
     assert set(BOXES.values()) <= kitti and len(BOXES) == 28
-    assert (BOXES["Pickup Truck"], BOXES["Bus"], BOXES["Cones"]) == ("Truck", "Misc", None)
+    assert (BOXES["Pickup Truck"], BOXES["Bus"], BOXES["Cones"]) == (
+        "Truck",
+        "Misc",
+        None,
+    )
 
 
 def test_a_camera_sees_what_the_sensor_passes(root: Path) -> None:
@@ -180,7 +220,9 @@ def test_a_camera_sees_what_the_sensor_passes(root: Path) -> None:
         # The camera's poses are those of the vehicle here.
         expected = (np.linalg.inv(poses[1]) @ [*world, 1])[:3]
         found = (camera.camera_from_sensor @ [*scan.points[at], 1])[:3]
-        assert np.allclose(found, expected, atol=0.3 if not compensated else 1e-3), times[1]
+        assert np.allclose(found, expected, atol=0.3 if not compensated else 1e-3), (
+            times[1]
+        )
 
 
 def test_sequences_and_cameras_are_chosen(tmp_path: Path) -> None:
@@ -195,9 +237,13 @@ def test_sequences_and_cameras_are_chosen(tmp_path: Path) -> None:
         == open_scans(tmp_path / "019").ids
         == ("019/00", "019/01")
     )
-    with pytest.raises(DataError, match="has no sequence 020; expected some of 007, 019"):
+    with pytest.raises(
+        DataError, match="has no sequence 020; expected some of 007, 019"
+    ):
         PandaSet(tmp_path, sequences=("020",))
-    with pytest.raises(ConfigError, match="camera 'front'.*front_camera, front_left_camera"):
+    with pytest.raises(
+        ConfigError, match="camera 'front'.*front_camera, front_left_camera"
+    ):
         PandaSet(tmp_path, camera="front")
     back = PandaSet(tmp_path, camera=CAMERAS[-1])
     assert back.calibration(0) is None and back[0].image_path is None
@@ -269,7 +315,9 @@ BOX = {key: values[:1] for key, values in CUBOIDS.items()}
         (
             rewrite(
                 "lidar/poses.json",
-                lambda poses: [p | {"position": NUMBERS | {"x": float("nan")}} for p in poses],
+                lambda poses: [
+                    p | {"position": NUMBERS | {"x": float("nan")}} for p in poses
+                ],
             ),
             "poses.json.*something else than finite numbers",
         ),
@@ -285,7 +333,10 @@ BOX = {key: values[:1] for key, values in CUBOIDS.items()}
             rewrite("lidar/timestamps.json", lambda times: "now"),
             "poses.json.*another number of poses",
         ),
-        (lambda folder: (folder / "lidar/poses.json").unlink(), "poses.json cannot be read"),
+        (
+            lambda folder: (folder / "lidar/poses.json").unlink(),
+            "poses.json cannot be read",
+        ),
         (
             lambda folder: (
                 write_track(folder / "lidar", *(v[:2] for v in drive(2)))
@@ -293,7 +344,10 @@ BOX = {key: values[:1] for key, values in CUBOIDS.items()}
             ),
             "frame '0[25]', but 2 poses",
         ),
-        (retable("lidar/00.pkl.gz", POINTS | {"d": [1] * 3}), "00.pkl.gz holds no points"),
+        (
+            retable("lidar/00.pkl.gz", POINTS | {"d": [1] * 3}),
+            "00.pkl.gz holds no points",
+        ),
         (
             retable("lidar/00.pkl.gz", POINTS | {"i": [9.0, 400.0, 1.0]}),
             r"to 400; expected values in \[0, 255\]",
@@ -306,13 +360,22 @@ BOX = {key: values[:1] for key, values in CUBOIDS.items()}
             retable("lidar/00.pkl.gz", POINTS | {"x": [1.0, 1e9, 1.0]}),
             r"a coordinate of 9[.\d]+e\+08 m",
         ),
-        (retable("lidar/00.pkl.gz", POINTS | {"t": [1.5e9, np.nan, 1.5e9]}), "times from nan s"),
+        (
+            retable("lidar/00.pkl.gz", POINTS | {"t": [1.5e9, np.nan, 1.5e9]}),
+            "times from nan s",
+        ),
         (
             retable("lidar/00.pkl.gz", POINTS | {"x": ["a", "b", "c"]}),
             "00.pkl.gz.*x of type object",
         ),
-        (retable("lidar/00.pkl.gz", {"x": [1.0]}), "00.pkl.gz has no column y, z, i, t, d"),
-        (retable("annotations/semseg/00.pkl.gz", {"class": [13]}), "has 1 labels, .*00.pkl.gz has"),
+        (
+            retable("lidar/00.pkl.gz", {"x": [1.0]}),
+            "00.pkl.gz has no column y, z, i, t, d",
+        ),
+        (
+            retable("annotations/semseg/00.pkl.gz", {"class": [13]}),
+            "has 1 labels, .*00.pkl.gz has",
+        ),
         (
             retable("annotations/semseg/00.pkl.gz", {"class": [43] * 800}),
             "800 labels|unknown class ids",
@@ -357,7 +420,9 @@ def test_bad_points_are_dropped_with_their_labels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_real_frames_agree_with_their_reference(labelled_scans: Path, index: int) -> None:
+def test_real_frames_agree_with_their_reference(
+    labelled_scans: Path, index: int
+) -> None:
     """The reference was computed by other code, and its beams lie on Hesai's table."""
     folder = labelled_scans / "pandaset"
     source = open_scans(folder / "as_published")
@@ -372,8 +437,12 @@ def test_real_frames_agree_with_their_reference(labelled_scans: Path, index: int
     assert np.allclose(scan.time, expected["time"])
     kept = np.array([BOXES[name] is not None for name in expected["box_names"]])
     assert np.allclose(scan.boxes.values, expected["boxes"][kept], atol=1e-4)
-    assert scan.boxes.names == tuple(BOXES[name] for name in expected["box_names"][kept])
-    elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1)))
+    assert scan.boxes.names == tuple(
+        BOXES[name] for name in expected["box_names"][kept]
+    )
+    elevation = np.degrees(
+        np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1))
+    )
     off = abs(elevation - np.array(scan.sensor.elevations)[scan.ring])
     assert (off < 0.05).mean() > 0.99
     compensated = PandaSet(folder / "as_published", motion_compensated=True)[index]
@@ -382,13 +451,19 @@ def test_real_frames_agree_with_their_reference(labelled_scans: Path, index: int
 
 def test_the_preset_has_the_beams_of_the_table(labelled_scans: Path) -> None:
     table = np.loadtxt(
-        labelled_scans / "pandaset" / "pandar64_elevations.csv", delimiter=",", skiprows=1
+        labelled_scans / "pandaset" / "pandar64_elevations.csv",
+        delimiter=",",
+        skiprows=1,
     )
     sensor = load_sensor("pandar64")
-    assert sensor.elevations == tuple(table[:, 1]) and sensor.azimuths == tuple(table[:, 2])
+    assert sensor.elevations == tuple(table[:, 1]) and sensor.azimuths == tuple(
+        table[:, 2]
+    )
 
 
-def test_azimuths_and_firings_of_the_preset_agree_with_the_times(labelled_scans: Path) -> None:
+def test_azimuths_and_firings_of_the_preset_agree_with_the_times(
+    labelled_scans: Path,
+) -> None:
     """A point's azimuth is that of its firing, which turns 0.2 degrees, and its laser's offset."""
     scan = open_scans(labelled_scans / "pandaset" / "as_published")[0]
     sensor = scan.sensor
@@ -406,10 +481,14 @@ def test_the_forward_sensor_sees_ahead(labelled_scans: Path) -> None:
     scan = PandaSet(labelled_scans / "pandaset" / "as_published", sensor="pandar_gt")[1]
     assert len(scan) == 62089 and scan.ring is None
     azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
-    elevation = np.degrees(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1)))
+    elevation = np.degrees(
+        np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1))
+    )
     assert abs(azimuth).max() < 32
     assert scan.sensor.down < elevation.min() and elevation.max() < scan.sensor.up
-    near_road = scan.points[(scan.label == NAMES.index("road")) & (scan.points[:, 0] < 15)]
+    near_road = scan.points[
+        (scan.label == NAMES.index("road")) & (scan.points[:, 0] < 15)
+    ]
     assert np.median(near_road[:, 2]) == pytest.approx(-2.05, abs=0.1)
 
 
@@ -418,19 +497,26 @@ def test_vehicles_project_into_the_image_where_their_boxes_do(
     labelled_scans: Path, motion_compensated: bool
 ) -> None:
     source = PandaSet(
-        labelled_scans / "pandaset" / "as_published", motion_compensated=motion_compensated
+        labelled_scans / "pandaset" / "as_published",
+        motion_compensated=motion_compensated,
     )
     scan = source[1]
     camera = source.calibration(1)
     assert scan.image_path.name == "40.jpg"
     inside = scan.boxes.contain(scan.points)
-    cars = [i for i, name in enumerate(scan.boxes.names) if name == "Car" and inside[i].sum() > 300]
+    cars = [
+        i
+        for i, name in enumerate(scan.boxes.names)
+        if name == "Car" and inside[i].sum() > 300
+    ]
     shares = []
     for i in cars:
         corners, depth = camera.pixels(scan.boxes[[i]].corners()[0])
         pixels, _ = camera.pixels(scan.points[inside[i]])
         if (depth > 2).all():
             shares.append(
-                ((pixels > corners.min(0) - 3) & (pixels < corners.max(0) + 3)).all(1).mean()
+                ((pixels > corners.min(0) - 3) & (pixels < corners.max(0) + 3))
+                .all(1)
+                .mean()
             )
     assert len(shares) >= 3 and min(shares) > 0.97

@@ -12,14 +12,21 @@ from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.viz.colour import DOMAINS
 
 sys.path.append(str(ROOT / "tools"))
-from panels import classes_panel, mixture_panel, scores_panel, verdict  # a script's own module
+from panels import (
+    classes_panel,
+    mixture_panel,
+    scores_panel,
+    verdict,
+)  # a script's own module
 
 REAL, SYNTHETIC = (f"rgb({','.join(map(str, colour))})" for colour in DOMAINS.values())
 
 
 def test_the_mixture_panel_shows_every_sample_in_order() -> None:
     panel = mixture_panel([0, 1, 0, 0, 1], ("town", "<made>"))
-    squares = re.findall(r'background:(rgb\([\d,]+\))" title="sample (\d): ([^"]+)"', panel)
+    squares = re.findall(
+        r'background:(rgb\([\d,]+\))" title="sample (\d): ([^"]+)"', panel
+    )
     assert squares == [
         (REAL, "0", "town"),
         (SYNTHETIC, "1", "&lt;made&gt;"),
@@ -35,8 +42,12 @@ def test_the_score_panel_shows_every_seed_mean_and_spread() -> None:
     panel = scores_panel({"a": [0.10, 0.14], "b & c": [0.2]}, ["short <training>"])
     rows = panel.split('<div class="score">')[1:3]
     top = 0.25  # 20 % and some room, in steps of 5 %
-    for row, scores, colour in zip(rows, ([0.10, 0.14], [0.2]), (REAL, SYNTHETIC), strict=True):
-        found = re.findall(r'class="seed" style="left:([\d.]+)%;background:(rgb\([\d,]+\))"', row)
+    for row, scores, colour in zip(
+        rows, ([0.10, 0.14], [0.2]), (REAL, SYNTHETIC), strict=True
+    ):
+        found = re.findall(
+            r'class="seed" style="left:([\d.]+)%;background:(rgb\([\d,]+\))"', row
+        )
         assert [float(left) for left, _ in found] == pytest.approx(
             [100 * s / top for s in scores], abs=0.01
         )
@@ -82,7 +93,9 @@ def test_the_class_table_is_ordered_by_its_first_column() -> None:
     share[TRAIN_ID["pole"]] = 0.0001
     iou[TRAIN_ID["road"]] = 0.9
     iou[TRAIN_ID["person"]] = 0.01
-    rows = re.findall(r"<tr><td>(.*?)</tr>", classes_panel({"share <1>": share, "IoU": iou}))
+    rows = re.findall(
+        r"<tr><td>(.*?)</tr>", classes_panel({"share <1>": share, "IoU": iou})
+    )
     cells = [re.sub("<[^>]+>", " ", row).split() for row in rows]
     assert cells == [
         ["car", "50.0", "–"],

@@ -68,20 +68,31 @@ OUTSIDE = {
 
 def parsers_of(path: Path) -> set[str]:
     calls = [
-        node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+        node.func
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
     ]
     return {
-        ast.unparse(call) for call in calls if isinstance(call, ast.Name | ast.Attribute)
+        ast.unparse(call)
+        for call in calls
+        if isinstance(call, ast.Name | ast.Attribute)
     } & PARSERS
 
 
 def test_no_parser_stands_outside_the_files_room() -> None:
-    found = {str(p.relative_to(PACKAGE)): parsers_of(p) for p in sorted(PACKAGE.rglob("*.py"))}
-    assert {n: c for n, c in found.items() if c and not n.startswith("files/")} == OUTSIDE
+    found = {
+        str(p.relative_to(PACKAGE)): parsers_of(p)
+        for p in sorted(PACKAGE.rglob("*.py"))
+    }
+    assert {
+        n: c for n, c in found.items() if c and not n.startswith("files/")
+    } == OUTSIDE
     assert "torch.load" not in set().union(*found.values())
 
 
-def test_pictures_start_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_start_no_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pillow gives PostScript to Ghostscript, whatever the name of the file says."""
     trace = tmp_path / "ran"
     program = tmp_path / "bin" / "gs"

@@ -120,7 +120,9 @@ def test_an_object_is_not_placed_without_suitable_ground() -> None:
         cast([], [wall(13.5, 0, np.pi / 2, 1)]),  # a post in its rear
         cast([], [wall(6, 0, np.pi / 2, 40)]),  # behind a long wall
         cast([car(12, 1.5)]),  # beside a car, nearer than anybody parks
-        cast(ground=-HEIGHT - LIFT - 0.2),  # on ground so low that it would be seen from above
+        cast(
+            ground=-HEIGHT - LIFT - 0.2
+        ),  # on ground so low that it would be seen from above
         cast()[cast().points[:, 0] < 5],  # on ground that nobody has seen
         cast()[:0],
     ):
@@ -137,7 +139,11 @@ def test_objects_in_front_occlude_a_pasted_object() -> None:
         front = wall(9, 0, np.pi / 2, width)
         pasted = paste(cast([], [front]), [alone])
         true = cast([car(15, 0, np.pi / 2)], [front])
-        assert pasted.boxes is not None and pasted.label is not None and true.label is not None
+        assert (
+            pasted.boxes is not None
+            and pasted.label is not None
+            and true.label is not None
+        )
         assert (pasted.label == WALL).sum() == (true.label == WALL).sum()
         assert (pasted.label == CAR).sum() == (true.label == CAR).sum()
         shares[width] = (pasted.label == CAR).sum() / len(alone.scan)
@@ -205,8 +211,12 @@ def test_pasted_objects_occlude_one_another_in_any_order() -> None:
         # From near to far.
         assert np.allclose(pasted.boxes.values[:, 0], [9, -9, 15, 22], atol=0.01)
         assert_nothing_shares_a_ray(pasted, 1)
-    twice = paste(cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2)
-    assert twice.boxes is not None and len(twice.boxes) == 2  # the second found no place
+    twice = paste(
+        cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2
+    )
+    assert (
+        twice.boxes is not None and len(twice.boxes) == 2
+    )  # the second found no place
 
 
 def test_gaps_in_an_object_show_nothing_behind_it() -> None:
@@ -219,7 +229,9 @@ def test_gaps_in_an_object_show_nothing_behind_it() -> None:
     assert_nothing_shares_a_ray(pasted, 1)
     assert ((full.label == CAR) & (project(pasted).range == 0)).sum() > 300
     across = np.arctan2(whole.scan.points[:, 1], whole.scan.points[:, 0])
-    post = np.abs(across - np.median(across)) < 0.03  # what stood before it when it was recorded
+    post = (
+        np.abs(across - np.median(across)) < 0.03
+    )  # what stood before it when it was recorded
     stripe = paste(background, [whole._replace(scan=whole.scan[~post])])
     closed = project(stripe).range[(full.label == CAR) & (project(stripe).label != CAR)]
     assert len(closed) > 100 and (closed == 0).mean() > 0.97
@@ -228,24 +240,44 @@ def test_gaps_in_an_object_show_nothing_behind_it() -> None:
 def test_fields_of_a_scan_with_pasted_objects() -> None:
     host = cast([], [wall(20, 0)])
     host = replace(
-        host, ring=np.zeros(len(host), np.int16), pose=np.eye(4), domain=0, confidence=None
+        host,
+        ring=np.zeros(len(host), np.int16),
+        pose=np.eye(4),
+        domain=0,
+        confidence=None,
     )
     candidate = seen(car(8, 5))
-    camera = {"truncation": [0.2], "alpha": [1.0], "image_box": [[1, 2, 3, 4]], "occlusion": [1]}
+    camera = {
+        "truncation": [0.2],
+        "alpha": [1.0],
+        "image_box": [[1, 2, 3, 4]],
+        "occlusion": [1],
+    }
     known = replace(candidate.scan.boxes, **{k: np.array(v) for k, v in camera.items()})
     candidate = candidate._replace(scan=replace(candidate.scan, boxes=known))
     pasted = paste(host, [candidate])
-    assert set(pasted.fields()) == {"reflectance", "label", "instance", "confidence", "ring"}
+    assert set(pasted.fields()) == {
+        "reflectance",
+        "label",
+        "instance",
+        "confidence",
+        "ring",
+    }
     new = slice(-len(candidate.scan), None)
     assert (
-        pasted.boxes is not None and pasted.confidence is not None and pasted.instance is not None
+        pasted.boxes is not None
+        and pasted.confidence is not None
+        and pasted.instance is not None
     )
     assert (pasted.confidence[new] == 1).all() and (pasted.instance[new] == 1).all()
     assert np.array_equal(pasted.reflectance[new], candidate.scan.reflectance)
     assert (pasted.domain, pasted.id, pasted.raw_label) == (SYNTHETIC, host.id, None)
     elevation, height = (values[pasted.ring[new]] for values in SENSOR.optics())
     x, y, z = pasted.points[new].T
-    assert np.abs(np.degrees(np.arctan2(z - height, np.hypot(x, y)) - elevation)).max() < 0.45
+    assert (
+        np.abs(np.degrees(np.arctan2(z - height, np.hypot(x, y)) - elevation)).max()
+        < 0.45
+    )
     boxes = pasted.boxes
     assert (boxes.occlusion.tolist(), boxes.image_box.tolist()) == ([1], [[-1] * 4])
     assert (boxes.truncation[0], boxes.alpha[0]) == (np.float32(0.2), 1)
@@ -302,7 +334,9 @@ def test_nothing_that_is_given_is_changed() -> None:
 def test_a_coarser_sensor_cannot_lend_objects() -> None:
     coarse = presets()["hdl32e_nuscenes"]
     [found] = objects_of(cast([car(8, 3)], sensor=coarse)).values()
-    with pytest.raises(DataError, match="returns of sensor 'hdl32e_nuscenes' for a scan of 'town'"):
+    with pytest.raises(
+        DataError, match="returns of sensor 'hdl32e_nuscenes' for a scan of 'town'"
+    ):
         paste(cast(), [found])
     fine = paste(cast(sensor=coarse), [seen(car(8, 3))])
     assert fine.boxes is not None and len(fine.boxes) == 1

@@ -17,27 +17,40 @@ KEY = st.integers(0, 2**62)
 
 @settings(max_examples=100)
 @given(st.integers(0, 3000), st.integers(0, 2**64 - 1), KEY, KEY)
-def test_an_order_is_a_bijection(size: int, seed: int, stream: int, number: int) -> None:
-    assert sorted(permute(np.arange(size), size, seed, stream, number)) == list(range(size))
+def test_an_order_is_a_bijection(
+    size: int, seed: int, stream: int, number: int
+) -> None:
+    assert sorted(permute(np.arange(size), size, seed, stream, number)) == list(
+        range(size)
+    )
 
 
 @settings(max_examples=30)
 @given(st.integers(1, 60), st.integers(1, 60), KEY)
-def test_entries_follow_from_themselves_alone(size: int, orders: int, seed: int) -> None:
+def test_entries_follow_from_themselves_alone(
+    size: int, orders: int, seed: int
+) -> None:
     """One entry, or one of another order in the same call, is what it is among all."""
     entries = np.tile(np.arange(size), orders)
     numbers = np.repeat(np.arange(orders), size)
     together = permute(entries, size, seed, 1, numbers).reshape(orders, size)
     for number in range(orders):
-        assert together[number].tolist() == permute(np.arange(size), size, seed, 1, number).tolist()
-    assert permute(np.array([size - 1]), size, seed, 1, orders - 1)[0] == together[-1, -1]
+        assert (
+            together[number].tolist()
+            == permute(np.arange(size), size, seed, 1, number).tolist()
+        )
+    assert (
+        permute(np.array([size - 1]), size, seed, 1, orders - 1)[0] == together[-1, -1]
+    )
 
 
 @pytest.mark.parametrize("size", [2, 3, 4])
 def test_short_orders_are_all_as_frequent(size: int) -> None:
     """No order of a handful of entries is off by more than a tenth."""
     count = 24_000
-    found = permute(np.tile(np.arange(size), count), size, 7, 1, np.repeat(np.arange(count), size))
+    found = permute(
+        np.tile(np.arange(size), count), size, 7, 1, np.repeat(np.arange(count), size)
+    )
     orders = Counter(map(tuple, found.reshape(count, size).tolist()))
     expected = count / np.prod(range(1, size + 1))
     assert len(orders) * expected == count
@@ -58,5 +71,16 @@ def test_long_orders_leave_no_trace_of_the_entry(size: int) -> None:
 
 
 def test_an_order_is_the_same_on_every_machine() -> None:
-    assert permute(np.arange(10), 10, 3, 1, 2).tolist() == [6, 8, 5, 1, 7, 9, 4, 0, 2, 3]
+    assert permute(np.arange(10), 10, 3, 1, 2).tolist() == [
+        6,
+        8,
+        5,
+        1,
+        7,
+        9,
+        4,
+        0,
+        2,
+        3,
+    ]
     assert key_words(1, 2, 2).tolist() == [14428589422588398592, 4881784966183016231]

@@ -11,7 +11,14 @@ import pytest
 from hypothesis import assume, given, settings
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.mixing import Linear, MixingPlan, Mixture, PlannedSource, make_schedule, plan
+from lidar_synth.mixing import (
+    Linear,
+    MixingPlan,
+    Mixture,
+    PlannedSource,
+    make_schedule,
+    plan,
+)
 from lidar_synth.mixing.batches import cut_steps, rank_share
 from lidar_synth.mixing.quotas import count_before, deal, exact_synthetic, quotas, split
 from lidar_synth.mixing.schedules import Schedule, share_of
@@ -24,13 +31,19 @@ WEIGHED = PlannedSource(3, 1.0)
 
 def mixture(real: int = 6, ratio: object = 0.25, **options: object) -> Mixture:
     return Mixture(
-        (PlannedSource(real, identity="real"),), (ENDLESS,), make_schedule(ratio), **options
+        (PlannedSource(real, identity="real"),),
+        (ENDLESS,),
+        make_schedule(ratio),
+        **options,
     )  # type: ignore[arg-type]
 
 
 def rows(made: MixingPlan) -> list[str]:
     """``r3`` or ``s0`` for one source of each kind."""
-    return [f"{'rs'[source]}{index}" for source, index in zip(made.source, made.index, strict=True)]
+    return [
+        f"{'rs'[source]}{index}"
+        for source, index in zip(made.source, made.index, strict=True)
+    ]
 
 
 def test_the_order_is_the_same_in_all_versions() -> None:
@@ -44,7 +57,16 @@ def test_the_order_is_the_same_in_all_versions() -> None:
         plan(mixture(), 2).hash
         == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
     )
-    assert rows(plan(mixture(balanced=True), 0)) == ["s1", "r5", "r3", "r2", "s0", "r1", "r0", "r4"]
+    assert rows(plan(mixture(balanced=True), 0)) == [
+        "s1",
+        "r5",
+        "r3",
+        "r2",
+        "s0",
+        "r1",
+        "r0",
+        "r4",
+    ]
     two = Mixture(
         (PlannedSource(3), PlannedSource(2)),
         (PlannedSource(None), PlannedSource(4)),
@@ -76,7 +98,9 @@ def test_counts_are_exact_over_epochs(
 ) -> None:
     share = Fraction(hundredths, 100)
     assume(share < 1 or size != "add")
-    mixed = mixture(real, hundredths / 100, seed=seed, epoch_size=size, balanced=balanced)
+    mixed = mixture(
+        real, hundredths / 100, seed=seed, epoch_size=size, balanced=balanced
+    )
     made = plan(mixed, epoch)
     assert (int(made.domain.sum()), len(made)) == (made.synthetics, sum(made.counts))
     if size == "add":
@@ -117,7 +141,9 @@ def test_every_source_gets_its_share_over_epochs(
     exact = Fraction(0)
     for epoch in range(12):
         made = plan(mixed, epoch)
-        assert np.bincount(made.source, minlength=len(given_so_far)).tolist() == list(made.counts)
+        assert np.bincount(made.source, minlength=len(given_so_far)).tolist() == list(
+            made.counts
+        )
         given_so_far += made.counts
         exact += exact_synthetic(mixed, epoch)
         kinds = (
@@ -144,7 +170,8 @@ def test_rare_sources_and_small_ratios_get_their_turn() -> None:
 
 @pytest.mark.parametrize("size", ["add", "replace", 17])
 @pytest.mark.parametrize(
-    "ratio", [0.1, 0.25, 1 / 3, Linear(0, 0.6, 4), {0: 0.6, 5: 0.2}, lambda e: 0.5 / (e + 1)]
+    "ratio",
+    [0.1, 0.25, 1 / 3, Linear(0, 0.6, 4), {0: 0.6, 5: 0.2}, lambda e: 0.5 / (e + 1)],
 )
 def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
     """What wraps a dataset asks for its length once."""
@@ -211,17 +238,28 @@ def test_running_indices(real: int, ratio: float, size: str | int) -> None:
     st.sampled_from([False, True]),
 )
 def test_reuse_is_spread_over_epochs(
-    reuse: int, real: int, ratio: float, weights: list[float | None], balanced: bool, rising: bool
+    reuse: int,
+    real: int,
+    ratio: float,
+    weights: list[float | None],
+    balanced: bool,
+    rising: bool,
 ) -> None:
     """No epoch has a scan twice, and in the long run each is given ``reuse`` times."""
     schedule = make_schedule(Linear(0.0, ratio, 3) if rising else ratio)
     sources = tuple(PlannedSource(None, w) for w in weights)
-    mixed = Mixture((PlannedSource(real),), sources, schedule, reuse=reuse, balanced=balanced)
+    mixed = Mixture(
+        (PlannedSource(real),), sources, schedule, reuse=reuse, balanced=balanced
+    )
     counts: Counter[tuple[int, int]] = Counter()
     for epoch in range(4 * reuse):
         made = plan(mixed, epoch)
         here = list(
-            zip(made.source[made.domain].tolist(), made.index[made.domain].tolist(), strict=True)
+            zip(
+                made.source[made.domain].tolist(),
+                made.index[made.domain].tolist(),
+                strict=True,
+            )
         )
         assert len(set(here)) == len(here)
         counts.update(here)
@@ -233,10 +271,14 @@ def test_reuse_is_spread_over_epochs(
 
 def test_a_bank_begins_again() -> None:
     bank = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.4))
-    indices = [sorted(plan(bank, e).index[plan(bank, e).domain].tolist()) for e in range(3)]
+    indices = [
+        sorted(plan(bank, e).index[plan(bank, e).domain].tolist()) for e in range(3)
+    ]
     assert indices == [[0, 1, 2, 3]] * 3
     few = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.5), reuse=2)
-    indices = [sorted(plan(few, e).index[plan(few, e).domain].tolist()) for e in range(3)]
+    indices = [
+        sorted(plan(few, e).index[plan(few, e).domain].tolist()) for e in range(3)
+    ]
     assert indices == [[0, 0, 1, 1, 2, 3], [0, 0, 1, 1, 2, 3], [0, 1, 2, 2, 3, 3]]
 
 
@@ -272,7 +314,9 @@ def test_a_balanced_plan_is_exact_in_every_batch(
 ) -> None:
     assume(share < 1 or size != "add")
     length = total if size == "number" else size
-    domain = plan(mixture(total, float(share), epoch_size=length, balanced=True), epoch).domain
+    domain = plan(
+        mixture(total, float(share), epoch_size=length, balanced=True), epoch
+    ).domain
     for start in range(len(domain) - batch + 1):
         difference = int(domain[start : start + batch].sum()) - batch * share
         assert abs(difference) < 1
@@ -280,12 +324,18 @@ def test_a_balanced_plan_is_exact_in_every_batch(
 
 
 @settings(max_examples=40)
-@given(st.lists(st.integers(1, 9), min_size=2, max_size=4), st.integers(1, 12), st.integers(0, 20))
+@given(
+    st.lists(st.integers(1, 9), min_size=2, max_size=4),
+    st.integers(1, 12),
+    st.integers(0, 20),
+)
 def test_a_balanced_plan_spreads_several_synthetic_sources(
     weights: list[int], batch: int, epoch: int
 ) -> None:
     sources = tuple(PlannedSource(None, float(w)) for w in weights)
-    mixed = Mixture((PlannedSource(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True)
+    mixed = Mixture(
+        (PlannedSource(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True
+    )
     source = plan(mixed, epoch).source
     for start in range(120 - batch + 1):
         for number, weight in enumerate(weights, 1):
@@ -296,9 +346,13 @@ def test_a_balanced_plan_spreads_several_synthetic_sources(
 
 
 def test_equal_synthetic_sources_alternate_in_every_batch() -> None:
-    mixed = Mixture((PlannedSource(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True)
+    mixed = Mixture(
+        (PlannedSource(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True
+    )
     batches = plan(mixed, 1).source.reshape(-1, 4)
-    assert [np.bincount(batch, minlength=3).tolist() for batch in batches] == [[2, 1, 1]] * 20
+    assert [np.bincount(batch, minlength=3).tolist() for batch in batches] == [
+        [2, 1, 1]
+    ] * 20
 
 
 SCHEDULES: list[tuple[object, list[float]]] = [
@@ -352,7 +406,12 @@ def test_the_hash_tells_plans_apart() -> None:
         plan(mixture(seed=1), 0),
         plan(mixture(ratio=0.5), 0),
         plan(mixture(balanced=True), 0),
-        plan(Mixture((PlannedSource(6, identity="real"),), (OTHER,), make_schedule(0.25)), 0),
+        plan(
+            Mixture(
+                (PlannedSource(6, identity="real"),), (OTHER,), make_schedule(0.25)
+            ),
+            0,
+        ),
     ]
     assert one == plan(mixture(), 0).hash
     assert len({one, *(other.hash for other in others)}) == 6
@@ -406,7 +465,11 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
             ConfigError,
             r"epoch 2 of a ratio schedule for 2 epochs.*longer",
         ),
-        (lambda: plan(mixture(ratio=lambda e: e * 0.6), 2), ConfigError, r"ratio 1.2 in epoch 2"),
+        (
+            lambda: plan(mixture(ratio=lambda e: e * 0.6), 2),
+            ConfigError,
+            r"ratio 1.2 in epoch 2",
+        ),
         (lambda: plan(mixture(), -1), ConfigError, r"epoch -1"),
         (
             lambda: mixture(ratio=1.0),
@@ -449,7 +512,9 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
         ),
     ],
 )
-def test_invalid_plans_are_refused(make: object, error: type[Exception], message: str) -> None:
+def test_invalid_plans_are_refused(
+    make: object, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         make()  # type: ignore[operator]
 
@@ -458,7 +523,8 @@ def test_synthetic_only_and_real_only() -> None:
     only = Mixture((), (ENDLESS,), make_schedule(1), epoch_size=5)
     assert sorted(plan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
     assert (
-        plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist() == [False] * 4
+        plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist()
+        == [False] * 4
     )
 
 
@@ -478,7 +544,9 @@ def test_a_plan_of_any_length_takes_the_same_memory() -> None:
             made = plan(mixed, 3)
             asked = np.random.default_rng(0).integers(0, len(made), 200)
             found = [made[int(position)] for position in asked]
-            assert found == list(zip(*(x.tolist() for x in made.at(asked)), strict=True))
+            assert found == list(
+                zip(*(x.tolist() for x in made.at(asked)), strict=True)
+            )
             assert len(made.hash) == 64
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:

@@ -28,22 +28,30 @@ from lidar_synth.geometry.sensor import Sensor, presets
 
 SMALL = {
     "linear": Sensor("linear", 32, 1.0, 80.0, rows=8, fov_up=10.0, fov_down=-20.0),
-    "table": Sensor("table", 16, 0.0, 80.0, elevations=(12.0, 7.0, 1.0, -2.0, -9.0, -25.0)),
+    "table": Sensor(
+        "table", 16, 0.0, 80.0, elevations=(12.0, 7.0, 1.0, -2.0, -9.0, -25.0)
+    ),
 }
 
 
 def image_of(sensor: Sensor, seed: int, share: float = 0.7) -> RangeImage:
     rng = np.random.default_rng(seed)
     low = max(sensor.range_min * 1.001, 0.01)
-    distance = np.exp(rng.uniform(np.log(low), np.log(sensor.range_max * 0.999), sensor.shape))
+    distance = np.exp(
+        rng.uniform(np.log(low), np.log(sensor.range_max * 0.999), sensor.shape)
+    )
     distance[rng.random(sensor.shape) > share] = 0
-    label = np.where(distance > 0, rng.integers(0, 19, sensor.shape), IGNORE).astype(np.uint8)
+    label = np.where(distance > 0, rng.integers(0, 19, sensor.shape), IGNORE).astype(
+        np.uint8
+    )
     return RangeImage(distance.astype(np.float32), sensor, {"label": label})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("beams", [False, True])
-def test_unprojecting_and_projecting_keeps_every_cell(sensor: Sensor, beams: bool) -> None:
+def test_unprojecting_and_projecting_keeps_every_cell(
+    sensor: Sensor, beams: bool
+) -> None:
     sensor = sensor.by_beams() if beams else sensor
     image = image_of(sensor, 1)
     back = project(unproject(image))
@@ -54,10 +62,14 @@ def test_unprojecting_and_projecting_keeps_every_cell(sensor: Sensor, beams: boo
 
 @settings(max_examples=60)
 @given(kind=st.sampled_from(sorted(SMALL)), data=st.data())
-def test_unprojecting_and_projecting_keeps_any_image(kind: str, data: st.DataObject) -> None:
+def test_unprojecting_and_projecting_keeps_any_image(
+    kind: str, data: st.DataObject
+) -> None:
     sensor = SMALL[kind]
     ranges = st.one_of(st.just(0.0), st.floats(1.5, 79.5, width=32))
-    image = RangeImage(data.draw(hnp.arrays(np.float32, sensor.shape, elements=ranges)), sensor)
+    image = RangeImage(
+        data.draw(hnp.arrays(np.float32, sensor.shape, elements=ranges)), sensor
+    )
     back = project(unproject(image))
     assert np.array_equal(back.mask, image.mask)
     assert np.allclose(back.range, image.range, rtol=3e-7, atol=0)
@@ -74,9 +86,13 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(sensor: Sensor) -> None:
     if len(sensor.starts):  # elevations are those from the lasers
         for points in (before, after):
             points[:, 2] -= sensor.starts[np.nonzero(cells.point >= 0)[0]]
-    elevation = [np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1)) for p in (before, after)]
+    elevation = [
+        np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1)) for p in (before, after)
+    ]
     azimuth = [-np.arctan2(p[:, 1], p[:, 0]) for p in (before, after)]
-    inside = (elevation[0] <= np.radians(sensor.up)) & (elevation[0] >= np.radians(sensor.down))
+    inside = (elevation[0] <= np.radians(sensor.up)) & (
+        elevation[0] >= np.radians(sensor.down)
+    )
     half = (
         np.abs(np.diff(sensor.edges)).max() / 2
         if sensor.elevations is None
@@ -84,17 +100,23 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(sensor: Sensor) -> None:
     )
     assert inside.sum() > 5000
     # Between two lasers that start at different heights, the edge of their rows does too.
-    steps = np.abs(np.diff(sensor.starts)).max(initial=0) / np.linalg.norm(before, axis=1)
+    steps = np.abs(np.diff(sensor.starts)).max(initial=0) / np.linalg.norm(
+        before, axis=1
+    )
     assert (np.abs(elevation[1] - elevation[0]) - steps)[inside].max() <= half + 1e-6
     turned = (azimuth[1] - azimuth[0] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(turned).max() <= np.pi / sensor.columns + 1e-6
 
 
 @pytest.mark.parametrize("name", sorted(presets()))
-def test_projection_equals_a_brute_force_search_for_the_nearest_points(name: str) -> None:
+def test_projection_equals_a_brute_force_search_for_the_nearest_points(
+    name: str,
+) -> None:
     sensor = presets()[name]
     scan = random_scan(sensor, 4000, seed=3)
-    scan = scan[np.r_[0:4000, 0:4000]]  # every point twice: the first of the two has to win
+    scan = scan[
+        np.r_[0:4000, 0:4000]
+    ]  # every point twice: the first of the two has to win
     cells = locate(scan.points, sensor)
     best: dict[int, int] = {}
     for i, (cell, distance) in enumerate(zip(cells.cell, cells.range, strict=True)):
@@ -106,7 +128,8 @@ def test_projection_equals_a_brute_force_search_for_the_nearest_points(name: str
     image = project(scan)
     assert image.reflectance is not None
     assert np.array_equal(
-        image.reflectance[cells.point >= 0], scan.reflectance[cells.point[cells.point >= 0]]
+        image.reflectance[cells.point >= 0],
+        scan.reflectance[cells.point[cells.point >= 0]],
     )
     assert np.all(image.label[~image.mask] == IGNORE)
 
@@ -131,7 +154,9 @@ def test_returns_at_exactly_the_range_limits_are_kept(kind: str) -> None:
     points = np.zeros((4, 3), np.float32)
     for i, distance in enumerate((low, high, *outside)):
         # Four different directions.
-        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][i]
+        points[i, :2] = [(distance, 0), (0, distance), (-distance, 0), (0, -distance)][
+            i
+        ]
     scan = Scan(points, np.zeros(4, np.float32), sensor)
     assert (locate(points, sensor).cell >= 0).tolist() == [True, True, False, False]
     assert locate(points, sensor).range[:2].tolist() == [low, high]
@@ -147,7 +172,14 @@ def test_columns_run_clockwise_from_the_rear_and_row_0_is_the_highest() -> None:
     row 0 is up."""
     sensor = SMALL["linear"]
     points = np.array(
-        [[9, -0.1, 0], [9, 0.1, 0], [0.01, -9, 0], [-9, 0.1, 0], [-9, -0.1, 0], [9, -0.1, 1.5]],
+        [
+            [9, -0.1, 0],
+            [9, 0.1, 0],
+            [0.01, -9, 0],
+            [-9, 0.1, 0],
+            [-9, -0.1, 0],
+            [9, -0.1, 1.5],
+        ],
         np.float32,
     )
     cell = locate(points, sensor).cell
@@ -159,9 +191,13 @@ def test_columns_run_clockwise_from_the_rear_and_row_0_is_the_highest() -> None:
         [-9, -1e-9, 0],
     ):  # +-pi in float32
         assert (
-            locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell % 32 == 0
+            locate(np.array([just_left_and_right_of_the_seam], np.float32), sensor).cell
+            % 32
+            == 0
         )
-    straight_up_and_down = locate(np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor).cell
+    straight_up_and_down = locate(
+        np.array([[0, 0, 9], [0, 0, -9]], np.float32), sensor
+    ).cell
     assert (straight_up_and_down // 32).tolist() == [0, 7]
 
 
@@ -190,9 +226,9 @@ def test_batches_on_any_device_equal_single_projections(
 ) -> None:
     sensor = sensor.by_beams() if beams else sensor
     scans = [random_scan(sensor, n, seed) for seed, n in enumerate((5000, 1, 3000))]
-    points = np.concatenate([np.c_[s.points, s.reflectance, s.label] for s in scans]).astype(
-        np.float32
-    )
+    points = np.concatenate(
+        [np.c_[s.points, s.reflectance, s.label] for s in scans]
+    ).astype(np.float32)
     offsets = torch.tensor(np.cumsum([0, *map(len, scans)]), device=device)
     batch = project_batch(torch.from_numpy(points).to(device), offsets, sensor)
     for b, scan in enumerate(scans):
@@ -201,7 +237,9 @@ def test_batches_on_any_device_equal_single_projections(
         assert np.array_equal(batch.range[b].cpu().numpy(), image.range)
         assert np.array_equal(batch.channels[b, 0].cpu().numpy(), image.reflectance)
         shown = batch.point[b].cpu().numpy()
-        assert np.array_equal(shown - np.where(shown >= 0, int(offsets[b]), 0), cells.point)
+        assert np.array_equal(
+            shown - np.where(shown >= 0, int(offsets[b]), 0), cells.point
+        )
 
 
 def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
@@ -217,11 +255,14 @@ def scan_in_ring_order(share: float = 0.9) -> tuple[Scan, np.ndarray]:
         order = np.argsort(-sensor.column_azimuths() % (2 * np.pi))
         order = order[image.range[row, order] > 0]
         points.append(
-            image.range[row, order, None] * sensor.by_beams().ray_directions()[row, order]
+            image.range[row, order, None]
+            * sensor.by_beams().ray_directions()[row, order]
         )
         rows.append(np.full(len(order), row))
     xyz = np.concatenate(points).astype(np.float32)
-    return Scan(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), sensor), np.concatenate(rows)
+    return Scan(
+        xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), sensor
+    ), np.concatenate(rows)
 
 
 def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> None:
@@ -229,7 +270,8 @@ def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> No
     for kept in (rows >= 0, rows < 39, rows >= 20, (rows < 10) | (rows > 30)):
         image = unfold(full_scan[kept])
         assert np.array_equal(
-            image.range, unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range
+            image.range,
+            unfold(replace(full_scan, ring=rows.astype(np.int16))[kept]).range,
         )
         assert np.array_equal(np.flatnonzero(image.mask.any(1)), np.unique(rows[kept]))
         assert np.array_equal(project(unproject(image)).mask, image.mask)
@@ -237,7 +279,11 @@ def test_unfolding_assigns_rings_to_their_beams_even_if_some_are_missing() -> No
         unfold(full_scan[np.random.default_rng(0).permutation(len(full_scan))])
 
 
-@given(first=st.integers(0, 359), width=st.integers(60, 360), share=st.sampled_from([0.3, 0.95]))
+@given(
+    first=st.integers(0, 359),
+    width=st.integers(60, 360),
+    share=st.sampled_from([0.3, 0.95]),
+)
 @settings(max_examples=25)
 def test_a_crop_unfolds_like_the_same_part_of_the_complete_scan(
     first: int, width: int, share: float
@@ -270,8 +316,12 @@ def test_stray_points_do_not_start_rings(seed: int, strays: int, at_seam: bool) 
     rng = np.random.default_rng(seed)
     place = rng.integers(1, len(full_scan), strays)
     if at_seam:
-        place = rng.choice(np.flatnonzero(np.diff(rows)) + 1) + rng.integers(-2, 3, strays)
-    order = np.insert(np.arange(len(full_scan)), place, rng.integers(0, len(full_scan), strays))
+        place = rng.choice(np.flatnonzero(np.diff(rows)) + 1) + rng.integers(
+            -2, 3, strays
+        )
+    order = np.insert(
+        np.arange(len(full_scan)), place, rng.integers(0, len(full_scan), strays)
+    )
     ring = ring_numbers(full_scan.points[order])
     moved = ring != rows[order]
     assert ring.max() == 63
@@ -291,7 +341,9 @@ def test_points_that_are_not_in_ring_order_are_refused() -> None:
     }
     for name, order in orders.items():
         scan = replace(full_scan[order], id=name)
-        with pytest.raises(DataError, match=f"{name}.*ring by ring, as KITTI stores them"):
+        with pytest.raises(
+            DataError, match=f"{name}.*ring by ring, as KITTI stores them"
+        ):
             unfold(scan)
 
 
@@ -311,7 +363,10 @@ def test_row_edges_of_a_beam_table_are_halfway_between_beams() -> None:
     halves = (beams[1:] + beams[:-1]) / 2
     for row, half in enumerate(halves):
         for side, expected in ((1e-4, row), (-1e-4, row + 1)):
-            point = np.array([[np.cos(half + side), 0, np.sin(half + side)]], np.float32) * 10
+            point = (
+                np.array([[np.cos(half + side), 0, np.sin(half + side)]], np.float32)
+                * 10
+            )
             assert locate(point, sensor).cell // 16 == expected
 
 

@@ -62,7 +62,10 @@ def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, P
 def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
     out, result = proof
     values = result.values
-    assert values["tested_places"] == ["00, place 1", "00, place 2"] and values["pairs"] == 2
+    assert (
+        values["tested_places"] == ["00, place 1", "00, place 2"]
+        and values["pairs"] == 2
+    )
     keys = [row["key"] for row in values["arms"]]
     assert keys == [
         "real",
@@ -75,13 +78,25 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
         "paste",
     ]
     for row in values["arms"]:
-        assert 0 < row["miou"] < 100 and row["minutes"] > 0 and "5 labelled scans" in row["budget"]
+        assert (
+            0 < row["miou"] < 100
+            and row["minutes"] > 0
+            and "5 labelled scans" in row["budget"]
+        )
         assert row["interval"] is None  # two places
         gain = row["miou"] - values["arms"][0]["miou"]
-        assert row["difference"] == (None if row["key"] == "real" else pytest.approx(gain))
-    assert "5 scans of the training places without labels" in values["arms"][4]["budget"]
-    assert "too few for an interval" in result.headline and result.headline in str(result)
-    assert json.loads((out / "results.json").read_text()) == json.loads(json.dumps(values))
+        assert row["difference"] == (
+            None if row["key"] == "real" else pytest.approx(gain)
+        )
+    assert (
+        "5 scans of the training places without labels" in values["arms"][4]["budget"]
+    )
+    assert "too few for an interval" in result.headline and result.headline in str(
+        result
+    )
+    assert json.loads((out / "results.json").read_text()) == json.loads(
+        json.dumps(values)
+    )
 
 
 def test_the_page_is_one_file_that_says_it_all(proof: tuple[Path, Proof]) -> None:
@@ -107,7 +122,9 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("width", [1280, 420])
-def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, Proof], browser: Any) -> None:
+def test_the_page_shows_in_a_browser(
+    width: int, proof: tuple[Path, Proof], browser: Any
+) -> None:
     browser.set_window_size(width, 900)
     browser.get((proof[0] / "index.html").as_uri())
     assert browser.get_log("browser") == []
@@ -121,13 +138,19 @@ def test_the_page_shows_in_a_browser(width: int, proof: tuple[Path, Proof], brow
 def test_a_comparison_resumes_and_grows(tmp_path: Path) -> None:
     source = drives(3, 4)
     prove(source, tmp_path, SMALL, jobs=1, progress=False)
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")}
+    before = {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")
+    }
     assert len(before) == 6
     (lost := next(iter(before))).unlink()
     more = replace(SMALL, arms=("real", "exchange", "longer"), seeds=2)
     again = prove(source, tmp_path, more, jobs=1, progress=False)
-    after = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")}
-    assert len(after) == 18 and [path for path in before if after[path] != before[path]] == [lost]
+    after = {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "runs").rglob("*.json")
+    }
+    assert len(after) == 18 and [
+        path for path in before if after[path] != before[path]
+    ] == [lost]
     assert again.values["pairs"] == 6
     with pytest.raises(ConfigError, match="'iterations': 10"):
         prove(source, tmp_path, replace(SMALL, iterations=12), jobs=1, progress=False)
@@ -143,11 +166,15 @@ def test_processes_give_the_results_of_one_process(tmp_path: Path) -> None:
 
 
 def test_a_time_that_is_over_starts_no_training(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="minutes, in which 2 places cannot be tested"):
+    with pytest.raises(
+        ConfigError, match="minutes, in which 2 places cannot be tested"
+    ):
         prove(drives(), tmp_path, SMALL, minutes=1e-6, jobs=1, progress=False)
 
 
-def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_path: Path) -> None:
+def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(
+    tmp_path: Path,
+) -> None:
     """Iteration times are measured again by each call, so that the same minutes could give another
     number."""
     source = drives(2, 3)
@@ -161,16 +188,24 @@ def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(tmp_
 def perfect(job: Job) -> np.ndarray:
     """A trainer that knows the labels where its arm exchanges parts, and takes everything for road
     otherwise."""
-    label = np.concatenate([scan.label for scan in job.held_out if scan.label is not None])
+    label = np.concatenate(
+        [scan.label for scan in job.held_out if scan.label is not None]
+    )
     label = label[label != 255].astype(int)
     given = label if job.row.name == "exchange" else np.full_like(label, 8)
     return np.bincount(label * 19 + given, minlength=361).reshape(19, 19)
 
 
 def test_a_trainer_of_ones_own_is_measured(tmp_path: Path) -> None:
-    result = prove(drives(6, 2), tmp_path, SMALL, jobs=1, trainer=perfect, progress=False)
+    result = prove(
+        drives(6, 2), tmp_path, SMALL, jobs=1, trainer=perfect, progress=False
+    )
     base, exchange = result.values["arms"]
-    assert exchange["miou"] == 100 and base["miou"] < 50 and result.values["trainer"] == "perfect"
+    assert (
+        exchange["miou"] == 100
+        and base["miou"] < 50
+        and result.values["trainer"] == "perfect"
+    )
     low, high = exchange["interval"]
     assert low <= exchange["difference"] <= high and low > 0
 
@@ -180,7 +215,9 @@ def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(
 ) -> None:
     saved = load_checkpoint(write_model(tmp_path / "plain.safetensors"))
     seen = frames_of("semantic_kitti", ["00/000000", "00/000001", "00/000002"])
-    header = replace(saved.header, provenance={**saved.header.provenance, "seen": seen.to_list()})
+    header = replace(
+        saved.header, provenance={**saved.header.provenance, "seen": seen.to_list()}
+    )
     path = tmp_path / "leaks.safetensors"
     save_checkpoint(path, header, saved.networks)
     with pytest.raises(ConfigError, match=r"2011_10_03_drive_0027 \(frame 2\)"):
@@ -192,37 +229,58 @@ def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(
 def test_a_generator_with_a_condition_gets_those_of_the_towns_streets(
     condition: str, tmp_path: Path
 ) -> None:
-    model = write_model(tmp_path / "model.safetensors", dropout=0.1, condition=condition)
+    model = write_model(
+        tmp_path / "model.safetensors", dropout=0.1, condition=condition
+    )
 
     def scans_of(seed: int) -> list[Scan]:
         task = PoolTask(
-            "generator", tmp_path / str(seed), SENSOR, None, 2, town_seed=seed, model=str(model)
+            "generator",
+            tmp_path / str(seed),
+            SENSOR,
+            None,
+            2,
+            town_seed=seed,
+            model=str(model),
         )
         return pools.read_pool(make_pool(task))
 
     one = scans_of(1)
     other = scans_of(2)
     assert len(one) == 2 and all(len(scan) for scan in one + other)
-    assert not np.array_equal(one[0].points, other[0].points), "another street gives another scan"
+    assert not np.array_equal(one[0].points, other[0].points), (
+        "another street gives another scan"
+    )
     with pytest.raises(ConfigError, match="needs camera images"):
         refuse_leaks("town-camera", frames_of("semantic_kitti", ["01/000000"]))
 
 
-def test_a_generator_that_saw_the_tested_scans_in_another_folder_is_refused(tmp_path: Path) -> None:
+def test_a_generator_that_saw_the_tested_scans_in_another_folder_is_refused(
+    tmp_path: Path,
+) -> None:
     scans = drives(3, 2)
     saved = load_checkpoint(write_model(tmp_path / "mine.safetensors"))
-    provenance = {**saved.header.provenance, "seen": contents([content_of(scans[0])]).to_list()}
+    provenance = {
+        **saved.header.provenance,
+        "seen": contents([content_of(scans[0])]).to_list(),
+    }
     save_checkpoint(
-        tmp_path / "mine.safetensors", replace(saved.header, provenance=provenance), saved.networks
+        tmp_path / "mine.safetensors",
+        replace(saved.header, provenance=provenance),
+        saved.networks,
     )
-    settings = replace(SMALL, arms=("generator",), model=str(tmp_path / "mine.safetensors"))
+    settings = replace(
+        SMALL, arms=("generator",), model=str(tmp_path / "mine.safetensors")
+    )
     with pytest.raises(ConfigError, match="trained on places that are tested: content"):
         prove(scans, tmp_path / "out", settings, jobs=1, progress=False)
 
 
 def test_a_pool_of_other_weights_is_not_reused(tmp_path: Path) -> None:
     model = write_model(tmp_path / "mine.safetensors")
-    task = PoolTask("generator", tmp_path / "pool", SENSOR, None, 1, 0, str(model), None, ())
+    task = PoolTask(
+        "generator", tmp_path / "pool", SENSOR, None, 1, 0, str(model), None, ()
+    )
     make_pool(task)
     saved = load_checkpoint(model)
     for weight in saved.networks[VELOCITY].parameters():
@@ -232,9 +290,15 @@ def test_a_pool_of_other_weights_is_not_reused(tmp_path: Path) -> None:
         make_pool(task)
 
 
-def test_the_shipped_generator_is_not_measured_on_its_own_town(town: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="trained on places that are tested: town seed 0"):
-        prove(town, tmp_path, replace(SMALL, arms=("generator",)), jobs=1, progress=False)
+def test_the_shipped_generator_is_not_measured_on_its_own_town(
+    town: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        ConfigError, match="trained on places that are tested: town seed 0"
+    ):
+        prove(
+            town, tmp_path, replace(SMALL, arms=("generator",)), jobs=1, progress=False
+        )
 
 
 def test_the_command_plans_and_proves(town: Path, tmp_path: Path) -> None:
@@ -289,7 +353,9 @@ def pandaset_frame(path: Path) -> Scan:
         )
 
 
-def test_labels_of_pandaset_need_its_table(labelled_scans: Path, tmp_path: Path) -> None:
+def test_labels_of_pandaset_need_its_table(
+    labelled_scans: Path, tmp_path: Path
+) -> None:
     paths = sorted((labelled_scans / "pandaset" / "sensor_frame").glob("*.npz"))[::5]
     source = [pandaset_frame(path) for path in paths]
     settings = replace(SMALL, places="stretch:2", arms=("real",), classes="pandaset")

@@ -18,7 +18,13 @@ from safetensors.torch import load_file
 from scipy import stats
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
-from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError, ProcessError
+from lidar_synth.errors import (
+    ConfigError,
+    DataError,
+    FileError,
+    LidarSynthError,
+    ProcessError,
+)
 from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.segmentation import class_ious
 from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
@@ -38,7 +44,12 @@ from lidar_synth.lab.proof.scores import (
     require_labels,
     t_quantile,
 )
-from lidar_synth.lab.proof.trial import pretrain, pretraining_seconds, reference, turn_scan
+from lidar_synth.lab.proof.trial import (
+    pretrain,
+    pretraining_seconds,
+    reference,
+    turn_scan,
+)
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
 
@@ -53,7 +64,9 @@ def test_wrapped_padding_is_circular_padding() -> None:
 
 SOURCES = {
     "drive": drives(3, 4),
-    "pose": Scans([f"00/{i:06d}" for i in range(9)], [0, 10, 40, 500, 510, 540, 900, 950, 960]),
+    "pose": Scans(
+        [f"00/{i:06d}" for i in range(9)], [0, 10, 40, 500, 510, 540, 900, 950, 960]
+    ),
     "stretch": Scans([f"00/{i:06d}" for i in range(16)]),
 }
 """A source for every split."""
@@ -96,13 +109,21 @@ def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
 ) -> None:
     places = find_places(drives(4, 5))
     picked = choose(places, "01", count, np.random.default_rng(0))
-    per_place = Counter(next(name for name, part in places.items() if i in part) for i in picked)
+    per_place = Counter(
+        next(name for name, part in places.items() if i in part) for i in picked
+    )
     assert "01" not in per_place and len(picked) == (count or 15)
-    assert max(per_place.values()) - (min(per_place.values()) if len(per_place) == 3 else 0) <= 1
+    assert (
+        max(per_place.values())
+        - (min(per_place.values()) if len(per_place) == 3 else 0)
+        <= 1
+    )
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_an_arm_trains_for_its_iterations_with_its_shares(name: str, tmp_path: Path) -> None:
+def test_an_arm_trains_for_its_iterations_with_its_shares(
+    name: str, tmp_path: Path
+) -> None:
     task = job(name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].swept else None)
     mixtures = list(task.mixtures(collate="range"))
     stages = task.row.stages()
@@ -143,7 +164,8 @@ def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) 
     assert [step for step, _ in shared.curve] == [15, 18, 20]
     pretrain(other, tmp_path / "other.safetensors")  # the labelled scans do not matter
     assert equal(
-        load_file(tmp_path / "other.safetensors"), load_file(tmp_path / "start.safetensors")
+        load_file(tmp_path / "other.safetensors"),
+        load_file(tmp_path / "start.safetensors"),
     )
 
 
@@ -155,7 +177,9 @@ def test_turning_keeps_every_return_in_a_cell() -> None:
     scan = thin_scan(random_scan(SENSOR, 20_000), SENSOR)
     cells = np.count_nonzero(project(scan).range)
     for seed in range(5):
-        kept = np.count_nonzero(project(turn_scan(scan, np.random.default_rng(seed))).range)
+        kept = np.count_nonzero(
+            project(turn_scan(scan, np.random.default_rng(seed))).range
+        )
         assert abs(kept - cells) <= 0.001 * cells
 
 
@@ -179,17 +203,22 @@ def test_pooled_classes_forgive_confusions_within_a_pool_and_no_others() -> None
     table[TRAIN_ID["road"], TRAIN_ID["pole"]] = 5  # a prediction of no pool
     table[TRAIN_ID["road"], TRAIN_ID["road"]] = 5
     table[TRAIN_ID["pole"], TRAIN_ID["road"]] = 7  # a label of no pool does not count
-    ious = dict(zip(GROUPS["pandaset"], group_ious(table, GROUPS["pandaset"]), strict=True))
+    ious = dict(
+        zip(GROUPS["pandaset"], group_ious(table, GROUPS["pandaset"]), strict=True)
+    )
     assert ious["vehicle"] == 1 and ious["road"] == 0.5 and np.isnan(ious["building"])
 
 
 @pytest.mark.parametrize("degrees", [1, 4, 6, 30])
 def test_the_quantile_of_t_is_that_of_scipy(degrees: int) -> None:
-    assert t_quantile(0.975, degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-3)
+    assert t_quantile(0.975, degrees) == pytest.approx(
+        stats.t.ppf(0.975, degrees), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(
-    ("places", "seeds", "between", "within"), [(6, 1, 1, 1), (7, 2, 1, 1), (7, 2, 1, 0.1)]
+    ("places", "seeds", "between", "within"),
+    [(6, 1, 1, 1), (7, 2, 1, 1), (7, 2, 1, 0.1)],
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(
     places: int, seeds: int, between: float, within: float
@@ -198,7 +227,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     held = 0
     count = 400
     for trial in range(count):
-        d = 2 + rng.normal(0, between, (places, 1)) + rng.normal(0, within, (places, seeds))
+        d = (
+            2
+            + rng.normal(0, between, (places, 1))
+            + rng.normal(0, within, (places, seeds))
+        )
         low, high = interval(d, seed=trial, draws=800)  # type: ignore[misc]
         held += low <= 2 <= high
     assert 0.91 <= held / count <= 0.99
@@ -213,11 +246,19 @@ def test_too_few_places_have_no_interval_and_missing_seeds_do_not_count() -> Non
 
 
 def test_ticks_are_round_and_few() -> None:
-    assert ticks(-3.2, 7.9) == [-2.0, 0.0, 2.0, 4.0, 6.0] and 3 <= len(ticks(0, 533)) <= 8
+    assert (
+        ticks(-3.2, 7.9) == [-2.0, 0.0, 2.0, 4.0, 6.0] and 3 <= len(ticks(0, 533)) <= 8
+    )
 
 
 SMALL = ProofSettings(
-    arms=("real", "town"), iterations=10, batch=2, seeds=2, columns=64, widths=(4, 8), tested=2
+    arms=("real", "town"),
+    iterations=10,
+    batch=2,
+    seeds=2,
+    columns=64,
+    widths=(4, 8),
+    tested=2,
 )
 
 
@@ -237,7 +278,9 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
     assert all(scan.sensor.columns == 64 for scan in scans.values())
 
 
-def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> None:
+def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> (
+    None
+):
     whole, _ = make_plan(drives(4, 5), replace(SMALL, iterations=100), None, 1)
     plan = replace(whole, step=6.0)
     minutes = estimate_minutes(plan, plan.pairs[:3]) + 0.01
@@ -274,21 +317,41 @@ BAD = {
         "places by 'street'; expected one of auto, drive",
     ),
     "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
-    "fewer scans than a batch": (drives(2, 3), {"batch": 4}, "3 labelled scans for batches of 4"),
-    "fewer labelled than a batch": (drives(), {"labelled": 1}, "1 labelled scans for batches of 2"),
+    "fewer scans than a batch": (
+        drives(2, 3),
+        {"batch": 4},
+        "3 labelled scans for batches of 4",
+    ),
+    "fewer labelled than a batch": (
+        drives(),
+        {"labelled": 1},
+        "1 labelled scans for batches of 2",
+    ),
     "more labelled than there are": (
         drives(),
         {"labelled": 9},
         "9 labelled scans; expected 1 to 8",
     ),
-    "an unknown class": (drives(), {"only": ("tram",)}, "class 'tram' of semantic_kitti"),
+    "an unknown class": (
+        drives(),
+        {"only": ("tram",)},
+        "class 'tram' of semantic_kitti",
+    ),
     "a class that is nowhere": (
         drives(),
         {"only": ("road", "bicyclist")},
         "class bicyclist, which no label",
     ),
-    "unknown pooled classes": (drives(), {"classes": "waymo"}, "classes 'waymo'; expected one of"),
-    "an unknown arm": (drives(), {"arms": ("real", "magic")}, "arm 'magic'; expected some of real"),
+    "unknown pooled classes": (
+        drives(),
+        {"classes": "waymo"},
+        "classes 'waymo'; expected one of",
+    ),
+    "an unknown arm": (
+        drives(),
+        {"arms": ("real", "magic")},
+        "arm 'magic'; expected some of real",
+    ),
     "a share of everything": (drives(), {"ratios": (1.0,)}, "ratio 1.0"),
     "no labels": (scans_with(label=None, raw_label=None), {}, "without labels"),
     "labels of another table": (
@@ -314,7 +377,13 @@ def test_groups_without_any_label_are_refused() -> None:
 
 def test_rows_have_one_key_each_and_the_base_comes_first() -> None:
     found = rows(("skin", "town"), (0.5, 0.25))
-    assert [row.key for row in found] == ["real", "town-25", "town-50", "skin-25", "skin-50"]
+    assert [row.key for row in found] == [
+        "real",
+        "town-25",
+        "town-50",
+        "skin-25",
+        "skin-50",
+    ]
 
 
 TRAINER = """
@@ -357,7 +426,8 @@ def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
     [stage] = describe(task)["stages"]
     assert stage["label_options"]["count"] == {"Pedestrian": 3}
     assert (
-        ObjectBank.load(stage["label_options"]["objects"]).boxes.names == task.objects.boxes.names
+        ObjectBank.load(stage["label_options"]["objects"]).boxes.names
+        == task.objects.boxes.names
     )
 
 
@@ -376,7 +446,10 @@ def test_returns_without_a_prediction_are_errors_in_every_pool(
     everything = replace(scan, label=np.arange(len(scan)).astype(np.uint8) % len(NAMES))
     task = replace(task, held_out=[everything])
     table = CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(task)
-    assert table.sum() == len(scan) and np.nanmax(group_ious(table, groups_of(classes))) == 0
+    assert (
+        table.sum() == len(scan)
+        and np.nanmax(group_ious(table, groups_of(classes))) == 0
+    )
 
 
 FAILING = {
@@ -401,7 +474,9 @@ FAILING = {
 def test_a_command_that_fails_is_named(case: str, tmp_path: Path) -> None:
     program, kind, message = FAILING[case]
     with pytest.raises(kind, match=message):
-        CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(job("real", tmp_path))
+        CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(
+            job("real", tmp_path)
+        )
 
 
 def test_a_command_names_its_job(tmp_path: Path) -> None:

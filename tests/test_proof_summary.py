@@ -26,7 +26,10 @@ FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600}
 def outcome(found: int, persons: int) -> TrialOutcome:
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
     table[ROAD, ROAD] = 5000
-    table[PERSON, PERSON], table[PERSON, ROAD] = min(found, persons), persons - min(found, persons)
+    table[PERSON, PERSON], table[PERSON, ROAD] = (
+        min(found, persons),
+        persons - min(found, persons),
+    )
     return TrialOutcome(table)
 
 
@@ -55,7 +58,9 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
         1,
     )
     found = {
-        (n, 0): {arm: outcome(FOUND[arm.name], 0 if n == "p6" else 1000) for arm in arms}
+        (n, 0): {
+            arm: outcome(FOUND[arm.name], 0 if n == "p6" else 1000) for arm in arms
+        }
         for n in names
     }
     values = summarise(plan, found, {}, "reference").values
@@ -64,5 +69,7 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
     assert by_key["pretrain"]["difference"] == pytest.approx(30)
     assert by_key["pretrain"]["by_place"]["p6"] is None
     chosen = values["chosen_elsewhere"]
-    assert chosen["arms"] == ["pretrain"] * 7 and chosen["difference"] == pytest.approx(30)
+    assert chosen["arms"] == ["pretrain"] * 7 and chosen["difference"] == pytest.approx(
+        30
+    )
     assert "NaN" not in json.dumps(values) and "nan" not in body(values)

@@ -50,7 +50,9 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_copy_alone_reads_every_bank_and_plan_bit_for_bit(cases: Path, tmp_path: Path) -> None:
+def test_a_copy_alone_reads_every_bank_and_plan_bit_for_bit(
+    cases: Path, tmp_path: Path
+) -> None:
     """``tools/test_reader_versions.py`` runs the same with old versions of Python, numpy and
     h5py."""
     assert len(list((cases / "banks").iterdir())) == len(BANKS) and len(
@@ -58,7 +60,9 @@ def test_a_copy_alone_reads_every_bank_and_plan_bit_for_bit(cases: Path, tmp_pat
     ) == len(MIXTURES)
     shutil.copy(SOURCE, tmp_path / "reader.py")
     command = [sys.executable, Path(__file__).parent / "read_alone.py", tmp_path, cases]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "are equal, bit for bit" in done.stdout
 
@@ -71,7 +75,9 @@ def test_the_file_is_of_python_3_8_and_imports_numpy_and_h5py_alone() -> None:
         if isinstance(node, ast.Import)
         for alias in node.names
     ]
-    names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    names += [
+        node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+    ]
     assert {name.split(".")[0] for name in names} - STANDARD == {"numpy", "h5py"}
 
 
@@ -136,7 +142,8 @@ INVALID: dict[str, tuple[Callable[[h5py.File, Path], None], str]] = {
 def test_a_shard_with_other_values_is_refused(tmp_path: Path, what: str) -> None:
     change, message = INVALID[what]
     [good], [bad] = (
-        write_bank(tmp_path / name, [some_image(0), some_image(1)]) for name in ("good", "bad")
+        write_bank(tmp_path / name, [some_image(0), some_image(1)])
+        for name in ("good", "bad")
     )
     with h5py.File(bad, "r+", libver=("v110", "v110")) as file:
         change(file, good)
@@ -145,7 +152,9 @@ def test_a_shard_with_other_values_is_refused(tmp_path: Path, what: str) -> None
 
 
 @pytest.mark.parametrize(("name", "code"), [("label", 19), ("confidence", 16)])
-def test_codes_without_a_meaning_are_refused(tmp_path: Path, name: str, code: int) -> None:
+def test_codes_without_a_meaning_are_refused(
+    tmp_path: Path, name: str, code: int
+) -> None:
     [path] = write_bank(tmp_path, [some_image(0)], fields=("label", "confidence"))
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         file[name][0, 0, 0] = code
@@ -157,12 +166,16 @@ def test_codes_without_a_meaning_are_refused(tmp_path: Path, name: str, code: in
 
 def values(scan: Any) -> list[Any]:
     """A scan in values that compare by ``==``, bit for bit."""
-    return [value.tobytes() if isinstance(value, np.ndarray) else value for value in scan]
+    return [
+        value.tobytes() if isinstance(value, np.ndarray) else value for value in scan
+    ]
 
 
 @pytest.mark.slow
 def test_no_flipped_bit_gives_another_scan(tmp_path: Path) -> None:
-    [path] = write_bank(tmp_path, [some_image(0), some_image(1)], fields=("reflectance", "label"))
+    [path] = write_bank(
+        tmp_path, [some_image(0), some_image(1)], fields=("reflectance", "label")
+    )
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     refused = 0
@@ -185,24 +198,32 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     write_bank(tmp_path, [some_image(i) for i in range(3)])
     text = (tmp_path / "index.json").read_text()
     values = {
-        key: value for key, value in json.loads(text).items() if key not in ("checksum", "files")
+        key: value
+        for key, value in json.loads(text).items()
+        if key not in ("checksum", "files")
     }
     values["shards"][0]["dropped"] = [1]
     values["scans"] -= 1
-    (tmp_path / "index.json").write_text(json.dumps({**values, "checksum": _sum(values)}))
+    (tmp_path / "index.json").write_text(
+        json.dumps({**values, "checksum": _sum(values)})
+    )
     assert len(Bank(tmp_path)) == 2
     refused = 0
     tried = [(path, wrong) for path in places(values) for wrong in WRONG]
     for path, wrong in tried[::3]:
         edited = with_value(values, path, wrong)
-        (tmp_path / "index.json").write_text(json.dumps({**edited, "checksum": _sum(edited)}))
+        (tmp_path / "index.json").write_text(
+            json.dumps({**edited, "checksum": _sum(edited)})
+        )
         try:
             bank = Bank(tmp_path)
             bank[0], bank[len(bank) - 1]
         except ReaderError:
             refused += 1
         except Exception as error:
-            pytest.fail(f"{path} = {str(wrong)[:40]!r}: {type(error).__name__}: {error}")
+            pytest.fail(
+                f"{path} = {str(wrong)[:40]!r}: {type(error).__name__}: {error}"
+            )
     assert refused > 0.5 * len(tried[::3])
 
 
@@ -240,7 +261,10 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "newer": (newer, "format .lidar-synth-bank/3., expected one of"),
     "blosc2": (blosc2, "compressed by 'blosc2'; bake it with --compression gzip"),
     "edited": (edited, "does not match its checksum"),
-    "no JSON": (lambda root: (root / "index.json").write_text("["), "index.json cannot be read"),
+    "no JSON": (
+        lambda root: (root / "index.json").write_text("["),
+        "index.json cannot be read",
+    ),
     "nested": (
         lambda root: (root / "index.json").write_text("[" * 10**6),
         "index.json cannot be read",
@@ -261,7 +285,10 @@ def planned(cases: Path, name: str, real: Any = None, **options: Any) -> MixedEp
     bank, count, _ = MIXTURES[name]
     given = range(count) if real is None else real
     return MixedEpochs(
-        cases / "plans" / name / "plan.npz", given, Bank(cases / "banks" / bank / "bank"), **options
+        cases / "plans" / name / "plan.npz",
+        given,
+        Bank(cases / "banks" / bank / "bank"),
+        **options,
     )
 
 
@@ -296,7 +323,9 @@ def test_real_samples_are_the_trainers_own_and_scans_get_its_form(cases: Path) -
         to_sample=lambda scan: ("made", scan.id),
     )
     kinds = [train[i][0] for i in range(len(train))]
-    assert [kind == "made" for kind in kinds] == [bool(train.domain(i)) for i in range(len(train))]
+    assert [kind == "made" for kind in kinds] == [
+        bool(train.domain(i)) for i in range(len(train))
+    ]
     with pytest.raises(IndexError):
         train[len(train)]
 
@@ -313,12 +342,18 @@ WRONG_PLANS: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "no archive": (lambda path: path.write_text("x"), "plan.npz cannot be read"),
     "another file": (lambda path: np.savez(path, a=1), "plan.npz cannot be read"),
-    "objects": (lambda path: np.savez(path, settings=np.array([{}])), "plan.npz cannot be read"),
+    "objects": (
+        lambda path: np.savez(path, settings=np.array([{}])),
+        "plan.npz cannot be read",
+    ),
     "newer": (
         lambda path: rewrite(path, format="lidar-synth-epochs/2"),
         "format 'lidar-synth-epochs/2', expected",
     ),
-    "another bank": (lambda path: rewrite(path, bank="x"), "made with another bank than"),
+    "another bank": (
+        lambda path: rewrite(path, bank="x"),
+        "made with another bank than",
+    ),
     "other real samples": (
         lambda path: rewrite(path, real=12),
         "for 12 real samples, but there are 11",
@@ -349,11 +384,15 @@ WRONG_PLANS: dict[str, tuple[Callable[[Path], Any], str]] = {
 def rewrite(path: Path, **changes: Any) -> None:
     """Change the settings of a plan."""
     settings = json.loads(np.load(path)["settings"].tobytes()) | changes
-    replace_member(path, "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8))
+    replace_member(
+        path, "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8)
+    )
 
 
 @pytest.mark.parametrize("what", WRONG_PLANS)
-def test_a_plan_that_does_not_fit_is_refused(cases: Path, tmp_path: Path, what: str) -> None:
+def test_a_plan_that_does_not_fit_is_refused(
+    cases: Path, tmp_path: Path, what: str
+) -> None:
     change, message = WRONG_PLANS[what]
     path = tmp_path / "plan.npz"
     shutil.copy(cases / "plans" / "generated" / "plan.npz", path)
@@ -366,7 +405,8 @@ def test_a_plan_that_does_not_fit_is_refused(cases: Path, tmp_path: Path, what: 
 
 def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
     with pytest.raises(
-        ReaderError, match="epoch 3 of a plan of 3 epochs; make it again with more --epochs"
+        ReaderError,
+        match="epoch 3 of a plan of 3 epochs; make it again with more --epochs",
     ):
         planned(cases, "generated").set_epoch(3)
 
@@ -378,7 +418,10 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
         ({"label_options": {"kind": "polar"}}, "no option but threshold"),
         ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
-        ({"synthetic": "town"}, "synthetic: town; expected a bank. lidar-synth bake OUT"),
+        (
+            {"synthetic": "town"},
+            "synthetic: town; expected a bank. lidar-synth bake OUT",
+        ),
         ({"unknown": 1}, "settings .'unknown'"),
     ],
 )
@@ -388,7 +431,10 @@ def test_mixtures_that_need_the_package_in_the_trainer_are_refused(
     bank = str(cases / "banks" / "all fields" / "bank")
     with pytest.raises(ConfigError, match=message):
         write_plan(
-            {"synthetic": bank, "ratio": 0.5, **settings}, tmp_path / "plan.npz", real=4, epochs=1
+            {"synthetic": bank, "ratio": 0.5, **settings},
+            tmp_path / "plan.npz",
+            real=4,
+            epochs=1,
         )
     assert not list(tmp_path.iterdir())
 
@@ -403,7 +449,8 @@ def test_a_plan_of_boxes_says_that_the_reader_keeps_unboxed_objects(
         "labels": labels,
     }
     with pytest.raises(
-        ConfigError, match="of a bank with boxes for a plan file; expected unboxed: keep"
+        ConfigError,
+        match="of a bank with boxes for a plan file; expected unboxed: keep",
     ):
         write_plan(settings, tmp_path / "plan.npz", real=4, epochs=1)
     write_plan(settings | {"unboxed": "keep"}, tmp_path / "plan.npz", real=4, epochs=1)
@@ -411,7 +458,10 @@ def test_a_plan_of_boxes_says_that_the_reader_keeps_unboxed_objects(
 
 @pytest.mark.slow
 def test_the_command_line(
-    cases: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cases: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The documented line, and its exit status 2 on wrong settings."""
     name, real, _ = MIXTURES["generated"]
@@ -421,10 +471,19 @@ def test_the_command_line(
         "lidar_synth.integrations.plan",
         str(cases / "plans" / "generated" / "mix.yaml"),
     ]
-    line = [*command, str(tmp_path / "plan.npz"), "--real", str(real), "--epochs", str(EPOCHS)]
+    line = [
+        *command,
+        str(tmp_path / "plan.npz"),
+        "--real",
+        str(real),
+        "--epochs",
+        str(EPOCHS),
+    ]
     done = subprocess.run(line, capture_output=True, text=True, check=True)
     assert "3 epochs, the first with plan " in done.stdout
-    train = MixedEpochs(tmp_path / "plan.npz", range(real), Bank(cases / "banks" / name / "bank"))
+    train = MixedEpochs(
+        tmp_path / "plan.npz", range(real), Bank(cases / "banks" / name / "bank")
+    )
     assert train.settings["hashes"] == planned(cases, "generated").settings["hashes"]
     monkeypatch.setattr(sys, "argv", [*line[2:-1], "0"])
     with pytest.raises(SystemExit, match="2"):

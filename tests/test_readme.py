@@ -25,8 +25,13 @@ def test_the_first_code_has_six_lines() -> None:
 
 def anchors(text: str) -> set[str]:
     """The anchors that GitHub makes of the headings of a Markdown file."""
-    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M
+    )
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        for heading in headings
+    }
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
@@ -43,6 +48,7 @@ def test_links_lead_to_existing_files_and_headings(document: Path) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_existing_files_of_the_repository(document: Path) -> None:
     named = re.findall(
-        r"`((?:lidar_synth|integrations|configs|tools|tests)/[\w/.]+\w/?)`", document.read_text()
+        r"`((?:lidar_synth|integrations|configs|tools|tests)/[\w/.]+\w/?)`",
+        document.read_text(),
     )
     assert [name for name in named if not (ROOT / name).exists()] == []

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.projection import locate, project, ring_numbers, unfold, unproject
+from lidar_synth.geometry.projection import (
+    locate,
+    project,
+    ring_numbers,
+    unfold,
+    unproject,
+)
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -18,8 +24,12 @@ def scans_below(root: Path) -> list[Scan]:
     scans = []
     for path in sorted(p for folder in ROOTS for p in (root / folder).rglob("*.bin")):
         points = read_points(path)
-        sensor = load_sensor("hdl64e_semantic_kitti" if "semantic" in str(path) else "hdl64e_kitti")
-        scans.append(Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root))))
+        sensor = load_sensor(
+            "hdl64e_semantic_kitti" if "semantic" in str(path) else "hdl64e_kitti"
+        )
+        scans.append(
+            Scan(points[:, :3], points[:, 3], sensor, id=str(path.relative_to(root)))
+        )
     return scans
 
 
@@ -30,7 +40,8 @@ def scans(real_scans: Path) -> list[Scan]:
 
 def elevation(points: np.ndarray) -> np.ndarray:
     return np.arcsin(
-        points[:, 2].astype(np.float64) / np.linalg.norm(points.astype(np.float64), axis=1)
+        points[:, 2].astype(np.float64)
+        / np.linalg.norm(points.astype(np.float64), axis=1)
     )
 
 
@@ -57,13 +68,19 @@ def test_a_kept_point_moves_by_at_most_half_a_cell(scans: list[Scan]) -> None:
         )
         half = np.radians(sensor.up - sensor.down) / sensor.shape[0] / 2
         assert seen.mean() > 0.9
-        assert np.abs(elevation(after) - elevation(before))[seen].max() <= half + 1e-6, scan.id
-        turned = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
+        assert (
+            np.abs(elevation(after) - elevation(before))[seen].max() <= half + 1e-6
+        ), scan.id
+        turned = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(
+            before[:, 1], before[:, 0]
+        )
         turned = (turned + np.pi) % (2 * np.pi) - np.pi
         assert np.abs(turned).max() <= np.pi / sensor.columns + 1e-6, scan.id
 
 
-def test_unfolding_finds_the_beam_of_each_ring_also_in_cropped_scans(scans: list[Scan]) -> None:
+def test_unfolding_finds_the_beam_of_each_ring_also_in_cropped_scans(
+    scans: list[Scan],
+) -> None:
     """The truncated scan has the upper 39 rings, and the camera-cropped one the upper 46; both
     start in row 0."""
     rows = {s.id: np.flatnonzero(unfold(s).mask.any(axis=1)) for s in scans}
@@ -91,5 +108,10 @@ def test_the_beam_table_matches_the_rings_of_real_scans(scans: list[Scan]) -> No
     for scan in (s for s in scans if len(s) > FULL_TURN):
         ring = ring_numbers(scan.points)
         assert ring[-1] == 63, scan.id
-        medians.append([np.median(elevation(scan.points[ring == i])) for i in range(64)])
-    assert np.degrees(np.abs(np.median(medians, axis=0) - sensor.laser_elevations)).max() < 0.03
+        medians.append(
+            [np.median(elevation(scan.points[ring == i])) for i in range(64)]
+        )
+    assert (
+        np.degrees(np.abs(np.median(medians, axis=0) - sensor.laser_elevations)).max()
+        < 0.03
+    )

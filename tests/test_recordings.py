@@ -31,13 +31,22 @@ DRIVES = st.dictionaries(
 
 def made(held: Held) -> Recordings:
     """None = the whole drive."""
-    ids = [f"{d}/{n}" for d, frames in held.items() if frames is not None for n in sorted(frames)]
-    return frames_of("kitti360", [*ids, *(d for d, frames in held.items() if frames is None)])
+    ids = [
+        f"{d}/{n}"
+        for d, frames in held.items()
+        if frames is not None
+        for n in sorted(frames)
+    ]
+    return frames_of(
+        "kitti360", [*ids, *(d for d, frames in held.items() if frames is None)]
+    )
 
 
 def numbers(recordings: Recordings) -> Held:
     return {
-        drive: None if runs is None else {n for first, last in runs for n in range(first, last + 1)}
+        drive: None
+        if runs is None
+        else {n for first, last in runs for n in range(first, last + 1)}
         for (_, drive), runs in recordings.drives.items()
     }
 
@@ -78,20 +87,27 @@ def test_splits_of_kitti360_leak_into_each_other() -> None:
     ]
     assert not sets["r2flow/train"] & sets["r2flow/test"]
     assert not sets["lidm/train"] & sets["lidm/val"]
-    assert [d[-9:-5] for _, d in (sets["r2flow/train"] & sets["lidm/val"]).drives] == ["0003"]
+    assert [d[-9:-5] for _, d in (sets["r2flow/train"] & sets["lidm/val"]).drives] == [
+        "0003"
+    ]
 
 
 def test_a_sequence_of_the_benchmark_is_a_part_of_a_raw_drive() -> None:
     frames = frames_of("semantic_kitti", ["08/000000", "08/000001", "08/000007"])
-    assert frames.drives == {(KITTI, "2011_09_30_drive_0028"): ((1100, 1101), (1107, 1107))}
+    assert frames.drives == {
+        (KITTI, "2011_09_30_drive_0028"): ((1100, 1101), (1107, 1107))
+    }
     raw = frames_of(
         "kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1101, 1107)]
     )
     assert (frames & raw).drives == {(KITTI, "2011_09_30_drive_0028"): ((1101, 1101),)}
-    before = frames_of("kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1100)])
+    before = frames_of(
+        "kitti_raw", [f"2011_09_30_drive_0028_sync/{n:010d}" for n in range(1100)]
+    )
     assert not frames_of("semantic_kitti", ["08"]) & before
     val, train = (
-        frames_of("semantic_kitti", semantic_kitti.SPLITS[s] or ()) for s in ("val", "train")
+        frames_of("semantic_kitti", semantic_kitti.SPLITS[s] or ())
+        for s in ("val", "train")
     )
     assert val and not val & train
     assert len({drive for drive, *_ in ODOMETRY.values()}) == len(ODOMETRY) == 11
@@ -103,11 +119,19 @@ def test_frames_without_a_number_count_as_the_complete_drive() -> None:
         (KITTI360, "drive"): None
     }
     assert not frames_of("npz", ["drive/0000000001"])
-    assert set(PLACES) == {"kitti360", "kitti_raw", "semantic_kitti", "kitti_object", "pandaset"}
+    assert set(PLACES) == {
+        "kitti360",
+        "kitti_raw",
+        "semantic_kitti",
+        "kitti_object",
+        "pandaset",
+    }
 
 
 def test_many_holes_are_kept_as_one_run() -> None:
-    [frames] = frames_of("kitti360", [f"d/{n}" for n in range(0, 10_000, 2)]).drives.values()
+    [frames] = frames_of(
+        "kitti360", [f"d/{n}" for n in range(0, 10_000, 2)]
+    ).drives.values()
     assert frames == ((0, 9998),)
 
 

@@ -4,13 +4,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidar_synth.generate.models.surface_codec.reflectance import BLANK, ZeroInflatedLogistic
+from lidar_synth.generate.models.surface_codec.reflectance import (
+    BLANK,
+    ZeroInflatedLogistic,
+)
 
 CASES = [(0.1, 0.15, 0.2), (-0.9, 0.2, 0.001), (0.8, 0.05, 0.9)]
 """Medians, scales, shares of a 0."""
 
 
-def readings(middle: float, scale: float, blank: float, cells: int = 1) -> ZeroInflatedLogistic:
+def readings(
+    middle: float, scale: float, blank: float, cells: int = 1
+) -> ZeroInflatedLogistic:
     values = torch.tensor([middle, scale, blank], dtype=torch.float64)
     parts = values[0], values[1].log(), values[2].logit()
     return ZeroInflatedLogistic(*(part.expand(cells, 1, 1, 1) for part in parts))
@@ -33,7 +38,9 @@ def test_chances_add_up_to_one(case: tuple[float, float, float]) -> None:
 def test_draws_are_as_likely_as_was_said(case: tuple[float, float, float]) -> None:
     count = 100_000
     drawn = (
-        readings(*case, cells=count).sample(column((torch.arange(count) + 0.5) / count)).flatten()
+        readings(*case, cells=count)
+        .sample(column((torch.arange(count) + 0.5) / count))
+        .flatten()
     )
     predicted = readings(*case)
     nothing = torch.exp(-predicted.nll(column(torch.tensor([BLANK])))).item()
@@ -52,7 +59,9 @@ def test_numbers_at_the_ends_of_chance_are_finite() -> None:
 
 
 def test_gradients_are_finite_where_a_reading_is_far_off() -> None:
-    parts = [torch.tensor(v).view(1, 1, 1, 1).requires_grad_() for v in (1.0, -4.6, -30.0)]
+    parts = [
+        torch.tensor(v).view(1, 1, 1, 1).requires_grad_() for v in (1.0, -4.6, -30.0)
+    ]
     predicted = ZeroInflatedLogistic(*parts)
     for x in (BLANK, -0.99, 1.0):
         predicted.nll(torch.full((1, 1, 1, 1), x)).sum().backward()

@@ -28,7 +28,12 @@ import lidar_synth.lab.train.runs as module
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
-from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, read_header, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    VELOCITY,
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+)
 from lidar_synth.generate.flow.path import Example
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import load_generator
@@ -111,9 +116,15 @@ def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(
     out = call("train", write_config(scans, tmp_path, samples={"every": 6, "count": 2}))
     run = tmp_path / "run"
     assert str(run / "run.safetensors") in out
-    assert sorted(p.name for p in (run / "samples").iterdir()) == ["0000006.png", "0000012.png"]
+    assert sorted(p.name for p in (run / "samples").iterdir()) == [
+        "0000006.png",
+        "0000012.png",
+    ]
     assert list((run / "logs").iterdir())
-    assert yaml.safe_load((run / "config.yaml").read_text())["recipe"]["metric"] == "squared_l2"
+    assert (
+        yaml.safe_load((run / "config.yaml").read_text())["recipe"]["metric"]
+        == "squared_l2"
+    )
     header, _ = read_header(run / "run.safetensors")
     assert header.time_grid == uniform_grid(5)
     assert header.provenance["iterations"] == 12
@@ -121,15 +132,23 @@ def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(
     [scan] = load_generator(run / "run.safetensors").scans(0, [0])
     assert (scan.id, scan.sensor) == ("run/0/0", SENSOR)
     saved = state(tmp_path)
-    checkpoint = load_checkpoint(run / "run.safetensors").networks[VELOCITY].state_dict()
-    assert all(torch.equal(saved[f"average.{name}"], value) for name, value in checkpoint.items())
+    checkpoint = (
+        load_checkpoint(run / "run.safetensors").networks[VELOCITY].state_dict()
+    )
+    assert all(
+        torch.equal(saved[f"average.{name}"], value)
+        for name, value in checkpoint.items()
+    )
     assert not all(
-        torch.equal(saved[f"network.{name}"], value) for name, value in checkpoint.items()
+        torch.equal(saved[f"network.{name}"], value)
+        for name, value in checkpoint.items()
     )
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(scans: Path, tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(
+    scans: Path, tmp_path: Path
+) -> None:
     configs = {}
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()
@@ -189,7 +208,9 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     two = state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name
-    assert len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1  # and not a run each
+    assert (
+        len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1
+    )  # and not a run each
 
 
 def test_minutes_stop_a_run_and_resume_goes_on(
@@ -224,15 +245,21 @@ def test_what_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint(
         calls.append(batch)
         example = task(batch)
         return Example(
-            example.y, example.t, example.velocity * (torch.nan if len(calls) == 7 else 1)
+            example.y,
+            example.t,
+            example.velocity * (torch.nan if len(calls) == 7 else 1),
         )
 
     monkeypatch.setattr(plan_module, "teacher_task", lambda timesteps: poisoned)
     with pytest.raises(
-        DataError, match=r"step 7: the loss is nan.*last saved state and checkpoint are kept"
+        DataError,
+        match=r"step 7: the loss is nan.*last saved state and checkpoint are kept",
     ):
         call("train", config)
-    assert read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"] == 4
+    assert (
+        read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"]
+        == 4
+    )
     assert load_generator(tmp_path / "run" / "run.safetensors").scans(0, [0])
     assert all(value.isfinite().all() for value in state(tmp_path).values())
     call("train", config, "--resume")  # the cause is gone: it goes on from there
@@ -246,13 +273,19 @@ def teacher(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_fine_tuning_starts_from_a_checkpoint(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_fine_tuning_starts_from_a_checkpoint(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path, recipe={"iterations": 1, "rate": 1e-9})
     call("train", config, f"init={teacher}")
-    start, end = (load_checkpoint(p) for p in (teacher, tmp_path / "run" / "run.safetensors"))
+    start, end = (
+        load_checkpoint(p) for p in (teacher, tmp_path / "run" / "run.safetensors")
+    )
     assert end.header.provenance["init"] == start.hash
     for a, b in zip(
-        start.networks[VELOCITY].parameters(), end.networks[VELOCITY].parameters(), strict=True
+        start.networks[VELOCITY].parameters(),
+        end.networks[VELOCITY].parameters(),
+        strict=True,
     ):
         assert torch.allclose(a, b, atol=1e-6)
     short = yaml.safe_load(config.read_text())
@@ -263,14 +296,25 @@ def test_fine_tuning_starts_from_a_checkpoint(scans: Path, teacher: Path, tmp_pa
     assert read_header(tmp_path / "short" / "short.safetensors")[0].sensor == SENSOR
     for other in ("sensor=town", "channels=[range]", "network.arguments.width=32"):
         with pytest.raises(
-            ConfigError, match=f"expected that of {teacher}.*Or leave out {other.split('=')[0][:6]}"
+            ConfigError,
+            match=f"expected that of {teacher}.*Or leave out {other.split('=')[0][:6]}",
         ):
-            call("train", config, f"init={teacher}", other, f"output={tmp_path / 'other'}")
+            call(
+                "train",
+                config,
+                f"init={teacher}",
+                other,
+                f"output={tmp_path / 'other'}",
+            )
 
 
 @pytest.mark.parametrize(
     ("strategy", "grid"),
-    [("adaptive_piecewise", None), ("uniform_piecewise", uniform_grid(4)), ("reflow", None)],
+    [
+        ("adaptive_piecewise", None),
+        ("uniform_piecewise", uniform_grid(4)),
+        ("reflow", None),
+    ],
 )
 def test_a_student_is_distilled(
     strategy: str,
@@ -303,7 +347,10 @@ def test_a_student_is_distilled(
         assert found["per_trajectory"].shape == (3, 3)
     monkeypatch.delattr(plan_module, "select_timesteps")  # it is not called again
     call("distill", config, "--resume", "recipe.iterations=14")
-    assert read_header(tmp_path / "run" / "run.safetensors")[0].time_grid == header.time_grid
+    assert (
+        read_header(tmp_path / "run" / "run.safetensors")[0].time_grid
+        == header.time_grid
+    )
 
 
 def distilling(scans: Path, folder: Path, teacher: Path) -> Path:
@@ -336,7 +383,8 @@ def test_a_selection_of_other_settings_is_refused(
     if override == "teacher":
         checkpoint = load_checkpoint(teacher)
         header = replace(
-            checkpoint.header, provenance=checkpoint.header.provenance | {"iterations": 99}
+            checkpoint.header,
+            provenance=checkpoint.header.provenance | {"iterations": 99},
         )
         save_checkpoint(tmp_path / "other.safetensors", header, checkpoint.networks)
         override = f"teacher={tmp_path / 'other.safetensors'}"
@@ -354,7 +402,10 @@ def test_a_selection_of_other_settings_is_refused(
         ("seed=3", r"seed=3 \(it began with 0\)"),
         ("recipe.metric=l1", r"recipe.metric='l1' \(it began with 'squared_l2'\)"),
         ("recipe.rate=1e-3", r"recipe.rate=0.001 \(it began with 0.01\)"),
-        ("recipe.weights={range: 2}", r"recipe.weights.range=2.0 \(it began with None\)"),
+        (
+            "recipe.weights={range: 2}",
+            r"recipe.weights.range=2.0 \(it began with None\)",
+        ),
         ("data.flip=false", r"data.flip=False \(it began with True\)"),
         ("precision=bf16", r"precision='bf16' \(it began with 'no'\)"),
         ("timesteps=u_shaped", r"timesteps='u_shaped' \(it began with 'uniform'\)"),
@@ -366,7 +417,8 @@ def test_a_run_is_not_resumed_with_other_settings(
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
     files = [
-        tmp_path / "run" / name for name in ("config.yaml", "state.safetensors", "run.safetensors")
+        tmp_path / "run" / name
+        for name in ("config.yaml", "state.safetensors", "run.safetensors")
     ]
     before = [file.read_bytes() for file in files]
     with pytest.raises(ConfigError, match=f"--resume of .*run with .*{named}"):
@@ -380,9 +432,17 @@ def test_a_run_is_resumed_with_more_iterations_and_what_changes_no_result(
 ) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
-    harmless = ["save_every=7", "samples.every=9", "samples.count=2", "gradient_checkpointing=true"]
+    harmless = [
+        "save_every=7",
+        "samples.every=9",
+        "samples.count=2",
+        "gradient_checkpointing=true",
+    ]
     call("train", config, "--resume", "recipe.iterations=14", *harmless)
-    assert read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"] == 14
+    assert (
+        read_header(tmp_path / "run" / "run.safetensors")[0].provenance["iterations"]
+        == 14
+    )
     with pytest.raises(ConfigError, match=r"recipe.iterations=12 \(it began with 14\)"):
         call("train", config, "--resume")
 
@@ -394,14 +454,19 @@ def test_a_run_is_resumed_with_fewer_iterations_before_its_rate_falls(
     for name in "ab":
         (tmp_path / name).mkdir()
     short, long = (
-        write_config(scans, tmp_path / name, recipe={"schedule": "trapezoid"}) for name in "ab"
+        write_config(scans, tmp_path / name, recipe={"schedule": "trapezoid"})
+        for name in "ab"
     )
     call("train", short)
     call("train", long, "recipe.iterations=1000", "--minutes", "0")
-    with pytest.raises(ConfigError, match=r"recipe.iterations=1 \(it began with 1000\)"):
+    with pytest.raises(
+        ConfigError, match=r"recipe.iterations=1 \(it began with 1000\)"
+    ):
         call("train", long, "--resume", "recipe.iterations=1")
     call("train", long, "--resume")
-    a, b = (load_checkpoint(tmp_path / name / "run" / "run.safetensors") for name in "ab")
+    a, b = (
+        load_checkpoint(tmp_path / name / "run" / "run.safetensors") for name in "ab"
+    )
     assert a.hash == b.hash
     with pytest.raises(ConfigError, match=r"recipe.iterations=9 \(it began with 12\)"):
         call("train", long, "--resume", "recipe.iterations=9")
@@ -413,7 +478,12 @@ def test_a_run_is_not_resumed_with_another_teacher_of_the_same_name(
     mine = tmp_path / "teacher.safetensors"
     mine.write_bytes(teacher.read_bytes())
     config = write_config(
-        scans, tmp_path, teacher=str(mine), strategy="reflow", steps=2, recipe={"iterations": 4}
+        scans,
+        tmp_path,
+        teacher=str(mine),
+        strategy="reflow",
+        steps=2,
+        recipe={"iterations": 4},
     )
     call("distill", config, "--minutes", "0")
     checkpoint = load_checkpoint(mine)
@@ -422,12 +492,15 @@ def test_a_run_is_not_resumed_with_another_teacher_of_the_same_name(
     )
     save_checkpoint(mine, header, checkpoint.networks)
     with pytest.raises(
-        ConfigError, match=r"--resume of .*run with teacher='\w+' \(it began with '\w+'\)"
+        ConfigError,
+        match=r"--resume of .*run with teacher='\w+' \(it began with '\w+'\)",
     ):
         call("distill", config, "--resume")
 
 
-def test_a_run_without_its_configuration_is_not_resumed(scans: Path, tmp_path: Path) -> None:
+def test_a_run_without_its_configuration_is_not_resumed(
+    scans: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path)
     call("train", config, "--minutes", "0")
     (tmp_path / "run" / "config.yaml").unlink()
@@ -435,7 +508,14 @@ def test_a_run_without_its_configuration_is_not_resumed(scans: Path, tmp_path: P
         call("train", config, "--resume")
 
 
-def test_a_cache_of_other_scans_is_refused(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_a_cache_of_other_scans_is_refused(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     config = write_config(scans, tmp_path)
     with pytest.raises(ConfigError, match="cache of other data"):
-        call("train", config, f"data.cache={teacher.parent / 'cache'}", "data.on_bad=skip")
+        call(
+            "train",
+            config,
+            f"data.cache={teacher.parent / 'cache'}",
+            "data.on_bad=skip",
+        )

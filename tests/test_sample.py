@@ -25,21 +25,41 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "form", [name for name in WRITERS if name != "kitti_object"]
 )  # no model gives boxes
-def test_sample_writes_every_format_and_resumes(form: str, path: Path, tmp_path: Path) -> None:
+def test_sample_writes_every_format_and_resumes(
+    form: str, path: Path, tmp_path: Path
+) -> None:
     from lidar_synth.cli import app
 
     def sample(*options: str) -> str:
         result = CliRunner().invoke(
-            app, ["sample", str(tmp_path / "out"), "--model", str(path), "--to", form, *options]
+            app,
+            [
+                "sample",
+                str(tmp_path / "out"),
+                "--model",
+                str(path),
+                "--to",
+                form,
+                *options,
+            ],
         )
         assert result.exception is None, result.exception
         return result.output
 
-    assert "2 scans written, 0 were there already" in sample("--count", "2", "--seed", "4")
-    assert "1 scans written, 2 were there already" in sample("--count", "3", "--seed", "4")
+    assert "2 scans written, 0 were there already" in sample(
+        "--count", "2", "--seed", "4"
+    )
+    assert "1 scans written, 2 were there already" in sample(
+        "--count", "3", "--seed", "4"
+    )
     written = open_scans(tmp_path / "out")
     generator = load_generator(path)
-    made = {"made_by": "model", "model": "small", "checkpoint": generator.hash, "seed": 4}
+    made = {
+        "made_by": "model",
+        "model": "small",
+        "checkpoint": generator.hash,
+        "seed": 4,
+    }
     assert (
         written.sensor == SENSOR
         and written[2].provenance == made
@@ -71,7 +91,15 @@ def test_sample_takes_another_format_after_one_that_cannot_hold_the_scans(
 ) -> None:
     from lidar_synth.cli import app
 
-    call = ["sample", str(tmp_path / "out"), "--model", str(path), "--count", "1", "--to"]
+    call = [
+        "sample",
+        str(tmp_path / "out"),
+        "--model",
+        str(path),
+        "--count",
+        "1",
+        "--to",
+    ]
     with pytest.raises(DataError, match="Write it as semantic_kitti"):
         CliRunner().invoke(app, [*call, "kitti_object"], catch_exceptions=False)
     result = CliRunner().invoke(app, [*call, "semantic_kitti"])
@@ -107,8 +135,13 @@ def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*call, *given, "--count", "1"])
     assert result.exception is None, result.exception
     result = CliRunner().invoke(app, [*call, *given, "--count", "3"])
-    assert result.exception is None and "2 scans written, 1 were there already" in result.output
-    expected = load_generator(guided).scans(3, range(3), [real[0], real[1], real[0]], guidance=2.0)
+    assert (
+        result.exception is None
+        and "2 scans written, 1 were there already" in result.output
+    )
+    expected = load_generator(guided).scans(
+        3, range(3), [real[0], real[1], real[0]], guidance=2.0
+    )
     for a, b in zip(open_scans(tmp_path / "out"), expected, strict=True):
         assert a.id == f"{int(b.id.rpartition('/')[2]):06d}"
         assert np.allclose(a.points, b.points, atol=1e-3)
@@ -146,11 +179,17 @@ def test_sample_takes_its_conditions_from_a_dataset(tmp_path: Path) -> None:
     ],
 )
 def test_sample_refuses_conditions_that_do_not_fit(
-    conditional: bool, options: list[str], error: type[Exception], message: str, tmp_path: Path
+    conditional: bool,
+    options: list[str],
+    error: type[Exception],
+    message: str,
+    tmp_path: Path,
 ) -> None:
     from lidar_synth.cli import app
 
-    model = write(tmp_path / "model.safetensors", ("range",), 0.1 if conditional else None)
+    model = write(
+        tmp_path / "model.safetensors", ("range",), 0.1 if conditional else None
+    )
     call = ["sample", str(tmp_path / "out"), "--model", str(model), *options]
     with pytest.raises(error, match=message):
         CliRunner().invoke(app, call, catch_exceptions=False)

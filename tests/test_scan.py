@@ -17,7 +17,13 @@ from lidar_synth.datasets.classes import (
     SEMANTIC_KITTI,
     Taxonomy,
 )
-from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError, LidarSynthError
+from lidar_synth.errors import (
+    ConfigError,
+    DataError,
+    FileError,
+    LibraryError,
+    LidarSynthError,
+)
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
 
@@ -27,7 +33,9 @@ TAXONOMIES = (SEMANTIC_KITTI, KITTI360, NUSCENES)
 def boxes(count: int, seed: int = 0) -> Boxes:
     rng = np.random.default_rng(seed)
     values = np.c_[
-        rng.uniform(-20, 20, (count, 3)), rng.uniform(0.5, 5, (count, 3)), rng.uniform(-4, 4, count)
+        rng.uniform(-20, 20, (count, 3)),
+        rng.uniform(0.5, 5, (count, 3)),
+        rng.uniform(-4, 4, count),
     ]
     return Boxes(values.astype(np.float32), ("Car",) * count)
 
@@ -63,7 +71,9 @@ def test_selecting_keeps_fields_together() -> None:
         == {"reflectance", "label", "raw_label", "instance"}
     )
     assert picked.boxes is scan.boxes
-    several = Boxes(boxes(3).values, ("Car", "Van", "Cyclist"), dont_care=np.ones((2, 4)))
+    several = Boxes(
+        boxes(3).values, ("Car", "Van", "Cyclist"), dont_care=np.ones((2, 4))
+    )
     some = several[[True, False, True]]
     assert (some.names, len(some.dont_care), some.occlusion.tolist()) == (
         ("Car", "Cyclist"),
@@ -94,7 +104,8 @@ def test_every_class_of_a_dataset_is_decoded_and_unknown_ones_are_refused(
     train = taxonomy.decode(ids)
     assert train.dtype == np.uint8 and np.all((train < 19) | (train == IGNORE))
     with pytest.raises(
-        DataError, match=rf"here: unknown class ids \[{ids.max() + 1}\].*{taxonomy.name}"
+        DataError,
+        match=rf"here: unknown class ids \[{ids.max() + 1}\].*{taxonomy.name}",
     ):
         taxonomy.decode(np.array([ids.max() + 1]), "here")
     with pytest.raises(DataError, match="unknown class ids"):
@@ -106,8 +117,17 @@ def test_every_class_of_a_dataset_is_decoded_and_unknown_ones_are_refused(
 def test_semantic_kitti_labels_are_encoded_as_static_classes() -> None:
     every = np.array([*range(19), IGNORE], np.uint8)
     assert np.array_equal(SEMANTIC_KITTI.decode(SEMANTIC_KITTI.encode(every)), every)
-    assert SEMANTIC_KITTI.decode(np.array([252, 259, 60, 1])).tolist() == [0, 4, 8, IGNORE]
-    assert SEMANTIC_KITTI.encode(np.array([0, 8, IGNORE], np.uint8)).tolist() == [10, 40, 0]
+    assert SEMANTIC_KITTI.decode(np.array([252, 259, 60, 1])).tolist() == [
+        0,
+        4,
+        8,
+        IGNORE,
+    ]
+    assert SEMANTIC_KITTI.encode(np.array([0, 8, IGNORE], np.uint8)).tolist() == [
+        10,
+        40,
+        0,
+    ]
     with pytest.raises(DataError, match=r"train ids \[19\]"):
         SEMANTIC_KITTI.encode(np.array([19], np.uint8))
     with pytest.raises(DataError, match="no table"):
@@ -125,4 +145,6 @@ def test_errors_state_input_expectation_and_hint_and_can_be_copied(kind: type) -
     # As pickling would rebuild it.
     error = copy.copy(kind("a.bin is cut", "whole points", "Copy it again."))
     assert str(error) == "a.bin is cut; expected whole points. Copy it again."
-    assert isinstance(error, LidarSynthError) and isinstance(error, ValueError | OSError)
+    assert isinstance(error, LidarSynthError) and isinstance(
+        error, ValueError | OSError
+    )

@@ -21,8 +21,20 @@ from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.proof.study import _is_there, read_outcome, to_values
 from lidar_synth.lab.proof.trial import TrialOutcome
-from lidar_synth.lab.train import TrainConfig, cache_latents, cache_scans, load_config, run
-from lidar_synth.lab.train.state import STATE, Recipe, Training, _checksum, read_progress
+from lidar_synth.lab.train import (
+    TrainConfig,
+    cache_latents,
+    cache_scans,
+    load_config,
+    run,
+)
+from lidar_synth.lab.train.state import (
+    STATE,
+    Recipe,
+    Training,
+    _checksum,
+    read_progress,
+)
 
 SENSOR = Sensor("tiny", 32, 1.0, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 SCANS = [random_scan(SENSOR, 100, seed) for seed in range(130)]
@@ -44,7 +56,9 @@ def cut(path: Path, at: int) -> None:
 def test_a_damaged_cache_is_made_again(
     tmp_path: Path, damage: Callable[[Path, int], None], file: str, at: int
 ) -> None:
-    made = np.array(cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False).fields["range"])
+    made = np.array(
+        cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False).fields["range"]
+    )
     damage(tmp_path / file, at)
     with pytest.warns(UserWarning, match="made again"):
         again = cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
@@ -87,11 +101,15 @@ def test_damaged_latents_are_made_again(
     cache = cache_scans(SCANS[:3], SENSOR, ["range"], progress=False)
     tensors = TensorFormat(("range",), NORMALISATIONS["r2flow"])
     codec: Any = Halves()
-    made = np.array(cache_latents(cache, tensors, codec, "cpu", tmp_path, "abc", progress=False))
+    made = np.array(
+        cache_latents(cache, tensors, codec, "cpu", tmp_path, "abc", progress=False)
+    )
     [path] = tmp_path.glob(f"latents-*{suffix}")
     damage(path, 30)
     with pytest.warns(UserWarning, match="latents are made again"):
-        again = cache_latents(cache, tensors, codec, "cpu", tmp_path, "abc", progress=False)
+        again = cache_latents(
+            cache, tensors, codec, "cpu", tmp_path, "abc", progress=False
+        )
     assert np.array_equal(again, made)
 
 
@@ -126,14 +144,22 @@ def test_no_flipped_bit_of_a_state_is_resumed(tmp_path: Path) -> None:
             continue
         assert other.step == 3
         assert all(
-            torch.equal(expected[f"network.{n}"], p) for n, p in other.network.state_dict().items()
+            torch.equal(expected[f"network.{n}"], p)
+            for n, p in other.network.state_dict().items()
         )
     assert refused > 180
 
 
 @pytest.mark.parametrize(
     "name",
-    ["x", "network", "network.weight", "optimizer.a.b.c", "optimizer.0.0", "optimizer.9.0.step"],
+    [
+        "x",
+        "network",
+        "network.weight",
+        "optimizer.a.b.c",
+        "optimizer.0.0",
+        "optimizer.9.0.step",
+    ],
 )
 def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / STATE
@@ -193,11 +219,15 @@ def test_a_run_with_a_damaged_state_begins_anew_and_says_so(tmp_path: Path) -> N
     expected = load_file(run(tiny(tmp_path / "run")))
     flip(tmp_path / "run" / STATE, -100)
     shutil.copy(tmp_path / "run" / STATE, tmp_path / "damaged")
-    (tmp_path / "run" / ".state.safetensors.12345678.part").write_bytes(b"of a killed run")
+    (tmp_path / "run" / ".state.safetensors.12345678.part").write_bytes(
+        b"of a killed run"
+    )
     with pytest.warns(UserWarning, match="begins anew"):
         found = load_file(run(tiny(tmp_path / "run"), resume=True))
     assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
-    assert (tmp_path / "run" / "state.damaged").read_bytes() == (tmp_path / "damaged").read_bytes()
+    assert (tmp_path / "run" / "state.damaged").read_bytes() == (
+        tmp_path / "damaged"
+    ).read_bytes()
     assert not list((tmp_path / "run").glob(".*.part"))
 
 
@@ -210,7 +240,9 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["name", "shape", "steps"])
-def test_moments_that_the_next_step_could_not_use_are_refused(tmp_path: Path, change: str) -> None:
+def test_moments_that_the_next_step_could_not_use_are_refused(
+    tmp_path: Path, change: str
+) -> None:
     path = tmp_path / STATE
     training().save(path)
     tensors = load_file(path)

@@ -49,7 +49,9 @@ def test_the_segmenter_learns_as_its_confusion_matrix_shows() -> None:
     torch.manual_seed(0)
     network = RangeSegmenter(widths=(8, 8, 8))
     untrained = mean_iou(confusion(network.eval(), batches(4, 1), HEIGHT))
-    losses = train_segmenter(network, batches(80), HEIGHT, 80, rate=2e-2, progress=False)
+    losses = train_segmenter(
+        network, batches(80), HEIGHT, 80, rate=2e-2, progress=False
+    )
     table = confusion(network, batches(4, 1), HEIGHT)
     assert np.mean(losses[-5:]) < 0.5 * losses[0]
     assert table.sum() == 4 * 2 * 16 * 24, "ignored cells are counted"
@@ -99,7 +101,9 @@ def test_a_judge_sees_a_scan_as_the_network_sees_its_image(judge: Judge) -> None
         height,
     )
     with torch.inference_mode():
-        assert np.allclose(judge.features([scan]), judge.network.features(inputs).numpy())
+        assert np.allclose(
+            judge.features([scan]), judge.network.features(inputs).numpy()
+        )
         said = judge.network(inputs)[0].argmax(0).numpy()
     label = image.channels["label"]
     table = judge.agreement([scan])

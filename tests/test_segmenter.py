@@ -3,7 +3,11 @@
 import pytest
 import torch
 
-from lidar_synth.lab.evaluate.segmenter import ROW_BANDS, RangeSegmenter, segmenter_input
+from lidar_synth.lab.evaluate.segmenter import (
+    ROW_BANDS,
+    RangeSegmenter,
+    segmenter_input,
+)
 
 
 def test_shapes_and_that_columns_wrap() -> None:
@@ -15,7 +19,9 @@ def test_shapes_and_that_columns_wrap() -> None:
     assert network.features(x).shape == (2, ROW_BANDS * 8)
     # A turn of the sensor by a multiple of the total stride turns the answer.
     assert torch.allclose(network(x.roll(16, -1)), logits.roll(16, -1), atol=1e-5)
-    assert torch.allclose(network.features(x.roll(16, -1)), network.features(x), atol=1e-5)
+    assert torch.allclose(
+        network.features(x.roll(16, -1)), network.features(x), atol=1e-5
+    )
 
 
 @pytest.mark.slow

@@ -26,7 +26,9 @@ LASERS = {
 def test_all_required_presets_exist() -> None:
     assert set(presets()) >= DESIGN
     values = {
-        k: v for k, v in presets()["town"].to_dict().items() if k not in ("name", "description")
+        k: v
+        for k, v in presets()["town"].to_dict().items()
+        if k not in ("name", "description")
     }
     assert values == {k: presets()["hdl64e_kitti360"].to_dict()[k] for k in values}
 
@@ -43,13 +45,25 @@ def test_lasers_beside_each_other_point_apart() -> None:
     azimuths = presets()["vls128"].azimuths
     assert azimuths is not None
     values, counts = np.unique(azimuths, return_counts=True)
-    assert values.tolist() == [-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354] and set(
-        counts
-    ) == {16}
-    assert dict(zip(presets()["vls128"].elevations or (), azimuths, strict=True))[-11.742] == 6.354
+    assert values.tolist() == [
+        -6.354,
+        -4.548,
+        -2.732,
+        -0.911,
+        0.911,
+        2.732,
+        4.548,
+        6.354,
+    ] and set(counts) == {16}
+    assert (
+        dict(zip(presets()["vls128"].elevations or (), azimuths, strict=True))[-11.742]
+        == 6.354
+    )
 
 
-def test_a_sensor_is_unchanged_by_yaml_copies_and_files(sensor: Sensor, tmp_path: Path) -> None:
+def test_a_sensor_is_unchanged_by_yaml_copies_and_files(
+    sensor: Sensor, tmp_path: Path
+) -> None:
     assert Sensor.from_dict(yaml.safe_load(yaml.safe_dump(sensor.to_dict()))) == sensor
     assert copy.deepcopy(sensor) == sensor  # as pickling would rebuild it
     values = sensor.to_dict()
@@ -59,7 +73,9 @@ def test_a_sensor_is_unchanged_by_yaml_copies_and_files(sensor: Sensor, tmp_path
 
 
 @pytest.mark.parametrize("rays", ["centre", "corner"])
-def test_rays_are_unit_vectors_in_the_documented_frame(sensor: Sensor, rays: str) -> None:
+def test_rays_are_unit_vectors_in_the_documented_frame(
+    sensor: Sensor, rays: str
+) -> None:
     for s in (sensor, sensor.by_beams()):
         rays_xyz = s.ray_directions(rays)  # type: ignore[arg-type]
         assert rays_xyz.shape == (*s.shape, 3)
@@ -68,7 +84,9 @@ def test_rays_are_unit_vectors_in_the_documented_frame(sensor: Sensor, rays: str
         middle = s.columns // 2
         # Ahead in the middle, the seam behind.
         assert rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0
-        assert rays_xyz[0, middle + s.columns // 4, 1] < 0  # clockwise: to the right of ahead is -y
+        assert (
+            rays_xyz[0, middle + s.columns // 4, 1] < 0
+        )  # clockwise: to the right of ahead is -y
         assert not rays_xyz.flags.writeable
 
 
@@ -81,7 +99,9 @@ def test_rows_lie_between_their_edges(sensor: Sensor) -> None:
 
 def test_laser_elevations_are_the_beams_or_the_rows() -> None:
     assert np.allclose(
-        np.degrees(presets()["town"].laser_elevations[[0, -1]]), [2.53, -23.62], atol=1e-5
+        np.degrees(presets()["town"].laser_elevations[[0, -1]]),
+        [2.53, -23.62],
+        atol=1e-5,
     )
     linear = presets()["os1_128"]
     assert np.array_equal(linear.laser_elevations, linear.row_elevations())
@@ -91,15 +111,21 @@ def test_laser_elevations_are_the_beams_or_the_rows() -> None:
 def test_lasers_of_a_fitted_sensor_point_where_they_were_fitted() -> None:
     """Beams are corrected for the height of their laser; the elevations of ``fit_sensor`` are the
     lasers' own."""
-    fitted = Sensor("fitted", 8, 1.0, 90.0, elevations=(2.0, -8.0), heights=(0.05, -0.05))
+    fitted = Sensor(
+        "fitted", 8, 1.0, 90.0, elevations=(2.0, -8.0), heights=(0.05, -0.05)
+    )
     elevation, height = fitted.optics()
-    assert np.allclose(np.degrees(elevation), [2.0, -8.0], atol=1e-5) and height.tolist() == [
+    assert np.allclose(
+        np.degrees(elevation), [2.0, -8.0], atol=1e-5
+    ) and height.tolist() == [
         0.05,
         -0.05,
     ]
     rays = rays_of(fitted)
     assert np.allclose(
-        rays.height + 9.0 * rays.slope, 9.0 * np.tan(np.radians([2.0, -8.0])) + height, atol=1e-6
+        rays.height + 9.0 * rays.slope,
+        9.0 * np.tan(np.radians([2.0, -8.0])) + height,
+        atol=1e-6,
     )
     town = presets()["town"]
     lower = np.asarray(town.heights) > 0
@@ -149,9 +175,9 @@ def test_numbers_of_numpy_become_those_of_python() -> None:
     }
     sensor = Sensor.from_dict({**GOOD, **numbers})
     assert sensor == Sensor.from_dict(GOOD) and sensor.to_dict() == GOOD
-    assert json.loads(json.dumps(sensor.to_dict())) == GOOD and "range_max: 9.0" in sensor_yaml(
-        sensor
-    )
+    assert json.loads(
+        json.dumps(sensor.to_dict())
+    ) == GOOD and "range_max: 9.0" in sensor_yaml(sensor)
 
 
 def test_unknown_names_and_invalid_files_are_explained(tmp_path: Path) -> None:

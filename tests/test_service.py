@@ -77,7 +77,9 @@ def test_slots_notice_damage(generator: Generator) -> None:
     with pytest.raises(DataError, match="scan 2 in slot 1"):
         slots.read(1, 2, checksum)
     slots._slot(1)[100] ^= 1
-    with pytest.raises(DataError, match="scan 1 in slot 1 of the rolling bank is damaged"):
+    with pytest.raises(
+        DataError, match="scan 1 in slot 1 of the rolling bank is damaged"
+    ):
         slots.read(1, 1, checksum)
 
 
@@ -91,13 +93,19 @@ def test_last_words_fit() -> None:
 
 @pytest.mark.slow
 @settings(max_examples=15)
-@given(numbers=st.lists(st.integers(0, 20) | st.integers(0, 2**62), min_size=1, max_size=5))
+@given(
+    numbers=st.lists(st.integers(0, 20) | st.integers(0, 2**62), min_size=1, max_size=5)
+)
 def test_a_rolling_bank_gives_the_generators_scans_in_every_order(
     bank: RollingBank, generator: Generator, numbers: list[int]
 ) -> None:
     for number in numbers:
         scan = bank[number]
-        assert (scan.id, scan.domain, scan.sensor) == (f"small/{SEED}/{number}", SYNTHETIC, SENSOR)
+        assert (scan.id, scan.domain, scan.sensor) == (
+            f"small/{SEED}/{number}",
+            SYNTHETIC,
+            SENSOR,
+        )
         assert agree(codes(scan), expected(generator, number))
         image = Encoding(SENSOR, FIELDS).encode(bank.image(number))
         assert all(
@@ -126,12 +134,18 @@ class Codes(Dataset[Any]):
     "options",
     [
         {},
-        {"num_workers": 2, "multiprocessing_context": "fork", "persistent_workers": True},
+        {
+            "num_workers": 2,
+            "multiprocessing_context": "fork",
+            "persistent_workers": True,
+        },
         {"num_workers": 1, "multiprocessing_context": "spawn"},
     ],
     ids=["main", "fork", "spawn"],
 )
-def test_workers_read_it(bank: RollingBank, generator: Generator, options: dict[str, Any]) -> None:
+def test_workers_read_it(
+    bank: RollingBank, generator: Generator, options: dict[str, Any]
+) -> None:
     numbers = [3, 3, 40, 41, 42, 5, 43, 0]
     bank[7]  # so that a fork inherits an open connection
     bank.expect(numbers)
@@ -140,7 +154,8 @@ def test_workers_read_it(bank: RollingBank, generator: Generator, options: dict[
         given = [sample for batch in loader for sample in batch]
         assert [name for name, _ in given] == [f"small/{SEED}/{n}" for n in numbers]
         assert all(
-            agree(c, expected(generator, n)) for (_, c), n in zip(given, numbers, strict=True)
+            agree(c, expected(generator, n))
+            for (_, c), n in zip(given, numbers, strict=True)
         )
     assert bank[1].id == f"small/{SEED}/1"
 
@@ -159,7 +174,9 @@ def test_threads_read_it(bank: RollingBank) -> None:
     for thread in threads:
         thread.join(60)
     assert sorted(found) == sorted(f"small/{SEED}/{n}" for n in range(40))
-    assert len(lines) == 4  # answers cannot be mixed up; nor between a process and its fork:
+    assert (
+        len(lines) == 4
+    )  # answers cannot be mixed up; nor between a process and its fork:
     assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
 
 
@@ -175,7 +192,10 @@ def test_announced_scans_are_made_before_they_are_requested(path: Path) -> None:
             f"small/{SEED}/{n}" for n in (102, 100, 101)
         ]
         after = bank.counts()
-        assert (after["served"] - before["served"], after["waited"] - before["waited"]) == (3, 0)
+        assert (
+            after["served"] - before["served"],
+            after["waited"] - before["waited"],
+        ) == (3, 0)
         many = list(range(200, 20_200))
         bank.expect(many)  # more than one message
         wait_until(lambda: bank.counts()["made"] >= after["made"] + 6)
@@ -197,13 +217,19 @@ def test_micro_batches_change_rounding_only(path: Path, generator: Generator) ->
     with RollingBank(path, seed=SEED, slots=8, threads=1, timeout=60, batch=3) as bank:
         pairs = [(codes(bank[n]), expected(generator, n)) for n in range(30)]
     for name in ("range", *FIELDS):
-        given, whole = (np.stack([p[k][name] for p in pairs]).astype(int) for k in (0, 1))
-        assert (abs(given - whole) <= 1).mean() >= 0.999  # one step of the encoding: 1.2 mm
+        given, whole = (
+            np.stack([p[k][name] for p in pairs]).astype(int) for k in (0, 1)
+        )
+        assert (
+            abs(given - whole) <= 1
+        ).mean() >= 0.999  # one step of the encoding: 1.2 mm
 
 
 @pytest.mark.slow
 def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) -> None:
-    with RollingBank(path, seed=SEED, slots=4, refresh=0.5, threads=1, timeout=60) as bank:
+    with RollingBank(
+        path, seed=SEED, slots=4, refresh=0.5, threads=1, timeout=60
+    ) as bank:
         assert [bank[n].id[-1] for n in range(8)] == list("01230123")
         bank.expect([17])  # a pool goes by epochs
         bank.set_epoch(1)
@@ -213,8 +239,12 @@ def test_a_pool_is_refreshed_with_the_epoch(path: Path, generator: Generator) ->
 
 
 @pytest.mark.slow
-def test_a_starved_bank_serves_scans_in_memory(path: Path, generator: Generator) -> None:
-    with RollingBank(path, seed=SEED, slots=4, starved="reuse", threads=1, timeout=60) as bank:
+def test_a_starved_bank_serves_scans_in_memory(
+    path: Path, generator: Generator
+) -> None:
+    with RollingBank(
+        path, seed=SEED, slots=4, starved="reuse", threads=1, timeout=60
+    ) as bank:
         bank[0]
         for number in range(100, 160):
             scan = bank[number]
@@ -252,7 +282,8 @@ def test_invalid_options_and_requests_are_refused(
 @pytest.mark.slow
 def test_the_error_names_why_the_process_did_not_start(path: Path) -> None:
     with pytest.raises(
-        ProcessError, match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere"
+        ProcessError,
+        match=r"died \(process \d+, exit code 1; .*device 'nowhere'|nowhere",
     ):
         RollingBank(path, device="nowhere", timeout=60)
 
@@ -324,7 +355,8 @@ def test_batch_mixing_takes_a_batch_sampler_and_several_sources(
         assert agree(values, dataset[position][1])
     for options in ({}, {"batch_size": 2, "batch_sampler": dataset.batches(2)}):
         with pytest.raises(
-            ConfigError, match="batch_size=.* and batch_sampler=.*; expected one of them"
+            ConfigError,
+            match="batch_size=.* and batch_sampler=.*; expected one of them",
         ):
             BatchMixer(dataset, **options)
 

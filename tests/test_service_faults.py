@@ -66,7 +66,9 @@ def gone(pid: int, seconds: float = 20) -> bool:
 
 @pytest.mark.slow
 def test_a_bank_outlives_a_worker_and_names_a_dead_generator(bank: RollingBank) -> None:
-    loader = DataLoader(Ids(bank), batch_size=2, num_workers=2, multiprocessing_context="fork")
+    loader = DataLoader(
+        Ids(bank), batch_size=2, num_workers=2, multiprocessing_context="fork"
+    )
     batches: Any = iter(loader)
     next(batches)
     os.kill(batches._workers[0].pid, signal.SIGKILL)
@@ -86,14 +88,17 @@ def test_a_bank_outlives_a_worker_and_names_a_dead_generator(bank: RollingBank) 
 
 
 @pytest.mark.slow
-def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(bank: RollingBank) -> None:
+def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(
+    bank: RollingBank,
+) -> None:
     bank[0]
     os.kill(bank.pid, signal.SIGSTOP)
     bank._client.timeout = 0.3
     start = time.monotonic()
     for _ in range(2):
         with pytest.raises(
-            ProcessError, match=rf"process {bank.pid}, .*has not answered \(scan 5\) within 0.3 s"
+            ProcessError,
+            match=rf"process {bank.pid}, .*has not answered \(scan 5\) within 0.3 s",
         ):
             bank[5]
     with pytest.raises(ProcessError, match="has not answered within 0.3 s"):
@@ -113,7 +118,8 @@ def test_a_generator_that_hangs_is_not_waited_for_longer_than_stated(bank: Rolli
 
 def test_a_model_that_loads_for_too_long(path: Path) -> None:
     with pytest.raises(
-        ProcessError, match="0 scans made so far.* has not loaded the model within 0.01 s"
+        ProcessError,
+        match="0 scans made so far.* has not loaded the model within 0.01 s",
     ):
         RollingBank(path, timeout=0.01)
 
@@ -128,7 +134,8 @@ def test_the_generators_last_words_are_heard(path: Path, tmp_path: Path) -> None
     with RollingBank(broken, threads=1, timeout=60) as bank:
         for _ in range(2):
             with pytest.raises(
-                ProcessError, match=r"died \(process \d+, exit code 1; DataError: .*NaN or infinity"
+                ProcessError,
+                match=r"died \(process \d+, exit code 1; DataError: .*NaN or infinity",
             ):
                 bank[0]
 
@@ -186,7 +193,9 @@ def test_a_trainer_that_ends_without_closing_leaves_nothing(
         os.killpg(trainer.pid, signal.SIGINT)  # as a terminal does it
     errors = trainer.communicate(timeout=60)[1]
     assert trainer.returncode == code, errors
-    assert errors.count("Traceback") == (how in ("raise", "interrupt"))  # the generator is silent
+    assert errors.count("Traceback") == (
+        how in ("raise", "interrupt")
+    )  # the generator is silent
     assert gone(int(pid))
 
 
@@ -194,19 +203,32 @@ def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER + "main()\n")
     trainer = subprocess.run(
-        [sys.executable, script, path, "return"], capture_output=True, text=True, timeout=60
+        [sys.executable, script, path, "return"],
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert trainer.returncode == 1
     assert (
-        "A script that starts processes begins with: if __name__ == '__main__':" in trainer.stderr
+        "A script that starts processes begins with: if __name__ == '__main__':"
+        in trainer.stderr
     )
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"
+)
 def test_a_killed_trainer_leaves_nothing() -> None:
     """A short run of the stress test; the whole one takes minutes."""
-    call = [sys.executable, ROOT / "tools" / "stress_service.py", "--kills", "1", "--reads", "0"]
+    call = [
+        sys.executable,
+        ROOT / "tools" / "stress_service.py",
+        "--kills",
+        "1",
+        "--reads",
+        "0",
+    ]
     run = subprocess.run(call, capture_output=True, text=True, timeout=240)
     assert run.returncode == 0, run.stdout + run.stderr
     assert "1 kills: 0 went wrong" in run.stdout

@@ -7,7 +7,12 @@ import numpy as np
 from hypothesis import given, settings
 
 from lidar_synth.mixing.service.ledger import COUNTERS, Ledger
-from lidar_synth.mixing.service.outlook import NEVER, KnownOrder, RotatingPool, SequentialPrefetch
+from lidar_synth.mixing.service.outlook import (
+    NEVER,
+    KnownOrder,
+    RotatingPool,
+    SequentialPrefetch,
+)
 
 
 def test_sequential_prefetch_follows_the_requests() -> None:
@@ -39,7 +44,10 @@ def test_a_known_order_predicts_every_use() -> None:
     assert outlook.upcoming({7, 8, 9}) is None
     outlook = KnownOrder([7, 9, 7, 8], window=4)
     assert [outlook.answer(n) for n in (7, 9)] == [7, 9]
-    assert outlook.upcoming(()) == (2, 7)  # what was asked for already is not made for that
+    assert outlook.upcoming(()) == (
+        2,
+        7,
+    )  # what was asked for already is not made for that
     for number in (7, 8, 5):
         assert outlook.answer(number) == number
     assert outlook.next_use(7, 0) == NEVER
@@ -99,7 +107,10 @@ def test_scans_are_made_in_the_order_of_their_use() -> None:
     ledger = Ledger(4, np.zeros(4, np.int64))
     assert claimed(ledger) == [0, 1]  # half of the slots at a time
     ledger.expect([5, 1, 5, 6, 7, 8])
-    assert claimed(ledger) == [5, 6]  # in the place of what is not there and of 0; 1 is kept
+    assert claimed(ledger) == [
+        5,
+        6,
+    ]  # in the place of what is not there and of 0; 1 is kept
     ledger.give_back(ledger.lend(5))
     assert claimed(ledger) == [7]
     lent = [ledger.lend(1), ledger.lend(5)]
@@ -112,7 +123,9 @@ def test_a_scan_that_is_read_stays_until_it_is_given_back() -> None:
     ledger = Ledger(1, np.zeros(4, np.int64))
     assert claimed(ledger) == [0]
     lent = ledger.lend(0)
-    thread = threading.Thread(target=lambda: ledger.give_back(ledger.lend(1)), daemon=True)
+    thread = threading.Thread(
+        target=lambda: ledger.give_back(ledger.lend(1)), daemon=True
+    )
     thread.start()
     maker = threading.Thread(target=claimed, args=(ledger,), daemon=True)
     maker.start()

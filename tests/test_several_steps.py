@@ -32,11 +32,21 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
     config = distilling(scans, tmp_path, teacher)
     call("distill", config, "also=[2, 1]")
     header, _ = read_header(tmp_path / "run" / "run.safetensors")
-    assert [len(grid) - 1 for grid in (header.time_grid, *header.other_grids)] == [4, 2, 1]
+    assert [len(grid) - 1 for grid in (header.time_grid, *header.other_grids)] == [
+        4,
+        2,
+        1,
+    ]
     student = load_generator(tmp_path / "run" / "run.safetensors")
-    assert student.network.ends and student.network.step.out.weight.any()  # it was trained
-    images = [student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)]
-    assert np.array_equal(images[2], images[3]) and not np.array_equal(images[0], images[1])
+    assert (
+        student.network.ends and student.network.step.out.weight.any()
+    )  # it was trained
+    images = [
+        student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)
+    ]
+    assert np.array_equal(images[2], images[3]) and not np.array_equal(
+        images[0], images[1]
+    )
     with pytest.raises(ConfigError, match="it predicts mean velocities"):
         student.range_images(0, [1], solver="heun")
     call("distill", config, "also=[2, 1]", "--resume", "recipe.iterations=6")
@@ -44,9 +54,16 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
     with pytest.raises(ConfigError, match="a student of several numbers of steps"):
         call("distill", config, f"teacher={made}", f"output={tmp_path / 'other'}")
     with pytest.raises(
-        ConfigError, match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise"
+        ConfigError,
+        match=r"also=\[2\] for a hdit by reflow; expected an hdit, adaptive_piecewise",
     ):
-        call("distill", config, "also=[2]", "strategy=reflow", f"output={tmp_path / 'other'}")
+        call(
+            "distill",
+            config,
+            "also=[2]",
+            "strategy=reflow",
+            f"output={tmp_path / 'other'}",
+        )
     call(
         "train",
         write_config(scans, tmp_path, recipe={"iterations": 1}),
@@ -61,15 +78,23 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
 def test_a_student_is_not_distilled_on_the_town_in_place_of_the_teachers_scans(
     teacher: Path, tmp_path: Path
 ) -> None:
-    given = [f"teacher={teacher}", f"output={tmp_path / 'run'}", "weaker=null", "guidance=1"]
+    given = [
+        f"teacher={teacher}",
+        f"output={tmp_path / 'run'}",
+        "weaker=null",
+        "guidance=1",
+    ]
     with pytest.raises(
-        ConfigError, match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null"
+        ConfigError,
+        match=r"data.town=3000 for teacher .*, which learnt from .*data.town=null",
     ):
         call("distill", "town_pixel_student", *given)
     assert not (tmp_path / "run" / "cache").exists()
 
 
-def test_a_damaged_selection_is_made_again(scans: Path, teacher: Path, tmp_path: Path) -> None:
+def test_a_damaged_selection_is_made_again(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
     config = distilling(scans, tmp_path, teacher)
     path = tmp_path / "run" / "selection.npz"
     path.parent.mkdir()

@@ -15,7 +15,14 @@ import torch
 from PIL import Image
 from torch.utils.data import DataLoader
 
-from lidar_synth import MixedScans, RollingBank, SemanticKITTI, Source, Town, load_generator
+from lidar_synth import (
+    MixedScans,
+    RollingBank,
+    SemanticKITTI,
+    Source,
+    Town,
+    load_generator,
+)
 from lidar_synth.bank import Bank
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.cli.bake import bake
@@ -65,10 +72,13 @@ def test_scans_follow_their_images(tmp_path: Path) -> None:
         Image.fromarray(town.image(i)).save(path := tmp_path / f"{i}.png")
         streets.append(replace(town[i], image_path=path))
     generator = load_generator("town-camera")
-    made = [generator.scans(0, [0], scan, steps=2)[0] for scan in streets]  # the same noise for all
+    made = [
+        generator.scans(0, [0], scan, steps=2)[0] for scan in streets
+    ]  # the same noise for all
     assert made[0].sensor == streets[0].sensor
     own, other = (
-        sight_agreement(made, some).value for some in (streets, [*streets[1:], streets[0]])
+        sight_agreement(made, some).value
+        for some in (streets, [*streets[1:], streets[0]])
     )
     assert own > other + 0.02
 
@@ -98,7 +108,9 @@ def real(request: pytest.FixtureRequest) -> Source:
     root = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
     if not root:
         pytest.skip("LIDAR_SYNTH_REAL_SCANS is not set")
-    source = SemanticKITTI(Path(root) / "semantic_kitti", sensor="hdl64e_lasers", split="train")
+    source = SemanticKITTI(
+        Path(root) / "semantic_kitti", sensor="hdl64e_lasers", split="train"
+    )
     return [source[i] for i in range(SCANS)]
 
 
@@ -111,7 +123,9 @@ def test_shipped_weights_state_their_licence_and_no_local_paths(name: str) -> No
 
 def sure(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """A teacher for pseudo labels with high confidence in half of the points."""
-    return np.full(len(scan), 8, np.uint8), (np.arange(len(scan)) % 2).astype(np.float32)
+    return np.full(len(scan), 8, np.uint8), (np.arange(len(scan)) % 2).astype(
+        np.float32
+    )
 
 
 @pytest.mark.slow
@@ -127,7 +141,9 @@ def test_every_source_gives_the_same_scan(
         given = encoding.encode(project(scan, generator.sensor, FIELDS))
         whole = encoding.encode(generator.range_images(0, [index])[0])
         for name, values in whole.items():
-            assert (abs(given[name].astype(int) - values.astype(int)) <= 1).mean() > 0.9999, (
+            assert (
+                abs(given[name].astype(int) - values.astype(int)) <= 1
+            ).mean() > 0.9999, (
                 number,
                 name,
             )
@@ -142,10 +158,19 @@ def test_every_source_and_label_policy_mixes_with_real_scans(
     kind: str, policy: str, sources: dict[str, Any], real: Source
 ) -> None:
     options = (
-        {"teacher": sure} if policy == "pseudo" else {"kind": "laser"} if policy == "mix" else {}
+        {"teacher": sure}
+        if policy == "pseudo"
+        else {"kind": "laser"}
+        if policy == "mix"
+        else {}
     )
     train = MixedScans(
-        real, sources[kind], 0.5, labels=policy, label_options=options, unlabelled="allow"
+        real,
+        sources[kind],
+        0.5,
+        labels=policy,
+        label_options=options,
+        unlabelled="allow",
     )
     seen = {0: 0, 1: 0}
     for batch in DataLoader(train, 3, collate_fn=train.collate):

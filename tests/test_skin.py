@@ -14,21 +14,36 @@ from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin, returns
+from lidar_synth.lab.town import (
+    STRETCH_FRAMES,
+    Skin,
+    Town,
+    fit_skin,
+    load_skin,
+    returns,
+)
 from lidar_synth.lab.town.returns import ReturnNoise
 from lidar_synth.lab.town.skin.features import features
 from lidar_synth.lab.town.skin.skin import BOXED, LONGEST, SOFT, shapes
 from lidar_synth.lab.town.skin.tables import grouped_quantiles, lookup
 
 SENSOR = Sensor(
-    "small", columns=900, range_min=1.0, range_max=80.0, rows=32, fov_up=3.0, fov_down=-25.0
+    "small",
+    columns=900,
+    range_min=1.0,
+    range_max=80.0,
+    rows=32,
+    fov_up=3.0,
+    fov_down=-25.0,
 )
 STREETS = 5
 
 pytestmark = pytest.mark.slow
 
 
-def cast(seed: int, skin: Skin | None = None, noise: ReturnNoise | None = None) -> list[Scan]:
+def cast(
+    seed: int, skin: Skin | None = None, noise: ReturnNoise | None = None
+) -> list[Scan]:
     """One scan of each of some streets."""
     town = Town(seed, SENSOR, STREETS * STRETCH_FRAMES, noise=noise, skin=skin)
     return [town[STRETCH_FRAMES * k + 4] for k in range(STREETS)]
@@ -59,7 +74,11 @@ def altered() -> list[Scan]:
         bright[scan.ring == 20] += 0.08
         out.append(
             replace(
-                scan, reflectance=bright.astype(np.float32), label=None, raw_label=None, boxes=None
+                scan,
+                reflectance=bright.astype(np.float32),
+                label=None,
+                raw_label=None,
+                boxes=None,
             )
         )
     return out
@@ -67,7 +86,9 @@ def altered() -> list[Scan]:
 
 @pytest.fixture(scope="module")
 def skin(altered: list[Scan]) -> Skin:
-    return fit_skin(altered, SENSOR, licence="none", streets=STREETS, lasers=True, progress=False)
+    return fit_skin(
+        altered, SENSOR, licence="none", streets=STREETS, lasers=True, progress=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -76,14 +97,17 @@ def dressed(skin: Skin) -> list[Scan]:
 
 
 def reflectance_quantiles(scans: list[Scan], ring: int | None = None) -> np.ndarray:
-    values = [s.reflectance if ring is None else s.reflectance[s.ring == ring] for s in scans]
+    values = [
+        s.reflectance if ring is None else s.reflectance[s.ring == ring] for s in scans
+    ]
     return np.quantile(np.concatenate(values), np.linspace(0.1, 0.9, 9))
 
 
 def range_residual(scans: list[Scan]) -> float:
     """Metres, median deviation of the range from its neighbours in the ring."""
     found = [
-        features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual for s in scans
+        features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual
+        for s in scans
     ]  # type: ignore[union-attr]
     return float(np.nanmedian(np.abs(np.concatenate(found))))
 
@@ -105,10 +129,17 @@ def test_a_skin_has_the_offset_of_each_laser(skin: Skin) -> None:
     assert np.abs(np.delete(offset, 20)).max() < 0.03
 
 
-def test_a_skin_of_the_town_itself_changes_little(plain: list[Scan], undressed: list[Scan]) -> None:
-    own = fit_skin(plain, SENSOR, licence="none", seed=11, streets=STREETS, progress=False)
+def test_a_skin_of_the_town_itself_changes_little(
+    plain: list[Scan], undressed: list[Scan]
+) -> None:
+    own = fit_skin(
+        plain, SENSOR, licence="none", seed=11, streets=STREETS, progress=False
+    )
     same = cast(13, own)
-    assert np.abs(reflectance_quantiles(same) - reflectance_quantiles(undressed)).max() < 0.02
+    assert (
+        np.abs(reflectance_quantiles(same) - reflectance_quantiles(undressed)).max()
+        < 0.02
+    )
     assert range_residual(same) == pytest.approx(range_residual(undressed), rel=0.15)
     assert sum(map(len, same)) == pytest.approx(sum(map(len, undressed)), rel=0.02)
 
@@ -116,18 +147,22 @@ def test_a_skin_of_the_town_itself_changes_little(plain: list[Scan], undressed: 
 def test_labels_rings_and_boxes_stay_and_points_move_along_their_rays(
     skin: Skin, undressed: list[Scan], dressed: list[Scan]
 ) -> None:
-    every = replace(skin, arrays={**skin.arrays, "missing": np.zeros_like(skin.arrays["missing"])})
+    every = replace(
+        skin, arrays={**skin.arrays, "missing": np.zeros_like(skin.arrays["missing"])}
+    )
     for k, before in enumerate(undressed[:2]):
-        after = Town(13, SENSOR, STREETS * STRETCH_FRAMES, skin=every)[STRETCH_FRAMES * k + 4]
+        after = Town(13, SENSOR, STREETS * STRETCH_FRAMES, skin=every)[
+            STRETCH_FRAMES * k + 4
+        ]
         for name in ("raw_label", "ring", "instance", "pose"):
             assert np.array_equal(getattr(before, name), getattr(after, name)), name
         assert np.array_equal(before.boxes.values, after.boxes.values)  # type: ignore[union-attr]
         shift = np.linalg.norm(after.points - before.points, axis=1)
         assert 0.05 < shift.max() < SOFT + 1e-3
         assert shift[before.instance > 0].max() < BOXED + 1e-3
-        across = np.linalg.norm(np.cross(after.points, before.points), axis=1) / np.linalg.norm(
-            before.points, axis=1
-        )
+        across = np.linalg.norm(
+            np.cross(after.points, before.points), axis=1
+        ) / np.linalg.norm(before.points, axis=1)
         assert across.max() < 0.05
         assert len(dressed[k]) <= len(before)
 
@@ -135,9 +170,12 @@ def test_labels_rings_and_boxes_stay_and_points_move_along_their_rays(
 def test_points_stay_in_their_boxes(dressed: list[Scan]) -> None:
     for scan in dressed:
         assert scan.boxes is not None and scan.instance is not None
-        grown = 2 * (0.1 + BOXED)  # 0.1 m on each side, as without a skin, and what a skin may add
+        grown = 2 * (
+            0.1 + BOXED
+        )  # 0.1 m on each side, as without a skin, and what a skin may add
         wider = replace(
-            scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, grown, grown, grown, 0])
+            scan.boxes,
+            values=scan.boxes.values + np.float32([0, 0, 0, grown, grown, grown, 0]),
         )
         inside = wider.contain(scan.points)
         for i, instance in enumerate(scan.boxes.instance):
@@ -161,13 +199,18 @@ def test_a_saved_skin_is_the_same(skin: Skin, tmp_path: Path) -> None:
     back.save(tmp_path / "b.skin")
     assert (tmp_path / "a.skin").read_bytes() == (tmp_path / "b.skin").read_bytes()
     assert back.sensor == SENSOR and back.provenance == skin.provenance
-    assert all(np.allclose(back.arrays[k], v, atol=1e-3, rtol=1e-3) for k, v in skin.arrays.items())
+    assert all(
+        np.allclose(back.arrays[k], v, atol=1e-3, rtol=1e-3)
+        for k, v in skin.arrays.items()
+    )
 
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda b: b"",
     "cut": lambda b: b[: len(b) // 2],
-    "a flipped bit of the values": lambda b: b[:-1000] + bytes([b[-1000] ^ 1]) + b[-999:],
+    "a flipped bit of the values": lambda b: (
+        b[:-1000] + bytes([b[-1000] ^ 1]) + b[-999:]
+    ),
     "another licence": lambda b: b.replace(b"none", b"free"),
     "another format": lambda b: b.replace(b"lidar-synth-skin/1", b"lidar-synth-skin/9"),
     "a header of another size": lambda b: b"\xff" * 8 + b[8:],
@@ -205,11 +248,17 @@ WRONG: dict[str, tuple[Callable[[Skin], object], type[LidarSynthError], str]] = 
         "1800 firings",
     ),
     "an unknown name": (lambda s: Town(skin="no_such"), ConfigError, "one of"),
-    "a missing file": (lambda s: load_skin("no/such.skin"), FileError, "cannot be read"),
+    "a missing file": (
+        lambda s: load_skin("no/such.skin"),
+        FileError,
+        "cannot be read",
+    ),
     "another suffix": (lambda s: s.save("skin.npz"), ConfigError, "ends in .skin"),
     "other arrays": (lambda s: replace(s, arrays={}), ConfigError, "arrays"),
     "not a number": (
-        lambda s: replace(s, arrays={**s.arrays, "missing": s.arrays["missing"] * np.nan}),
+        lambda s: replace(
+            s, arrays={**s.arrays, "missing": s.arrays["missing"] * np.nan}
+        ),
         ConfigError,
         "not finite",
     ),
@@ -226,7 +275,13 @@ def test_wrong_use_is_an_error(skin: Skin, name: str) -> None:
 def test_the_shipped_skin_states_where_it_comes_from() -> None:
     shipped = load_skin("pandar64")
     text = json.dumps(shipped.provenance)
-    for needed in ("CC BY 4.0", "Scale AI", "Hesai", "Dataset Terms", "frames 00 to 30"):
+    for needed in (
+        "CC BY 4.0",
+        "Scale AI",
+        "Hesai",
+        "Dataset Terms",
+        "frames 00 to 30",
+    ):
         assert needed in text
     assert {k: v.shape for k, v in shipped.arrays.items()} == shapes(64)
 
@@ -244,7 +299,9 @@ def test_quantiles_by_group_are_those_of_numpy() -> None:
     for g in range(8):
         assert number[g] == (group == g).sum()
         expected = (
-            np.quantile(value[group == g], np.linspace(0, 1, 5)) if number[g] else np.zeros(5)
+            np.quantile(value[group == g], np.linspace(0, 1, 5))
+            if number[g]
+            else np.zeros(5)
         )
         assert np.allclose(table[g], expected, atol=1e-6)
 

@@ -34,7 +34,9 @@ def test_solvers_converge_at_their_order(name: str, uneven: bool) -> None:
     for count in steps:
         grid = torch.tensor(uniform_grid(int(count)), dtype=torch.float64)
         grid = grid.square() if uneven else grid
-        errors.append((solve(gaussian_velocity, NOISE, grid, name) - DATA).norm().item())
+        errors.append(
+            (solve(gaussian_velocity, NOISE, grid, name) - DATA).norm().item()
+        )
     order = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert order == pytest.approx(SOLVERS[name].order, abs=0.15)
 
@@ -86,10 +88,15 @@ def test_trajectory_streams_states_and_the_velocities_between_them(name: str) ->
     assert torch.equal(states[0].y, NOISE)
     assert states[-1].velocity is None
     for here, there in pairwise(states):
-        assert torch.allclose(there.y, here.y + (there.t - here.t)[:, None, None] * here.velocity)
+        assert torch.allclose(
+            there.y, here.y + (there.t - here.t)[:, None, None] * here.velocity
+        )
     assert torch.equal(states[-1].y, solve(gaussian_velocity, NOISE, grid, name))
     lazy = trajectory(
-        lambda y, t, c: pytest.fail("evaluated before it was asked for"), NOISE, grid, name
+        lambda y, t, c: pytest.fail("evaluated before it was asked for"),
+        NOISE,
+        grid,
+        name,
     )
     assert iter(lazy) is lazy
 
@@ -97,7 +104,12 @@ def test_trajectory_streams_states_and_the_velocities_between_them(name: str) ->
 @pytest.mark.parametrize("name", SOLVERS)
 def test_each_sample_can_have_its_own_time_grid(name: str) -> None:
     grids = torch.tensor(
-        [[1.0, 0.8, 0.6, 0.5], [0.9, 0.5, 0.2, 0.0], [0.4, 0.3, 0.2, 0.1], [1.0, 0.9, 0.1, 0.0]]
+        [
+            [1.0, 0.8, 0.6, 0.5],
+            [0.9, 0.5, 0.2, 0.0],
+            [0.4, 0.3, 0.2, 0.1],
+            [1.0, 0.9, 0.1, 0.0],
+        ]
     ).double()
     together = solve(gaussian_velocity, NOISE, grids.T, name)
     for i, grid in enumerate(grids):
@@ -112,8 +124,12 @@ def test_the_state_keeps_its_dtype() -> None:
         assert low.dtype == dtype
 
 
-@pytest.mark.parametrize("model", ["r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier"])
-def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str) -> None:
+@pytest.mark.parametrize(
+    "model", ["r2flow_hdit_tiny_learnable", "r2flow_hdit_tiny_fourier"]
+)
+def test_euler_on_uneven_grids_equals_that_of_r2flow(
+    golden: Golden, model: str
+) -> None:
     """R2Flow's states follow from its velocities in our convention of time and sign; no network is
     involved."""
     vectors = {
@@ -128,7 +144,12 @@ def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str)
         return -next(answers)
 
     states = torch.stack(
-        [s.y for s in trajectory(velocity, vectors["input.x0"], 1 - vectors["input.grid"])]
+        [
+            s.y
+            for s in trajectory(
+                velocity, vectors["input.x0"], 1 - vectors["input.grid"]
+            )
+        ]
     )
     assert times == pytest.approx(vectors["input.grid"][:-1].tolist(), abs=1e-7)
     assert (states - vectors["states"]).norm() / vectors["states"].norm() < 1e-6
@@ -137,10 +158,21 @@ def test_euler_on_uneven_grids_equals_that_of_r2flow(golden: Golden, model: str)
 
 @pytest.mark.parametrize(
     "grid",
-    [(1.0,), (0.0, 1.0), (1.0, 0.5, 0.5, 0.0), (1.1, 0.0), (1.0, -0.1), (1.0, float("nan"), 0.0)],
+    [
+        (1.0,),
+        (0.0, 1.0),
+        (1.0, 0.5, 0.5, 0.0),
+        (1.1, 0.0),
+        (1.0, -0.1),
+        (1.0, float("nan"), 0.0),
+    ],
 )
-def test_grids_that_do_not_descend_within_0_and_1_are_refused(grid: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match=r"time grid .*; expected at least two descending times"):
+def test_grids_that_do_not_descend_within_0_and_1_are_refused(
+    grid: tuple[float, ...],
+) -> None:
+    with pytest.raises(
+        ConfigError, match=r"time grid .*; expected at least two descending times"
+    ):
         solve(gaussian_velocity, NOISE, grid)
 
 

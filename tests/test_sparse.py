@@ -67,7 +67,8 @@ def test_a_kernel_of_size_2_and_its_transpose_are_dense_convolutions() -> None:
     back = torch.randn(8, 7, 4, generator=generator)
     weight = back.view(2, 2, 2, 7, 4).permute(3, 4, 0, 1, 2)
     expected = at(
-        F.conv_transpose3d(dense(level.voxels, coarse, SIDE // 2), weight, stride=2), fine
+        F.conv_transpose3d(dense(level.voxels, coarse, SIDE // 2), weight, stride=2),
+        fine,
     )
     torch.testing.assert_close(
         convolve(coarse, back, level.children.reversed(), len(fine)), expected
@@ -96,12 +97,16 @@ def test_the_offsets_of_size_3_by_hand(k: int, offset: tuple[int, int, int]) -> 
     kernel[k] = 1
     position = {tuple(v): i for i, v in enumerate(voxels.tolist())}
     out = convolve(values, kernel, neighbours(voxels), len(voxels))
-    assert out[position[4, 4, 4]] == values[position[tuple((here + torch.tensor(offset)).tolist())]]
+    assert (
+        out[position[4, 4, 4]]
+        == values[position[tuple((here + torch.tensor(offset)).tolist())]]
+    )
     assert len(voxels) == 1 or out.count_nonzero() == 1
 
 
 @pytest.mark.parametrize(
-    ("k", "place"), [(0, (0, 0, 0)), (1, (0, 0, 1)), (2, (0, 1, 0)), (4, (1, 0, 0)), (6, (1, 1, 0))]
+    ("k", "place"),
+    [(0, (0, 0, 0)), (1, (0, 0, 1)), (2, (0, 1, 0)), (4, (1, 0, 0)), (6, (1, 1, 0))],
 )
 def test_the_offsets_of_size_2_by_hand(k: int, place: tuple[int, int, int]) -> None:
     level = pyramid(torch.tensor([place]) + 6, 2)[1]
@@ -141,7 +146,9 @@ def test_voxels_hold_their_first_point_and_no_remission() -> None:
     cloud = np.array([(1.0, 2, 3), (1.01, 2, 3), (0.0, 2, 3), (1.2, 2, 3)], np.float32)
     voxels, features = voxelise(cloud)
     assert voxels.tolist() == [[0, 0, 0], [20, 0, 0], [24, 0, 0]]
-    np.testing.assert_array_equal(features.numpy(), np.c_[cloud[[2, 0, 3]], [-1, -1, -1]])
+    np.testing.assert_array_equal(
+        features.numpy(), np.c_[cloud[[2, 0, 3]], [-1, -1, -1]]
+    )
 
 
 def test_voxels_too_far_apart_are_refused() -> None:
@@ -150,7 +157,9 @@ def test_voxels_too_far_apart_are_refused() -> None:
 
 
 def test_rings_and_bands_by_hand() -> None:
-    voxels = torch.tensor([(0, 0, 0), (0, 200, 0), (0, -200, 0), (4000, 0, 0), (-4000, 0, 0)])
+    voxels = torch.tensor(
+        [(0, 0, 0), (0, 200, 0), (0, -200, 0), (4000, 0, 0), (-4000, 0, 0)]
+    )
     features = torch.tensor([[1.0], [2.0], [4.0], [8.0], [16.0]])
     # Distances 0, 10, 10, 200, 200 m from the centre.
     found = mean_over_rings(features, voxels, 0.05, 56.0)

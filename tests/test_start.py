@@ -24,9 +24,13 @@ def test_a_shipped_model_is_a_start_by_its_name(
         load_config(TrainConfig, "town_teacher", ["init=town", "codec=null"])
     )
     shipped = load_checkpoint(find_model("town"))
-    assert header.provenance["init"] == shipped.hash and set(networks) == set(shipped.networks)
+    assert header.provenance["init"] == shipped.hash and set(networks) == set(
+        shipped.networks
+    )
     with pytest.raises(ConfigError, match="expected a shipped one"):
-        start_networks(load_config(TrainConfig, "town_teacher", ["init=towns", "codec=null"]))
+        start_networks(
+            load_config(TrainConfig, "town_teacher", ["init=towns", "codec=null"])
+        )
 
 
 def config(folder: Path, chosen: str) -> TrainConfig:
@@ -46,11 +50,17 @@ def test_rehearsed_scans_are_learnt_from_too_and_named(tmp_path: Path) -> None:
     }
     rehearsed = run(TrainConfig.model_validate(both))
     weights = [
-        load_checkpoint(path).networks["velocity"].state_dict() for path in (plain, rehearsed)
+        load_checkpoint(path).networks["velocity"].state_dict()
+        for path in (plain, rehearsed)
     ]
-    assert any(not torch.equal(weights[0][name], value) for name, value in weights[1].items())
+    assert any(
+        not torch.equal(weights[0][name], value) for name, value in weights[1].items()
+    )
     facts = load_checkpoint(rehearsed).header.provenance
-    assert facts["rehearsal"]["seed"] == 5 and (facts["data"]["seed"], facts["data"]["town"]) == (
+    assert facts["rehearsal"]["seed"] == 5 and (
+        facts["data"]["seed"],
+        facts["data"]["town"],
+    ) == (
         0,
         2,
     )
@@ -65,7 +75,8 @@ def faster(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> b
 
 
 @pytest.mark.skipif(
-    torch.cuda.is_available() or torch.backends.mps.is_available(), reason="a GPU has bfloat16"
+    torch.cuda.is_available() or torch.backends.mps.is_available(),
+    reason="a GPU has bfloat16",
 )
 def test_bfloat16_is_for_processors_that_are_faster_with_it(faster: bool) -> None:
     assert precision.choose_precision("bf16") == ("bf16" if faster else "no")
@@ -73,19 +84,30 @@ def test_bfloat16_is_for_processors_that_are_faster_with_it(faster: bool) -> Non
 
 
 @pytest.mark.slow
-def test_runs_of_one_process_may_differ_in_precision(faster: bool, tmp_path: Path) -> None:
-    made = {name: load_checkpoint(run(config(tmp_path / name, name))) for name in ("bf16", "no")}
+def test_runs_of_one_process_may_differ_in_precision(
+    faster: bool, tmp_path: Path
+) -> None:
+    made = {
+        name: load_checkpoint(run(config(tmp_path / name, name)))
+        for name in ("bf16", "no")
+    }
     weights = [
-        dict(checkpoint.networks["velocity"].named_parameters()) for checkpoint in made.values()
+        dict(checkpoint.networks["velocity"].named_parameters())
+        for checkpoint in made.values()
     ]
-    same = all(torch.equal(weights[0][name], value) for name, value in weights[1].items())
+    same = all(
+        torch.equal(weights[0][name], value) for name, value in weights[1].items()
+    )
     assert same is not faster, "the same weights where both were trained in float32"
     AcceleratorState._reset_state()
     mine = Accelerator(mixed_precision="no")  # the caller's own stays as it is
     if faster:
         with pytest.raises(
-            ConfigError, match="precision=bf16, where this process has set up Accelerate with 'no'"
+            ConfigError,
+            match="precision=bf16, where this process has set up Accelerate with 'no'",
         ):
             run(config(tmp_path / "refused", "bf16"))
-    assert run(config(tmp_path / "same", "no")).exists() and mine.mixed_precision == "no"
+    assert (
+        run(config(tmp_path / "same", "no")).exists() and mine.mixed_precision == "no"
+    )
     AcceleratorState._reset_state()

@@ -12,8 +12,12 @@ from lidar_synth.mixing import MixedScans, MixedStream, Sources
 from lidar_synth.mixing.state import after_epoch, make_state
 
 
-def mixed(real: int = 12, ratio: Any = 0.25, synth: Any = None, **options: Any) -> MixedScans:
-    return MixedScans(Scans("r", real), Endless() if synth is None else synth, ratio, **options)
+def mixed(
+    real: int = 12, ratio: Any = 0.25, synth: Any = None, **options: Any
+) -> MixedScans:
+    return MixedScans(
+        Scans("r", real), Endless() if synth is None else synth, ratio, **options
+    )
 
 
 def batches(train: MixedScans) -> Any:
@@ -54,10 +58,16 @@ def test_a_state_of_another_mixture_is_refused(
 
 
 @WAYS
-def test_a_state_survives_json_and_fits_its_mixture(make: Callable[[MixedScans], Any]) -> None:
+def test_a_state_survives_json_and_fits_its_mixture(
+    make: Callable[[MixedScans], Any],
+) -> None:
     whole = make(mixed())
     state = json.loads(json.dumps(whole.state_dict(2)))
-    assert (state["epoch"], state["position"], state["mixture"]["ratio"]) == (0, 8, "1/4")
+    assert (state["epoch"], state["position"], state["mixture"]["ratio"]) == (
+        0,
+        8,
+        "1/4",
+    )
     again = make(mixed())
     again.load_state_dict(state)
     assert len(list(again)) == (2 if make is batches else 8)
@@ -70,7 +80,9 @@ def test_a_state_without_its_plan(make: Callable[[MixedScans], Any]) -> None:
 
 
 @WAYS
-def test_a_position_beyond_the_epoch_is_refused(make: Callable[[MixedScans], Any]) -> None:
+def test_a_position_beyond_the_epoch_is_refused(
+    make: Callable[[MixedScans], Any],
+) -> None:
     with pytest.raises(ConfigError, match="position 17 of an epoch of 16 samples"):
         make(mixed()).load_state_dict(make_state(mixed().mixture, 0, 17))
 

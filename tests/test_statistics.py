@@ -32,7 +32,10 @@ Sets = list[np.ndarray]
 
 def histograms_mmd(real: np.ndarray, fake: np.ndarray) -> Statistic:
     return gaussian_mmd(
-        normalised_rows(real), normalised_rows(fake), (len(real), len(fake)), real[0].size
+        normalised_rows(real),
+        normalised_rows(fake),
+        (len(real), len(fake)),
+        real[0].size,
     )
 
 
@@ -50,20 +53,25 @@ def mmd_by_definition(a: np.ndarray, b: np.ndarray) -> float:
 def frechet_by_definition(a: np.ndarray, b: np.ndarray) -> float:
     covariances = np.cov(a.T), np.cov(b.T)
     root = sqrtm(covariances[0] @ covariances[1]).real
-    return float(((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(sum(covariances) - 2 * root))
+    return float(
+        ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(sum(covariances) - 2 * root)
+    )
 
 
 def kernel_by_pairs(a: np.ndarray, b: np.ndarray) -> float:
     kernel = lambda x, y: (x @ y / a.shape[1] + 1) ** 3  # noqa: E731
     within = [
-        np.mean([kernel(s[i], s[j]) for i in range(len(s)) for j in range(len(s)) if i != j])
+        np.mean(
+            [kernel(s[i], s[j]) for i in range(len(s)) for j in range(len(s)) if i != j]
+        )
         for s in (a, b)
     ]
     return float(sum(within) - 2 * np.mean([[kernel(x, y) for y in b] for x in a]))
 
 
 CASES: dict[
-    str, tuple[Callable[..., Statistic], Sets, Callable[[np.ndarray, np.ndarray], float]]
+    str,
+    tuple[Callable[..., Statistic], Sets, Callable[[np.ndarray, np.ndarray], float]],
 ] = {
     "jsd": (
         histogram_distance,
@@ -78,7 +86,11 @@ CASES: dict[
     "mmd": (histograms_mmd, COUNTS, mmd_by_definition),
     "frechet": (frechet, FEATURES, frechet_by_definition),
     "kernel": (polynomial_mmd, FEATURES, kernel_by_pairs),
-    "matching": (squared, FEATURES, lambda a, b: cdist(a, b, "sqeuclidean").min(1).mean()),
+    "matching": (
+        squared,
+        FEATURES,
+        lambda a, b: cdist(a, b, "sqeuclidean").min(1).mean(),
+    ),
 }
 
 
@@ -116,7 +128,9 @@ def test_copies_in_a_resample_are_no_pair_of_the_unbiased_kernel_distance() -> N
     within = (weights * kernel)[~np.eye(len(a), dtype=bool)].sum() / weights[
         ~np.eye(len(a), dtype=bool)
     ].sum()
-    others = kernel_by_pairs(b, b) + 2 * ((b @ b.T / 3 + 1) ** 3).mean()  # twice the mean within b
+    others = (
+        kernel_by_pairs(b, b) + 2 * ((b @ b.T / 3 + 1) ** 3).mean()
+    )  # twice the mean within b
     across = (counts @ (a @ b.T / 3 + 1) ** 3).mean() / counts.sum()
     assert value == pytest.approx(within + others / 2 - 2 * across, rel=1e-9)
 
@@ -128,7 +142,9 @@ def test_covariances_without_full_rank(samples: tuple[int, int]) -> None:
     a, b = (rng.normal(k, 1, (n, 12)) for k, n in enumerate(samples))
     p, q = ((s - s.mean(0)) / np.sqrt(len(s) - 1) for s in (a, b))
     cross = np.linalg.svd(p @ q.T, compute_uv=False).sum()
-    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + (p**2).sum() + (q**2).sum() - 2 * cross
+    expected = (
+        ((a.mean(0) - b.mean(0)) ** 2).sum() + (p**2).sum() + (q**2).sum() - 2 * cross
+    )
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-6)
     assert frechet_distance(a, a) == pytest.approx(0, abs=1e-6)
 
@@ -137,11 +153,13 @@ def test_the_extrapolated_frechet_distance_loses_most_of_the_bias() -> None:
     rng = np.random.default_rng(0)
     pairs = [rng.normal(size=(2, 150, 8)) for _ in range(8)]  # the true distance is 0
     biased, extrapolated = (
-        np.mean([f(*p) for p in pairs]) for f in (frechet_distance, extrapolated_frechet)
+        np.mean([f(*p) for p in pairs])
+        for f in (frechet_distance, extrapolated_frechet)
     )
     assert biased > 0.15 and abs(extrapolated) < biased / 4
     with pytest.raises(
-        DataError, match="10 and 30 samples of 8 features; expected more than 16 samples"
+        DataError,
+        match="10 and 30 samples of 8 features; expected more than 16 samples",
     ):
         extrapolated_frechet(pairs[0][0][:10], pairs[0][1][:30])
 
@@ -166,7 +184,9 @@ def test_intervals_cover_the_truth(name: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_an_interval_narrows_with_more_samples_and_repeats_with_its_seed() -> None:
     rng = np.random.default_rng(0)
-    few, many = (frechet(rng.normal(size=(n, 2)), rng.normal(1, 1, (n, 2))) for n in (40, 400))
+    few, many = (
+        frechet(rng.normal(size=(n, 2)), rng.normal(1, 1, (n, 2))) for n in (40, 400)
+    )
     assert bootstrap(few, 100) == bootstrap(few, 100) != bootstrap(few, 100, seed=1)
     narrow = bootstrap(many, 100)
     wide = bootstrap(few, 100)
@@ -180,7 +200,11 @@ def test_an_interval_narrows_with_more_samples_and_repeats_with_its_seed() -> No
     equal = bootstrap(frechet(*[rng.normal(size=(40, 2))] * 2), 50, smallest=0.0)
     assert equal.low == 0.0 <= equal.high
     nearly_all = share(np.r_[np.ones(28), 0, 0], True, 30)
-    assert bootstrap(nearly_all, 50, largest=1.0).high == 1.0 < bootstrap(nearly_all, 50).high
+    assert (
+        bootstrap(nearly_all, 50, largest=1.0).high
+        == 1.0
+        < bootstrap(nearly_all, 50).high
+    )
 
 
 def test_intervals_refuse_what_cannot_give_one() -> None:
@@ -225,7 +249,9 @@ def test_precision_recall_density_and_coverage_by_hand() -> None:
 def test_neighbours_tell_fidelity_from_diversity() -> None:
     rng = np.random.default_rng(0)
     real = rng.normal(size=(300, 4))
-    good, narrow, wide = (manifold(real, s * rng.normal(size=(300, 4))) for s in (1, 0.2, 5))
+    good, narrow, wide = (
+        manifold(real, s * rng.normal(size=(300, 4))) for s in (1, 0.2, 5)
+    )
     assert min(s.value for s in good) > 0.7
     assert narrow.precision.value > 0.95 and narrow.recall.value < 0.2
     assert wide.precision.value < 0.4 and wide.coverage.value < good.coverage.value / 2
@@ -233,7 +259,8 @@ def test_neighbours_tell_fidelity_from_diversity() -> None:
     low, high = bootstrap(good.precision, 100)
     assert 0 < high - low < 0.2
     with pytest.raises(
-        DataError, match="3 real and 300 generated samples; expected more than k = 5 of each"
+        DataError,
+        match="3 real and 300 generated samples; expected more than k = 5 of each",
     ):
         manifold(real[:3], real)
 

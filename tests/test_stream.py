@@ -50,7 +50,9 @@ def sequence(epochs: int = 6) -> list[str]:
 
 
 def load(stream: MixedStream, workers: int, **options: Any) -> DataLoader[Any]:
-    return DataLoader(stream, stream.batch_size, num_workers=workers, collate_fn=list, **options)
+    return DataLoader(
+        stream, stream.batch_size, num_workers=workers, collate_fn=list, **options
+    )
 
 
 def cut(samples: list[str], size: int) -> list[list[str]]:
@@ -92,7 +94,9 @@ def test_without_end_the_synthetic_source_hears_of_every_epoch() -> None:
 def test_ranks_and_workers_divide_the_stream(ranks: int, endless: bool) -> None:
     given: list[str] = []
     for rank in range(ranks):
-        stream = MixedStream(mixed(), batch_size=2, endless=endless, rank=rank, world_size=ranks)
+        stream = MixedStream(
+            mixed(), batch_size=2, endless=endless, rank=rank, world_size=ranks
+        )
         # 30 samples, whole steps for 2 and 3 ranks, are two epochs
         given += [
             x
@@ -106,7 +110,12 @@ def test_the_last_samples_may_be_left_out() -> None:
     given = []
     for rank in range(2):
         stream = MixedStream(
-            mixed(), batch_size=2, endless=False, drop_last=True, rank=rank, world_size=2
+            mixed(),
+            batch_size=2,
+            endless=False,
+            drop_last=True,
+            rank=rank,
+            world_size=2,
         )
         given.append(list(load(stream, 0)))
     assert [len(batches) for batches in given] == [3, 3]
@@ -120,7 +129,10 @@ def test_the_remainder_is_a_batch_of_its_own() -> None:
         MixedStream(mixed(), batch_size=7, endless=False, rank=rank, world_size=2)
         for rank in range(2)
     ]
-    assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [[7, 1], [7]]
+    assert [[len(batch) for batch in load(stream, 0)] for stream in given] == [
+        [7, 1],
+        [7],
+    ]
     assert given[0].state_dict(1) == state(0, 14)
     assert given[0].state_dict(2) == state(1, 0)
 
@@ -129,7 +141,8 @@ def test_the_remainder_is_a_batch_of_its_own() -> None:
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("done", range(5))
 @pytest.mark.parametrize(
-    ("before", "after"), [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))]
+    ("before", "after"),
+    [((1, 0), (2, 1)), ((2, 2), (1, 0)), ((2, 1), (3, 2)), ((3, 0), (1, 2))],
 )
 def test_a_state_fits_any_number_of_ranks_and_workers(
     before: tuple[int, int], after: tuple[int, int], done: int, endless: bool
@@ -150,11 +163,15 @@ def test_a_state_fits_any_number_of_ranks_and_workers(
     assert set(states[0]) == {"version", "seed", "epoch", "position", "plan", "mixture"}
     rest = []
     for rank in range(after[0]):
-        stream = MixedStream(mixed(), batch_size=3, endless=endless, rank=rank, world_size=after[0])
+        stream = MixedStream(
+            mixed(), batch_size=3, endless=endless, rank=rank, world_size=after[0]
+        )
         stream.load_state_dict(states[0])
         rest += [
             x
-            for batch in islice(load(stream, after[1]), 24 // 3 // after[0] if endless else None)
+            for batch in islice(
+                load(stream, after[1]), 24 // 3 // after[0] if endless else None
+            )
             for x in batch
         ]
     length = len(seen) + 24 // (3 * after[0]) * 3 * after[0] if endless else 15
@@ -166,7 +183,9 @@ def test_a_state_fits_any_number_of_ranks_and_workers(
 
 @pytest.mark.parametrize("endless", [False, True])
 @pytest.mark.parametrize("given", range(15))
-def test_without_workers_the_stream_tracks_its_position(given: int, endless: bool) -> None:
+def test_without_workers_the_stream_tracks_its_position(
+    given: int, endless: bool
+) -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=endless)
     iterator = iter(stream)
     seen = list(islice(iterator, given))
@@ -208,10 +227,14 @@ def test_an_epochs_end_that_is_loaded_after_the_next_has_begun() -> None:
         assert len(list(resumed)) == (15 if isinstance(resumed, MixedStream) else 4)
 
 
-def test_a_workers_state_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_workers_state_leaves_the_others_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     stream = MixedStream(mixed(), batch_size=4, endless=False)
     stream.set_epoch(3)
-    monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=1, num_workers=2))
+    monkeypatch.setattr(
+        module, "get_worker_info", lambda: SimpleNamespace(id=1, num_workers=2)
+    )
     list(stream)
     after = stream.state_dict()
     stream.set_epoch(4)
@@ -295,7 +318,9 @@ def test_torchdata_without_end(workers: int, done: int) -> None:
 
     def make() -> Any:
         stream = MixedStream(mixed(), batch_size=4)
-        return torchdata.StatefulDataLoader(stream, 4, num_workers=workers, collate_fn=list)
+        return torchdata.StatefulDataLoader(
+            stream, 4, num_workers=workers, collate_fn=list
+        )
 
     loader = make()
     seen = list(islice(loader, done))
@@ -316,9 +341,13 @@ def test_invalid_options_and_states_of_a_stream_are_refused(
         stream.load_state_dict({"seed": 3, "epoch": 0, "position": 0, "plan": ""})
     next(iter(stream))
     after = stream.state_dict()
-    monkeypatch.setattr(module, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=2))
+    monkeypatch.setattr(
+        module, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=2)
+    )
     stream.load_state_dict(after)
-    with pytest.raises(ConfigError, match=r"'workers': 1.*'workers': 2.*state_dict\(done=...\)"):
+    with pytest.raises(
+        ConfigError, match=r"'workers': 1.*'workers': 2.*state_dict\(done=...\)"
+    ):
         iter(stream)
 
 
@@ -337,7 +366,10 @@ def test_only_this_ranks_share_is_announced_to_a_source_that_works_ahead() -> No
     source = Ahead()
     scans = MixedScans(Scans("r", 6), source, 0.5)
     asked = [
-        [int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1 for i in range(12)]
+        [
+            int(scans.sample(e, i)["id"][1:]) if scans.plan(e).domain[i] else -1
+            for i in range(12)
+        ]
         for e in (0, 1)
     ]
     stream = MixedStream(scans, batch_size=2, rank=1, world_size=2)
@@ -350,4 +382,7 @@ def test_only_this_ranks_share_is_announced_to_a_source_that_works_ahead() -> No
 def test_it_says_what_it_is() -> None:
     first, second = repr(MixedStream(mixed(), batch_size=4)).splitlines()
     assert first == "MixedStream: batches of 4, rank 0 of 1, endless"
-    assert second.strip() == "MixedScans: 15 samples in epoch 0, 6 of them synthetic; seed 0"
+    assert (
+        second.strip()
+        == "MixedScans: 15 samples in epoch 0, 6 of them synthetic; seed 0"
+    )

@@ -22,7 +22,12 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.evaluate.extractors.bonnetal import PARTS
 from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
-from lidar_synth.lab.evaluate.recognition import Recognition, as_text, compare, recognise
+from lidar_synth.lab.evaluate.recognition import (
+    Recognition,
+    as_text,
+    compare,
+    recognise,
+)
 from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
 
 RAW = [0, 10, 11, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 70, 71, 72, 80, 81]
@@ -68,12 +73,17 @@ def change(archive: Path, edit: Callable[[dict], object]) -> None:  # type: igno
     (archive / "arch_cfg.yaml").write_text(yaml.safe_dump(settings))
 
 
-def test_the_input_of_the_network_is_the_nearest_point_of_each_cell(archive: Path) -> None:
+def test_the_input_of_the_network_is_the_nearest_point_of_each_cell(
+    archive: Path,
+) -> None:
     judge = load_archive(archive, columns=1024)
     scan = random_scan(presets()["town"], 4000, seed=1)
     image, label = judge.image(scan)
     expected = project(scan, judge.segmenter.sensor, ["reflectance", "label"])
-    values = image * judge.segmenter.deviation[:, None, None] + judge.segmenter.mean[:, None, None]
+    values = (
+        image * judge.segmenter.deviation[:, None, None]
+        + judge.segmenter.mean[:, None, None]
+    )
     filled = expected.mask
     assert image.shape == (5, 64, 1024) and (image[:, ~filled] == 0).all()
     np.testing.assert_allclose(values[0, filled], expected.range[filled], rtol=1e-4)
@@ -86,10 +96,16 @@ def test_the_input_of_the_network_is_the_nearest_point_of_each_cell(archive: Pat
     assert (label == np.where(filled, expected.channels["label"], IGNORE)).all()
 
 
-def test_predictions_are_counted_by_train_id_and_never_as_unlabelled(archive: Path) -> None:
+def test_predictions_are_counted_by_train_id_and_never_as_unlabelled(
+    archive: Path,
+) -> None:
     judge = load_archive(archive, columns=64)
     scan = random_scan(presets()["town"], 2000, seed=2)
-    for chosen in (0, 9, 17):  # the head predicts one class everywhere: unlabelled, road, terrain
+    for chosen in (
+        0,
+        9,
+        17,
+    ):  # the head predicts one class everywhere: unlabelled, road, terrain
         with torch.no_grad():
             judge.segmenter.network.segmentation_head[1].weight.zero_()
             judge.segmenter.network.segmentation_head[1].bias.copy_(
@@ -121,15 +137,25 @@ def test_recognition_by_hand() -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], type[LidarSynthError], str]] = {
-    "code": (lambda a: torch.save({"a": print}, a / "backbone"), DataError, "not tensors by name"),
+    "code": (
+        lambda a: torch.save({"a": print}, a / "backbone"),
+        DataError,
+        "not tensors by name",
+    ),
     "truncated": (
         lambda a: (a / "backbone").write_bytes((a / "backbone").read_bytes()[:9000]),
         DataError,
         "backbone",
     ),
-    "missing": (lambda a: (a / "segmentation_head").unlink(), FileError, "segmentation_head"),
+    "missing": (
+        lambda a: (a / "segmentation_head").unlink(),
+        FileError,
+        "segmentation_head",
+    ),
     "other weights": (
-        lambda a: torch.save(torch.nn.Linear(2, 2).state_dict(), a / "segmentation_head"),
+        lambda a: torch.save(
+            torch.nn.Linear(2, 2).state_dict(), a / "segmentation_head"
+        ),
         DataError,
         "architecture",
     ),
@@ -143,14 +169,22 @@ FAULTS: dict[str, tuple[Callable[[Path], object], type[LidarSynthError], str]] =
         ConfigError,
         "darknet.*squeezeseg",
     ),
-    "no sensor": (lambda a: change(a, lambda s: s["dataset"].pop("sensor")), ConfigError, "sensor"),
+    "no sensor": (
+        lambda a: change(a, lambda s: s["dataset"].pop("sensor")),
+        ConfigError,
+        "sensor",
+    ),
     "other input": (
-        lambda a: change(a, lambda s: s["backbone"]["input_depth"].update(remission=False)),
+        lambda a: change(
+            a, lambda s: s["backbone"]["input_depth"].update(remission=False)
+        ),
         DataError,
         "architecture",
     ),
     "text as a mean": (
-        lambda a: change(a, lambda s: s["dataset"]["sensor"].update(img_means=["x"] * 5)),
+        lambda a: change(
+            a, lambda s: s["dataset"]["sensor"].update(img_means=["x"] * 5)
+        ),
         ConfigError,
         "arch_cfg",
     ),
@@ -177,15 +211,29 @@ def test_scans_without_labels_are_refused(archive: Path) -> None:
         judge.confusion([replace(scan, label=None)])
     with pytest.raises(DataError, match="no labelled return"):
         recognise(
-            judge, [replace(scan, label=np.full(len(scan), IGNORE, np.uint8))], progress=False
+            judge,
+            [replace(scan, label=np.full(len(scan), IGNORE, np.uint8))],
+            progress=False,
         )
 
 
 @pytest.mark.slow
 def test_the_command_line_prints_both_sets(archive: Path, tmp_path: Path) -> None:
     for seed in (0, 1):
-        town = [str(tmp_path / f"town{seed}"), "--scans", "2", "--seed", str(seed), "--no-camera"]
-        assert CliRunner().invoke(app, ["town", *town, "--layout", "semantic_kitti"]).exit_code == 0
+        town = [
+            str(tmp_path / f"town{seed}"),
+            "--scans",
+            "2",
+            "--seed",
+            str(seed),
+            "--no-camera",
+        ]
+        assert (
+            CliRunner()
+            .invoke(app, ["town", *town, "--layout", "semantic_kitti"])
+            .exit_code
+            == 0
+        )
     call = [
         "evaluate",
         str(tmp_path / "town0"),
@@ -216,17 +264,23 @@ def test_a_real_archive_has_its_accuracy_on_a_sequence_that_it_never_saw(
     if not (folder / "sequences" / "08").is_dir():
         pytest.skip(f"{folder} without sequence 08; the others trained the network")
     scans = open_scans(folder, split="val")
-    found = recognise(street_judge, [scans[i] for i in range(min(10, len(scans)))], progress=False)
+    found = recognise(
+        street_judge, [scans[i] for i in range(min(10, len(scans)))], progress=False
+    )
     assert found.accuracy == pytest.approx(0.740, abs=0.01)
 
 
 @pytest.mark.slow
 def test_a_real_archive_recognises_real_streets(street_judge: StreetJudge) -> None:
     scans = open_scans(_folder("LIDAR_SYNTH_LABELLED_SCANS") / "semantic_kitti")
-    found = recognise(street_judge, [scans[i] for i in range(0, len(scans), 7)], progress=False)
+    found = recognise(
+        street_judge, [scans[i] for i in range(0, len(scans), 7)], progress=False
+    )
     assert found.accuracy > 0.7  # 0.753 over all 28 frames at 64 x 2048
     assert (
-        found.iou()["road"] > 0.6 and found.iou()["car"] > 0.6 and found.iou()["vegetation"] > 0.5
+        found.iou()["road"] > 0.6
+        and found.iou()["car"] > 0.6
+        and found.iou()["vegetation"] > 0.5
     )
 
 

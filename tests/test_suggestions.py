@@ -25,10 +25,16 @@ CALLS = {
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_a_misspelt_name_is_answered_with_the_nearest(call: str, tmp_path: Path) -> None:
+def test_a_misspelt_name_is_answered_with_the_nearest(
+    call: str, tmp_path: Path
+) -> None:
     given = call.replace("OUT", str(tmp_path / "out")).split()
     result = CliRunner().invoke(app, given)
-    said = result.output if result.exception is None else f"{result.output}{result.exception}"
+    said = (
+        result.output
+        if result.exception is None
+        else f"{result.output}{result.exception}"
+    )
     assert (
         result.exit_code != 0
         and "Did you mean" in said
@@ -41,5 +47,9 @@ def test_a_name_like_none_has_no_suggestion() -> None:
 
 
 def test_the_sensor_of_a_folder_is_a_preset(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"sensor 'os1_12' is no preset.*Did you mean 'os1_128'"):
-        Description.from_dict({"format": "lidar-synth-scans/1", "sensor": "os1_12", "origins": []})
+    with pytest.raises(
+        ValueError, match=r"sensor 'os1_12' is no preset.*Did you mean 'os1_128'"
+    ):
+        Description.from_dict(
+            {"format": "lidar-synth-scans/1", "sensor": "os1_12", "origins": []}
+        )

@@ -17,10 +17,19 @@ from lidar_synth.generate.flow.path import METRICS
 from lidar_synth.generate.loading import _compile
 from lidar_synth.generate.models.objective import Losses
 from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
-from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, split, to_patches
+from lidar_synth.generate.models.surface_codec.blocks import (
+    PATCH,
+    from_patches,
+    split,
+    to_patches,
+)
 from lidar_synth.generate.models.surface_codec.measure_noise import PLANTS
 from lidar_synth.generate.models.surface_codec.reflectance import ZeroInflatedLogistic
-from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, relief_fields
+from lidar_synth.generate.models.surface_codec.relief import (
+    SPANS,
+    correlation,
+    relief_fields,
+)
 from lidar_synth.generate.models.surface_codec.surfaces import (
     DRAWS,
     NUMBERS,
@@ -53,7 +62,12 @@ FLAT = Noise(torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.zeros(L
 def small(**changes: object) -> SurfaceAutoencoder:
     """A network for 16 x 256 cells."""
     torch.manual_seed(0)
-    arguments = {"encoder_widths": (16, 24), "widths": (16, 24), "reaches": (1, 2), "depth": 1}
+    arguments = {
+        "encoder_widths": (16, 24),
+        "widths": (16, 24),
+        "reaches": (1, 2),
+        "depth": 1,
+    }
     return SurfaceAutoencoder(COARSE.shape, **arguments | changes)  # type: ignore[arg-type]
 
 
@@ -61,7 +75,9 @@ def random_surfaces(patches: int, spread: float = 1.0) -> Surfaces:
     generator = torch.Generator().manual_seed(3)
     numbers = K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL)
     x = spread * torch.randn(patches, numbers, generator=generator)
-    x[:, : K * (NUMBERS + LABELS)].view(patches, K, -1)[:, :, 0] += torch.tensor([1.5, 2.3, 3.0])
+    x[:, : K * (NUMBERS + LABELS)].view(patches, K, -1)[:, :, 0] += torch.tensor(
+        [1.5, 2.3, 3.0]
+    )
     return surfaces_of(x, K, LABELS, PATCH)
 
 
@@ -72,7 +88,9 @@ def random_surfaces(patches: int, spread: float = 1.0) -> Surfaces:
     rows=st.integers(1, 3),
     columns=st.integers(1, 4),
 )
-def test_patches_have_an_inverse(batch: int, channels: int, rows: int, columns: int) -> None:
+def test_patches_have_an_inverse(
+    batch: int, channels: int, rows: int, columns: int
+) -> None:
     x = torch.randn(batch, channels, rows * PATCH[0], columns * PATCH[1])
     patches = to_patches(x, PATCH)
     assert patches.shape == (batch * rows * columns, channels, CELLS)
@@ -81,7 +99,9 @@ def test_patches_have_an_inverse(batch: int, channels: int, rows: int, columns: 
 
 
 def test_splitting_puts_the_cells_of_a_patch_beside_each_other() -> None:
-    x = torch.arange(2 * 2 * 3, dtype=torch.float32).view(1, 12, 1, 1)  # 2 x 2 cells of 3 channels
+    x = torch.arange(2 * 2 * 3, dtype=torch.float32).view(
+        1, 12, 1, 1
+    )  # 2 x 2 cells of 3 channels
     assert split(x, (2, 2))[0, :, 1, 0].tolist() == [6, 7, 8]
     assert split(x, (2, 2))[0, :, 0, 1].tolist() == [3, 4, 5]
 
@@ -112,7 +132,11 @@ def test_the_likelihoods_of_all_that_a_cell_can_show_sum_to_one() -> None:
             grid[None, :, 0], grid[None, :, 1], codes, SCALE, (1.0, 1.0)
         ).exp()
         dark = one.log_likelihood(
-            far[None], torch.full((1, len(far)), -1.0), codes[:, : len(far)], SCALE, (1.0, 1.0)
+            far[None],
+            torch.full((1, len(far)), -1.0),
+            codes[:, : len(far)],
+            SCALE,
+            (1.0, 1.0),
         )
         total = total + cells.sum() * area + dark.exp().sum() * (far[1] - far[0])
     assert total.item() == pytest.approx(1, abs=0.01)
@@ -126,7 +150,9 @@ def test_samples_have_the_predicted_frequencies() -> None:
         *(_repeat(part, 4000) for part in surfaces[4:]),
     )
     noise = uniform(0, [0], (4000, DRAWS, CELLS))[0]
-    alike = Noise(torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.full((LABELS,), 0.5))
+    alike = Noise(
+        torch.zeros(LABELS), torch.zeros(LABELS, len(SPANS)), torch.full((LABELS,), 0.5)
+    )
     relief = torch.zeros(4000, len(SPANS), CELLS)
     distance, value, code, likely = many.sample(noise, relief, alike, SCALE).unbind(1)
     shares = surfaces.weights.exp()
@@ -134,7 +160,9 @@ def test_samples_have_the_predicted_frequencies() -> None:
     assert torch.allclose((distance > -1).float().mean(0), returned[0], atol=0.03)
     for k, best in enumerate(surfaces.classes[0].argmax(1).tolist()):
         same = [j for j in range(K) if surfaces.classes[0, j].argmax() == best]
-        assert torch.allclose((code == best).float().mean(0), shares[0, same].sum(0), atol=0.03), k
+        assert torch.allclose(
+            (code == best).float().mean(0), shares[0, same].sum(0), atol=0.03
+        ), k
     assert ((value >= -1) & (likely > 0) & (likely <= 1)).all()
 
 
@@ -148,7 +176,9 @@ def test_a_wall_is_exact_in_every_cell_of_a_patch() -> None:
     numbers = x[:, : K * (NUMBERS + LABELS)].view(K, -1)
     numbers[0, :3] = torch.tensor([np.log(10.0), 0.5, -0.4])
     inverse = surfaces_of(x, K, LABELS, PATCH).inverse[0, 0].view(PATCH)
-    assert torch.allclose(inverse.diff(dim=1), inverse.diff(dim=1)[0, 0].expand(2, 7), atol=1e-6)
+    assert torch.allclose(
+        inverse.diff(dim=1), inverse.diff(dim=1)[0, 0].expand(2, 7), atol=1e-6
+    )
     assert inverse.mean() == pytest.approx(0.1)
 
 
@@ -160,8 +190,13 @@ def test_images_are_decoded_with_valid_labels_and_ranges() -> None:
     again = FORMAT.to_images(Latent(network, FORMAT).decode(z[1:], noise[1:]), COARSE)
     assert np.allclose(images[1].range, again[0].range, rtol=1e-4)
     for image in images:
-        assert image.label is not None and set(np.unique(image.label)) <= {*range(19), 255}
-        assert ((image.range == 0) | ((image.range >= 1.45) & (image.range <= 80))).all()
+        assert image.label is not None and set(np.unique(image.label)) <= {
+            *range(19),
+            255,
+        }
+        assert (
+            (image.range == 0) | ((image.range >= 1.45) & (image.range <= 80))
+        ).all()
     # The most likely image.
     assert torch.equal(*(Latent(network, FORMAT).decode(z) for _ in range(2)))
 
@@ -170,10 +205,12 @@ def test_half_the_columns_show_the_same_street() -> None:
     """A wider cell looks through the middle of two: on one plane, its inverse range is their
     mean."""
     x = torch.zeros(5, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
-    x[:, :3] = torch.randn(5, 3, generator=torch.Generator().manual_seed(0)) / 3 + torch.tensor(
-        [2.0, 0, 0]
+    x[:, :3] = torch.randn(
+        5, 3, generator=torch.Generator().manual_seed(0)
+    ) / 3 + torch.tensor([2.0, 0, 0])
+    fine, coarse = (
+        surfaces_of(x, K, LABELS, PATCH, merged).inverse[:, 0] for merged in (1, 2)
     )
-    fine, coarse = (surfaces_of(x, K, LABELS, PATCH, merged).inverse[:, 0] for merged in (1, 2))
     assert torch.allclose(fine.view(5, 2, 4, 2).mean(3).flatten(1), coarse, rtol=1e-5)
     network = small().eval()
     z = torch.randn(1, *network.latent_shape)
@@ -194,7 +231,8 @@ def layout_with_a_box() -> Tensor:
     steps = round(12 / DEPTH_STEP)
     image[:, 0] = CODES["ground"]
     values = torch.tensor(
-        [CODES["Car"], steps >> 8, steps & 255, round(3 / CHORD_STEP), 0], dtype=torch.uint8
+        [CODES["Car"], steps >> 8, steps & 255, round(3 / CHORD_STEP), 0],
+        dtype=torch.uint8,
     )
     image[..., 4:9, 30:41] = values.view(5, 1, 1)
     return image
@@ -202,7 +240,9 @@ def layout_with_a_box() -> Tensor:
 
 @pytest.mark.parametrize("width", [256, 128])
 @pytest.mark.parametrize("cars", [1, 2, 3])
-def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int) -> None:
+def test_objects_are_decoded_in_the_boxes_of_a_layout_only(
+    cars: int, width: int
+) -> None:
     network = small().eval()
     with torch.no_grad():  # classes of the three surfaces of every patch
         kinds = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)[:, NUMBERS:]
@@ -215,7 +255,9 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
 
     def image_of(layout: Tensor | None) -> RangeImage:
         known = None if layout is None else {"layout": layout}
-        [image] = FORMAT.to_images(Latent(network, FORMAT).decode(z, noise, known), sensor)
+        [image] = FORMAT.to_images(
+            Latent(network, FORMAT).decode(z, noise, known), sensor
+        )
         assert image.label is not None
         return image
 
@@ -223,7 +265,9 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     bounded = image_of(layout)
     inside = (layout[0, 0] == CODES["Car"]).view(16, width, -1).any(2).numpy()
     object_ = bounded.mask & (bounded.channels["label"] == TRAIN_ID["car"])
-    assert (free.mask & (free.channels["label"] == TRAIN_ID["car"]))[~inside].mean() > 0.1
+    assert (free.mask & (free.channels["label"] == TRAIN_ID["car"]))[
+        ~inside
+    ].mean() > 0.1
     assert object_[inside].any() and not object_[~inside].any()
     assert ((bounded.range[object_] > 11.99) & (bounded.range[object_] < 15.01)).all()
     # A cell without a box shows the road instead, if its patch has one.
@@ -237,7 +281,9 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(cars: int, width: int
     assert np.array_equal(free.range, image_of(torch.zeros_like(layout)).range)
     # What stands in a box has its class.
     layout[:, 0][layout[:, 0] == CODES["Car"]] = CODES["Cyclist"]
-    assert np.array_equal(object_, image_of(layout).channels["label"] == TRAIN_ID["bicyclist"])
+    assert np.array_equal(
+        object_, image_of(layout).channels["label"] == TRAIN_ID["bicyclist"]
+    )
 
 
 @pytest.mark.parametrize("width", [256, 128])
@@ -246,7 +292,11 @@ def test_returns_have_the_labels_of_a_map(width: int) -> None:
     z = torch.randn(1, *network.latent_shape)
     noise = uniform(0, [0], (network.draws, 16, width))
     labels = torch.randint(
-        0, 19, (1, 16, width), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+        0,
+        19,
+        (1, 16, width),
+        dtype=torch.uint8,
+        generator=torch.Generator().manual_seed(0),
     )
     labels[..., ::3] = IGNORE
     given_map = labels.repeat_interleave(256 // width, 2)
@@ -256,16 +306,22 @@ def test_returns_have_the_labels_of_a_map(width: int) -> None:
         )
     states = Latent(network, FORMAT)
     made, free = (
-        FORMAT.to_images(states.decode(z, noise, known), replace(COARSE, columns=width))[0]
+        FORMAT.to_images(
+            states.decode(z, noise, known), replace(COARSE, columns=width)
+        )[0]
         for known in ({"semantic": given_map}, None)
     )
     known = made.mask & (labels[0].numpy() != IGNORE)
     assert known.mean() > 0.1
     assert np.array_equal(made.channels["label"][known], labels[0].numpy()[known])
-    assert np.array_equal(made.range[~known & made.mask], free.range[~known & made.mask])
+    assert np.array_equal(
+        made.range[~known & made.mask], free.range[~known & made.mask]
+    )
 
 
-def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_the_class() -> None:
+def test_a_cell_of_a_given_class_shows_each_surface_with_its_probability_given_the_class() -> (
+    None
+):
     count = 40_000
     shown = TRAIN_ID["pole"]
     numbers = torch.zeros(1, K * (NUMBERS + LABELS) + CELLS * (K + PER_CELL))
@@ -308,7 +364,12 @@ def test_training_lowers_the_likelihood_of_a_street() -> None:
     x = FORMAT.from_images([project(scan, COARSE, ["reflectance", "label"])])
     network = small()
     trained = Autoencoding(
-        network, FORMAT, COARSE, Losses(noise=0.03, rare=0.5), METRICS["l1"], {"range": 0.5}
+        network,
+        FORMAT,
+        COARSE,
+        Losses(noise=0.03, rare=0.5),
+        METRICS["l1"],
+        {"range": 0.5},
     )
     optimizer = torch.optim.Adam(network.parameters(), 5e-3)
     losses = []
@@ -346,10 +407,16 @@ def test_the_noise_of_scans_is_measured() -> None:
         numbers[:, 3], numbers[:, 4], numbers[:, 7] = -4.5, 0.5, -6
         network.roughness.fill_(0.3)
         network.alike.fill_(0.6)
-    z = torch.randn(6, *network.latent_shape, generator=torch.Generator().manual_seed(1))
+    z = torch.randn(
+        6, *network.latent_shape, generator=torch.Generator().manual_seed(1)
+    )
     images = []
     for i in range(6):
-        images.append(network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape))))
+        images.append(
+            network.decode(
+                z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape))
+            )
+        )
     latents = iter(network.bounded(z).split(1))
     network.squeeze = lambda x: next(latents)  # type: ignore[method-assign]
     network.measure_noise(images, noise=0.0)
@@ -358,15 +425,21 @@ def test_the_noise_of_scans_is_measured() -> None:
 
 
 @pytest.mark.parametrize("merged", [1, 2])
-def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(merged: int) -> None:
+def test_the_fields_of_relief_are_standard_normal_and_correlated_along_rows(
+    merged: int,
+) -> None:
     fields = relief_fields(uniform(0, [0], (64, 4096 // merged)), merged)[0]
     assert fields.mean((1, 2)).abs().max() < 0.06
     for field, span in zip(fields, SPANS, strict=True):
         # At every column.
-        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(1, abs=0.12)
+        assert field.square().mean(0).view(-1, span // merged).mean(0) == pytest.approx(
+            1, abs=0.12
+        )
         for lag in range(0, 2 * span + 1, 2):
             found = (field * field.roll(-lag // merged, 1)).mean()
-            assert found == pytest.approx(correlation(span // merged, lag // merged), abs=0.06)
+            assert found == pytest.approx(
+                correlation(span // merged, lag // merged), abs=0.06
+            )
         assert (
             torch.equal(field[::2], field[1::2])
             and (field[::2] * field[::2].roll(1, 0)).mean().abs() < 0.06
@@ -378,7 +451,10 @@ def test_the_relief_of_plants_is_measured() -> None:
     """Images with a relief that is known; other classes have none."""
     network = small().eval()
     relief = torch.zeros(LABELS, 2)
-    relief[PLANTS[0]], relief[PLANTS[1]] = torch.tensor([1.0, 0.5]), torch.tensor([0.3, 1.0])
+    relief[PLANTS[0]], relief[PLANTS[1]] = (
+        torch.tensor([1.0, 0.5]),
+        torch.tensor([0.3, 1.0]),
+    )
     with torch.no_grad():
         numbers = network.head.bias[: K * (NUMBERS + LABELS)].view(K, -1)
         numbers[:, 0] = torch.tensor([1.0, 2.3, 3.6])
@@ -388,7 +464,9 @@ def test_the_relief_of_plants_is_measured() -> None:
             numbers[k, NUMBERS + plant] = 12
         network.roughness.fill_(0.2)
         network.relief.copy_(relief)
-    z = torch.randn(4, *network.latent_shape, generator=torch.Generator().manual_seed(1))
+    z = torch.randn(
+        4, *network.latent_shape, generator=torch.Generator().manual_seed(1)
+    )
     images = [
         network.decode(z[i : i + 1], uniform(0, [i], (network.draws, *COARSE.shape)))
         for i in range(4)

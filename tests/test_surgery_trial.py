@@ -22,9 +22,13 @@ def test_the_town_without_cars_is_what_an_edit_should_bring_about() -> None:
     gone = [int(np.bincount(scan.instance[place.mine]).argmax()) for place in places]
     truth = Emptied(TOWN, gone)[1]
     assert truth.instance is not None and not np.isin(gone, truth.instance).any()
-    assert set(scan.instance) - set(gone) <= set(truth.instance)  # all others are still there
+    assert set(scan.instance) - set(gone) <= set(
+        truth.instance
+    )  # all others are still there
     boxes = Boxes(np.array([place.box for place in places]), ("Car",) * len(places))
-    assert not boxes.contain(truth.points[truth.points[:, 2] > -1.3]).any()  # above the ground
+    assert not boxes.contain(
+        truth.points[truth.points[:, 2] > -1.3]
+    ).any()  # above the ground
 
     def agreement(result: Scan) -> list[float]:
         return np.nanmean(fidelity(scan, places, result, truth), 0).tolist()

@@ -15,7 +15,12 @@ from torch import Tensor
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.flow.path import METRICS, per_sample
 from lidar_synth.generate.flow.solvers import uniform_grid
-from lidar_synth.generate.flow.timesteps import best_path, cost_matrix, path_cost, select_timesteps
+from lidar_synth.generate.flow.timesteps import (
+    best_path,
+    cost_matrix,
+    path_cost,
+    select_timesteps,
+)
 from lidar_synth.noise import gaussian
 
 SHAPE = (2, 3, 8)
@@ -47,7 +52,8 @@ def test_dynamic_programming_equals_brute_force(
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", METRICS)
 @pytest.mark.parametrize(
-    "knots", [(1.0, 0.86, 0.58, 0.22, 0.0), (1.0, 0.42, 0.2, 0.08, 0.0), (1.0, 0.5, 0.0)]
+    "knots",
+    [(1.0, 0.86, 0.58, 0.22, 0.0), (1.0, 0.42, 0.2, 0.08, 0.0), (1.0, 0.5, 0.0)],
 )
 def test_the_knots_of_a_piecewise_linear_flow_are_found(
     metric: str, knots: tuple[float, ...]
@@ -58,7 +64,9 @@ def test_the_knots_of_a_piecewise_linear_flow_are_found(
         piece = (t[:, None] <= torch.tensor(knots[1:]) + 1e-6).sum(1)
         return velocities[piece]
 
-    found = select_timesteps(velocity, SHAPE, len(knots) - 1, 50, 3, metric, progress=False)
+    found = select_timesteps(
+        velocity, SHAPE, len(knots) - 1, 50, 3, metric, progress=False
+    )
     assert found.grid == pytest.approx(knots)
     assert found.cost < 1e-6 < found.uniform_cost or knots == (1.0, 0.5, 0.0)
     assert np.allclose(found.per_trajectory, knots[1:-1])
@@ -72,7 +80,9 @@ def test_costs_equal_their_definition() -> None:
     states = [start]
     velocities = []
     for t, t_next in pairwise(times):
-        velocities.append(gaussian_velocity(y, torch.full((3,), t, dtype=torch.float64)))
+        velocities.append(
+            gaussian_velocity(y, torch.full((3,), t, dtype=torch.float64))
+        )
         y = y + (t_next - t) * velocities[-1]
         states.append(y)
     for i in range(13):
@@ -89,10 +99,20 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
     """The selection minimises the mean cost; each trajectory's own optimum costs at most as
     much."""
     found = select_timesteps(
-        gaussian_velocity, SHAPE, 4, 40, 7, "squared_l2", seed=3, batch=3, progress=False
+        gaussian_velocity,
+        SHAPE,
+        4,
+        40,
+        7,
+        "squared_l2",
+        seed=3,
+        batch=3,
+        progress=False,
     )
     noise = gaussian(3, range(7), SHAPE)
-    costs = cost_matrix(gaussian_velocity, noise, uniform_grid(40), METRICS["squared_l2"])
+    costs = cost_matrix(
+        gaussian_velocity, noise, uniform_grid(40), METRICS["squared_l2"]
+    )
     path = [round((1 - t) * 40) for t in found.grid]
     assert found.costs[np.triu_indices(41, 1)] == pytest.approx(
         costs.mean(0)[np.triu_indices(41, 1)]
@@ -107,7 +127,11 @@ def test_the_selection_minimises_the_mean_cost_of_a_curved_flow() -> None:
     for one, times in zip(costs, found.per_trajectory, strict=True):
         own = [0, *np.round((1 - times) * 40).astype(int), 40]
         assert path_cost(one, np.array(own)) <= path_cost(one, np.array(path)) + 1e-12
-    assert found.candidates == uniform_grid(40) and found.grid[0] == 1 and found.grid[-1] == 0
+    assert (
+        found.candidates == uniform_grid(40)
+        and found.grid[0] == 1
+        and found.grid[-1] == 0
+    )
 
 
 @pytest.mark.slow
@@ -117,7 +141,9 @@ def test_the_batch_size_changes_only_rounding() -> None:
         for b in (1, 3)
     )
     assert one.grid == three.grid
-    assert np.allclose(np.triu(one.costs, 1), np.triu(three.costs, 1), rtol=1e-5, atol=1e-9)
+    assert np.allclose(
+        np.triu(one.costs, 1), np.triu(three.costs, 1), rtol=1e-5, atol=1e-9
+    )
     assert np.array_equal(one.per_trajectory, three.per_trajectory)
 
 
@@ -152,7 +178,9 @@ def test_a_custom_metric_and_one_condition_per_trajectory() -> None:
 def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
     def live() -> int:
         return sum(
-            x.numel() for x in gc.get_objects() if type(x) is Tensor and x.shape[-3:] == SHAPE
+            x.numel()
+            for x in gc.get_objects()
+            if type(x) is Tensor and x.shape[-3:] == SHAPE
         )
 
     def peaks(trajectories: int) -> int:
@@ -171,7 +199,9 @@ def test_memory_does_not_grow_with_the_number_of_trajectories() -> None:
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_teacher_with_nan_or_infinity_is_refused(bad: float) -> None:
     with pytest.raises(DataError, match="the teacher's trajectory is not finite"):
-        select_timesteps(lambda y, t, c: torch.full_like(y, bad), SHAPE, 2, 5, 2, progress=False)
+        select_timesteps(
+            lambda y, t, c: torch.full_like(y, bad), SHAPE, 2, 5, 2, progress=False
+        )
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,8 @@ def test_tensors_are_those_of_torch(tmp_path: Path, zipped: bool) -> None:
         assert found[name].dtype == tensor.dtype, name
         assert torch.equal(found[name], tensor.detach()), name
     assert (
-        found["turned"].untyped_storage().data_ptr() == found["plain"].untyped_storage().data_ptr()
+        found["turned"].untyped_storage().data_ptr()
+        == found["plain"].untyped_storage().data_ptr()
     )
 
 
@@ -101,7 +102,10 @@ def test_a_checkpoint_of_lightning_1_4_is_read(
     content = {
         "epoch": 3,
         "callbacks": {
-            lightning.ModelCheckpoint: {"best_model_score": torch.tensor(0.5), "monitor": None}
+            lightning.ModelCheckpoint: {
+                "best_model_score": torch.tensor(0.5),
+                "monitor": None,
+            }
         },
         "hyper_parameters": lightning.AttributeDict(lr=1e-4, betas=(0.9, 0.99)),
         "namespace": argparse.Namespace(width=64, nested=argparse.Namespace(depth=2)),
@@ -120,14 +124,22 @@ def test_a_checkpoint_of_lightning_1_4_is_read(
     assert (found["loss"], found["count"], found["epoch"]) == (0.25, 7, 3)
     assert list(found["callbacks"]) == ["pytorch_lightning_1_4.ModelCheckpoint"]
     weights = state_of(found, "state_dict", path)
-    assert all(torch.equal(weights[name], tensor.detach()) for name, tensor in state.items())
+    assert all(
+        torch.equal(weights[name], tensor.detach()) for name, tensor in state.items()
+    )
 
 
 @pytest.mark.parametrize(
-    "wrap", ["{}", "module.{}", "_orig_mod.{}", "module._orig_mod.{}", "_orig_mod.module.{}"]
+    "wrap",
+    ["{}", "module.{}", "_orig_mod.{}", "module._orig_mod.{}", "_orig_mod.module.{}"],
 )
-def test_names_of_wrapped_networks_are_those_of_the_network(tmp_path: Path, wrap: str) -> None:
-    state = {wrap.format(name): tensor for name, tensor in nn.Linear(2, 2).state_dict().items()}
+def test_names_of_wrapped_networks_are_those_of_the_network(
+    tmp_path: Path, wrap: str
+) -> None:
+    state = {
+        wrap.format(name): tensor
+        for name, tensor in nn.Linear(2, 2).state_dict().items()
+    }
     found = load_pickle(save(tmp_path / "a.pth", state, True), "a peer")
     assert set(state_of(found, "weights", tmp_path)) == {"weight", "bias"}
     assert set(state_of({"weights": found}, "weights", tmp_path)) == {"weight", "bias"}
@@ -191,12 +203,20 @@ def rebuilt(
         + b"tQ"
     )
     body += (
-        b"\x8a\x08" + struct.pack("<q", offset) + b"(" + numbers + b"t(" + strides + b"t\x89}tR."
+        b"\x8a\x08"
+        + struct.pack("<q", offset)
+        + b"("
+        + numbers
+        + b"t("
+        + strides
+        + b"t\x89}tR."
     )
     return archive(body)
 
 
-def archive(body: bytes, storage: bytes = bytes(16), method: int = zipfile.ZIP_STORED) -> bytes:
+def archive(
+    body: bytes, storage: bytes = bytes(16), method: int = zipfile.ZIP_STORED
+) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", method) as file:
         file.writestr("a/data.pkl", body)
@@ -222,7 +242,9 @@ DAMAGED = {
     "8 EB of one number": lambda: rebuilt((1 << 40, 1 << 20), (0, 0)),
     "more strides than sizes": lambda: rebuilt((2,), (1, 1)),
     "a storage of another size": lambda: rebuilt((2,), (1,), count=1 << 40),
-    "compressed": lambda: archive(b"\x80\x02N.", bytes(10_000_000), zipfile.ZIP_DEFLATED),
+    "compressed": lambda: archive(
+        b"\x80\x02N.", bytes(10_000_000), zipfile.ZIP_DEFLATED
+    ),
     "shared lists": shared_lists,
     "2 GB of text": lambda: archive(b"\x80\x04X\xff\xff\xff\x7fx."),
     "opcodes without end": lambda: archive(b"\x80\x02" + b"N0" * 1_600_000 + b"N."),
@@ -237,7 +259,9 @@ DAMAGED = {
 def test_damaged_files_are_refused_within_limits(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.pth"
     path.write_bytes(DAMAGED[name]())
-    with pytest.raises(DataError, match=r"a\.pth is truncated, damaged or no \.pth file"):
+    with pytest.raises(
+        DataError, match=r"a\.pth is truncated, damaged or no \.pth file"
+    ):
         load_pickle(path, "a peer")
 
 
@@ -248,15 +272,22 @@ def test_deep_and_circular_values_end(tmp_path: Path, zipped: bool) -> None:
     circle: dict[str, Any] = {}
     circle["self"] = circle
     found = load_pickle(
-        save(tmp_path / "a.pth", {"deep": deep, "circle": circle, "x": 1}, zipped), "a peer"
+        save(tmp_path / "a.pth", {"deep": deep, "circle": circle, "x": 1}, zipped),
+        "a peer",
     )
     assert found["x"] == 1
     assert found["circle"] == {"self": None}
     assert len(repr(found["deep"])) < 200
 
 
-def test_flipped_and_cut_files_give_no_foreign_error(tmp_path: Path, zipped: bool) -> None:
-    path = save(tmp_path / "a.pth", {"weights": {"a": torch.ones(3)}, "b": np.float32(1)}, zipped)
+def test_flipped_and_cut_files_give_no_foreign_error(
+    tmp_path: Path, zipped: bool
+) -> None:
+    path = save(
+        tmp_path / "a.pth",
+        {"weights": {"a": torch.ones(3)}, "b": np.float32(1)},
+        zipped,
+    )
     content = path.read_bytes()
     rng = Random(0)
     refused = 0
@@ -264,7 +295,9 @@ def test_flipped_and_cut_files_give_no_foreign_error(tmp_path: Path, zipped: boo
         changed = bytearray(content)
         for _ in range(rng.choice((1, 1, 3, 20))):
             changed[rng.randrange(len(changed))] = rng.randrange(256)
-        path.write_bytes(changed[: rng.choice((len(changed), rng.randrange(len(changed))))])
+        path.write_bytes(
+            changed[: rng.choice((len(changed), rng.randrange(len(changed))))]
+        )
         try:
             load_pickle(path, "a peer")
         except DataError:

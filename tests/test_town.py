@@ -49,7 +49,9 @@ def fingerprint(index: int) -> list[bytes]:
 
 
 def as_bytes(scan: Scan) -> list[bytes]:
-    assert scan.raw_label is not None and scan.boxes is not None and scan.pose is not None
+    assert (
+        scan.raw_label is not None and scan.boxes is not None and scan.pose is not None
+    )
     boxes = [
         scan.boxes.values,
         scan.boxes.occlusion,
@@ -57,7 +59,14 @@ def as_bytes(scan: Scan) -> list[bytes]:
         scan.boxes.image_box,
         scan.boxes.instance,
     ]
-    arrays = [scan.points, scan.reflectance, scan.raw_label, scan.ring, scan.pose, *boxes]
+    arrays = [
+        scan.points,
+        scan.reflectance,
+        scan.raw_label,
+        scan.ring,
+        scan.pose,
+        *boxes,
+    ]
     return [np.ascontiguousarray(a).tobytes() for a in arrays]
 
 
@@ -98,16 +107,26 @@ def test_invalid_options_are_refused(options: dict[str, object]) -> None:
         Town(**options)  # type: ignore[arg-type]
 
 
-def test_a_missing_embreex_is_named_with_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_embreex_is_named_with_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     free_rays.cache_clear()
-    with pytest.raises(LibraryError, match=r"needs embreex.*aarch64.*pip install embreex"):
+    with pytest.raises(
+        LibraryError, match=r"needs embreex.*aarch64.*pip install embreex"
+    ):
         Town()
 
 
 def test_a_scan_has_every_field(scans: dict[int, Scan]) -> None:
     for index, scan in scans.items():
-        assert set(scan.fields()) == {"reflectance", "label", "raw_label", "instance", "ring"}
+        assert set(scan.fields()) == {
+            "reflectance",
+            "label",
+            "raw_label",
+            "instance",
+            "ring",
+        }
         assert scan.domain == SYNTHETIC and scan.id == f"town-0-{index:06d}"
         assert scan.points.dtype == np.float32 and np.isfinite(scan.points).all()
         distance = np.linalg.norm(scan.points, axis=1)
@@ -120,7 +139,9 @@ def test_a_scan_has_every_field(scans: dict[int, Scan]) -> None:
 def test_label_raw_label_and_instance_agree(scans: dict[int, Scan]) -> None:
     for scan in scans.values():
         assert scan.raw_label is not None
-        assert np.array_equal(scan.label, SEMANTIC_KITTI.decode(scan.raw_label & 0xFFFF))
+        assert np.array_equal(
+            scan.label, SEMANTIC_KITTI.decode(scan.raw_label & 0xFFFF)
+        )
         assert np.array_equal(scan.instance, scan.raw_label >> 16)
         things = np.isin(scan.label, [TRAIN_ID[n] for n in NAMES[:8]])
         assert np.array_equal(things, scan.instance > 0)
@@ -141,25 +162,33 @@ def test_classes_are_at_plausible_heights(scans: dict[int, Scan]) -> None:
         x, y, z = scan.points.T
         near = np.hypot(x, y) < 8
 
-        def height(name: str, keep: np.ndarray, scan: Scan = scan, z: np.ndarray = z) -> np.ndarray:
+        def height(
+            name: str, keep: np.ndarray, scan: Scan = scan, z: np.ndarray = z
+        ) -> np.ndarray:
             return z[(scan.label == TRAIN_ID[name]) & keep]
 
         assert abs(np.median(height("road", near)) + 1.73) < 0.12
         assert np.ptp(height("road", near)) < 0.6
         if len(height("sidewalk", near)) > 50:
             assert (
-                0.03 < np.median(height("sidewalk", near)) - np.median(height("road", near)) < 0.35
+                0.03
+                < np.median(height("sidewalk", near)) - np.median(height("road", near))
+                < 0.35
             )
         if len(height("building", near | True)) > 200:
             assert np.percentile(height("building", near | True), 90) > -0.5
 
 
-def test_reflectance_is_quantised_and_differs_between_materials(scans: dict[int, Scan]) -> None:
+def test_reflectance_is_quantised_and_differs_between_materials(
+    scans: dict[int, Scan],
+) -> None:
     reflectance = np.concatenate([s.reflectance for s in scans.values()])
     assert np.array_equal(reflectance * LEVELS, np.round(reflectance * LEVELS))
     assert reflectance.min() == 0 and reflectance.max() < 1
     raw = np.concatenate([s.raw_label & 0xFFFF for s in scans.values()])
-    near = np.concatenate([np.linalg.norm(s.points, axis=1) for s in scans.values()]) < 25
+    near = (
+        np.concatenate([np.linalg.norm(s.points, axis=1) for s in scans.values()]) < 25
+    )
     mean = {c: reflectance[(raw == c) & near].mean() for c in (40, 60, 81, 50)}
     assert mean[40] < min(mean[60], mean[81])
     assert (
@@ -175,11 +204,15 @@ def test_boxes_contain_the_points_of_their_instance(scans: dict[int, Scan]) -> N
         boxes = scan.boxes
         assert boxes is not None and len(np.unique(boxes.instance)) == len(boxes)
         wider = type(boxes)(
-            boxes.values + np.array([0, 0, 0, 0.25, 0.25, 0.25, 0], np.float32), boxes.names
+            boxes.values + np.array([0, 0, 0, 0.25, 0.25, 0.25, 0], np.float32),
+            boxes.names,
         )
         for i, number in enumerate(boxes.instance):
             own = scan.instance == number
-            assert own.any() and wider.contain(scan.points[own])[i].all(), (scan.id, boxes.names[i])
+            assert own.any() and wider.contain(scan.points[own])[i].all(), (
+                scan.id,
+                boxes.names[i],
+            )
         inside = boxes.contain(scan.points, above_floor=0.3)
         total += int(inside.sum())
         foreign += int((inside & (scan.instance != boxes.instance[:, None])).sum())
@@ -222,7 +255,9 @@ def test_image_boxes_and_truncation_match_the_boxes(scans: dict[int, Scan]) -> N
             # The image box of the object lies within the image box of its 3-D box.
             low = corners.min(0) - 3
             high = corners.max(0) + 3
-            assert (boxes.image_box[i, :2] > low).all() and (boxes.image_box[i, 2:] < high).all()
+            assert (boxes.image_box[i, :2] > low).all() and (
+                boxes.image_box[i, 2:] < high
+            ).all()
         ahead = (boxes.values[:, 0] > 6) & (
             np.abs(boxes.values[:, 1]) < 0.8 * boxes.values[:, 0] - 4
         )
@@ -249,8 +284,12 @@ def test_no_ray_passes_through_walls_or_cars(town: Town) -> None:
         measured = np.linalg.norm(offset, axis=1)
         origins = (start @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
         rays = ((offset / measured[:, None]) @ pose[:3, :3].T).astype(np.float32)
-        open_or_soft = [name for name, m in MATERIALS.items() if m.transmission or m.relief]
-        solid = ~np.isin(np.array(list(MATERIALS))[world.surfaces.material], open_or_soft)
+        open_or_soft = [
+            name for name, m in MATERIALS.items() if m.transmission or m.relief
+        ]
+        solid = ~np.isin(
+            np.array(list(MATERIALS))[world.surfaces.material], open_or_soft
+        )
         first, face, _ = Solid(world.triangles).first(origins, rays)
         behind = (first < measured - 0.25) & solid[world.faces[face]]
         # At edges, the ray computed from a rounded point can miss what the original ray hit.
@@ -281,7 +320,9 @@ def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -
     near = place(lorry, 14, 0, 1)
     behind = place(car, 30, 0, 2)
     beside = place(car, 30, 9, 3)
-    boxes = boxes_of([near, behind, beside], pose, Snapshot(bare, [near, behind, beside]))
+    boxes = boxes_of(
+        [near, behind, beside], pose, Snapshot(bare, [near, behind, beside])
+    )
     assert boxes.occlusion[[0, 2]].tolist() == [0, 0] and boxes.occlusion[1] >= 2
     assert boxes.truncation.tolist() == [0, 0, 0]
     alone = boxes_of([behind], pose, Snapshot(bare, [behind]))
@@ -292,12 +333,15 @@ def test_occlusion_and_truncation_of_hidden_cut_and_invisible_cars(town: Town) -
     assert away.truncation[0] == away.occlusion[0] == away.image_box[0, 0] == -1
 
 
-def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Scan]) -> None:
+def test_neighbouring_scans_overlap_when_accumulated_by_pose(
+    scans: dict[int, Scan],
+) -> None:
     def cloud(index: int, pose: np.ndarray | None = None) -> np.ndarray:
         scan = scans[index]
         assert scan.pose is not None and scan.raw_label is not None
         still = np.isin(
-            scan.label, [TRAIN_ID[n] for n in ("road", "sidewalk", "building", "pole", "trunk")]
+            scan.label,
+            [TRAIN_ID[n] for n in ("road", "sidewalk", "building", "pole", "trunk")],
         )
         still &= np.linalg.norm(scan.points, axis=1) < 14
         pose = scan.pose if pose is None else pose
@@ -316,12 +360,18 @@ def test_neighbouring_scans_overlap_when_accumulated_by_pose(scans: dict[int, Sc
     # poses.
     without_motion = tree.query(cloud(5, first.pose), distance_upper_bound=3)[0]
     heights = [np.abs(q[:, 2]).mean() for q in (cloud(4), cloud(5))]
-    assert np.mean(np.minimum(without_motion, 3)) > np.mean(np.minimum(distance_to_first, 3))
+    assert np.mean(np.minimum(without_motion, 3)) > np.mean(
+        np.minimum(distance_to_first, 3)
+    )
     assert abs(heights[0] - heights[1]) < 1
 
 
 def test_stretches_are_far_apart_in_the_world(scans: dict[int, Scan]) -> None:
-    places = {i // STRETCH_FRAMES: s.pose[:3, 3] for i, s in scans.items() if s.pose is not None}
+    places = {
+        i // STRETCH_FRAMES: s.pose[:3, 3]
+        for i, s in scans.items()
+        if s.pose is not None
+    }
     assert len(places) == 4 and abs(places[8][0] - places[0][0]) > 1500
 
 
@@ -337,7 +387,9 @@ def test_points_lie_on_their_lasers_rays(scans: dict[int, Scan]) -> None:
     scan = Town(scans=5, motion=False)[4]
     x, y, z = scan.points.T
     assert np.allclose(
-        np.arctan2(z - height[scan.ring], np.hypot(x, y)), elevation[scan.ring], atol=1e-5
+        np.arctan2(z - height[scan.ring], np.hypot(x, y)),
+        elevation[scan.ring],
+        atol=1e-5,
     )
     turned = np.arctan2(-y, x) - np.radians(sensor.azimuths)[scan.ring]
     firing = (turned / np.pi + 1) / 2 * sensor.firings % sensor.firings
@@ -370,7 +422,9 @@ def test_returns_from_a_level_road_have_the_elevations_of_the_beams() -> None:
     assert np.abs(np.degrees(seen - sensor.laser_elevations[down])).max() < 0.2
 
 
-def test_range_images_are_about_as_full_as_those_of_real_scans(scans: dict[int, Scan]) -> None:
+def test_range_images_are_about_as_full_as_those_of_real_scans(
+    scans: dict[int, Scan],
+) -> None:
     filled = [int(project(s).mask.sum()) for s in scans.values()]
     assert all(38_000 < n < 53_000 for n in filled), filled
 
@@ -381,7 +435,9 @@ def test_the_town_can_be_scanned_with_another_preset(name: str) -> None:
     scan = Town(seed=0, sensor=sensor, scans=500, motion=False)[4]
     assert scan.sensor == sensor and scan.ring is not None
     x, y, z = scan.points.T
-    assert np.allclose(np.arctan2(z, np.hypot(x, y)), sensor.laser_elevations[scan.ring], atol=1e-5)
+    assert np.allclose(
+        np.arctan2(z, np.hypot(x, y)), sensor.laser_elevations[scan.ring], atol=1e-5
+    )
     assert project(scan).mask.mean() > 0.5
     assert np.linalg.norm(scan.points, axis=1).max() > 70
 
@@ -392,7 +448,9 @@ def test_the_town_can_be_scanned_with_a_custom_sensor() -> None:
     assert 0 < len(scan) <= 5 * 64 and scan.ring is not None and scan.ring.max() <= 4
 
 
-def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan]) -> None:
+def test_camera_and_lidar_see_the_same_classes(
+    town: Town, scans: dict[int, Scan]
+) -> None:
     snapshot, pose, _ = town.moment(4)
     surfaces = town.world(4).surfaces
     scan = scans[4]
@@ -400,7 +458,10 @@ def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan
     width, height = CAMERA.image_size or (0, 0)
     with np.errstate(invalid="ignore"):
         inside = (
-            (depth > 1) & (pixels >= 0).all(1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+            (depth > 1)
+            & (pixels >= 0).all(1)
+            & (pixels[:, 0] < width)
+            & (pixels[:, 1] < height)
         )
     eye, rays = pixel_rays(pose, pixels[inside])
     hits = camera_hits(snapshot, eye, rays, surfaces)
@@ -413,7 +474,9 @@ def test_camera_and_lidar_see_the_same_classes(town: Town, scans: dict[int, Scan
     turned = SEMANTIC_KITTI.decode(surfaces.raw)[
         camera_hits(snapshot, eye, aside, surfaces).surface
     ]
-    assert (turned == scan.label[inside]).mean() < (seen == scan.label[inside]).mean() - 0.03  # type: ignore[index]
+    assert (turned == scan.label[inside]).mean() < (
+        seen == scan.label[inside]
+    ).mean() - 0.03  # type: ignore[index]
 
 
 @pytest.mark.slow
@@ -423,7 +486,9 @@ def test_the_camera_image_shows_a_street_with_sky(town: Town) -> None:
     assert np.array_equal(image, town.image(4))
     assert image.std() > 30
     snapshot, pose, _ = town.moment(4)
-    grid = np.stack(np.meshgrid(np.arange(0, 1408, 8), np.arange(0, 376, 8)), -1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.arange(0, 1408, 8), np.arange(0, 376, 8)), -1
+    ).reshape(-1, 2)
     eye, rays = pixel_rays(pose, grid)
     hits = camera_hits(snapshot, eye, rays, town.world(4).surfaces)
     colour = image[grid[:, 1], grid[:, 0]].astype(float)
@@ -432,7 +497,9 @@ def test_the_camera_image_shows_a_street_with_sky(town: Town) -> None:
         colour[hits.surface < 0].mean()
         > colour[(label == TRAIN_ID["road"]) & (hits.surface >= 0)].mean() + 30
     )
-    red, green, _ = colour[(label == TRAIN_ID["vegetation"]) & (hits.surface >= 0)].mean(0)
+    red, green, _ = colour[
+        (label == TRAIN_ID["vegetation"]) & (hits.surface >= 0)
+    ].mean(0)
     assert green > red
 
 

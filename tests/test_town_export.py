@@ -39,12 +39,17 @@ def written(
     request: pytest.FixtureRequest, town: Town, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, Path]:
     root = tmp_path_factory.mktemp(request.param)
-    assert export_town(town, root, request.param, camera=False, progress=False) == (COUNT, 0)
+    assert export_town(town, root, request.param, camera=False, progress=False) == (
+        COUNT,
+        0,
+    )
     return request.param, root
 
 
 @pytest.mark.slow
-def test_points_are_read_back_bit_for_bit(written: tuple[str, Path], scans: list[Scan]) -> None:
+def test_points_are_read_back_bit_for_bit(
+    written: tuple[str, Path], scans: list[Scan]
+) -> None:
     layout, root = written
     read = open_scans(root, split="train" if layout == "semantic_kitti" else None)
     assert len(read) == COUNT
@@ -58,14 +63,20 @@ def test_scans_read_from_an_exported_town_are_synthetic(
 ) -> None:
     root = written[1]
     read = open_scans(root)
-    assert [scan.domain for scan in read] == [SYNTHETIC] * COUNT and read[0].domain == SYNTHETIC
-    one = next(path for path in sorted(root.rglob("*.bin")) if path.parent.name != "labels")
+    assert [scan.domain for scan in read] == [SYNTHETIC] * COUNT and read[
+        0
+    ].domain == SYNTHETIC
+    one = next(
+        path for path in sorted(root.rglob("*.bin")) if path.parent.name != "labels"
+    )
     assert open_scans(one)[0].domain == SYNTHETIC
     view(root, 0, 1, tmp_path / "page.html", None)
     assert '"domain": 1' in (tmp_path / "page.html").read_text().replace(
         '"domain":1', '"domain": 1'
     )
-    real = MixedScans(read, ratio=0)  # a mixture counts every scan of its real source as real
+    real = MixedScans(
+        read, ratio=0
+    )  # a mixture counts every scan of its real source as real
     assert real[0]["domain"] == REAL
 
 
@@ -163,19 +174,24 @@ def test_splits_and_times_of_each_layout_are_written(written: tuple[str, Path]) 
     if layout == "semantic_kitti":
         assert len(SemanticKITTI(root, split="train")) == COUNT
         times = [
-            float(line) for line in (root / "sequences" / "00" / "times.txt").read_text().split()
+            float(line)
+            for line in (root / "sequences" / "00" / "times.txt").read_text().split()
         ]
         assert np.allclose(times, [0, 0.4, 0.8])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("layout", "scan"), {"semantic_kitti": "000001.bin", "kitti360": "0000000001.bin"}.items()
+    ("layout", "scan"),
+    {"semantic_kitti": "000001.bin", "kitti360": "0000000001.bin"}.items(),
 )
 def test_an_interrupted_or_extended_export_changes_no_byte(
     layout: str, scan: str, tmp_path: Path, town: Town
 ) -> None:
-    assert export_town(town, tmp_path, layout, camera=False, progress=False) == (COUNT, 0)
+    assert export_town(town, tmp_path, layout, camera=False, progress=False) == (
+        COUNT,
+        0,
+    )
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     [lost] = tmp_path.rglob(f"velodyne*/**/{scan}")
     lost.unlink()
@@ -186,14 +202,19 @@ def test_an_interrupted_or_extended_export_changes_no_byte(
         )
         assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
     longer = Town(seed=5, scans=COUNT + 1)
-    assert export_town(longer, tmp_path, layout, camera=False, progress=False) == (1, COUNT)
+    assert export_town(longer, tmp_path, layout, camera=False, progress=False) == (
+        1,
+        COUNT,
+    )
     poses = [p for p in before if p.name == "poses.txt"]
     assert poses and all(p.read_bytes().startswith(before[p]) for p in poses)
 
 
 def test_fewer_scans_than_there_are_keep_all_times(tmp_path: Path) -> None:
     times = tmp_path / "sequences" / "00" / "times.txt"
-    export_town(Town(seed=5, scans=2), tmp_path, "semantic_kitti", camera=False, progress=False)
+    export_town(
+        Town(seed=5, scans=2), tmp_path, "semantic_kitti", camera=False, progress=False
+    )
     before = times.read_text()
     assert export_town(
         Town(seed=5, scans=1), tmp_path, "semantic_kitti", camera=False, progress=False
@@ -214,10 +235,14 @@ def test_the_readme_shows_a_sensor_s_name_as_text(tmp_path: Path) -> None:
     }
 
 
-def test_a_folder_that_holds_another_town_is_refused(tmp_path: Path, town: Town) -> None:
+def test_a_folder_that_holds_another_town_is_refused(
+    tmp_path: Path, town: Town
+) -> None:
     export_town(Town(seed=5, scans=0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=r"was filled with .*'seed': 5"):
-        export_town(Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False)
+        export_town(
+            Town(seed=6, scans=1), tmp_path, "kitti", camera=False, progress=False
+        )
 
 
 @pytest.mark.parametrize(
@@ -234,7 +259,11 @@ def test_a_folder_is_not_continued_by_a_town_whose_scans_differ(
     export_town(Town(5, "pandar64", 0), tmp_path, "kitti", camera=False, progress=False)
     with pytest.raises(ConfigError, match=f"was filled with .*{named}"):
         export_town(
-            Town(5, "pandar64", 1, **options), tmp_path, "kitti", camera=False, progress=False
+            Town(5, "pandar64", 1, **options),
+            tmp_path,
+            "kitti",
+            camera=False,
+            progress=False,
         )
 
 
@@ -259,13 +288,24 @@ def test_invalid_arguments_are_refused(
 def test_an_unwritable_folder_is_reported(tmp_path: Path, town: Town) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="cannot be written"):
-        export_town(town, tmp_path / "file" / "out", "kitti360", camera=False, progress=False)
+        export_town(
+            town, tmp_path / "file" / "out", "kitti360", camera=False, progress=False
+        )
 
 
 @pytest.mark.slow
-def test_several_processes_write_the_same_files_as_one(tmp_path: Path, town: Town) -> None:
+def test_several_processes_write_the_same_files_as_one(
+    tmp_path: Path, town: Town
+) -> None:
     for jobs in (1, 2):
-        export_town(town, tmp_path / str(jobs), "kitti360", camera=False, jobs=jobs, progress=False)
+        export_town(
+            town,
+            tmp_path / str(jobs),
+            "kitti360",
+            camera=False,
+            jobs=jobs,
+            progress=False,
+        )
     one, two = (
         {
             p.relative_to(tmp_path / j): p.read_bytes()
@@ -302,7 +342,11 @@ def test_the_command_writes_camera_images_and_accepts_sensors(
         assert image.size == (1408, 376)
         assert np.array_equal(np.asarray(image), Town(seed=5, scans=1).image(0))
     command(
-        tmp_path / "b", scans=1, sensor="hdl32e_nuscenes", camera=False, layout="semantic_kitti"
+        tmp_path / "b",
+        scans=1,
+        sensor="hdl32e_nuscenes",
+        camera=False,
+        layout="semantic_kitti",
     )
     read = SemanticKITTI(tmp_path / "b", sensor="hdl32e_nuscenes")[0]
     assert len(read) > 5000 and read.sensor == load_sensor("hdl32e_nuscenes")

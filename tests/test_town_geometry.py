@@ -13,7 +13,14 @@ from lidar_synth.lab.town.ground import KINDS, NAMES, TownGround
 from lidar_synth.lab.town.materials import MATERIALS, Finish, Finishes
 from lidar_synth.lab.town.meshes import Mesh, ball, boxes, loft, merge, prism, tube
 from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, sitter, walker
-from lidar_synth.lab.town.plants import CORE, LEAF, SPECIES, VARIANTS, coarse_plant, plant
+from lidar_synth.lab.town.plants import (
+    CORE,
+    LEAF,
+    SPECIES,
+    VARIANTS,
+    coarse_plant,
+    plant,
+)
 from lidar_synth.lab.town.returns import ReturnNoise, cell_noise, laser_gains
 from lidar_synth.lab.town.solid import Solid
 from lidar_synth.lab.town.street import KINDS as STREETS
@@ -26,7 +33,9 @@ UP = np.array((0.0, 0.0, 1.0))
 
 def hits(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distances to the mesh, inf where rays miss it."""
-    return Solid(mesh.triangles).first(origins.astype(np.float32), directions.astype(np.float32))[0]
+    return Solid(mesh.triangles).first(
+        origins.astype(np.float32), directions.astype(np.float32)
+    )[0]
 
 
 def rays_towards_origin(
@@ -41,7 +50,9 @@ def rays_towards_origin(
 
 @given(low=st.tuples(*[st.floats(-5, 5)] * 3), size=st.tuples(*[st.floats(0.1, 5)] * 3))
 @settings(max_examples=20)
-def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, ...]) -> None:
+def test_rays_hit_the_faces_of_a_box(
+    low: tuple[float, ...], size: tuple[float, ...]
+) -> None:
     a = np.array(low)
     b = np.array(low) + np.array(size)
     mesh = boxes([a], [b])
@@ -50,7 +61,9 @@ def test_rays_hit_the_faces_of_a_box(low: tuple[float, ...], size: tuple[float, 
     for axis in range(3):
         direction = np.zeros(3)
         direction[axis] = 1.0
-        distances = hits(mesh, np.array([middle - 20 * direction]), np.array([direction]))
+        distances = hits(
+            mesh, np.array([middle - 20 * direction]), np.array([direction])
+        )
         assert np.isclose(distances[0], 20 - size[axis] / 2, atol=1e-3)
 
 
@@ -82,13 +95,17 @@ def test_a_tube_has_the_given_radius() -> None:
 
 @given(yaw=st.floats(-3, 3), scale=st.floats(0.5, 2), x=st.floats(-10, 10))
 @settings(max_examples=20)
-def test_moved_equals_scaling_and_a_rigid_motion(yaw: float, scale: float, x: float) -> None:
+def test_moved_equals_scaling_and_a_rigid_motion(
+    yaw: float, scale: float, x: float
+) -> None:
     mesh = vehicles()["sedan"].mesh
     moved = mesh.moved((x, 1, 2), yaw, scale)
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = x, 1, 2
-    assert np.allclose(moved.triangles, mesh.moved(scale=scale).posed(pose).triangles, atol=1e-4)
+    assert np.allclose(
+        moved.triangles, mesh.moved(scale=scale).posed(pose).triangles, atol=1e-4
+    )
     assert np.array_equal(moved.slot, mesh.slot)
 
 
@@ -117,7 +134,9 @@ def test_vehicles_have_plausible_shapes() -> None:
     # wheels.
     car = kinds["sedan"].mesh
     front, roof, boot = 5 - hits(
-        car, np.array([(x, 0.0, 5.0) for x in (1.8, 0.0, -2.1)]), np.tile((0, 0, -1), (3, 1))
+        car,
+        np.array([(x, 0.0, 5.0) for x in (1.8, 0.0, -2.1)]),
+        np.tile((0, 0, -1), (3, 1)),
     )
     assert front < 1.0 < roof and boot < roof - 0.2
     assert np.isinf(hits(car, np.array([(0.0, -5.0, 0.1)]), np.array([(0, 1, 0)])))[0]
@@ -151,7 +170,10 @@ def test_rays_enter_the_crown_of_a_plant(species: str) -> None:
         depth = 50 - distances[np.isfinite(distances)]
         # Some rays end outside, some deep inside; with a smooth surface, all would end at the same
         # depth.
-        assert len(depth) > 0.2 * side.sum() and depth.std() > 0.015 * (high - low)[:2].mean()
+        assert (
+            len(depth) > 0.2 * side.sum()
+            and depth.std() > 0.015 * (high - low)[:2].mean()
+        )
     assert np.isin(plant(species, 0).slot, (LEAF, CORE)).mean() > 0.5
 
 
@@ -183,7 +205,9 @@ def test_the_mesh_of_the_ground_matches_its_height_and_kind(stretch: int) -> Non
     )
     corners = np.zeros(len(s), bool)
     for c in ground.corners:
-        corners |= (np.abs(s - c.s) < c.radius + 0.3) & (np.abs(t - c.t) < c.radius + 0.3)
+        corners |= (np.abs(s - c.s) < c.radius + 0.3) & (
+            np.abs(t - c.t) < c.radius + 0.3
+        )
     keep = paved & ~corners
     mesh = ground.mesh(np.random.default_rng(0))
     points = ground.points(s[keep], t[keep])
@@ -194,7 +218,8 @@ def test_the_mesh_of_the_ground_matches_its_height_and_kind(stretch: int) -> Non
     assert np.percentile(np.abs(30 - distances), 97) < 0.02
     slot = mesh.slot[
         Solid(mesh.triangles).first(
-            (points + UP * 30).astype(np.float32), np.tile(np.float32([0, 0, -1]), (len(points), 1))
+            (points + UP * 30).astype(np.float32),
+            np.tile(np.float32([0, 0, -1]), (len(points), 1)),
         )[1]
     ]
     assert (slot == kind[keep]).mean() > 0.97
@@ -204,7 +229,9 @@ def test_the_ground_has_no_holes() -> None:
     world = build_world(0, 0, 0.4)
     mesh = world.scene.ground.mesh(np.random.default_rng(0))
     rng = np.random.default_rng(0)
-    points = world.scene.ground.points(rng.uniform(-80, 110, 20_000), rng.uniform(-80, 80, 20_000))
+    points = world.scene.ground.points(
+        rng.uniform(-80, 110, 20_000), rng.uniform(-80, 80, 20_000)
+    )
     distances = hits(mesh, points + UP * 50, np.tile((0, 0, -1.0), (len(points), 1)))
     assert np.isinf(distances).sum() <= 2
 
@@ -215,7 +242,13 @@ def test_a_kerb_closes_the_step_between_road_and_pavement() -> None:
     pavement = NAMES.index("sidewalk")
     rects = [(-50.0, 50.0, -20.0, 20.0, pavement), (-50.0, 50.0, -3.0, 3.0, road)]
     ground = TownGround(
-        Course(-50, 50, 0, rng), Relief(0.0, rng), (3, 3), (-60, 60, -60, 60), (-50, 50), rects, []
+        Course(-50, 50, 0, rng),
+        Relief(0.0, rng),
+        (3, 3),
+        (-60, 60, -60, 60),
+        (-50, 50),
+        rects,
+        [],
     )
     step = float(ground.height(0, 3.01) - ground.height(0, 2.99))
     assert step == pytest.approx(KINDS["sidewalk"].lift, abs=1e-3)
@@ -231,20 +264,26 @@ def test_sampled_streets_of_a_kind_vary_and_are_valid(kind: str) -> None:
     assert len({(s.edge, s.parking, len(s.crossings)) for s in streets}) > 10
     for street in streets:
         assert street.kind == kind and street.length > 20
-        assert -street.edge[RIGHT] < street.lanes[0].t < 0 and street.lanes[0].direction == 1
+        assert (
+            -street.edge[RIGHT] < street.lanes[0].t < 0
+            and street.lanes[0].direction == 1
+        )
         for lane in street.lanes:
-            assert -street.edge[RIGHT] < lane.t < street.edge[LEFT] and lane.direction == (
-                1 if lane.t < 0 else -1
-            )
+            assert -street.edge[RIGHT] < lane.t < street.edge[
+                LEFT
+            ] and lane.direction == (1 if lane.t < 0 else -1)
         assert street.ends[0] < -20 and street.ends[1] > street.length + 20
         if kind == "junction":
             assert any(
-                c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20 for c in street.crossings
+                c.sides == (RIGHT, LEFT) and 0 < c.s < street.length + 20
+                for c in street.crossings
             )
 
 
 def test_all_kinds_of_street_are_sampled() -> None:
-    assert {str(rng_for(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)} == set(STREETS)
+    assert {
+        str(rng_for(WORLD, 0, k).choice(STREETS, p=SHARES)) for k in range(40)
+    } == set(STREETS)
     assert sum(SHARES) == pytest.approx(1)
 
 
@@ -291,7 +330,9 @@ def test_laser_gains_are_fixed_for_a_sensor() -> None:
 
     sensor = load_sensor("town")
     gains = laser_gains(sensor, ReturnNoise())
-    assert np.array_equal(gains, laser_gains(sensor, ReturnNoise())) and gains.shape == (64,)
+    assert np.array_equal(
+        gains, laser_gains(sensor, ReturnNoise())
+    ) and gains.shape == (64,)
     assert 0.9 < gains.mean() < 1.2 and gains.std() > 0.05
 
 

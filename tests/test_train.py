@@ -61,7 +61,8 @@ class Convolution(nn.Module):
 def new_training(**recipe: Any) -> Training:
     torch.manual_seed(0)
     return Training(
-        Convolution(), Recipe(**{"iterations": 6, "batch": 4, "warmup": 2, "rate": 1e-2} | recipe)
+        Convolution(),
+        Recipe(**{"iterations": 6, "batch": 4, "warmup": 2, "rate": 1e-2} | recipe),
     )
 
 
@@ -90,10 +91,15 @@ def test_a_cache_holds_the_projected_scans_within_its_steps(tmp_path: Path) -> N
         fields = cache.read([4, 0])
         for i, scan in enumerate((SCANS[4], SCANS[0])):
             image = project(scan)
-            assert np.abs(fields["range"][i].numpy() - image.range).max() <= 80 / 65535 / 2 * 1.01
+            assert (
+                np.abs(fields["range"][i].numpy() - image.range).max()
+                <= 80 / 65535 / 2 * 1.01
+            )
             assert np.array_equal(fields["range"][i].numpy() > 0, image.mask)
             assert (
-                np.abs(fields["reflectance"][i].numpy() - image.channels["reflectance"]).max()
+                np.abs(
+                    fields["reflectance"][i].numpy() - image.channels["reflectance"]
+                ).max()
                 <= 0.5 / 255 * 1.01
             )
             assert np.array_equal(fields["label"][i].numpy(), image.channels["label"])
@@ -122,7 +128,9 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
     with pytest.raises(KeyboardInterrupt):
         cache_scans(broken, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
     again = Counted(scans)
-    cache = cache_scans(again, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False)
+    cache = cache_scans(
+        again, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False
+    )
     assert again.reads == 150 - 64  # what was noted as done is kept
     fresh = cache_scans(scans, SENSOR, ["range"], progress=False)
     assert np.array_equal(cache.fields["range"], fresh.fields["range"])
@@ -132,7 +140,9 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
     with pytest.raises(ConfigError, match=r"cache of other data \(source differ\)"):
         cache_scans(scans, SENSOR, ["range"], tmp_path, {"town": 151}, progress=False)
     with pytest.raises(ConfigError, match="channels"):
-        cache_scans(scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False)
+        cache_scans(
+            scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False
+        )
 
 
 def test_a_source_that_gives_nothing_or_lacks_a_channel_is_refused() -> None:
@@ -143,11 +153,16 @@ def test_a_source_that_gives_nothing_or_lacks_a_channel_is_refused() -> None:
         cache_scans([bare], SENSOR, ["range", "label"], progress=False)
 
 
-def test_what_stands_at_a_position_does_not_depend_on_the_others(batches: Batches) -> None:
+def test_what_stands_at_a_position_does_not_depend_on_the_others(
+    batches: Batches,
+) -> None:
     together = batches(range(7, 13))
     for i, position in enumerate(range(7, 13)):
         alone = batches([position])
-        assert all(torch.equal(a[i], b[0]) for a, b in zip(together[:3], alone[:3], strict=True))
+        assert all(
+            torch.equal(a[i], b[0])
+            for a, b in zip(together[:3], alone[:3], strict=True)
+        )
 
 
 def test_two_sequences_take_turns(batches: Batches) -> None:
@@ -155,13 +170,21 @@ def test_two_sequences_take_turns(batches: Batches) -> None:
     both = InTurns(batches, other)(range(3, 8))
     for i, position in enumerate(range(3, 8)):
         alone = (batches, other)[position % 2]([position // 2])
-        assert all(torch.equal(a[i], b[0]) for a, b in zip(both[:3], alone[:3], strict=True))
-    with pytest.raises(ConfigError, match="rehearsal for a model with the condition 'semantic'"):
-        InTurns(replace(batches, roll=False, conditioning=Conditioning("semantic")), other)
+        assert all(
+            torch.equal(a[i], b[0]) for a, b in zip(both[:3], alone[:3], strict=True)
+        )
+    with pytest.raises(
+        ConfigError, match="rehearsal for a model with the condition 'semantic'"
+    ):
+        InTurns(
+            replace(batches, roll=False, conditioning=Conditioning("semantic")), other
+        )
 
 
 @given(epoch=st.integers(0, 50))
-def test_every_epoch_is_a_permutation_of_all_scans(batches: Batches, epoch: int) -> None:
+def test_every_epoch_is_a_permutation_of_all_scans(
+    batches: Batches, epoch: int
+) -> None:
     assert sorted(batches.scans_at(range(epoch * 5, epoch * 5 + 5))) == list(range(5))
 
 
@@ -176,7 +199,9 @@ def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
             (flip, shift)
             for flip in (False, True)
             for shift in range(32)
-            if torch.equal(sample, (original.flip(-1) if flip else original).roll(shift, -1))
+            if torch.equal(
+                sample, (original.flip(-1) if flip else original).roll(shift, -1)
+            )
         ]
         assert len(found) == 1, position
         seen |= set(found)
@@ -185,7 +210,9 @@ def test_augmentation_turns_and_mirrors_whole_columns(batches: Batches) -> None:
 
 
 def test_mirroring_an_image_is_mirroring_its_points() -> None:
-    mirrored = Scan(SCANS[0].points * np.float32([1, -1, 1]), SCANS[0].reflectance, SENSOR)
+    mirrored = Scan(
+        SCANS[0].points * np.float32([1, -1, 1]), SCANS[0].reflectance, SENSOR
+    )
     assert (
         project(mirrored).range == project(SCANS[0]).range[:, ::-1]
     ).mean() > 0.99  # all but points on an edge
@@ -202,14 +229,20 @@ def test_processes_and_micro_batches_share_the_positions_of_a_step(
 ) -> None:
     batch = size * accumulate * processes
     parts = [
-        p for r in range(processes) for p in micro_batches(step, batch, accumulate, r, processes)
+        p
+        for r in range(processes)
+        for p in micro_batches(step, batch, accumulate, r, processes)
     ]
-    assert sorted(i for p in parts for i in p) == list(range(step * batch, (step + 1) * batch))
+    assert sorted(i for p in parts for i in p) == list(
+        range(step * batch, (step + 1) * batch)
+    )
     assert {len(p) for p in parts} == {size}
 
 
 def test_a_batch_that_cannot_be_divided_is_refused() -> None:
-    with pytest.raises(ConfigError, match="batch 8 over 3 micro-batches and 1 processes"):
+    with pytest.raises(
+        ConfigError, match="batch 8 over 3 micro-batches and 1 processes"
+    ):
         list(micro_batches(0, 8, 3))
 
 
@@ -244,7 +277,9 @@ def test_training_lowers_the_loss(batches: Batches, accelerator: Accelerator) ->
     training = new_training(iterations=60, clip=10.0)
     records = list(steps(training, teacher_task(), batches, accelerator))
     assert [r.step for r in records] == list(range(1, 61))
-    assert np.mean([r.loss for r in records[-10:]]) < 0.9 * np.mean([r.loss for r in records[:10]])
+    assert np.mean([r.loss for r in records[-10:]]) < 0.9 * np.mean(
+        [r.loss for r in records[:10]]
+    )
     assert records[0].rate == pytest.approx(0.5e-2)
     assert all(r.gradient > 0 and r.teacher_evaluations == 0 for r in records)
 
@@ -256,8 +291,12 @@ def test_the_first_loss_is_that_of_the_metric_on_the_batch(
     for metric in METRICS:
         training = new_training(metric=metric)
         batch = batches(range(4))
-        y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(-1, 1, 1, 1) * batch.y1
-        expected = METRICS[metric](training.network(y, batch.u), batch.y1 - batch.y0).mean()
+        y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(
+            -1, 1, 1, 1
+        ) * batch.y1
+        expected = METRICS[metric](
+            training.network(y, batch.u), batch.y1 - batch.y0
+        ).mean()
         record = next(steps(training, teacher_task(), batches, accelerator))
         assert record.loss == pytest.approx(expected.item(), rel=1e-5)
 
@@ -267,18 +306,29 @@ def test_weights_of_channels_are_those_of_their_squared_errors(
 ) -> None:
     training = new_training(weights={"range": 4.0, "label": 0.5})
     batch = batches(range(4))
-    y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(-1, 1, 1, 1) * batch.y1
-    error = (training.network(y, batch.u) - (batch.y1 - batch.y0)).square().mean((0, 2, 3))
-    expected = (error * torch.tensor([4, 1] + [0.5] * 5)).mean()
-    assert next(steps(training, teacher_task(), batches, accelerator)).loss == pytest.approx(
-        expected.item(), rel=1e-5
+    y = (1 - batch.u.view(-1, 1, 1, 1)) * batch.y0 + batch.u.view(
+        -1, 1, 1, 1
+    ) * batch.y1
+    error = (
+        (training.network(y, batch.u) - (batch.y1 - batch.y0)).square().mean((0, 2, 3))
     )
+    expected = (error * torch.tensor([4, 1] + [0.5] * 5)).mean()
+    assert next(
+        steps(training, teacher_task(), batches, accelerator)
+    ).loss == pytest.approx(expected.item(), rel=1e-5)
 
 
 @pytest.mark.slow
-def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accelerator) -> None:
+def test_accumulation_changes_rounding_only(
+    batches: Batches, accelerator: Accelerator
+) -> None:
     one, two = (
-        [r.loss for r in steps(new_training(accumulate=n), teacher_task(), batches, accelerator)]
+        [
+            r.loss
+            for r in steps(
+                new_training(accumulate=n), teacher_task(), batches, accelerator
+            )
+        ]
         for n in (1, 2)
     )
     assert one == pytest.approx(two, rel=1e-4)
@@ -287,10 +337,18 @@ def test_accumulation_changes_rounding_only(batches: Batches, accelerator: Accel
 def transformer() -> nn.Module:
     """A velocity network that every optimiser can train."""
     torch.manual_seed(0)
-    arguments = {"width": 16, "time_width": 16, "depths": [1], "heads": [2], "patch": [2, 4]}
+    arguments = {
+        "width": 16,
+        "time_width": 16,
+        "depths": [1],
+        "heads": [2],
+        "patch": [2, 4],
+    }
     angles = torch.from_numpy(SENSOR.ray_angles())
     return build_network(
-        "hdit", {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles} | arguments
+        "hdit",
+        {"resolution": SENSOR.shape, "channels": TENSORS.size, "angles": angles}
+        | arguments,
     )
 
 
@@ -299,7 +357,9 @@ def transformer() -> nn.Module:
 def test_a_saved_run_goes_on_with_the_very_same_losses(
     optimizer: str, batches: Batches, accelerator: Accelerator, tmp_path: Path
 ) -> None:
-    recipe = Recipe(iterations=6, batch=4, warmup=2, rate=1e-2, ema_every=1, optimizer=optimizer)
+    recipe = Recipe(
+        iterations=6, batch=4, warmup=2, rate=1e-2, ema_every=1, optimizer=optimizer
+    )
     whole = Training(transformer(), recipe)
     losses = [r.loss for r in steps(whole, teacher_task(), batches, accelerator)]
     first = Training(transformer(), recipe)
@@ -310,8 +370,12 @@ def test_a_saved_run_goes_on_with_the_very_same_losses(
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["state.safetensors"]
     second = Training(transformer(), recipe)
     second.load(tmp_path / "run" / "state.safetensors")
-    assert [r.loss for r in steps(second, teacher_task(), batches, accelerator)] == losses[3:]
-    for a, b in zip(whole.average.parameters(), second.average.parameters(), strict=True):
+    assert [
+        r.loss for r in steps(second, teacher_task(), batches, accelerator)
+    ] == losses[3:]
+    for a, b in zip(
+        whole.average.parameters(), second.average.parameters(), strict=True
+    ):
         assert torch.equal(a, b)
 
 
@@ -321,7 +385,12 @@ def test_every_weight_is_moved_once_at_the_rate_of_the_schedule(
 ) -> None:
     recipe = Recipe(iterations=2, batch=4, warmup=4, rate=1e-2, optimizer=optimizer)
     training = Training(transformer(), recipe)
-    moved = [p for o in training.optimizers for group in o.param_groups for p in group["params"]]
+    moved = [
+        p
+        for o in training.optimizers
+        for group in o.param_groups
+        for p in group["params"]
+    ]
     assert sorted(map(id, moved)) == sorted(map(id, training.network.parameters()))
     record = next(steps(training, teacher_task(), batches, accelerator))
     assert (
@@ -331,14 +400,18 @@ def test_every_weight_is_moved_once_at_the_rate_of_the_schedule(
     )
 
 
-def test_the_average_follows_the_weights(batches: Batches, accelerator: Accelerator) -> None:
+def test_the_average_follows_the_weights(
+    batches: Batches, accelerator: Accelerator
+) -> None:
     training = new_training(iterations=4, ema_every=2, ema_decay=0.5)
     start = [p.clone() for p in training.average.parameters()]
     seen = []
     for _ in steps(training, teacher_task(), batches, accelerator):
         seen.append([p.detach().clone() for p in training.network.parameters()])
     keep = [2 / 11, 3 / 12]  # below the decay: the start is forgotten
-    for i, (average, first) in enumerate(zip(training.average.parameters(), start, strict=True)):
+    for i, (average, first) in enumerate(
+        zip(training.average.parameters(), start, strict=True)
+    ):
         expected = first
         for k, weights in zip(keep, (seen[1], seen[3]), strict=True):
             expected = k * expected + (1 - k) * weights[i]
@@ -351,14 +424,19 @@ def test_a_loss_that_is_not_finite_stops_and_leaves_the_training_as_it_was(
     def poisoned(batch: Batch) -> Example:
         example = teacher_task()(batch)
         bad = (
-            torch.full_like(example.velocity, torch.nan) if training.step == 2 else example.velocity
+            torch.full_like(example.velocity, torch.nan)
+            if training.step == 2
+            else example.velocity
         )
         return Example(example.y, example.t, bad)
 
     training = new_training(ema_every=1)
     run = steps(training, poisoned, batches, accelerator)
     next(run), next(run)
-    before = [p.clone() for p in (*training.network.parameters(), *training.average.parameters())]
+    before = [
+        p.clone()
+        for p in (*training.network.parameters(), *training.average.parameters())
+    ]
     with pytest.raises(DataError, match="step 3: the loss is nan"):
         next(run)
     after = (*training.network.parameters(), *training.average.parameters())
@@ -372,7 +450,9 @@ def test_a_student_is_trained_by_every_strategy(
 ) -> None:
     teacher = Convolution().eval().requires_grad_(False)
     task = student_task(strategy, teacher, uniform_grid(4), 2)
-    records = list(steps(new_training(metric="pseudo_huber"), task, batches, accelerator))
+    records = list(
+        steps(new_training(metric="pseudo_huber"), task, batches, accelerator)
+    )
     assert all(math.isfinite(r.loss) for r in records)
     assert [r.teacher_evaluations for r in records] == [8] * 6
 

@@ -19,7 +19,13 @@ from lidar_synth.lab.train.start import start_networks
 from lidar_synth.lab.train.state import read_progress
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
-SHORT = ("recipe.batch=1", "data.town=2", "samples.every=0", "recipe.warmup=1", "save_every=2")
+SHORT = (
+    "recipe.batch=1",
+    "data.town=2",
+    "samples.every=0",
+    "recipe.warmup=1",
+    "save_every=2",
+)
 HELD = "held_out={data: {licence: MIT, town: 2, seed: 1}, samples: 1, patience: 2}"
 
 
@@ -41,7 +47,9 @@ def test_a_second_run_does_not_empty_the_cache_of_the_first(tmp_path: Path) -> N
         def __getitem__(self, index: Any) -> Any:
             if index == 5:
                 with pytest.raises(KeyboardInterrupt):
-                    cache_scans(Stopped(self), SENSOR, ["range"], tmp_path, progress=False)
+                    cache_scans(
+                        Stopped(self), SENSOR, ["range"], tmp_path, progress=False
+                    )
             return super().__getitem__(index)
 
     scans = [random_scan(SENSOR, 100, seed) for seed in range(8)]
@@ -77,28 +85,45 @@ def test_the_rate_falls_after_a_plateau_that_patience_has_ended(
     rates: list[float] = []
     add = runs._Log.add
     monkeypatch.setattr(
-        runs._Log, "add", lambda self, record: rates.append(record.rate) or add(self, record)
+        runs._Log,
+        "add",
+        lambda self, record: rates.append(record.rate) or add(self, record),
     )
     # At this rate the loss goes up and down, so that patience ends soon.
-    given = config(tmp_path / "run", HELD, "recipe.rate=0.05", "recipe.schedule=trapezoid")
+    given = config(
+        tmp_path / "run", HELD, "recipe.rate=0.05", "recipe.schedule=trapezoid"
+    )
     train_for(given, 1.0)
     plateau = read_progress(tmp_path / "run").step * PLATEAU
     assert rates[-1] < 0.05 * 0.5 and len(rates) > plateau
 
 
 @pytest.mark.slow
-def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(tmp_path: Path) -> None:
+def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(
+    tmp_path: Path,
+) -> None:
     first = "condition={kind: semantic, dropout: 0.0}"
     start = run(
-        config(tmp_path / "start", "recipe.iterations=2", "channels=[range,reflectance]", first)
+        config(
+            tmp_path / "start",
+            "recipe.iterations=2",
+            "channels=[range,reflectance]",
+            first,
+        )
     )
     assert read_header(start)[0].conditioning == {"semantic": {}}
 
     def header(condition: str) -> Any:
-        more = ("channels=[range,reflectance]", f"init={start}", f"condition={condition}")
+        more = (
+            "channels=[range,reflectance]",
+            f"init={start}",
+            f"condition={condition}",
+        )
         return start_networks(config(tmp_path / "next", *more))[1]
 
-    assert header("{kind: semantic, dropout: 0.5}").conditioning == {"semantic": {"dropout": 0.5}}
+    assert header("{kind: semantic, dropout: 0.5}").conditioning == {
+        "semantic": {"dropout": 0.5}
+    }
     assert header("{kind: semantic}").conditioning == {"semantic": {}}
     with pytest.raises(
         ConfigError,

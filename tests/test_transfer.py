@@ -5,7 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import BUILDING, CAR, CAR_BOX, GROUND, REFLECTANCE, ROAD, WALL, image, record
+from blocks import (
+    BUILDING,
+    CAR,
+    CAR_BOX,
+    GROUND,
+    REFLECTANCE,
+    ROAD,
+    WALL,
+    image,
+    record,
+)
 from conftest import Golden, random_scan
 
 from lidar_synth import Town
@@ -34,7 +44,11 @@ TARGETS = {
     "os1_128": load_sensor("os1_128"),
     "hdl64e at heights": load_sensor("hdl64e_kitti"),
 }
-MOUNTS = {"same place": Mount(), "higher": Mount(0.4), "lower, looking down": Mount(-0.2, 3.0)}
+MOUNTS = {
+    "same place": Mount(),
+    "higher": Mount(0.4),
+    "lower, looking down": Mount(-0.2, 3.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +58,9 @@ def scan() -> Scan:
 
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("target", TARGETS)
-def test_it_sees_what_the_target_itself_records(scan: Scan, target: str, mount: str) -> None:
+def test_it_sees_what_the_target_itself_records(
+    scan: Scan, target: str, mount: str
+) -> None:
     """Ranges, occlusion and labels: also behind the car, whose shadow moves with the mount."""
     truth = record(TARGETS[target], MOUNTS[mount])
     found = Transfer(TARGETS[target], MOUNTS[mount])(scan)
@@ -82,7 +98,10 @@ def test_the_nearer_surface_hides_the_farther_one(scan: Scan) -> None:
     at_found = image(found)
     both = (at_truth >= 0) & (at_found >= 0)
     on_car = truth.label[at_truth[both]] == CAR
-    assert on_car.sum() > 1000 and (found.label[at_found[both]][on_car] == CAR).mean() > 0.97
+    assert (
+        on_car.sum() > 1000
+        and (found.label[at_found[both]][on_car] == CAR).mean() > 0.97
+    )
 
 
 @pytest.mark.parametrize("target", ["uneven", "hdl32e"])
@@ -94,7 +113,11 @@ def test_no_return_hangs_between_surfaces(scan: Scan, target: str) -> None:
         c = np.cos(box[6])
         s = np.sin(box[6])
         local = (points - box[:3]) @ np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)])
-        off.append(np.linalg.norm(np.maximum(np.abs(local) - np.array(box[3:6]) / 2, 0), axis=1))
+        off.append(
+            np.linalg.norm(
+                np.maximum(np.abs(local) - np.array(box[3:6]) / 2, 0), axis=1
+            )
+        )
     assert (np.min(off, 0) > 0.3).mean() < 1e-3
 
 
@@ -107,10 +130,14 @@ def test_a_plane_stays_a_plane(scan: Scan, mount: str) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_returns_lie_on_the_beams_and_firings_of_the_target(scan: Scan, target: str) -> None:
+def test_returns_lie_on_the_beams_and_firings_of_the_target(
+    scan: Scan, target: str
+) -> None:
     sensor = TARGETS[target]
     found = Transfer(sensor, Mount(0.2))(scan)
-    elevation = np.arctan2(found.points[:, 2].astype(float), np.hypot(*found.points[:, :2].T))
+    elevation = np.arctan2(
+        found.points[:, 2].astype(float), np.hypot(*found.points[:, :2].T)
+    )
     off = np.degrees(np.abs(elevation - sensor.laser_elevations[found.ring]))
     assert off.max() < 1e-3 if sensor.heights is None else np.median(off) < 0.2
     azimuths = sensor.firing_azimuths()
@@ -139,7 +166,9 @@ def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) ->
 
 def test_a_real_street_of_the_town_too() -> None:
     """A scan of a range image has no ring, and rows without a return."""
-    town = Town(seed=5, scans=1, motion=False)[0]  # few leaves, whose returns have random depths
+    town = Town(seed=5, scans=1, motion=False)[
+        0
+    ]  # few leaves, whose returns have random depths
     for scan in (town, unproject(project(replace(town, boxes=None, pose=None)))):
         found = Transfer(scan.sensor)(replace(scan, ring=scan.ring))
         ranges = [project(s).range for s in (scan, found)]
@@ -150,11 +179,17 @@ def test_a_real_street_of_the_town_too() -> None:
 
 def test_fields_are_those_of_the_surface_that_returns(scan: Scan) -> None:
     found = Transfer(UNEVEN, Mount(0.3))(scan)
-    inner = np.abs(found.reflectance - np.vectorize(REFLECTANCE.get)(found.label)) < 1e-6
-    assert inner.mean() > 0.99  # between two surfaces that touch, reflectance is interpolated
+    inner = (
+        np.abs(found.reflectance - np.vectorize(REFLECTANCE.get)(found.label)) < 1e-6
+    )
+    assert (
+        inner.mean() > 0.99
+    )  # between two surfaces that touch, reflectance is interpolated
     assert ((found.label == CAR) == (found.instance == 1)).all()
     assert set(found.fields()) == set(scan.fields())
-    assert found.id == scan.id and found.sensor == UNEVEN and found.domain == scan.domain
+    assert (
+        found.id == scan.id and found.sensor == UNEVEN and found.domain == scan.domain
+    )
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -163,10 +198,13 @@ def test_boxes_and_pose_move_to_the_targets_frame(scan: Scan, mount: str) -> Non
     np.testing.assert_allclose(found.pose, MOUNTS[mount].matrix)
     slack = 0.03 + 2 * np.sin(np.radians(MOUNTS[mount].pitch)) * CAR_BOX[3] / 2
     grown = replace(
-        found.boxes, values=found.boxes.values + np.float32([0, 0, 0, slack, slack, slack, 0])
+        found.boxes,
+        values=found.boxes.values + np.float32([0, 0, 0, slack, slack, slack, 0]),
     )
     inside = grown.contain(found.points)[0]
-    assert (inside[found.label == CAR]).mean() > 0.99 and (found.label == CAR).sum() > 500
+    assert (
+        (inside[found.label == CAR]).mean() > 0.99 and (found.label == CAR).sum() > 500
+    )
     world = found.points.astype(float) @ found.pose[:3, :3].T + found.pose[:3, 3]
     assert np.median(np.abs(world[found.label == ROAD, 2] - GROUND)) < 0.01
 
@@ -176,7 +214,9 @@ def test_porous_surfaces_keep_their_share_of_returns() -> None:
     full = record(HDL64E)
     rng = np.random.default_rng(0)
     distance = np.linalg.norm(full.points, axis=1)
-    leaves = full.points * (rng.uniform(10, 14, len(full)) / distance)[:, None].astype(np.float32)
+    leaves = full.points * (rng.uniform(10, 14, len(full)) / distance)[:, None].astype(
+        np.float32
+    )
     scan = replace(full, points=leaves.astype(np.float32))
     for share in (0.3, 0.6, 1.0):
         some = scan[rng.random(len(scan)) < share]
@@ -196,15 +236,21 @@ def test_a_narrow_pole_stays() -> None:
     for target in (HDL64E, UNEVEN):
         found = Transfer(target)(record(HDL64E, car=pole))
         truth = record(target, car=pole)
-        assert abs(np.log((found.label == CAR).sum() / (truth.label == CAR).sum())) < 0.35
+        assert (
+            abs(np.log((found.label == CAR).sum() / (truth.label == CAR).sum())) < 0.35
+        )
 
 
 def test_what_was_not_seen_returns_nothing(scan: Scan) -> None:
     front = scan[scan.points[:, 0] > np.abs(scan.points[:, 1])]
     found, seen = Transfer(HDL64E).cast(front)
-    assert (found.points[:, 0] > 0.9 * np.abs(found.points[:, 1])).all() and abs(seen - 0.25) < 0.02
+    assert (found.points[:, 0] > 0.9 * np.abs(found.points[:, 1])).all() and abs(
+        seen - 0.25
+    ) < 0.02
     found, seen = Transfer(load_sensor("os1_128")).cast(scan)
-    elevation = np.degrees(np.arctan2(found.points[:, 2], np.hypot(*found.points[:, :2].T)))
+    elevation = np.degrees(
+        np.arctan2(found.points[:, 2], np.hypot(*found.points[:, :2].T))
+    )
     assert elevation.max() < 3.1 and abs(seen - 25.5 / 45) < 0.02
 
 
@@ -220,7 +266,9 @@ def test_surfaces_end_where_rings_are_missing(scan: Scan) -> None:
 
 
 def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
-    target = replace(UNEVEN, range_min=6.0, range_max=20.0, range_step=0.05, reflectance_levels=8)
+    target = replace(
+        UNEVEN, range_min=6.0, range_max=20.0, range_step=0.05, reflectance_levels=8
+    )
     found = Transfer(target)(scan)
     steps = np.linalg.norm(found.points.astype(float), axis=1) / 0.05
     assert (
@@ -228,7 +276,10 @@ def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
         and steps.min() >= 120
         and 0.05 * steps.max() <= 20
     )
-    assert np.abs(found.reflectance * 8 % 1).max() < 1e-6 and found.reflectance.max() <= 7 / 8
+    assert (
+        np.abs(found.reflectance * 8 % 1).max() < 1e-6
+        and found.reflectance.max() <= 7 / 8
+    )
 
 
 def test_noise_and_losses_are_added_and_keyed(scan: Scan) -> None:
@@ -255,7 +306,9 @@ def test_a_response_gives_the_targets_distribution(scan: Scan) -> None:
     target = replace(scan, reflectance=(rng.random(len(scan), np.float32) ** 2 / 3))
     response = Response.match([recorded], [target])
     np.testing.assert_allclose(
-        response(np.array([0.3, 0.6, 0.9])), np.array([0.3, 0.6, 0.9]) ** 2 / 3, atol=0.01
+        response(np.array([0.3, 0.6, 0.9])),
+        np.array([0.3, 0.6, 0.9]) ** 2 / 3,
+        atol=0.01,
     )
     found = Transfer(HDL64E, measurement=Measurement(response=response))(recorded)
     assert found.reflectance.max() < 0.34
@@ -277,9 +330,13 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
     assert len(filled) > 1.1 * len(alone)
     car = filled.points[filled.label == CAR]
     assert len(car) > 300
-    grown = replace(scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, 0.3, 0.3, 0.3, 0]))
+    grown = replace(
+        scan.boxes, values=scan.boxes.values + np.float32([0, 0, 0, 0.3, 0.3, 0.3, 0])
+    )
     assert grown.contain(car)[0].mean() > 0.98
-    unknown = replace(later, boxes=replace(later.boxes, instance=np.array([9], np.int32)))
+    unknown = replace(
+        later, boxes=replace(later.boxes, instance=np.array([9], np.int32))
+    )
     assert not (Transfer(HDL64E).cast(blind, sweeps=[unknown]).scan.label == CAR).any()
     with pytest.raises(DataError, match="without a pose; expected poses"):
         Transfer(HDL64E).cast(scan, sweeps=[replace(later, pose=None)])
@@ -292,19 +349,30 @@ def test_the_own_vehicle_does_not_stand_in_the_way_of_another_mount(scan: Scan) 
         (scan.ring > 50) & (np.abs(scan.points[:, 1]) < 0.5 * np.abs(scan.points[:, 0]))
     )
     points = scan.points.copy()
-    points[own] *= (-0.5 / rays.slope[scan.ring[own]] / np.hypot(*points[own, :2].T))[:, None]
+    points[own] *= (-0.5 / rays.slope[scan.ring[own]] / np.hypot(*points[own, :2].T))[
+        :, None
+    ]
     given = replace(scan, points=points)
     lower = Transfer(HDL64E, Mount(-0.4))
-    assert len(lower(given)) > 0.95 * len(lower(scan[np.setdiff1d(np.arange(len(scan)), own)]))
+    assert len(lower(given)) > 0.95 * len(
+        lower(scan[np.setdiff1d(np.arange(len(scan)), own)])
+    )
     assert len(replace(lower, vehicle=(0.0, 0.0))(given)) < 0.98 * len(lower(given))
-    near = np.linalg.norm(Transfer(replace(HDL64E, range_min=0.1))(given).points, axis=1) < 1.8
+    near = (
+        np.linalg.norm(Transfer(replace(HDL64E, range_min=0.1))(given).points, axis=1)
+        < 1.8
+    )
     assert near.sum() > 0.9 * len(own)  # in the same place it stays
 
 
 def test_a_source_seen_as_another_sensor(scan: Scan) -> None:
-    scans = SeenAs([scan, scan], Transfer(UNEVEN, measurement=Measurement(loss=0.5)), seed=3)
+    scans = SeenAs(
+        [scan, scan], Transfer(UNEVEN, measurement=Measurement(loss=0.5)), seed=3
+    )
     assert len(scans) == 2 and scans.sensor == UNEVEN
-    assert np.array_equal(scans[1].points, scans[-1].points) and len(scans[0]) != len(scans[1])
+    assert np.array_equal(scans[1].points, scans[-1].points) and len(scans[0]) != len(
+        scans[1]
+    )
 
 
 @pytest.mark.parametrize("name", presets())
@@ -319,7 +387,9 @@ BAD = {
     "empty": (lambda s: s[:0], "without a return"),
     "one beam": (lambda s: s[s.ring == 40], "one beam only"),
     "not finite": (
-        lambda s: replace(s, points=np.where(s.ring[:, None] == 5, np.float32(np.nan), s.points)),
+        lambda s: replace(
+            s, points=np.where(s.ring[:, None] == 5, np.float32(np.nan), s.points)
+        ),
         "NaN",
     ),
     "fewer beams": (
@@ -365,7 +435,8 @@ def test_rows_whose_rays_start_above_the_origin_are_found_without_rings() -> Non
     rows, on_grid = rings_of(replace(on_rows, ring=None))
     assert on_grid and np.array_equal(rows, np.nonzero(drawn.mask)[0])
     given, without = (
-        Transfer(load_sensor("hdl32e"))(s) for s in (on_rows, replace(on_rows, ring=None))
+        Transfer(load_sensor("hdl32e"))(s)
+        for s in (on_rows, replace(on_rows, ring=None))
     )
     assert len(without) > 0.95 * len(given)
 
@@ -376,7 +447,9 @@ def test_impossible_mounts_are_refused(wrong: dict[str, float]) -> None:
         Mount(**wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"range_noise": -1.0}, {"loss": 1.0}, {"reach": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"range_noise": -1.0}, {"loss": 1.0}, {"reach": 0.0}]
+)
 def test_impossible_measurements_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match="range_noise="):
         Measurement(**wrong)
@@ -406,7 +479,8 @@ def test_returns_are_those_of_the_kernels_before_they_were_made_faster(
     found = Transfer(target, MOUNTS[mount])(porous())
     with np.load(golden / "transfer.npz") as file:
         before = {
-            name: file[f"{mount} {name}"] for name in ("points", "ring", "label", "reflectance")
+            name: file[f"{mount} {name}"]
+            for name in ("points", "ring", "label", "reflectance")
         }
     assert np.array_equal(found.ring, before["ring"]) and np.array_equal(
         found.label, before["label"]

@@ -57,14 +57,20 @@ def test_the_settings_of_an_adapter_name_the_sensor(
     path = tmp_path / "theirs.yaml"
     path.write_text(yaml.safe_dump({values.pop("name"): values}))
     mixed = mix_for_trainer(
-        3, {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)}, lambda scan, rng: scan
+        3,
+        {"synthetic": scans[1], "ratio": 0.5, "as_sensor": str(path)},
+        lambda scan, rng: scan,
     )
     made = [
-        sample for sample in map(mixed.__getitem__, range(len(mixed))) if isinstance(sample, Scan)
+        sample
+        for sample in map(mixed.__getitem__, range(len(mixed)))
+        if isinstance(sample, Scan)
     ]
     assert len(made) == 3
     for scan in made:
-        assert np.array_equal(scan.points, Transfer(THEIRS)(scans[1][int(scan.id[1:])]).points)
+        assert np.array_equal(
+            scan.points, Transfer(THEIRS)(scans[1][int(scan.id[1:])]).points
+        )
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -72,7 +78,9 @@ def test_noise_depends_on_seed_epoch_and_position_alone(
     scans: tuple[list[Scan], list[Scan]], workers: int
 ) -> None:
     def epoch(seed: int, number: int, count: int) -> dict[str, torch.Tensor]:
-        train = MixedScans(*scans, ratio=0.5, seed=seed, as_sensor=NOISY, reuse=2, collate="range")
+        train = MixedScans(
+            *scans, ratio=0.5, seed=seed, as_sensor=NOISY, reuse=2, collate="range"
+        )
         train.set_epoch(number)
         [batch] = DataLoader(train, 8, num_workers=count, collate_fn=train.collate)
         assert batch["range"].shape[1:] == THEIRS.shape
@@ -88,7 +96,9 @@ def test_noise_depends_on_seed_epoch_and_position_alone(
     assert shared and not any(torch.equal(first[name], other[name]) for name in shared)
 
 
-def test_the_plans_hash_tells_the_transfer(scans: tuple[list[Scan], list[Scan]]) -> None:
+def test_the_plans_hash_tells_the_transfer(
+    scans: tuple[list[Scan], list[Scan]],
+) -> None:
     hashes = {
         MixedScans(*scans, ratio=0.5, as_sensor=t).plan(0).hash
         for t in (THEIRS, NOISY, Transfer(THEIRS))
@@ -111,7 +121,9 @@ def test_a_trainers_own_dataset_with_scans_of_another_sensor(
     assert max(lengths) < 0.7 * len(scans[1][0])
 
 
-def test_objects_are_pasted_after_the_transfer(scans: tuple[list[Scan], list[Scan]]) -> None:
+def test_objects_are_pasted_after_the_transfer(
+    scans: tuple[list[Scan], list[Scan]],
+) -> None:
     """The label policy gets scans of the target, and of all fields."""
     seen: list[Scan] = []
 

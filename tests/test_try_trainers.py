@@ -19,7 +19,9 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     import try_trainers
 
     yield try_trainers
-    for name in [n for n in sys.modules if n.split(".")[0] in ("trainers", "try_trainers")]:
+    for name in [
+        n for n in sys.modules if n.split(".")[0] in ("trainers", "try_trainers")
+    ]:
         del sys.modules[name]
 
 
@@ -81,15 +83,23 @@ def test_a_command_is_judged_by_its_status_and_output(
         with pytest.raises(script.Failed, match=message):
             trial.run("train", python(code), **options)
     [log] = (trial.folder / "logs").iterdir()
-    assert log.name == "01-train.log" and log.read_text().startswith(f"$ {sys.executable} -c")
+    assert log.name == "01-train.log" and log.read_text().startswith(
+        f"$ {sys.executable} -c"
+    )
 
 
-def test_a_command_runs_as_a_user_does(trial: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_runs_as_a_user_does(
+    trial: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PYTHONPATH", "/own")
     output = trial.run(
         "show", python("import os; print(os.getcwd(), os.environ)"), env={"GIVEN": "1"}
     )
-    assert str(trial.folder) in output and "'GIVEN': '1'" in output and "PYTHONPATH" not in output
+    assert (
+        str(trial.folder) in output
+        and "'GIVEN': '1'" in output
+        and "PYTHONPATH" not in output
+    )
 
 
 def test_a_trial_types_the_commands_of_the_page(
@@ -102,7 +112,11 @@ def test_a_trial_types_the_commands_of_the_page(
     page.write_text(PAGE)
     monkeypatch.setattr(sys.modules["trainers.trial"], "ROOT", tmp_path)
     said = trial.type_page(
-        "type", Path(sys.executable), "some", {"TREE": trial.folder, "B": "C"}, skip="^pip"
+        "type",
+        Path(sys.executable),
+        "some",
+        {"TREE": trial.folder, "B": "C"},
+        skip="^pip",
     )
     lines = [line for line in said.splitlines() if not line.startswith(("+", "$"))]
     assert lines[-2:] == ["configured as C", f"{trial.folder} C TREES --set -p "]
@@ -111,11 +125,14 @@ def test_a_trial_types_the_commands_of_the_page(
 
 
 @pytest.mark.parametrize(
-    "page", ["range-view", "cylinder3d", "waffleiron", "openpcdet", "pointcept", "open3d-ml"]
+    "page",
+    ["range-view", "cylinder3d", "waffleiron", "openpcdet", "pointcept", "open3d-ml"],
 )
 def test_pages_name_what_to_install_and_how_to_train(script: Any, page: str) -> None:
     commands = sys.modules["trainers.trial"].commands_of(page)
-    assert commands[0].startswith("pip install ") and any("train" in each for each in commands)
+    assert commands[0].startswith("pip install ") and any(
+        "train" in each for each in commands
+    )
 
 
 def test_the_source_tree_is_a_copy(

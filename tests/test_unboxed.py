@@ -35,13 +35,17 @@ def with_boxes(scan: Scan, keep: list[int] | None) -> Scan:
     return replace(scan, boxes=boxes, instance=None)
 
 
-@pytest.mark.parametrize(("keep", "expected"), [([0, 1], 0), ([0], 1), ([], 2), (None, 2)])
+@pytest.mark.parametrize(
+    ("keep", "expected"), [([0, 1], 0), ([0], 1), ([], 2), (None, 2)]
+)
 def test_unboxed_objects_are_counted(keep: list[int] | None, expected: int) -> None:
     scan = with_boxes(BOTH, keep)
     found = edit.measure([scan, scan])
     assert found.scans == 2 and found.objects == 2 * expected
     assert found.points == 2 * (BOTH.label == CAR).sum()
-    outside = sum((BOTH.instance == k).sum() for k in (1, 2) if keep is None or k - 1 not in keep)
+    outside = sum(
+        (BOTH.instance == k).sum() for k in (1, 2) if keep is None or k - 1 not in keep
+    )
     assert found.share == pytest.approx(outside / (BOTH.label == CAR).sum())
 
 
@@ -76,7 +80,9 @@ def mixed(scan: Scan, **options: object) -> dict[str, object]:
 @pytest.mark.parametrize("labels", ["generated", "boxes"])
 def test_mixtures_close_unboxed_objects_of_boxed_scans(labels: str) -> None:
     item = mixed(with_boxes(BOTH, [0]), labels=labels)
-    assert (item["label"] == CAR).sum() == (BOTH.instance == 1).sum() and len(item["boxes"]) == 1  # type: ignore
+    assert (item["label"] == CAR).sum() == (BOTH.instance == 1).sum() and len(
+        item["boxes"]
+    ) == 1  # type: ignore
     kept = mixed(with_boxes(BOTH, [0]), labels=labels, unboxed="keep")
     assert (kept["label"] == CAR).sum() == (BOTH.label == CAR).sum()  # type: ignore[attr-defined]
     with pytest.raises(
@@ -93,7 +99,9 @@ def test_mixtures_close_unboxed_objects_of_boxed_scans(labels: str) -> None:
 def test_low_confidence_does_not_hide_an_object() -> None:
     scan = with_boxes(BOTH, [0])
     scan.confidence = np.where(scan.label == CAR, 0.2, 1).astype(np.float32)
-    own = make_policy("mix", fields=FIELDS | {"confidence"}, objects=BANK, count=1, threshold=0.5)
+    own = make_policy(
+        "mix", fields=FIELDS | {"confidence"}, objects=BANK, count=1, threshold=0.5
+    )
     assert BOTH.boxes is not None
     assert not BOTH.boxes.contain(
         own(replace(scan, boxes=None), keyed_rng(0)).points, above_floor=0.4
@@ -112,14 +120,27 @@ def test_scans_without_boxes_keep_their_objects() -> None:
 
 @pytest.mark.parametrize("kind", ["objects", "polar"])
 def test_mix_hands_out_no_object_without_a_box(kind: str) -> None:
-    options = {"objects": BANK} if kind == "objects" else {"real": [cast([car(9, 3)])], "width": 30}
+    options = (
+        {"objects": BANK}
+        if kind == "objects"
+        else {"real": [cast([car(9, 3)])], "width": 30}
+    )
     policy = make_policy("mix", fields=FIELDS, kind=kind, **options)
     train = MixedScans.wrap(
-        [0], [with_boxes(BOTH, None)], 0.5, labels=policy, to_sample=lambda s, _: s, compare=False
+        [0],
+        [with_boxes(BOTH, None)],
+        0.5,
+        labels=policy,
+        to_sample=lambda s, _: s,
+        compare=False,
     )
     [scan] = [s for s in (train[i] for i in range(2)) if isinstance(s, Scan)]
     assert scan.boxes is not None and len(scan.boxes) >= 1
-    assert edit.measure([scan]).objects == 0 < edit.measure([with_boxes(BOTH, None)]).objects
+    assert (
+        edit.measure([scan]).objects
+        == 0
+        < edit.measure([with_boxes(BOTH, None)]).objects
+    )
 
 
 def test_scans_with_boxes_and_no_labels_pass() -> None:
@@ -138,13 +159,17 @@ def test_a_source_without_boxes_is_refused_for_a_detector() -> None:
         and "boxes" not in make_synthetic([with_boxes(BOTH, None)]).fields
     )
     with pytest.raises(
-        ConfigError, match="labels='boxes', but .* only have .*expected scans with boxes"
+        ConfigError,
+        match="labels='boxes', but .* only have .*expected scans with boxes",
     ):
         MixedScans([BOTH], [with_boxes(BOTH, None)], labels="boxes")
-    with pytest.raises(ConfigError, match="labels='boxes', but .*labels='mix' pastes objects"):
+    with pytest.raises(
+        ConfigError, match="labels='boxes', but .*labels='mix' pastes objects"
+    ):
         make_policy("boxes", fields=Endless().fields)
     with pytest.raises(
-        ConfigError, match="neither labels nor boxes.*own objects cannot be found.*clear=False"
+        ConfigError,
+        match="neither labels nor boxes.*own objects cannot be found.*clear=False",
     ):
         make_policy("mix", fields=frozenset({"reflectance"}), objects=BANK)
 
@@ -153,7 +178,11 @@ def test_unboxed_objects_are_reported_once(caplog: pytest.LogCaptureFixture) -> 
     real = [cast([car(9, 1)])] * 3
     with caplog.at_level(logging.WARNING):
         train = MixedScans(
-            real, [with_boxes(BOTH, None)] * 3, 0.5, labels="mix", label_options={"objects": BANK}
+            real,
+            [with_boxes(BOTH, None)] * 3,
+            0.5,
+            labels="mix",
+            label_options={"objects": BANK},
         )
         [train[i] for i in range(len(train))]
         assert (
@@ -173,4 +202,6 @@ def test_handling_is_a_function_of_the_scan() -> None:
     points = scan.points.copy()
     first = HANDLING["close"](scan)
     second = HANDLING["close"](scan)
-    assert np.array_equal(first.points, second.points) and np.array_equal(scan.points, points)
+    assert np.array_equal(first.points, second.points) and np.array_equal(
+        scan.points, points
+    )

@@ -14,7 +14,11 @@ from lidar_synth.generate.flow.path import Velocity
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.convolution import WrapConv, fold, unfold
-from lidar_synth.generate.models.lidm.diffusion import DiffusionUNet, schedule_times, step_of
+from lidar_synth.generate.models.lidm.diffusion import (
+    DiffusionUNet,
+    schedule_times,
+    step_of,
+)
 from lidar_synth.generate.models.lidm.unet import UNet
 
 SMALL: dict[str, Any] = {
@@ -61,7 +65,9 @@ def test_samples_of_a_batch_are_independent(arguments: dict[str, Any]) -> None:
     together = net(state(), T)
     assert together.shape == (2, 3, 8, 32)
     for i in range(2):
-        assert torch.allclose(net(state()[i : i + 1], T[i]), together[i : i + 1], atol=1e-5)
+        assert torch.allclose(
+            net(state()[i : i + 1], T[i]), together[i : i + 1], atol=1e-5
+        )
     assert not torch.allclose(net(state(), T + 0.1), together, atol=1e-3)
 
 
@@ -86,10 +92,13 @@ def test_the_position_table_distinguishes_columns() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [{}, {"context_channels": 5}, {"condition_channels": 2}, {"patch": (2, 4)}]
+    "arguments",
+    [{}, {"context_channels": 5}, {"condition_channels": 2}, {"patch": (2, 4)}],
 )
 @pytest.mark.parametrize("checkpointing", [False, True])
-def test_every_weight_gets_a_gradient(arguments: dict[str, Any], checkpointing: bool) -> None:
+def test_every_weight_gets_a_gradient(
+    arguments: dict[str, Any], checkpointing: bool
+) -> None:
     net = network(**arguments)
     assert isinstance(net, UNet)
     net.gradient_checkpointing = checkpointing
@@ -109,7 +118,9 @@ def test_conditions_change_the_velocity() -> None:
     beside = network(condition_channels=2)
     y = state()
     assert not torch.allclose(
-        beside(y, T, torch.zeros(2, 2, 8, 32)), beside(y, T, torch.ones(2, 2, 8, 32)), atol=1e-3
+        beside(y, T, torch.zeros(2, 2, 8, 32)),
+        beside(y, T, torch.ones(2, 2, 8, 32)),
+        atol=1e-3,
     )
     context = network(context_channels=5)
     tokens = torch.randn(2, 4, 5)
@@ -124,7 +135,9 @@ def test_precision_and_memory_format_change_only_rounding() -> None:
     net = network()
     y = state()
     out = net(y, T)
-    assert torch.allclose(net.to(memory_format=torch.channels_last)(y, T), out, atol=1e-5)  # type: ignore[call-overload]
+    assert torch.allclose(
+        net.to(memory_format=torch.channels_last)(y, T), out, atol=1e-5
+    )  # type: ignore[call-overload]
     rough = net.bfloat16()(y, T)
     assert rough.dtype == torch.float32
     assert 0 < (rough - out).abs().mean() < 0.05 * out.abs().mean()
@@ -167,7 +180,10 @@ def test_states_and_times_of_another_shape_are_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"resolution": (8, 33)}, r"of \(8, 33\) rows and columns; expected multiples of \(2, 2\)"),
+        (
+            {"resolution": (8, 33)},
+            r"of \(8, 33\) rows and columns; expected multiples of \(2, 2\)",
+        ),
         ({"patch": (3, 1)}, r"a state of \(8, 32\)"),
         ({"patch": (8, 1)}, r"patches of \(8, 1\)"),
         ({"head_channels": 24}, "multiples of head_channels"),
@@ -182,7 +198,11 @@ def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) 
 
 @settings(max_examples=20)
 @given(
-    st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3), st.integers(1, 3)
+    st.integers(1, 3),
+    st.integers(1, 4),
+    st.integers(1, 3),
+    st.integers(1, 3),
+    st.integers(1, 3),
 )
 def test_unfold_is_the_inverse_of_fold(
     p: int, q: int, rows: int, columns: int, channels: int
@@ -267,15 +287,29 @@ def known() -> Velocity:
 
 def normal(count: int, seed: int = 0) -> Tensor:
     return torch.randn(
-        count, 1, 2, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        count,
+        1,
+        2,
+        2,
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.float64,
     )
 
 
 def test_steps_are_found_by_their_signal_to_noise_ratio() -> None:
     whole = torch.tensor([0, 1, 45, 254, 602, 998, 999])
     assert torch.allclose(step_of(TIMES[whole], TIMES), whole.float(), atol=1e-2)
-    assert step_of(torch.tensor([0.22, 0.5, 0.82]), TIMES).round().tolist() == [45, 254, 602]
-    assert step_of(torch.tensor([0.0, 0.01, 0.999, 1.0]), TIMES).tolist() == [0, 0, 999, 999]
+    assert step_of(torch.tensor([0.22, 0.5, 0.82]), TIMES).round().tolist() == [
+        45,
+        254,
+        602,
+    ]
+    assert step_of(torch.tensor([0.0, 0.01, 0.999, 1.0]), TIMES).tolist() == [
+        0,
+        0,
+        999,
+        999,
+    ]
     assert (float(TIMES[0]), float(TIMES[-1])) == (
         pytest.approx(0.037, abs=5e-4),
         pytest.approx(0.988, abs=5e-4),
@@ -286,24 +320,34 @@ def test_steps_are_found_by_their_signal_to_noise_ratio() -> None:
 
 
 @torch.no_grad()
-def test_the_velocity_is_exact_at_the_steps_and_close_between_them(known: Velocity) -> None:
+def test_the_velocity_is_exact_at_the_steps_and_close_between_them(
+    known: Velocity,
+) -> None:
     for t in (TIMES[[0, 10, 300, 700, 999]], torch.tensor([0.1, 0.4, 0.51, 0.9, 0.98])):
         y = normal(5)
-        assert torch.allclose(known(y, t.float(), None), known_velocity(y, t.float()), atol=1e-4)
+        assert torch.allclose(
+            known(y, t.float(), None), known_velocity(y, t.float()), atol=1e-4
+        )
 
 
 @torch.no_grad()
-def test_the_velocity_beyond_the_schedule_is_clamped_and_stays_close(known: Velocity) -> None:
+def test_the_velocity_beyond_the_schedule_is_clamped_and_stays_close(
+    known: Velocity,
+) -> None:
     y = normal(2)
     noisiest = known(y, torch.tensor([1.0, 0.995]), None)
     assert (noisiest - known_velocity(y, torch.tensor([1.0, 0.995]))).abs().max() < 0.02
     cleanest = known(0.4 * y + MEAN, torch.tensor([0.0, 0.01]), None)
     assert cleanest.isfinite().all()
-    assert (cleanest - known_velocity(0.4 * y + MEAN, torch.tensor([0.0, 0.01]))).abs().max() < 0.5
+    assert (
+        cleanest - known_velocity(0.4 * y + MEAN, torch.tensor([0.0, 0.01]))
+    ).abs().max() < 0.5
 
 
 @torch.no_grad()
-def test_the_flow_of_a_diffusion_network_ends_at_the_data_distribution(known: Velocity) -> None:
+def test_the_flow_of_a_diffusion_network_ends_at_the_data_distribution(
+    known: Velocity,
+) -> None:
     data = solve(known, normal(500).float(), uniform_grid(100))
     assert float(data.mean()) == pytest.approx(MEAN, abs=0.02)
     assert float(data.std()) == pytest.approx(SPREAD, abs=0.02)

@@ -37,7 +37,10 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def baked(out: Path, model: Path, **settings: Any) -> Path:
     bake(
-        make_plan(out, BakeJob(**{"model": str(model), "count": 8, "shard_size": 3} | settings)),
+        make_plan(
+            out,
+            BakeJob(**{"model": str(model), "count": 8, "shard_size": 3} | settings),
+        ),
         progress=False,
     )
     return out
@@ -74,9 +77,15 @@ def flip(path: Path, bit: int) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "flip": (lambda path: flip(path, 8 * path.stat().st_size // 2), r"has \d+ bytes and sha256"),
+    "flip": (
+        lambda path: flip(path, 8 * path.stat().st_size // 2),
+        r"has \d+ bytes and sha256",
+    ),
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-9]), "the index lists"),
-    "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "the index lists"),
+    "longer": (
+        lambda path: path.write_bytes(path.read_bytes() + b"x"),
+        "the index lists",
+    ),
     "missing": (lambda path: path.unlink(), r"cannot be read \(No such file"),
     "another": (
         lambda path: shutil.copyfile(path.with_name("shard-00000.h5"), path),
@@ -96,11 +105,15 @@ def test_an_intact_bank_needs_no_repair(root: Path, model: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_damage_is_found_and_repaired(root: Path, original: Path, model: Path, kind: str) -> None:
+def test_damage_is_found_and_repaired(
+    root: Path, original: Path, model: Path, kind: str
+) -> None:
     damage, message = DAMAGE[kind]
     damage(root / "shard-00001.h5")
     status, output = call("verify", root)
-    assert status == 1 and "shard-00001.h5: " in output and "lidar-synth repair" in output
+    assert (
+        status == 1 and "shard-00001.h5: " in output and "lidar-synth repair" in output
+    )
     problems = verify(root, progress=False)
     assert {p.file for p in problems} == {"shard-00001.h5"}
     assert any(re.search(message, p.what) for p in problems)
@@ -112,7 +125,9 @@ def test_damage_is_found_and_repaired(root: Path, original: Path, model: Path, k
 def test_every_flipped_bit_is_found(root: Path) -> None:
     path = root / "shard-00002.h5"
     content = path.read_bytes()
-    for bit in np.random.default_rng(1).choice(8 * len(content), 40, replace=False).tolist():
+    for bit in (
+        np.random.default_rng(1).choice(8 * len(content), 40, replace=False).tolist()
+    ):
         flip(path, bit)
         assert verify(root, progress=False), f"bit {bit}"
         path.write_bytes(content)
@@ -127,7 +142,9 @@ def test_a_damaged_scan_is_named(root: Path) -> None:
         file["label"][2, 3, 4] = 18 - file["label"][2, 3, 4] % 19
     index = Index.from_json((root / INDEX).read_bytes(), INDEX)
     entry = replace(index.shards[1], bytes=path.stat().st_size, sha256=sha256(path))
-    write_bank_files(root, replace(index, shards=(index.shards[0], entry, index.shards[2])))
+    write_bank_files(
+        root, replace(index, shards=(index.shards[0], entry, index.shards[2]))
+    )
     [problem] = verify(root, progress=False)
     assert (
         problem.file == "shard-00001.h5"
@@ -181,14 +198,23 @@ def test_repair_removes_what_a_killed_repair_left(root: Path, model: Path) -> No
     assert not part.exists() and repair(root, str(model), progress=False) == {}
 
 
-def test_verify_and_repair_report_damage_of_other_files(root: Path, model: Path) -> None:
+def test_verify_and_repair_report_damage_of_other_files(
+    root: Path, model: Path
+) -> None:
     (root / SETTINGS).write_text("{}")
     status, output = call("verify", root)
-    assert status == 1 and f"{SETTINGS}: has sha256" in output and "was damaged or edited" in output
+    assert (
+        status == 1
+        and f"{SETTINGS}: has sha256" in output
+        and "was damaged or edited" in output
+    )
     status, output = call("repair", root)
     assert status == 0 and f"{SETTINGS}: rewritten from the index" in output
     assert (
-        bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
+        bake(
+            make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)),
+            progress=False,
+        )
         is not None
     )
 
@@ -220,7 +246,10 @@ def test_an_index_of_an_older_version_lists_no_other_files(
     assert Bank(root).identity == Bank(original).identity
     (root / "README.md").unlink()
     assert verify(root, progress=False) == [] and repair(root, progress=False) == {}
-    bake(make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)), progress=False)
+    bake(
+        make_plan(root, BakeJob(model=str(model), count=8, shard_size=3)),
+        progress=False,
+    )
     assert list(json.loads((root / SETTINGS).read_bytes())) == list(reversed(settings))
     assert verify(root, progress=False) == [] and (root / "README.md").is_file()
     flip(root / SETTINGS, 80)
@@ -228,17 +257,30 @@ def test_an_index_of_an_older_version_lists_no_other_files(
     assert sides(root) == sides(original)
 
 
-def test_deep_verification_samples_other_scans_each_time(root: Path, model: Path) -> None:
-    outputs = [call("verify", root, "--deep", "--model", model, "--sample", 2)[1] for _ in range(2)]
-    seeds = [re.findall(r"scans selected by --seed (\d+)", output) for output in outputs]
+def test_deep_verification_samples_other_scans_each_time(
+    root: Path, model: Path
+) -> None:
+    outputs = [
+        call("verify", root, "--deep", "--model", model, "--sample", 2)[1]
+        for _ in range(2)
+    ]
+    seeds = [
+        re.findall(r"scans selected by --seed (\d+)", output) for output in outputs
+    ]
     assert len(seeds[0]) == len(seeds[1]) == 1 and seeds[0] != seeds[1]
     assert (
         "selected by --seed 7"
-        in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[1]
+        in call("verify", root, "--deep", "--model", model, "--sample", 2, "--seed", 7)[
+            1
+        ]
     )
-    samples = [frozenset(regenerate(root, str(model), 2, progress=False)) for _ in range(8)]
+    samples = [
+        frozenset(regenerate(root, str(model), 2, progress=False)) for _ in range(8)
+    ]
     assert len(set(samples)) > 1
-    again = [set(regenerate(root, str(model), 2, progress=False, seed=7)) for _ in range(2)]
+    again = [
+        set(regenerate(root, str(model), 2, progress=False, seed=7)) for _ in range(2)
+    ]
     assert again[0] == again[1] and len(again[0]) == 2
 
 
@@ -267,15 +309,21 @@ def test_deep_verification_finds_scans_that_do_not_match_their_seeds(
     tmp_path: Path, model: Path
 ) -> None:
     honest = Bank(baked(tmp_path / "honest", model, seed=5))
-    stored = {name: getattr(honest.facts, name) for name in ("settings", "checkpoint", "fields")}
+    stored = {
+        name: getattr(honest.facts, name)
+        for name in ("settings", "checkpoint", "fields")
+    }
     write_bank(tmp_path / "false", [some_image(i) for i in range(8)], **stored)
     assert verify(tmp_path / "false", progress=False) == []
-    assert max(regenerate(tmp_path / "false", str(model), progress=False).values()) < AGREE
+    assert (
+        max(regenerate(tmp_path / "false", str(model), progress=False).values()) < AGREE
+    )
     status, output = call("verify", tmp_path / "false", "--deep", "--model", model)
     assert status == 1 and "of its cells agree with the regenerated scan" in output
     other = write(tmp_path / "other.safetensors", ("range",))
     with pytest.raises(
-        ConfigError, match=r"other.*the checkpoint that made the bank's scans, small .*--model"
+        ConfigError,
+        match=r"other.*the checkpoint that made the bank's scans, small .*--model",
     ):
         regenerate(honest.root, str(other), progress=False)
     with pytest.raises(ConfigError, match="model 'small'; expected a shipped one"):
@@ -292,7 +340,9 @@ def test_a_lost_or_damaged_index_is_rebuilt(
     if lost:
         (root / INDEX).unlink()
     else:
-        (root / INDEX).write_text((root / INDEX).read_text().replace('"seed": 0', '"seed": 1', 1))
+        (root / INDEX).write_text(
+            (root / INDEX).read_text().replace('"seed": 0', '"seed": 1', 1)
+        )
     (root / "shard-00002.h5").unlink()
     flip(root / "shard-00000.h5", 8 * 5000)
     with pytest.raises((DataError, FileError)):
@@ -336,7 +386,9 @@ def test_a_repair_with_different_bytes_is_recorded(
             self.batch = generator.batch
 
         def range_images(self, *arguments: Any, **options: Any) -> list[RangeImage]:
-            images: list[RangeImage] = self.generator.range_images(*arguments, **options)
+            images: list[RangeImage] = self.generator.range_images(
+                *arguments, **options
+            )
             for image in images:
                 image.range[image.mask] = np.minimum(
                     image.range[image.mask] * np.float32(1 + 1e-4), 80
@@ -406,7 +458,9 @@ def test_head_takes_the_first_scans(root: Path, tmp_path: Path, model: Path) -> 
     }
     assert shards(tmp_path / "head") == before
     for count in (0, 9):
-        with pytest.raises(ConfigError, match=f"the first {count} scans of .*; expected 1 to 8"):
+        with pytest.raises(
+            ConfigError, match=f"the first {count} scans of .*; expected 1 to 8"
+        ):
             head(Bank(root), count, tmp_path / "none", progress=False)
 
 
@@ -420,7 +474,9 @@ def test_banks_of_several_bakes_can_be_merged_and_repaired(
     bank = Bank(tmp_path / "all")
     assert len(bank.index.sources) == 2 and bank[11].id == "small/0/11"
     (tmp_path / "all" / "shard-00003.h5").unlink()
-    assert repair(tmp_path / "all", str(model), progress=False) == {"shard-00003.h5": "regenerated"}
+    assert repair(tmp_path / "all", str(model), progress=False) == {
+        "shard-00003.h5": "regenerated"
+    }
     assert names_and_points(tmp_path / "all") == names_and_points(root, other)
     with pytest.raises(
         ConfigError, match="both hold scan 6 of seed 0; expected every scan only once"
@@ -432,7 +488,8 @@ def test_banks_of_several_bakes_can_be_merged_and_repaired(
         )
     write_bank(tmp_path / "few", [some_image()])
     with pytest.raises(
-        ConfigError, match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected"
+        ConfigError,
+        match=r"few holds \('reflectance', 'label'\) of sensor 'small'; expected",
     ):
         merge([Bank(root), Bank(tmp_path / "few")], tmp_path / "x", progress=False)
     assert not (tmp_path / "x").exists()
@@ -467,6 +524,10 @@ def test_info_describes_a_bank(root: Path) -> None:
     ):
         assert text in output
     found = json.loads(call("info", root, "--json")[1])
-    assert (found["scans"], found["shards"], found["identity"]) == (8, 3, Bank(root).identity)
+    assert (found["scans"], found["shards"], found["identity"]) == (
+        8,
+        3,
+        Bank(root).identity,
+    )
     with pytest.raises(FileError, match="holds no bank"):
         call("info", root / "nowhere")

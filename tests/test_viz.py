@@ -40,7 +40,12 @@ def few_points(
     points = np.array(places, np.float32).reshape(-1, 3)
     labels = None if label is None else np.array(label, np.uint8)
     return Scan(
-        points, np.full(len(points), 0.5, np.float32), SMALL, label=labels, id="few", **fields
+        points,
+        np.full(len(points), 0.5, np.float32),
+        SMALL,
+        label=labels,
+        id="few",
+        **fields,
     )
 
 
@@ -52,7 +57,10 @@ def wall(x: float, label: int) -> Scan:
 
 
 def joined(first: Scan, second: Scan) -> Scan:
-    both = {n: np.concatenate([first.fields()[n], second.fields()[n]]) for n in first.fields()}
+    both = {
+        n: np.concatenate([first.fields()[n], second.fields()[n]])
+        for n in first.fields()
+    }
     return replace(first, points=np.concatenate([first.points, second.points]), **both)
 
 
@@ -66,7 +74,9 @@ def test_a_picture_has_the_colour_of_every_cell(sensor: Sensor) -> None:
     assert image.label is not None
     for train, colour in [*enumerate(COLOURS), (IGNORE, UNLABELLED)]:
         cells = image.mask & (image.label == train)
-        np.testing.assert_array_equal(labels[cells], np.broadcast_to(colour, labels[cells].shape))
+        np.testing.assert_array_equal(
+            labels[cells], np.broadcast_to(colour, labels[cells].shape)
+        )
     for channel in ("range", "reflectance"):
         pixels = picture(image, channel)
         assert (pixels[~image.mask] == EMPTY).all()
@@ -114,7 +124,9 @@ def test_the_near_point_hides_the_far_one(camera: Camera, order: int) -> None:
     near = wall(5, CAR)
     far = wall(15, ROAD)
     both = joined(near, far)[np.arange(len(near) + len(far))[::order]]
-    pixels = render(both, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
+    pixels = render(both, "label", camera=camera, size=(200, 200), rings=False)[
+        100, 100
+    ]
     assert np.abs(pixels.astype(int) - COLOURS[CAR]).max() < 12
     alone = render(far, "label", camera=camera, size=(200, 200), rings=False)[100, 100]
     assert np.abs(alone.astype(int) - COLOURS[ROAD]).max() < 12
@@ -122,19 +134,23 @@ def test_the_near_point_hides_the_far_one(camera: Camera, order: int) -> None:
 
 def test_from_the_other_side_the_far_point_hides_the_near_one() -> None:
     both = joined(wall(5, CAR), wall(15, ROAD))
-    pixels = render(both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False)[
-        100, 100
-    ]
+    pixels = render(
+        both, "label", camera=Camera((40, 0, 0)), size=(200, 200), rings=False
+    )[100, 100]
     assert np.abs(pixels.astype(int) - COLOURS[ROAD]).max() < 12
 
 
 def test_from_above_ahead_is_up_and_left_is_left() -> None:
     scan = few_points((20, 0, 0), (0, 10, 0), label=[CAR, ROAD])
-    pixels = render(scan, "label", camera=bird(25), size=(500, 500), rings=False).astype(int)
+    pixels = render(
+        scan, "label", camera=bird(25), size=(500, 500), rings=False
+    ).astype(int)
     assert (
         np.abs(pixels[48:52, 248:252] - COLOURS[CAR]).max(-1) < 70
     ).any()  # 20 m: 200 pixels up from the middle
-    assert (np.abs(pixels[248:252, 148:152] - COLOURS[ROAD]).max(-1) < 70).any()  # 10 m to the left
+    assert (
+        np.abs(pixels[248:252, 148:152] - COLOURS[ROAD]).max(-1) < 70
+    ).any()  # 10 m to the left
     far = np.ones((500, 500), bool)
     far[40:60, 240:260] = far[240:260, 140:160] = False
     assert (pixels[far] == EMPTY).all()
@@ -151,7 +167,9 @@ def test_an_orbit_keeps_its_target_in_the_centre(
     )
     np.testing.assert_allclose(pixel[0], (320, 240), atol=0.01)
     np.testing.assert_allclose(depth[0], distance, rtol=1e-4)
-    np.testing.assert_allclose(per_metre[0], 240 / np.tan(np.radians(21)) / distance, rtol=1e-3)
+    np.testing.assert_allclose(
+        per_metre[0], 240 / np.tan(np.radians(21)) / distance, rtol=1e-3
+    )
     assert pixel[1, 1] < 240  # z is up
     assert abs(pixel[1, 0] - 320) < 0.01
 
@@ -159,7 +177,8 @@ def test_an_orbit_keeps_its_target_in_the_centre(
 def test_points_behind_the_camera_are_not_drawn() -> None:
     scan = few_points((-30, 0, 0), (-21, 0.2, 0), label=[CAR, CAR])
     assert (
-        render(scan, "label", camera=Camera((-20, 0, 0)), size=(64, 64), rings=False) == EMPTY
+        render(scan, "label", camera=Camera((-20, 0, 0)), size=(64, 64), rings=False)
+        == EMPTY
     ).all()
 
 
@@ -198,18 +217,23 @@ def test_boxes_are_drawn_along_their_edges_unless_switched_off() -> None:
         assert pixels[row - 2 : row + 3, column - 2 : column + 3].max() > 180
     assert pixels[80, 100].min() > 90, "the line to the front"
     assert pixels[120, 100].max() < 90, "none to the back"
-    without = render(scan, "label", camera=bird(10), size=(200, 200), rings=False, boxes=False)
+    without = render(
+        scan, "label", camera=bird(10), size=(200, 200), rings=False, boxes=False
+    )
     assert (without[60, 95:105] == EMPTY).all()
 
 
 def test_box_segments_connect_the_corners() -> None:
     boxes = Boxes(
-        np.array([(1, 2, 3, 4, 2, 1.5, 0.7), (9, 0, 0, 1, 1, 1, 0)], np.float32), ("Car", "Misc")
+        np.array([(1, 2, 3, 4, 2, 1.5, 0.7), (9, 0, 0, 1, 1, 1, 0)], np.float32),
+        ("Car", "Misc"),
     )
     segments = box_segments(boxes)
     assert segments.shape == (26, 2, 3)
     lengths = np.linalg.norm(segments[:, 0] - segments[:, 1], axis=1)
-    np.testing.assert_allclose(np.sort(lengths[:12]), [1.5] * 4 + [2] * 4 + [4] * 4, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.sort(lengths[:12]), [1.5] * 4 + [2] * 4 + [4] * 4, rtol=1e-5
+    )
     front = segments[24, 1] - segments[24, 0]
     np.testing.assert_allclose(front, (2 * np.cos(0.7), 2 * np.sin(0.7), 0), atol=1e-5)
 
@@ -222,7 +246,9 @@ def test_points_can_be_coloured_by_every_quantity(by: str) -> None:
     assert pixels.shape == (90, 160, 3)
     assert pixels.dtype == np.uint8
     assert (pixels != EMPTY).any(-1).mean() > 0.02
-    with pytest.raises(ConfigError, match="one of height, range, reflectance, confidence, domain"):
+    with pytest.raises(
+        ConfigError, match="one of height, range, reflectance, confidence, domain"
+    ):
         render(replace(scan, label=None), "label", size=(16, 9))
     with pytest.raises(ConfigError, match="colour by 'velocity'"):
         render(scan, "velocity", size=(16, 9))
@@ -230,7 +256,12 @@ def test_points_can_be_coloured_by_every_quantity(by: str) -> None:
 
 def test_real_and_synthetic_differ_in_colour() -> None:
     real, synthetic = (
-        render(replace(wall(5, CAR), domain=d), "domain", camera=Camera((-20, 0, 0)), size=(64, 64))
+        render(
+            replace(wall(5, CAR), domain=d),
+            "domain",
+            camera=Camera((-20, 0, 0)),
+            size=(64, 64),
+        )
         for d in (REAL, SYNTHETIC)
     )
     assert np.abs(real[32, 32].astype(int) - synthetic[32, 32]).max() > 100
@@ -252,17 +283,22 @@ def rgb(figure: Any) -> np.ndarray:
 @pytest.mark.slow
 def test_a_sheet_shows_its_scan_its_views_and_its_classes() -> None:
     scan = replace(
-        random_scan(SMALL), boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",))
+        random_scan(SMALL),
+        boxes=Boxes(np.array([(5, 0, 0, 4, 2, 1.5, 0)], np.float32), ("Car",)),
     )
     assert scan.label is not None
     figure = sheet(scan)
     assert f"{len(scan):,} points" in figure.texts[0].get_text()
     [legend] = figure.legends
     named = {text.get_text().rsplit(" ", 1)[0] for text in legend.get_texts()}
-    assert named == {NAMES[i] if i < IGNORE else "unlabelled" for i in np.unique(scan.label)}
+    assert named == {
+        NAMES[i] if i < IGNORE else "unlabelled" for i in np.unique(scan.label)
+    }
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert {"range (m)", "reflectance", "label"} <= set(titles)
-    above = next(axes for axes in figure.axes if "from above" in axes.get_title(loc="left"))
+    above = next(
+        axes for axes in figure.axes if "from above" in axes.get_title(loc="left")
+    )
     assert above.get_xlim() == (50, -50)
     assert above.get_ylim() == (-50, 50)
     pixels = rgb(figure)
@@ -287,7 +323,9 @@ def test_a_sheet_of_a_range_image_shows_its_cells() -> None:
 def test_a_contact_sheet_shows_every_scan() -> None:
     scans = [replace(random_scan(SMALL, seed=i), domain=i % 2) for i in range(5)]
     figure = contact_sheet(scans, title="five")
-    captions = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
+    captions = [
+        axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")
+    ]
     assert len(captions) == 5
     assert "random-3" in captions[3]
     assert "synthetic" in captions[3]
@@ -311,7 +349,11 @@ def test_pictures_and_pages_are_written_to_files(tmp_path: Path) -> None:
     write_view(tmp_path / "one.png", scans[:1])
     write_view(tmp_path / "two.png", scans)
     write_view(tmp_path / "two.html", scans, title="Two")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["one.png", "two.html", "two.png"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "one.png",
+        "two.html",
+        "two.png",
+    ]
     assert Image.open(tmp_path / "one.png").size[0] == 1700
     assert "<title>Two</title>" in (tmp_path / "two.html").read_text(encoding="utf-8")
 
@@ -331,7 +373,9 @@ def test_invalid_paths_and_empty_lists_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [r"$\frac", "a$b$c", r"$$_{"])
 def test_names_of_scans_are_no_formulas(name: str, tmp_path: Path) -> None:
     scan = replace(random_scan(SMALL, 50, 0), id=name)
-    for number, figure in enumerate((sheet(scan), contact_sheet([scan, scan], title=name))):
+    for number, figure in enumerate(
+        (sheet(scan), contact_sheet([scan, scan], title=name))
+    ):
         path = tmp_path / f"{number}.png"
         figure.savefig(path)
         assert path.stat().st_size > 1000

@@ -28,9 +28,12 @@ def scan(seed: int, domain: int, count: int = 1500) -> Scan:
     made = replace(random_scan(SMALL, count, seed), domain=domain)
     if domain == REAL:
         return replace(
-            made, boxes=Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
+            made,
+            boxes=Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",)),
         )
-    return replace(made, confidence=np.random.default_rng(seed).random(count).astype(np.float32))
+    return replace(
+        made, confidence=np.random.default_rng(seed).random(count).astype(np.float32)
+    )
 
 
 REALS = [scan(seed, REAL) for seed in (0, 1, 2)]
@@ -49,7 +52,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "overlap": [behind_each_other()],
     }
     for name, scans in pages.items():
-        (out / f"{name}.html").write_text(html_page(scans, title=name), encoding="utf-8")
+        (out / f"{name}.html").write_text(
+            html_page(scans, title=name), encoding="utf-8"
+        )
     return out
 
 
@@ -69,11 +74,17 @@ def behind_each_other() -> Scan:
 
 
 @pytest.mark.parametrize("name", ["pair", "one", "bare", "empty"])
-def test_a_page_opens_offline_without_an_error(driver: Any, folder: Path, name: str) -> None:
+def test_a_page_opens_offline_without_an_error(
+    driver: Any, folder: Path, name: str
+) -> None:
     page = Page(driver, folder / f"{name}.html")
     assert page.errors() == []
-    loaded = page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)")
-    assert [address for address in loaded if not address.startswith(("data:", "blob:"))] == []
+    loaded = page.run(
+        "return performance.getEntriesByType('resource').map((entry) => entry.name)"
+    )
+    assert [
+        address for address in loaded if not address.startswith(("data:", "blob:"))
+    ] == []
     drawn = [
         view
         for view in range(len(page.all(".view")))
@@ -81,16 +92,24 @@ def test_a_page_opens_offline_without_an_error(driver: Any, folder: Path, name: 
     ]
     assert drawn
     if name != "empty":
-        assert all(len(np.unique(page.pixels(view).reshape(-1, 3), axis=0)) > 20 for view in drawn)
+        assert all(
+            len(np.unique(page.pixels(view).reshape(-1, 3), axis=0)) > 20
+            for view in drawn
+        )
 
 
-def test_a_real_scan_is_on_the_left_and_a_synthetic_one_on_the_right(page: Page) -> None:
+def test_a_real_scan_is_on_the_left_and_a_synthetic_one_on_the_right(
+    page: Page,
+) -> None:
     left, right = page.texts(".caption")
     assert left.startswith("real\nrandom-0 · small · 1,500 points · 1 of 3")
     assert right.startswith("synthetic\nrandom-3 · small · 1,500 points · 1 of 2")
     page.all(".strip")[0].find_elements("css selector", "button")[2].click()
     page.settle()
-    assert [text.splitlines()[1][:8] for text in page.texts(".caption")] == ["random-2", "random-3"]
+    assert [text.splitlines()[1][:8] for text in page.texts(".caption")] == [
+        "random-2",
+        "random-3",
+    ]
 
 
 @pytest.mark.parametrize("dragged", [0, 1])
@@ -98,7 +117,9 @@ def test_one_camera_turns_both_views(page: Page, dragged: int) -> None:
     before = [page.pixels(view) for view in (0, 1)]
     page.drag(dragged, 120, 40)
     after = [page.pixels(view) for view in (0, 1)]
-    assert all((a != b).any(-1).mean() > 0.01 for a, b in zip(before, after, strict=True))
+    assert all(
+        (a != b).any(-1).mean() > 0.01 for a, b in zip(before, after, strict=True)
+    )
     camera = page.camera()
     page.press("r")
     for view in (0, 1):
@@ -106,7 +127,9 @@ def test_one_camera_turns_both_views(page: Page, dragged: int) -> None:
     page.drag(1 - dragged, 120, 40)
     assert page.camera() == camera
     for view in (0, 1):
-        np.testing.assert_array_equal(page.pixels(view), after[view], "turned from the other view")
+        np.testing.assert_array_equal(
+            page.pixels(view), after[view], "turned from the other view"
+        )
 
 
 def test_dragging_turns_and_moves_and_the_wheel_zooms(page: Page) -> None:
@@ -125,7 +148,9 @@ def test_dragging_turns_and_moves_and_the_wheel_zooms(page: Page) -> None:
     origin = ScrollOrigin.from_element(page.all(".view canvas")[1])
     ActionChains(page.driver).scroll_from_origin(origin, 0, 300).perform()
     page.settle()
-    assert page.camera()["distance"] == pytest.approx(start["distance"] * np.exp(0.36), rel=0.01)
+    assert page.camera()["distance"] == pytest.approx(
+        start["distance"] * np.exp(0.36), rel=0.01
+    )
     assert page.texts(".picked") == ["", ""], "dragging picks nothing"
 
 
@@ -135,14 +160,19 @@ def visible(
     """Pixels, depths and disc radii (in pixels) of the points in a view, by the package's own
     renderer."""
     orbit = Orbit(
-        **{key: tuple(value) if key == "target" else value for key, value in camera.items()}
+        **{
+            key: tuple(value) if key == "target" else value
+            for key, value in camera.items()
+        }
     )
     pixels, depth, per_metre = orbit.camera().look(given.points, size)
     gap = 0.015 + 0.003 * np.linalg.norm(given.points, axis=1)
     return pixels, depth, np.maximum(2 * gap * per_metre, 1.5) / 2
 
 
-def nearest(given: Scan, camera: dict[str, Any], size: tuple[int, int], x: int, y: int) -> int:
+def nearest(
+    given: Scan, camera: dict[str, Any], size: tuple[int, int], x: int, y: int
+) -> int:
     """The point that a click at (x, y) means, by brute force; -1 for none."""
     pixels, depth, radius = visible(given, camera, size)
     away = np.where(depth > 0.2, np.linalg.norm(pixels - (x, y), axis=1), np.inf)
@@ -159,33 +189,47 @@ def agrees(shown: dict[str, str], given: Scan, i: int) -> bool:
         return shown == {}
     assert given.label is not None
     label = "unlabelled" if given.label[i] == IGNORE else NAMES[given.label[i]]
-    confidence = "the scan has none" if given.confidence is None else f"{given.confidence[i]:.3f}"
-    near = lambda text, value, tolerance: abs(float(text.split()[0]) - value) <= tolerance  # noqa: E731
+    confidence = (
+        "the scan has none"
+        if given.confidence is None
+        else f"{given.confidence[i]:.3f}"
+    )
+
+    def near(text: str, value: float, tolerance: float) -> bool:
+        return bool(abs(float(text.split()[0]) - value) <= tolerance)
+
     return (
         near(shown["range"], np.linalg.norm(given.points[i]), 0.008)
         and shown["label"] == label
         and near(shown["reflectance"], given.reflectance[i], 0.008)
         and (
-            shown["confidence"] == confidence or near(shown["confidence"], float(confidence), 0.008)
+            shown["confidence"] == confidence
+            or near(shown["confidence"], float(confidence), 0.008)
         )
         and np.allclose(
-            [float(v) for v in shown["x, y, z"][:-2].split(", ")], given.points[i], atol=0.008
+            [float(v) for v in shown["x, y, z"][:-2].split(", ")],
+            given.points[i],
+            atol=0.008,
         )
     )
 
 
 @pytest.mark.parametrize("view", [0, 1])
-def test_a_click_shows_the_values_of_the_point_under_the_cursor(page: Page, view: int) -> None:
+def test_a_click_shows_the_values_of_the_point_under_the_cursor(
+    page: Page, view: int
+) -> None:
     given = (REALS[0], SYNTHETICS[0])[view]
     page.drag(0, 60, 30)  # a camera other than the first
     camera = page.camera()
     size = page.size(view)
     pixels, depth, _ = visible(given, camera, size)
     inside = ((pixels > 80) & (pixels < np.array(size) - 80)).all(1) & (depth > 1)
-    gaps = np.linalg.norm(pixels[inside][:, None] - pixels[inside][None], axis=-1) + 1e9 * np.eye(
-        inside.sum()
-    )
-    alone = np.flatnonzero(inside)[gaps.min(1) > 9]  # nothing else is near these on the screen
+    gaps = np.linalg.norm(
+        pixels[inside][:, None] - pixels[inside][None], axis=-1
+    ) + 1e9 * np.eye(inside.sum())
+    alone = np.flatnonzero(inside)[
+        gaps.min(1) > 9
+    ]  # nothing else is near these on the screen
     assert len(alone) >= 5
     for i in alone[:5]:
         x, y = np.rint(pixels[i]).astype(int)
@@ -214,7 +258,9 @@ def test_a_click_shows_the_values_of_the_point_under_the_cursor(page: Page, view
     assert page.texts(".picked")[1 - view] == "", "the other view keeps its own"
 
 
-def test_the_front_point_is_picked_where_points_overlap(driver: Any, folder: Path) -> None:
+def test_the_front_point_is_picked_where_points_overlap(
+    driver: Any, folder: Path
+) -> None:
     page = Page(driver, folder / "overlap.html")
     width, height = page.size(0)
     shown = page.click(0, width // 2, height // 2)
@@ -279,7 +325,9 @@ def test_every_key_in_the_help_works(page: Page) -> None:
             press_shown(page, key)
     for i, name in enumerate(page.texts("#colours button")):
         page.press(str(i + 1))
-        assert [b.text for b in page.all('#colours button[aria-pressed="true"]')] == [name]
+        assert [b.text for b in page.all('#colours button[aria-pressed="true"]')] == [
+            name
+        ]
         assert f"colour by {name}" in page.texts("#keys > span")[len(MOUSE) + i]
 
 
@@ -287,7 +335,11 @@ def test_every_key_that_works_is_in_the_help(page: Page) -> None:
     from selenium.webdriver import Keys
 
     listed = set(page.texts("#keys kbd"))
-    others = [chr(code) for code in range(33, 127) if chr(code).replace("-", "−") not in listed]
+    others = [
+        chr(code)
+        for code in range(33, 127)
+        if chr(code).replace("-", "−") not in listed
+    ]
     named = (
         "ARROW_UP",
         "ARROW_DOWN",
@@ -330,7 +382,10 @@ def test_a_page_without_labels_says_so(driver: Any, folder: Path) -> None:
     pixels, _, _ = visible(REALS[0], page.camera(), (width, height))
     target = pixels[((pixels > 100) & (pixels < (width - 100, height - 100))).all(1)][0]
     shown = page.click(0, *np.rint(target).astype(int).tolist())
-    assert (shown["label"], shown["confidence"]) == ("the scan has none", "the scan has none")
+    assert (shown["label"], shown["confidence"]) == (
+        "the scan has none",
+        "the scan has none",
+    )
 
 
 def test_a_scan_without_the_chosen_quantity_is_grey_and_says_so(page: Page) -> None:
@@ -338,7 +393,9 @@ def test_a_scan_without_the_chosen_quantity_is_grey_and_says_so(page: Page) -> N
     left, right = page.texts(".caption")
     assert left.endswith("This scan has no confidence.")
     assert "no confidence" not in right
-    strongest = [np.ptp(page.pixels(view).astype(int), axis=-1).max() for view in (0, 1)]
+    strongest = [
+        np.ptp(page.pixels(view).astype(int), axis=-1).max() for view in (0, 1)
+    ]
     assert strongest[0] < 40 < strongest[1], "grey on the left, colours on the right"
 
 
@@ -346,7 +403,8 @@ def test_a_narrow_window_needs_no_scrolling_sideways(driver: Any, folder: Path) 
     page = Page(driver, folder / "pair.html", (500, 800))
     assert page.run("return document.documentElement.scrollWidth <= innerWidth")
     boxes = [
-        page.run("return arguments[0].getBoundingClientRect()", view) for view in page.all(".view")
+        page.run("return arguments[0].getBoundingClientRect()", view)
+        for view in page.all(".view")
     ]
     assert boxes[0]["bottom"] <= boxes[1]["top"], "the views are stacked"
     for button in page.all("#controls button"):

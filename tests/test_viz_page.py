@@ -49,7 +49,10 @@ def scans() -> list[Scan]:
 @pytest.fixture(scope="module")
 def page(scans: list[Scan]) -> str:
     return html_page(
-        scans, title="A <title> & more", notes="First.\n\nSecond & <last>. @data@", panels=PANELS
+        scans,
+        title="A <title> & more",
+        notes="First.\n\nSecond & <last>. @data@",
+        panels=PANELS,
     )
 
 
@@ -74,14 +77,18 @@ def test_the_page_contains_all_points(page: str, scans: list[Scan]) -> None:
         x, y, z, reflectance, label, *confidence = unpacked(packed)
         step = packed["metres"]
         assert step <= np.abs(scan.points).max() / 32767 * 1.001
-        np.testing.assert_allclose(np.stack([x, y, z], 1), scan.points, atol=step / 2 * 1.01)
+        np.testing.assert_allclose(
+            np.stack([x, y, z], 1), scan.points, atol=step / 2 * 1.01
+        )
         np.testing.assert_allclose(reflectance, scan.reflectance, atol=0.5 / 255 + 1e-6)
         np.testing.assert_array_equal(
             label, np.full(len(scan), IGNORE) if scan.label is None else scan.label
         )
         assert len(confidence) == (scan.confidence is not None)
         if scan.confidence is not None:
-            np.testing.assert_allclose(confidence[0], scan.confidence, atol=0.5 / 255 + 1e-6)
+            np.testing.assert_allclose(
+                confidence[0], scan.confidence, atol=0.5 / 255 + 1e-6
+            )
 
 
 def test_the_page_contains_the_facts_of_each_scan(page: str, scans: list[Scan]) -> None:
@@ -104,7 +111,9 @@ def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> Non
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         image = project(scan)
         channels = ["range", "reflectance"] + ["label"] * (scan.label is not None)
-        assert [p["title"] for p in packed["pictures"]] == [colours[c].title for c in channels]
+        assert [p["title"] for p in packed["pictures"]] == [
+            colours[c].title for c in channels
+        ]
         for channel, shown in zip(channels, packed["pictures"], strict=True):
             np.testing.assert_array_equal(
                 pixels(shown["uri"]), picture(image, channel, colours[channel])
@@ -112,15 +121,23 @@ def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> Non
         assert pixels(packed["still"]).shape == (360, 640, 3)
 
 
-def test_the_page_uses_the_colour_tables_of_the_pictures(page: str, scans: list[Scan]) -> None:
+def test_the_page_uses_the_colour_tables_of_the_pictures(
+    page: str, scans: list[Scan]
+) -> None:
     data = page_data(page)
     colours = scales(scans)
-    table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(len(colours), 256, 3)
+    table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(
+        len(colours), 256, 3
+    )
     assert list(data["scales"]) == list(VALUES) == list(colours)
     for name, scale in colours.items():
         row = data["scales"][name]
         np.testing.assert_array_equal(table[row["row"]], scale.table)
-        assert (row["low"], row["high"], row["gamma"]) == (scale.low, scale.high, scale.gamma)
+        assert (row["low"], row["high"], row["gamma"]) == (
+            scale.low,
+            scale.high,
+            scale.gamma,
+        )
     np.testing.assert_array_equal(table[data["scales"]["label"]["row"], :19], COLOURS)
 
 
@@ -158,7 +175,10 @@ def test_panels_stand_on_the_page_as_they_are(page: str) -> None:
 
 def test_domains_can_have_other_names(scans: list[Scan]) -> None:
     assert page_data(html_page(scans[1:]))["domains"] == ["real", "synthetic"]
-    assert page_data(html_page(scans[1:], domains=("town", "made")))["domains"] == ["town", "made"]
+    assert page_data(html_page(scans[1:], domains=("town", "made")))["domains"] == [
+        "town",
+        "made",
+    ]
 
 
 def test_a_page_with_a_full_scan_is_below_2_1_megabytes() -> None:

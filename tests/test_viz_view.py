@@ -36,13 +36,17 @@ def view(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> View:
     data.mkdir()
     for i in range(3):
         scan = random_scan(load_sensor("town"), 400, seed=i)
-        np.column_stack([scan.points, scan.reflectance]).astype("<f4").tofile(data / f"{i:06}.bin")
+        np.column_stack([scan.points, scan.reflectance]).astype("<f4").tofile(
+            data / f"{i:06}.bin"
+        )
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(window, "has_screen", lambda: False)
     app = typer.Typer()
     app.command()(command)
-    return lambda *args: CliRunner().invoke(app, [str(data), *args], catch_exceptions=True)
+    return lambda *args: CliRunner().invoke(
+        app, [str(data), *args], catch_exceptions=True
+    )
 
 
 def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
@@ -65,7 +69,9 @@ def test_view_writes_a_page_where_there_is_no_screen(view: View) -> None:
         (["--count", "9"], ["000000", "000001", "000002"]),
     ],
 )
-def test_view_shows_the_selected_scans(view: View, args: list[str], ids: list[str]) -> None:
+def test_view_shows_the_selected_scans(
+    view: View, args: list[str], ids: list[str]
+) -> None:
     assert view(*args, "--out", "out.html").exit_code == 0
     shown = page_data(Path("out.html").read_text(encoding="utf-8"))["scans"]
     assert [scan["id"][-6:] for scan in shown] == ids
@@ -86,7 +92,10 @@ def test_view_accepts_a_sensor_and_writes_a_sheet(view: View) -> None:
     [
         (["--index", "3"], r"--index 3: .* holds 3 scans; expected 0 \.\. 2"),
         (["--index", "-4"], r"--index -4: .* holds 3 scans"),
-        (["--out", "scan.jpg"], r"scan\.jpg; expected a file that ends in \.png or \.html"),
+        (
+            ["--out", "scan.jpg"],
+            r"scan\.jpg; expected a file that ends in \.png or \.html",
+        ),
         (["--sensor", "velodyne"], r"sensor 'velodyne'; expected one of"),
     ],
 )
@@ -99,8 +108,12 @@ def test_the_error_of_a_wrong_call_names_the_right_one(
     assert not list(Path().iterdir())
 
 
-@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="a screen is always there")
-def test_there_is_no_window_if_no_display_server_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(
+    sys.platform in ("win32", "darwin"), reason="a screen is always there"
+)
+def test_there_is_no_window_if_no_display_server_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A DISPLAY without a server is not a screen: open3d would wait forever."""
     monkeypatch.setenv("DISPLAY", ":4242")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -123,7 +136,9 @@ def test_the_window_draws_points_and_boxes() -> None:
     boxes = Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
     scan = replace(random_scan(SMALL), boxes=boxes)
     cloud, lines = window.geometries(scan, scales([scan]))
-    np.testing.assert_array_equal(np.asarray(cloud.points).astype(np.float32), scan.points)
+    np.testing.assert_array_equal(
+        np.asarray(cloud.points).astype(np.float32), scan.points
+    )
     np.testing.assert_allclose(
         np.asarray(cloud.colors) * 255, scales([scan])["label"](scan.label), atol=1e-4
     )

@@ -74,7 +74,9 @@ def test_the_encoder_wraps_columns_but_not_rows(patch: tuple[int, int]) -> None:
     z = net.encode(x)
     columns = 2 * patch[1]
     assert torch.allclose(net.encode(x.roll(columns, -1)), z.roll(1, -1), atol=1e-5)
-    assert not torch.allclose(net.encode(x.roll(2 * patch[0], -2)), z.roll(1, -2), atol=1e-2)
+    assert not torch.allclose(
+        net.encode(x.roll(2 * patch[0], -2)), z.roll(1, -2), atol=1e-2
+    )
 
 
 @torch.no_grad()
@@ -83,8 +85,12 @@ def test_vectors_are_quantised_to_their_nearest_codes() -> None:
     z = torch.randn(2, 4, 4, 16)
     quantised, index = net.codebook(z)
     tokens = z.movedim(1, -1).flatten(0, 2)
-    assert torch.equal(index.flatten(), torch.cdist(tokens, net.codebook.codes).argmin(1))
-    assert torch.equal(quantised.movedim(1, -1).flatten(0, 2), net.codebook.codes[index.flatten()])
+    assert torch.equal(
+        index.flatten(), torch.cdist(tokens, net.codebook.codes).argmin(1)
+    )
+    assert torch.equal(
+        quantised.movedim(1, -1).flatten(0, 2), net.codebook.codes[index.flatten()]
+    )
     again, same = net.codebook(quantised)
     assert torch.equal(same, index)
     assert torch.equal(again, quantised)
@@ -104,7 +110,9 @@ def test_gradients_pass_straight_through_the_codebook() -> None:
     output, gap, code_gap = net(image())
     assert gap.shape == (2,) and torch.equal(gap, code_gap)
     output.square().mean().backward(retain_graph=True)
-    assert net.encoder.stem.weight.grad is not None and net.encoder.stem.weight.grad.any()
+    assert (
+        net.encoder.stem.weight.grad is not None and net.encoder.stem.weight.grad.any()
+    )
     assert net.codebook.codes.grad is None or not net.codebook.codes.grad.any()
     net.zero_grad()
     gap.mean().backward(retain_graph=True)
@@ -119,9 +127,13 @@ def test_training_moves_the_codes_towards_the_latents(codebook: str) -> None:
     """After some steps, the codes are closer to the latents of the same images than before."""
     net = network(codebook=codebook).train()
     for parameter in net.parameters():
-        parameter.requires_grad_(parameter is net.codebook.codes and codebook == "gradient")
+        parameter.requires_grad_(
+            parameter is net.codebook.codes and codebook == "gradient"
+        )
     before = net(image()).gap.mean()
-    optimizer = torch.optim.Adam([net.codebook.codes], 0.05) if codebook == "gradient" else None
+    optimizer = (
+        torch.optim.Adam([net.codebook.codes], 0.05) if codebook == "gradient" else None
+    )
     for _ in range(30):
         gap = net(image()).code_gap.mean()
         if optimizer is not None:

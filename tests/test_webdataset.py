@@ -28,7 +28,9 @@ def samples(path: Path) -> dict[str, dict[str, bytes]]:
             folder, _, name = member.name.rpartition("/")
             stem, kind = name.split(".", 1)
             key = f"{folder}/{stem}" if folder else stem
-            assert key not in found or key == list(found)[-1], "members of a scan stand together"
+            assert key not in found or key == list(found)[-1], (
+                "members of a scan stand together"
+            )
             assert kind not in found.setdefault(key, {})
             content = tar.extractfile(member)
             assert content is not None
@@ -42,9 +44,15 @@ def tars(root: Path) -> dict[str, bytes]:
 
 def test_members_are_what_webdataset_decodes(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
-    scans[1].label = scans[1].raw_label = scans[1].instance = scans[1].boxes = scans[1].pose = None
+    scans[1].label = scans[1].raw_label = scans[1].instance = scans[1].boxes = scans[
+        1
+    ].pose = None
     convert(scans, WebDatasetWriter(tmp_path, shard_size=2), progress=False)
-    assert sorted(tars(tmp_path)) == ["scans-000000.tar", "scans-000001.tar", "scans-000002.tar"]
+    assert sorted(tars(tmp_path)) == [
+        "scans-000000.tar",
+        "scans-000001.tar",
+        "scans-000002.tar",
+    ]
     found = samples(tmp_path / "scans-000000.tar")
     assert list(found) == ["000000", "000001"]
     first, second = found.values()
@@ -66,7 +74,9 @@ def test_members_are_what_webdataset_decodes(tmp_path: Path) -> None:
     assert (np.load(BytesIO(second["label.npy"])) == IGNORE).all()
     read = open_scans(tmp_path)
     assert type(read) is WebDataset and read.ids == tuple(f"{i:06d}" for i in range(5))
-    assert read[0].boxes is not None and np.array_equal(read[0].boxes.values, scans[0].boxes.values)
+    assert read[0].boxes is not None and np.array_equal(
+        read[0].boxes.values, scans[0].boxes.values
+    )
     assert np.array_equal(read[4].pose, scans[4].pose) and read[1].pose is None
     assert len(open_scans(tmp_path / "scans-000002.tar")) == 1
 
@@ -79,12 +89,18 @@ def test_a_bank_goes_out_under_its_names(tmp_path: Path) -> None:
     )
     bank = open_scans(tmp_path / "bank")
     convert(bank, WebDatasetWriter(tmp_path / "out", shard_size=3), progress=False)
-    assert list(samples(tmp_path / "out" / "scans-000001.tar")) == ["small/5/3", "small/5/4"]
+    assert list(samples(tmp_path / "out" / "scans-000001.tar")) == [
+        "small/5/3",
+        "small/5/4",
+    ]
     read = open_scans(tmp_path / "out")
     assert read.ids == bank.ids and read.sensor == bank.sensor
     for a, b in zip(read, bank, strict=True):
         assert (a.id, a.domain) == (b.id, b.domain)
-        assert all(np.array_equal(a.fields()[name], values) for name, values in b.fields().items())
+        assert all(
+            np.array_equal(a.fields()[name], values)
+            for name, values in b.fields().items()
+        )
 
 
 def test_names_with_dots(tmp_path: Path) -> None:
@@ -95,16 +111,21 @@ def test_names_with_dots(tmp_path: Path) -> None:
         assert writer.complete(index, name)
     writer.finish()
     assert (
-        list(open_scans(tmp_path).ids) == names and len(samples(tmp_path / "scans-000000.tar")) == 3
+        list(open_scans(tmp_path).ids) == names
+        and len(samples(tmp_path / "scans-000000.tar")) == 3
     )
 
 
 @pytest.mark.slow
-def test_bytes_repeat_in_any_order_and_by_any_number_of_processes(tmp_path: Path) -> None:
+def test_bytes_repeat_in_any_order_and_by_any_number_of_processes(
+    tmp_path: Path,
+) -> None:
     write_bank(tmp_path / "bank", [some_image(i) for i in range(5)])
     bank = open_scans(tmp_path / "bank")
     convert(bank, WebDatasetWriter(tmp_path / "one", shard_size=2), progress=False)
-    convert(bank, WebDatasetWriter(tmp_path / "two", shard_size=2), jobs=2, progress=False)
+    convert(
+        bank, WebDatasetWriter(tmp_path / "two", shard_size=2), jobs=2, progress=False
+    )
     backwards = WebDatasetWriter(tmp_path / "three", shard_size=2)
     for index in reversed(range(5)):
         backwards.write(bank[index], index, name=bank.ids[index])
@@ -151,7 +172,9 @@ def test_a_resumed_run_writes_the_same_bytes(tmp_path: Path) -> None:
     }
 
 
-def test_killed_while_gathering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_while_gathering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Tar files are there, but so are the scans that they were made of: none of them comes
     twice."""
     import lidar_synth.formats.webdataset as module
@@ -168,11 +191,20 @@ def test_killed_while_gathering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_skipped_scans_are_added_by_a_later_run(tmp_path: Path) -> None:
     scans = [some_scan(i) for i in range(5)]
     report = convert(
-        Interrupted(scans, DataError), WebDatasetWriter(tmp_path), on_bad="skip", progress=False
+        Interrupted(scans, DataError),
+        WebDatasetWriter(tmp_path),
+        on_bad="skip",
+        progress=False,
     )
     assert report.written == 4 and len(open_scans(tmp_path)) == 4
     assert convert(scans, WebDatasetWriter(tmp_path), progress=False) == Report(1, 4)
-    assert open_scans(tmp_path).ids == ("000000", "000001", "000002", "000004", "000003")
+    assert open_scans(tmp_path).ids == (
+        "000000",
+        "000001",
+        "000002",
+        "000004",
+        "000003",
+    )
     with pytest.raises(ConfigError, match="0 scans in a tar file; expected at least 1"):
         WebDatasetWriter(tmp_path, shard_size=0)
 
@@ -201,7 +233,8 @@ def damaged(path: Path, **members: bytes | None) -> None:
     [(key, there)] = samples(path).items()
     with tarfile.open(path, "w") as tar:
         for kind, content in (
-            there | {kind.replace("_", "."): content for kind, content in members.items()}
+            there
+            | {kind.replace("_", "."): content for kind, content in members.items()}
         ).items():
             if content is not None:
                 info = tarfile.TarInfo(f"{key}.{kind}")
@@ -224,10 +257,15 @@ def test_damaged_members_are_named_and_skipped(
 ) -> None:
     path = write_tars(tmp_path)[1]
     damaged(path, **members)
-    with pytest.raises(DataError, match=f"scan '000001' of .*scans-000001.tar: .*({message})"):
+    with pytest.raises(
+        DataError, match=f"scan '000001' of .*scans-000001.tar: .*({message})"
+    ):
         open_scans(tmp_path)[1]
     with pytest.warns(UserWarning, match="skipped scan 000001"):
-        assert [scan.id for scan in open_scans(tmp_path, on_bad="skip")] == ["000000", "000002"]
+        assert [scan.id for scan in open_scans(tmp_path, on_bad="skip")] == [
+            "000000",
+            "000002",
+        ]
 
 
 def test_damaged_and_missing_files(tmp_path: Path) -> None:
@@ -250,7 +288,12 @@ def test_damaged_and_missing_files(tmp_path: Path) -> None:
         scans[1]
 
 
-PAX = {"GNU.sparse.map": "x,y", "GNU.sparse.size": "x", "size": "-5", "GNU.sparse.offset": "x"}
+PAX = {
+    "GNU.sparse.map": "x,y",
+    "GNU.sparse.size": "x",
+    "size": "-5",
+    "GNU.sparse.offset": "x",
+}
 
 
 @pytest.mark.parametrize("key", PAX)

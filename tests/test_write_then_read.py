@@ -56,7 +56,9 @@ def distorted(rng: np.random.Generator) -> Scan:
     """A scan with a few faults, of which some are none for some formats."""
     scan = complete()
     names = [n for n in WRONG if rng.random() < 0.7]
-    scan = replace(scan, **{n: None for n in WRONG if n not in ("points", "reflectance", *names)})
+    scan = replace(
+        scan, **{n: None for n in WRONG if n not in ("points", "reflectance", *names)}
+    )
     for _ in range(rng.integers(1, 3)):
         scan = FAULTS[rng.integers(len(FAULTS))](scan, rng)
     return scan
@@ -66,10 +68,16 @@ def _value(scan: Scan, rng: np.random.Generator) -> Scan:
     known = [
         n
         for n in WRONG
-        if getattr(scan, n) is not None and getattr(scan, n).dtype.kind in "iuf" and len(scan)
+        if getattr(scan, n) is not None
+        and getattr(scan, n).dtype.kind in "iuf"
+        and len(scan)
     ]
     name = known[rng.integers(len(known))] if known else "points"
-    return with_value(scan, name, WRONG[name][rng.integers(len(WRONG[name]))]) if known else scan
+    return (
+        with_value(scan, name, WRONG[name][rng.integers(len(WRONG[name]))])
+        if known
+        else scan
+    )
 
 
 def _kind(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -135,7 +143,9 @@ def _origin(scan: Scan, rng: np.random.Generator) -> Scan:
         {"a": "x" * 10**5},
     ]
     return replace(
-        scan, domain=int(rng.integers(-1, 3)), provenance=wrong[rng.integers(len(wrong))]
+        scan,
+        domain=int(rng.integers(-1, 3)),
+        provenance=wrong[rng.integers(len(wrong))],
     )
 
 
@@ -197,7 +207,15 @@ def test_what_is_written_is_read(to: str, tmp_path: Path) -> None:
         lambda scan: with_value(scan, "time", 1e30),
         lambda scan: scan[:0],
     ],
-    ids=["nan", "1e30 m", "label 261", "instance 2^32 + 7", "ring 70,000", "time 1e30", "empty"],
+    ids=[
+        "nan",
+        "1e30 m",
+        "label 261",
+        "instance 2^32 + 7",
+        "ring 70,000",
+        "time 1e30",
+        "empty",
+    ],
 )
 def test_no_writer_takes_what_readers_refuse(
     to: str, fault: Callable[[Scan], Scan], tmp_path: Path
@@ -212,7 +230,9 @@ def test_labels_of_another_integer_type_become_pictures(tmp_path: Path) -> None:
     scan = some_scan()
     assert scan.label is not None
     for kind in (np.int64, np.uint8):
-        WRITERS["png"](tmp_path / str(kind)).write(replace(scan, label=scan.label.astype(kind)), 0)  # type: ignore[call-arg]
+        WRITERS["png"](tmp_path / str(kind)).write(
+            replace(scan, label=scan.label.astype(kind)), 0
+        )  # type: ignore[call-arg]
     wide, own = (back("png", tmp_path / str(kind))[0] for kind in (np.int64, np.uint8))
     assert np.array_equal(wide.label, own.label)  # type: ignore[arg-type]
 

@@ -28,9 +28,7 @@ from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels.augment import compose, flip_y, scale, yaw
 
 AUGMENT = compose([yaw, flip_y, scale])
-AUGMENTATION = (
-    "rotation about the vertical axis, mirroring and scaling, of real and synthetic scans alike"
-)
+AUGMENTATION = "rotation about the vertical axis, mirroring and scaling, of real and synthetic scans alike"
 WIDTHS = (8, 16, 32, 48)
 """Channels of the segmenter: half of its default, for a short training on a CPU."""
 
@@ -63,20 +61,30 @@ class Protocol:
         sensor = self.real[0].sensor
         if not same_grid(sensor, self.synthetic[0].sensor):
             options["as_sensor"] = sensor
-        return MixedScans(self.real, self.synthetic if ratio else None, ratio, seed=seed, **options)
+        return MixedScans(
+            self.real, self.synthetic if ratio else None, ratio, seed=seed, **options
+        )
 
     def train(self, ratio: float, seed: int) -> NDArray[np.int64]:
         """(19, 19) confusion matrix on the held-out scans after a training with this share of
         synthetic samples."""
         torch.manual_seed(seed)
-        mixed = self.mixture(ratio, seed, augment=AUGMENT, augment_real=True, collate="range")
+        mixed = self.mixture(
+            ratio, seed, augment=AUGMENT, augment_real=True, collate="range"
+        )
         held_out = MixedScans(self.held_out, ratio=0, collate="range")
         height = torch.from_numpy(np.sin(mixed.collate.sensor.ray_angles()[0]))
         network = RangeSegmenter(widths=WIDTHS)
         train_segmenter(
-            network, endless_batches(mixed, self.batch), height, self.steps, progress=False
+            network,
+            endless_batches(mixed, self.batch),
+            height,
+            self.steps,
+            progress=False,
         )
-        return confusion(network, DataLoader(held_out, 1, collate_fn=held_out.collate), height)
+        return confusion(
+            network, DataLoader(held_out, 1, collate_fn=held_out.collate), height
+        )
 
 
 @dataclass(frozen=True)

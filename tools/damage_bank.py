@@ -34,7 +34,9 @@ def by_index(root: Path, number: int) -> list[bytes]:
     scans = [bank[i] for i in range(first, bank.index.ends[number])]
     bank.close()
     return [
-        b"".join(a.tobytes() for a in (s.points, s.reflectance, s.label) if a is not None)
+        b"".join(
+            a.tobytes() for a in (s.points, s.reflectance, s.label) if a is not None
+        )
         for s in scans
     ]
 
@@ -43,7 +45,8 @@ def alone(path: Path) -> list[bytes]:
     """The arrays of a shard's scans, read from the shard alone."""
     with ShardReader(path, str(path)) as shard:
         return [
-            b"".join(a.tobytes() for a in shard.read(i).values()) for i in range(shard.entry.scans)
+            b"".join(a.tobytes() for a in shard.read(i).values())
+            for i in range(shard.entry.scans)
         ]
 
 
@@ -61,7 +64,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
+    parser.add_argument(
+        "--model", default="town", help="a shipped model or a checkpoint"
+    )
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--cuts", type=int, default=200)
     parser.add_argument(
@@ -72,7 +77,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "bank"
         index = bake(
-            make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)), progress=False
+            make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)),
+            progress=False,
         )
         assert index is not None
         path = root / index.shards[1].file
@@ -89,8 +95,12 @@ def main() -> None:
         counts: Counter[tuple[str, str, str]] = Counter()
         for kind, values in tqdm(damaged, unit="damage"):
             path.write_bytes(values)
-            counts[kind, "reading the bank", attempt(lambda: by_index(root, 1), whole)] += 1
-            counts[kind, "reading the shard alone", attempt(lambda: alone(path), arrays)] += 1
+            counts[
+                kind, "reading the bank", attempt(lambda: by_index(root, 1), whole)
+            ] += 1
+            counts[
+                kind, "reading the shard alone", attempt(lambda: alone(path), arrays)
+            ] += 1
             found = next(check_shard(root, facts, entry), None) is not None
             counts[kind, "verify", "found" if found else "NOT FOUND"] += 1
         done = repair(root, given.model, progress=False)

@@ -83,7 +83,9 @@ def command(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "lidar_synth", *words], check=True)
 
 
-def spread(source: Source, count: int, chosen: Sequence[int] | None = None) -> list[Scan]:
+def spread(
+    source: Source, count: int, chosen: Sequence[int] | None = None
+) -> list[Scan]:
     """At most ``count`` scans, evenly spread over a source or over some of its indices."""
     indices = list(range(len(source))) if chosen is None else chosen
     places = np.unique(
@@ -94,7 +96,10 @@ def spread(source: Source, count: int, chosen: Sequence[int] | None = None) -> l
 
 def town(out: Path, scans: int, seed: int) -> Data:
     """Scans of two towns; those of the first one take the place of the user's own."""
-    for name, number, more in (("town", seed, ()), ("other_town", seed + 1, ("--no-camera",))):
+    for name, number, more in (
+        ("town", seed, ()),
+        ("other_town", seed + 1, ("--no-camera",)),
+    ):
         words = (
             "--scans",
             str(scans),
@@ -132,7 +137,10 @@ def semantic_kitti(root: str, scans: int) -> Data:
     source = open_scans(root, layout="semantic_kitti", split="all")
     # The test set has no labels.
     labelled = [i for i, name in enumerate(source.ids) if int(name[:2]) < 11]
-    sequences = {key: list(found) for key, found in groupby(labelled, lambda i: source.ids[i][:2])}
+    sequences = {
+        key: list(found)
+        for key, found in groupby(labelled, lambda i: source.ids[i][:2])
+    }
     held_out = "08" if "08" in sequences else max(sequences)
     chosen = [i for key, found in sequences.items() if key != held_out for i in found]
     if not chosen:
@@ -165,10 +173,14 @@ def kitti360(root: str, scans: int) -> Data:
         return Data(real, [], name, "real", notes)
     drives = {
         key: list(found)
-        for key, found in groupby(range(len(source)), lambda i: source.ids[i].split("/")[0])
+        for key, found in groupby(
+            range(len(source)), lambda i: source.ids[i].split("/")[0]
+        )
     }
     *others, last = drives.values()
-    chosen = [i for indices in others for i in indices] or last[: max(1, 3 * len(last) // 4)]
+    chosen = [i for indices in others for i in indices] or last[
+        : max(1, 3 * len(last) // 4)
+    ]
     held_out = [i for i in last if i not in set(chosen)]
     notes = (
         f"Real scans: KITTI-360, {len(drives)} drives, with labels from its accumulated clouds. "
@@ -179,7 +191,12 @@ def kitti360(root: str, scans: int) -> Data:
         "trained"
     )
     return Data(
-        spread(source, scans, chosen), spread(source, scans, held_out), name, "real", notes, place
+        spread(source, scans, chosen),
+        spread(source, scans, held_out),
+        name,
+        "real",
+        notes,
+        place,
     )
 
 
@@ -217,20 +234,29 @@ def protocol_notes(protocol: Protocol, place: str) -> list[str]:
 def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
     """The panels of the page below the viewer."""
     labels = "none" if result is None else "generated"
-    mixed = protocol.mixture(protocol.ratio, 0, labels=labels, to_sample=lambda scan, rng: scan)
+    mixed = protocol.mixture(
+        protocol.ratio, 0, labels=labels, to_sample=lambda scan, rng: scan
+    )
     epoch = [mixed[i] for i in range(len(mixed))]
     kinds = (data.kind, "synthetic")
     made = [mixture_panel([scan.domain for scan in epoch], kinds)]
     if result is None:
         return made
     without, with_synthetic = result.scores()
-    arms = {f"{data.kind} scans only": without, f"{data.kind} and synthetic scans": with_synthetic}
+    arms = {
+        f"{data.kind} scans only": without,
+        f"{data.kind} and synthetic scans": with_synthetic,
+    }
     columns = {
         f"% of points, {kind}": shares([s for s in epoch if s.domain == d])
         for d, kind in enumerate(kinds)
     }
     ious = dict(
-        zip((f"IoU %, {data.kind} only", "IoU %, with synthetic"), result.ious(), strict=True)
+        zip(
+            (f"IoU %, {data.kind} only", "IoU %, with synthetic"),
+            result.ious(),
+            strict=True,
+        )
     )
     notes = [
         f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : "
@@ -250,7 +276,11 @@ def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
     names = (data.name, "Synthetic scan, generated in 4 steps")
     shown = real + spread(bank, SHOWN)
     text = html_page(
-        shown, title="Real and synthetic scans", notes=data.notes, domains=names, panels=made
+        shown,
+        title="Real and synthetic scans",
+        notes=data.notes,
+        domains=names,
+        panels=made,
     )
     write_file(path, text.encode())
 
@@ -264,7 +294,10 @@ def main() -> None:
         "out", type=Path, nargs="?", default=Path("demo_out"), help="folder to write to"
     )
     parser.add_argument(
-        "--scans", type=int, default=24, help="how many scans to train on, and how many to hold out"
+        "--scans",
+        type=int,
+        default=24,
+        help="how many scans to train on, and how many to hold out",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the town")
     given = parser.parse_args()
@@ -289,7 +322,11 @@ def main() -> None:
 
     few = given.scans < 12
     protocol = Protocol(
-        data.real, list(bank), data.held_out, steps=40 if few else 120, seeds=2 if few else 3
+        data.real,
+        list(bank),
+        data.held_out,
+        steps=40 if few else 120,
+        seeds=2 if few else 3,
     )
     result = None
     if data.labelled:

@@ -25,7 +25,17 @@ from fuzzing.cases import Cases
 from fuzzing.checks import flaws
 from fuzzing.run import FLAWS, Report, fuzz
 from fuzzing.targets import TARGETS
-from fuzzing.worker import DIED, EQUAL, FOREIGN, MEMORY, REFUSED, SLOW, SOUND, UNSOUND, Limits
+from fuzzing.worker import (
+    DIED,
+    EQUAL,
+    FOREIGN,
+    MEMORY,
+    REFUSED,
+    SLOW,
+    SOUND,
+    UNSOUND,
+    Limits,
+)
 
 PART = 1250
 """Cases that one process reads; readers that are fuzzed for longer are spread over several."""
@@ -55,16 +65,25 @@ def main() -> None:
         help="a reader to fuzz; repeat for several [default: all]",
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2, help="processes that read at a time")
     parser.add_argument(
-        "--memory", type=float, default=500, help="limit of memory of a case, in megabytes"
+        "--jobs", type=int, default=2, help="processes that read at a time"
+    )
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=500,
+        help="limit of memory of a case, in megabytes",
     )
     parser.add_argument(
         "--seconds", type=float, default=5, help="limit of time of a case, in seconds"
     )
-    parser.add_argument("--keep", type=Path, help="folder for the files of the cases with a flaw")
     parser.add_argument(
-        "--case", type=int, help="write this case to --keep, and read it in this process"
+        "--keep", type=Path, help="folder for the files of the cases with a flaw"
+    )
+    parser.add_argument(
+        "--case",
+        type=int,
+        help="write this case to --keep, and read it in this process",
     )
     given = parser.parse_args()
     names = given.reader or list(TARGETS)
@@ -90,8 +109,15 @@ def run(
     """A report for each reader, and what went wrong with the harness itself."""
     failures: list[str] = []
     reports = {name: Report() for name in names}
-    parts = [(name, range(cases)[i : i + PART]) for i in range(0, cases, PART) for name in names]
-    with tqdm(total=cases * len(names), unit="case") as bar, ThreadPoolExecutor(jobs) as pool:
+    parts = [
+        (name, range(cases)[i : i + PART])
+        for i in range(0, cases, PART)
+        for name in names
+    ]
+    with (
+        tqdm(total=cases * len(names), unit="case") as bar,
+        ThreadPoolExecutor(jobs) as pool,
+    ):
 
         def one(name: str, numbers: range) -> tuple[str, Report]:
             try:
@@ -113,10 +139,19 @@ def table(reports: dict[str, Report]) -> str:
     lines = [f"| {' | '.join(head)} |", f"|---|{'---:|' * (len(head) - 1)}"]
     for name, report in reports.items():
         counts = [
-            sum(report.counts[verdict] for verdict in verdicts) for verdicts in COLUMNS.values()
+            sum(report.counts[verdict] for verdict in verdicts)
+            for verdicts in COLUMNS.values()
         ]
-        row = [name, report.cases, *counts, f"{report.peak / 1e6:.0f}", f"{report.slowest:.2f}"]
-        lines.append(f"| {' | '.join(f'{v:,}' if isinstance(v, int) else v for v in row)} |")
+        row = [
+            name,
+            report.cases,
+            *counts,
+            f"{report.peak / 1e6:.0f}",
+            f"{report.slowest:.2f}",
+        ]
+        lines.append(
+            f"| {' | '.join(f'{v:,}' if isinstance(v, int) else v for v in row)} |"
+        )
     return "\n".join(lines)
 
 
@@ -125,11 +160,15 @@ def print_flaws(name: str, seed: int, report: Report, keep: Path | None) -> None
     kinds = Counter((flaw.verdict, flaw.detail[:90]) for flaw in report.flaws)
     for (verdict, detail), count in kinds.most_common():
         numbers = [
-            f.number for f in report.flaws if (f.verdict, f.detail[:90]) == (verdict, detail)
+            f.number
+            for f in report.flaws
+            if (f.verdict, f.detail[:90]) == (verdict, detail)
         ][:3]
         print(f"{name} --seed {seed} --case {numbers}: {count} x {verdict}: {detail!r}")
         for number in numbers if keep is not None else ():
-            Cases(name, TARGETS[name], seed, keep / name / f"{seed}-{number}").place(number)
+            Cases(name, TARGETS[name], seed, keep / name / f"{seed}-{number}").place(
+                number
+            )
 
 
 def look(name: str, seed: int, number: int, keep: Path) -> str:
@@ -137,9 +176,14 @@ def look(name: str, seed: int, number: int, keep: Path) -> str:
     folder = keep / name / f"{seed}-{number}"
     root = Cases(name, TARGETS[name], seed, folder).place(number)
     print(f"the case is in {root}, the valid files are in {folder / 'valid'}")
-    return "\n".join(flaws(TARGETS[name].read(root))) or "read, and nothing is wrong with it"
+    return (
+        "\n".join(flaws(TARGETS[name].read(root)))
+        or "read, and nothing is wrong with it"
+    )
 
 
 if __name__ == "__main__":
-    assert set(FLAWS) < {verdict for verdicts in COLUMNS.values() for verdict in verdicts}
+    assert set(FLAWS) < {
+        verdict for verdicts in COLUMNS.values() for verdict in verdicts
+    }
     main()

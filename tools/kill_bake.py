@@ -80,9 +80,13 @@ def main() -> None:
     given = parser.parse_args()
     rng = random.Random(given.seed)
     with tempfile.TemporaryDirectory() as folder:
-        model = given.model or str(write_untrained(Path(folder) / "untrained.safetensors"))
+        model = given.model or str(
+            write_untrained(Path(folder) / "untrained.safetensors")
+        )
         job = BakeJob(model=model, count=given.count, shard_size=given.shard_size)
-        whole, plan = (make_plan(Path(folder) / name / "bank", job) for name in ("whole", "killed"))
+        whole, plan = (
+            make_plan(Path(folder) / name / "bank", job) for name in ("whole", "killed")
+        )
         assert not killed(start(whole, "local", 1), 1e6)
         begin = time.monotonic()
         assert not killed(start(plan, given.engine, given.workers), 1e6)

@@ -72,7 +72,9 @@ def run(words: list[str]) -> None:
     if isinstance(result.exception, LidarSynthError):
         raise result.exception
     if result.exit_code != 0:
-        raise RuntimeError(f"lidar-synth {' '.join(words)}: {result.exception or result.output}")
+        raise RuntimeError(
+            f"lidar-synth {' '.join(words)}: {result.exception or result.output}"
+        )
 
 
 def start(words: list[str], limit: Callable[[], object] = lambda: None) -> int:
@@ -244,7 +246,9 @@ def make_places(root: Path) -> dict[str, str]:
     places["MODEL"] = str(write_untrained(root / "untrained.safetensors"))
     town = ["--no-camera", "--scans"]
     run(["town", places["TOWN"], "--layout", "semantic_kitti", *town, "12"])
-    run(["town", places["KITTI360"], "--layout", "kitti360", "--accumulate", *town, "6"])
+    run(
+        ["town", places["KITTI360"], "--layout", "kitti360", "--accumulate", *town, "6"]
+    )
     for name, first in (("BANK", "0"), ("OTHER", "24")):
         sizes = ["--count", "24", "--shard-size", "5", "--first", first]
         run(["bake", places[name], "--model", places["MODEL"], *sizes])
@@ -260,13 +264,19 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--times", type=int, default=4, help="of each other disturbance")
-    parser.add_argument("--command", action="append", choices=COMMANDS, help="repeatable [all]")
+    parser.add_argument(
+        "--times", type=int, default=4, help="of each other disturbance"
+    )
+    parser.add_argument(
+        "--command", action="append", choices=COMMANDS, help="repeatable [all]"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
     given = parser.parse_args()
     rng = random.Random(given.seed)
     failed = False
-    print(f"| command | {' | '.join(DISTURBANCES)} |\n|---|{'---:|' * len(DISTURBANCES)}")
+    print(
+        f"| command | {' | '.join(DISTURBANCES)} |\n|---|{'---:|' * len(DISTURBANCES)}"
+    )
     with tempfile.TemporaryDirectory() as folder:
         places = make_places(Path(folder))
         for name in tqdm(given.command or COMMANDS, unit="command"):

@@ -15,7 +15,9 @@ from lidar_synth.datasets.classes import COLOURS, NAMES
 from lidar_synth.viz.colour import DOMAINS
 
 
-def mixture_panel(domains: Sequence[int], names: Sequence[str], notes: Sequence[str] = ()) -> str:
+def mixture_panel(
+    domains: Sequence[int], names: Sequence[str], notes: Sequence[str] = ()
+) -> str:
     """The samples of an epoch in their order, each as a square in the colour of its domain.
 
     Args:
@@ -24,7 +26,9 @@ def mixture_panel(domains: Sequence[int], names: Sequence[str], notes: Sequence[
         notes: paragraphs below.
     """
     counts = [sum(domain == d for domain in domains) for d in (0, 1)]
-    squares = "".join(_swatch(d, f"sample {i}: {names[d]}") for i, d in enumerate(domains))
+    squares = "".join(
+        _swatch(d, f"sample {i}: {names[d]}") for i, d in enumerate(domains)
+    )
     share = 100 * counts[1] / max(len(domains), 1)
     text = (
         f"{len(domains)} samples in training order: {_swatch(0)}{counts[0]} "
@@ -32,7 +36,9 @@ def mixture_panel(domains: Sequence[int], names: Sequence[str], notes: Sequence[
     )
     text += f"{_swatch(1)}{counts[1]} {html.escape(names[1])} ({share:.0f} %)."
     return _panel(
-        "Samples of the first epoch", f'<div class="samples">{squares}</div><p>{text}</p>', notes
+        "Samples of the first epoch",
+        f'<div class="samples">{squares}</div><p>{text}</p>',
+        notes,
     )
 
 
@@ -46,12 +52,15 @@ def scores_panel(arms: Mapping[str, Sequence[float]], notes: Sequence[str] = ())
     """
     top = 0.05 * np.ceil(20 * 1.15 * max(max(scores) for scores in arms.values()))
     rows = "".join(
-        _score_row(d, name, scores, top) for d, (name, scores) in enumerate(arms.items())
+        _score_row(d, name, scores, top)
+        for d, (name, scores) in enumerate(arms.items())
     )
     ends = f'<div class="score"><span></span><div class="ends"><span>0</span><span>{100 * top:.0f} %</span></div></div>'
     without, with_synthetic = arms.values()
     body = f'{rows}{ends}<p class="large">{verdict(without, with_synthetic)}</p>'
-    return _panel("mIoU on held-out scans, without and with synthetic scans", body, notes)
+    return _panel(
+        "mIoU on held-out scans, without and with synthetic scans", body, notes
+    )
 
 
 def verdict(without: Sequence[float], with_synthetic: Sequence[float]) -> str:
@@ -59,12 +68,16 @@ def verdict(without: Sequence[float], with_synthetic: Sequence[float]) -> str:
     gains = 100 * np.subtract(with_synthetic, without)
     count = len(gains)
     better = int((gains > 0).sum())
-    change = f"Synthetic scans changed the mIoU by {gains.mean():+.1f} percentage points"
+    change = (
+        f"Synthetic scans changed the mIoU by {gains.mean():+.1f} percentage points"
+    )
     if count == 1:
         return f"{change}. One seed cannot tell a difference from chance."
     change += f" (by seed: {', '.join(f'{gain:+.1f}' for gain in gains)})"
     if better == count:
-        return f"{change}. In this comparison they helped with each of the {count} seeds."
+        return (
+            f"{change}. In this comparison they helped with each of the {count} seeds."
+        )
     if better == 0:
         return f"{change}. In this comparison they did not help with any of the {count} seeds."
     return (
@@ -73,7 +86,9 @@ def verdict(without: Sequence[float], with_synthetic: Sequence[float]) -> str:
     )
 
 
-def classes_panel(columns: Mapping[str, NDArray[np.floating]], notes: Sequence[str] = ()) -> str:
+def classes_panel(
+    columns: Mapping[str, NDArray[np.floating]], notes: Sequence[str] = ()
+) -> str:
     """A table with one row for each class and one column for each quantity.
 
     Args:
@@ -92,7 +107,9 @@ def classes_panel(columns: Mapping[str, NDArray[np.floating]], notes: Sequence[s
         if np.nan_to_num(values[:, i]).any()
     )
     return _panel(
-        "By class", f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>", notes
+        "By class",
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>",
+        notes,
     )
 
 

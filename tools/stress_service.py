@@ -74,14 +74,21 @@ class Reads(Dataset[int]):
         return int(checksum(self.bank.image(number)) != self.known[number])
 
 
-def loader(bank: RollingBank, known: list[int], reads: int, workers: int) -> DataLoader[int]:
-    return DataLoader(Reads(bank, known, reads), batch_size=16, num_workers=workers, collate_fn=sum)
+def loader(
+    bank: RollingBank, known: list[int], reads: int, workers: int
+) -> DataLoader[int]:
+    return DataLoader(
+        Reads(bank, known, reads), batch_size=16, num_workers=workers, collate_fn=sum
+    )
 
 
 def train(model: Path, known: list[int], workers: int) -> None:
     """A trainer that reads without end and prints the errors that it meets."""
     bank = RollingBank(model, slots=16, threads=1, timeout=LIMIT / 3)
-    for reads in (10**6, 320):  # after the death of a worker the same bank serves the next loader
+    for reads in (
+        10**6,
+        320,
+    ):  # after the death of a worker the same bank serves the next loader
         batches = iter(loader(bank, known, reads, workers))
         try:
             for n, wrong in enumerate(batches):
@@ -89,7 +96,9 @@ def train(model: Path, known: list[int], workers: int) -> None:
                     raise SystemExit("wrong scan")
                 if n == 2 and reads > 320:
                     pids = [w.pid for w in batches._workers]  # type: ignore[attr-defined]
-                    print(json.dumps({"generator": bank.pid, "worker": pids}), flush=True)
+                    print(
+                        json.dumps({"generator": bank.pid, "worker": pids}), flush=True
+                    )
         except LidarSynthError as error:
             raise SystemExit(f"{type(error).__name__}: {error}") from None
         except RuntimeError as error:
@@ -124,7 +133,11 @@ def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> 
         "2",
     ]
     trainer = subprocess.Popen(
-        call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        call,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     assert trainer.stdout is not None
     pids: dict[str, Any] = json.loads(trainer.stdout.readline() or "{}")
@@ -145,8 +158,11 @@ def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> 
         return f"{victim} killed: still running after {LIMIT:g} s"
     said = {
         "trainer": trainer.returncode == -signal.SIGKILL,
-        "generator": trainer.returncode == 1 and f"rolling bank died (process {target}" in errors,
-        "worker": trainer.returncode == 0 and "went on after" in output and str(target) in output,
+        "generator": trainer.returncode == 1
+        and f"rolling bank died (process {target}" in errors,
+        "worker": trainer.returncode == 0
+        and "went on after" in output
+        and str(target) in output,
     }[victim]
     if not said:
         return f"{victim} killed: exit code {trainer.returncode}, {output} {errors}"
@@ -154,7 +170,9 @@ def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> 
     while (left := living(trainer.pid)) and time.monotonic() < end:
         time.sleep(0.1)
     segments = [
-        p.name for p in Path("/dev/shm").glob("*") if any(f"_{pid}_" in p.name for pid in everyone)
+        p.name
+        for p in Path("/dev/shm").glob("*")
+        if any(f"_{pid}_" in p.name for pid in everyone)
     ]
     return (
         f"{victim} killed: processes {left} and segments {segments} are left"
@@ -184,15 +202,21 @@ def main() -> None:
         model = write_untrained(Path(folder) / "untrained.safetensors")
         known = known_checksums(model)
         rng = random.Random(options.seed)
-        victims = [("trainer", "generator", "worker")[n % 3] for n in range(options.kills)]
-        for victim in tqdm(rng.sample(victims, len(victims)), desc="kills", unit="kill"):
+        victims = [
+            ("trainer", "generator", "worker")[n % 3] for n in range(options.kills)
+        ]
+        for victim in tqdm(
+            rng.sample(victims, len(victims)), desc="kills", unit="kill"
+        ):
             if problem := kill_one(model, known, victim, rng):
                 wrong.append(problem)
         print(f"{options.kills} kills: {len(wrong)} went wrong")
         if options.reads:
             with RollingBank(model, slots=16, threads=1) as bank:
                 batches = tqdm(
-                    loader(bank, known, options.reads, options.workers), desc="reads", unit="batch"
+                    loader(bank, known, options.reads, options.workers),
+                    desc="reads",
+                    unit="batch",
                 )
                 torn = sum(batches)
                 print(

@@ -52,7 +52,9 @@ TESTS = (
 
 def lowest() -> dict[str, str]:
     """{distribution: lowest version} of pyproject.toml."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "dependencies"
+    ]
     found = [re.match(r"([\w-]+)>=([\d.]+)", text) for text in declared]
     assert all(found), declared
     return {match[1]: match[2] for match in found if match}
@@ -92,11 +94,15 @@ def main() -> None:
         default=ROOT / ".venv-lowest",
         help="folder of the environment, which is replaced",
     )
-    parser.add_argument("tests", nargs="*", help="test files [default: those of files and banks]")
+    parser.add_argument(
+        "tests", nargs="*", help="test files [default: those of files and banks]"
+    )
     options = parser.parse_args()
     wanted = {name: text for name, text in lowest().items() if name not in KEPT}
     python = install(options.venv.absolute(), wanted)
-    tests = options.tests or [f"tests/{name}" for name in TESTS if (ROOT / "tests" / name).exists()]
+    tests = options.tests or [
+        f"tests/{name}" for name in TESTS if (ROOT / "tests" / name).exists()
+    ]
     versions = subprocess.run(
         [
             python,
@@ -109,8 +115,12 @@ def main() -> None:
         capture_output=True,
         text=True,
     ).stdout.split()
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(options.venv.absolute() / "numba")}
-    done = subprocess.run([python, "-m", "pytest", *tests], cwd=ROOT, env=environment, check=False)
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(options.venv.absolute() / "numba")
+    }
+    done = subprocess.run(
+        [python, "-m", "pytest", *tests], cwd=ROOT, env=environment, check=False
+    )
     print(
         f"\nPython {sys.version.split()[0]}\n\n| dependency | declared from | tested "
         "|\n|---|---|---|"

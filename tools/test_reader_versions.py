@@ -53,7 +53,9 @@ def main() -> None:
                 "--quiet",
                 "--disable-pip-version-check",
             ]
-            subprocess.run([*pip, "--only-binary", ":all:", "h5py", *packages], check=True)
+            subprocess.run(
+                [*pip, "--only-binary", ":all:", "h5py", *packages], check=True
+            )
             command = [
                 folder / "bin" / "python",
                 ROOT / "tests" / "read_alone.py",

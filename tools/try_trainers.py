@@ -56,7 +56,13 @@ def line(row: Row) -> str:
     """A row in Markdown."""
     script = f"`{row.script}`" if row.script else ""
     marks = ["yes" if step in row.ran else "no" for step in STEPS]
-    cells = [row.trainer, script, *marks, row.left_out.replace("|", "\\|"), f"{row.minutes:.1f}"]
+    cells = [
+        row.trainer,
+        script,
+        *marks,
+        row.left_out.replace("|", "\\|"),
+        f"{row.minutes:.1f}",
+    ]
     return f"| {' | '.join(cells)} |"
 
 
@@ -80,7 +86,9 @@ def main() -> None:
         "--scans", type=int, default=1, help="scans of each SemanticKITTI sequence [1]"
     )
     parser.add_argument(
-        "--reuse-environments", action="store_true", help="keep those of an earlier run, to develop"
+        "--reuse-environments",
+        action="store_true",
+        help="keep those of an earlier run, to develop",
     )
     options = parser.parse_args()
     work = options.work.absolute()

@@ -3,9 +3,13 @@
 # changes. The list is balanced by class beforehand (write_infos(..., balance=True)), because
 # CBGSDataset would change the ratio. The list is written by
 # lidar_synth.integrations.mmdet3d_infos.write_infos; see docs/how-to/trainers/mmdetection3d.md.
-_base_ = ["mmdet3d::centerpoint/centerpoint_pillar02_second_secfpn_8xb4-cyclic-20e_nus-3d.py"]
+_base_ = [
+    "mmdet3d::centerpoint/centerpoint_pillar02_second_secfpn_8xb4-cyclic-20e_nus-3d.py"
+]
 
-custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False)
+custom_imports = dict(
+    imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False
+)
 custom_hooks = [dict(type="SynthEpochHook")]
 
 train_dataloader = dict(

@@ -4,7 +4,9 @@
 # docs/how-to/trainers/mmdetection3d.md.
 _base_ = ["mmdet3d::pointpillars/pointpillars_hv_secfpn_8xb6-160e_kitti-3d-3class.py"]
 
-custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False)
+custom_imports = dict(
+    imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False
+)
 custom_hooks = [dict(type="SynthEpochHook")]
 
 train_dataloader = dict(

@@ -10,7 +10,9 @@ from pathlib import Path as __Path
 
 _base_ = [str(__Path("configs/sonata/pretrain-sonata-v1m1-0-base.py").resolve())]
 
-custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
+custom_imports = dict(
+    imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False
+)
 
 model = dict(backbone=dict(in_channels=4))
 

@@ -23,7 +23,9 @@ from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.noise import keyed_rng
 
 
-def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) -> Index:
+def turn_bank(
+    bank: Bank, out: Path, transfer: Transfer, progress: bool = True
+) -> Index:
     """Write a bank with the scans of another one as the target sensor would have recorded them.
 
     An interrupted run resumes after its last complete shard when it is run again. Run on a complete
@@ -44,25 +46,35 @@ def turn_bank(bank: Bank, out: Path, transfer: Transfer, progress: bool = True) 
         entries = []
         with tqdm(total=len(bank), unit="scan", disable=not progress) as bar:
             for number, entry in enumerate(bank.index.shards):
-                entries.append(_shard(bank, number, sources[entry.source], transfer, out))
+                entries.append(
+                    _shard(bank, number, sources[entry.source], transfer, out)
+                )
                 bar.update(entry.kept)
-        return write_bank_files(out, Index(sources, tuple(entries), curation=bank.index.curation))
+        return write_bank_files(
+            out, Index(sources, tuple(entries), curation=bank.index.curation)
+        )
 
 
 def _facts(facts: Facts, transfer: Transfer) -> Facts:
     return replace(
-        facts, sensor=transfer.target, settings=facts.settings | {"as_sensor": transfer.identity}
+        facts,
+        sensor=transfer.target,
+        settings=facts.settings | {"as_sensor": transfer.identity},
     )
 
 
-def _shard(bank: Bank, number: int, facts: Facts, transfer: Transfer, out: Path) -> Entry:
+def _shard(
+    bank: Bank, number: int, facts: Facts, transfer: Transfer, out: Path
+) -> Entry:
     """Turn one shard, unless its file is there and intact."""
     entry = bank.index.shards[number]
     path = out / entry.file
     if not path.is_file() or next(check_scans(path, facts, entry), None) is not None:
         shard = bank.shard(number)
         part = part_of(path)
-        names = [name for p in range(entry.scans) if (name := shard.condition(p)) is not None]
+        names = [
+            name for p in range(entry.scans) if (name := shard.condition(p)) is not None
+        ]
         try:
             with ShardWriter(part, facts, entry, conditions=names) as writer:
                 for image in _images(bank, number, transfer):

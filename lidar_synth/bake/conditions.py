@@ -88,18 +88,25 @@ def open_conditions(
         return open_scans(path, layout=layout, split=split)
     if layout is not None or split is not None:
         raise ConfigError(
-            f"conditions of layout {layout} and split {split}, but no dataset", "--condition PATH"
+            f"conditions of layout {layout} and split {split}, but no dataset",
+            "--condition PATH",
         )
     return None
 
 
 def _is_yaml(path: Path) -> bool:
     """Whether a path is a YAML file, or a folder with nothing else."""
-    return all(p.suffix in (".yaml", ".yml") for p in (path.iterdir() if path.is_dir() else [path]))
+    return all(
+        p.suffix in (".yaml", ".yml")
+        for p in (path.iterdir() if path.is_dir() else [path])
+    )
 
 
 def conditions_for(
-    generator: Generator, path: str | None, layout: str | None = None, split: str | None = None
+    generator: Generator,
+    path: str | None,
+    layout: str | None = None,
+    split: str | None = None,
 ) -> ConditionSource | None:
     """The dataset of a model's conditions, after a check that it fits the model.
 
@@ -111,7 +118,11 @@ def conditions_for(
         FileError: as ``open_conditions``.
     """
     if (generator.condition is None) != (path is None):
-        needs = f"{generator.condition} conditions" if generator.condition else "no condition"
+        needs = (
+            f"{generator.condition} conditions"
+            if generator.condition
+            else "no condition"
+        )
         raise ConfigError(
             f"condition {path} for model {generator.name!r}, which takes {needs}",
             "a dataset whose scans have them" if generator.condition else "none",
@@ -123,7 +134,9 @@ def conditions_for(
             f"a dataset whose scans have {generator.condition}",
         )
     if isinstance(source, ScanFiles) and generator.condition:
-        _check_camera(source, generator.header.conditioning[generator.condition].get("focal"))
+        _check_camera(
+            source, generator.header.conditioning[generator.condition].get("focal")
+        )
     return source
 
 
@@ -135,7 +148,11 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
     camera = source.calibration(0)
     actual = None if camera is None else float(camera.projection[0, 0])
     if actual is None or abs(actual / focal - 1) > FOCAL_TOLERANCE:
-        given = "no calibration" if actual is None else f"a focal length of {actual:.1f} pixels"
+        given = (
+            "no calibration"
+            if actual is None
+            else f"a focal length of {actual:.1f} pixels"
+        )
         raise DataError(
             f"{source.root}: a camera with {given}",
             f"{focal:.1f} pixels, the focal length that the model was trained with",
@@ -165,9 +182,17 @@ def conditions(
     Raises:
         FileError, DataError: if one cannot be read.
     """
-    return None if source is None else [source.read(index % len(source)) for index in indices]
+    return (
+        None
+        if source is None
+        else [source.read(index % len(source)) for index in indices]
+    )
 
 
-def condition_names(source: ConditionSource | None, indices: Iterable[int]) -> list[str]:
+def condition_names(
+    source: ConditionSource | None, indices: Iterable[int]
+) -> list[str]:
     """The names of these conditions; an empty list for an unconditional model."""
-    return [] if source is None else [source.ids[index % len(source)] for index in indices]
+    return (
+        [] if source is None else [source.ids[index % len(source)] for index in indices]
+    )

@@ -51,7 +51,9 @@ def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
         return _write(out, complete, [(bank, 0, len(bank)) for bank in banks], progress)
 
 
-def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dict[Path, Index]:
+def split(
+    bank: Bank, parts: Mapping[Path, float], progress: bool = True
+) -> dict[Path, Index]:
     """Split a bank into several with consecutive scans.
 
     Args:
@@ -64,8 +66,13 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
             something else.
         FileError: if it cannot be written.
     """
-    if any(not share > 0 for share in parts.values()) or abs(sum(parts.values()) - 1) > 1e-9:
-        raise ConfigError(f"shares {list(parts.values())}", "positive numbers that sum to 1")
+    if (
+        any(not share > 0 for share in parts.values())
+        or abs(sum(parts.values()) - 1) > 1e-9
+    ):
+        raise ConfigError(
+            f"shares {list(parts.values())}", "positive numbers that sum to 1"
+        )
     ends = [0]
     total = 0.0
     for share in parts.values():
@@ -73,7 +80,8 @@ def split(bank: Bank, parts: Mapping[Path, float], progress: bool = True) -> dic
         ends.append(round(total * len(bank)))
     if any(start == stop for start, stop in pairwise(ends)):
         raise ConfigError(
-            f"{len(bank)} scans in shares {list(parts.values())}", "at least one scan for each"
+            f"{len(bank)} scans in shares {list(parts.values())}",
+            "at least one scan for each",
         )
     with ExitStack() as claims:
         made = {}
@@ -97,12 +105,16 @@ def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
         FileError: if it cannot be written.
     """
     if not 1 <= scans <= len(bank):
-        raise ConfigError(f"the first {scans} scans of {bank.root}", f"1 to {len(bank)}")
+        raise ConfigError(
+            f"the first {scans} scans of {bank.root}", f"1 to {len(bank)}"
+        )
     with _making(out, "head", [bank], scans) as complete:
         return _write(out, complete, [(bank, 0, scans)], progress)
 
 
-def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True) -> Index:
+def drop(
+    bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool = True
+) -> Index:
     """A curated bank: all scans of a bank except some. Shards are linked, not rewritten; empty ones
     are omitted.
 
@@ -123,26 +135,41 @@ def drop(bank: Bank, numbers: Iterable[int], why: str, out: Path, progress: bool
         raise ConfigError(f"scans {invalid[:8]} to leave out", f"0 to {len(bank) - 1}")
     if len(left_out) == len(bank):
         raise ConfigError(
-            f"all {len(bank)} scans of {bank.root} left out ({why})", "a rule that leaves some"
+            f"all {len(bank)} scans of {bank.root} left out ({why})",
+            "a rule that leaves some",
         )
-    with _making(out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why) as complete:
-        return Bank(out).index if complete else _link_kept(bank, left_out, why, out, progress)
+    with _making(
+        out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why
+    ) as complete:
+        return (
+            Bank(out).index
+            if complete
+            else _link_kept(bank, left_out, why, out, progress)
+        )
 
 
-def _link_kept(bank: Bank, left_out: set[int], why: str, out: Path, progress: bool) -> Index:
+def _link_kept(
+    bank: Bank, left_out: set[int], why: str, out: Path, progress: bool
+) -> Index:
     """Write the index of a curated bank beside links to the shards of which a scan is left."""
     entries: list[Entry] = []
     shards = tqdm(bank.index.shards, desc="shards", unit="shard", disable=not progress)
     for entry, end in zip(shards, bank.index.ends, strict=True):
         start = end - entry.kept
         more = (
-            entry.position(number - start) for number in range(start, end) if number in left_out
+            entry.position(number - start)
+            for number in range(start, end)
+            if number in left_out
         )
         dropped = tuple(sorted({*entry.dropped, *more}))
         if len(dropped) < entry.scans:
-            entries.append(replace(entry, file=_name(len(entries), True), dropped=dropped))
+            entries.append(
+                replace(entry, file=_name(len(entries), True), dropped=dropped)
+            )
             _link(Path(bank.root) / entry.file, out / entries[-1].file)
-    index = replace(bank.index, shards=tuple(entries), curation=(*bank.index.curation, why))
+    index = replace(
+        bank.index, shards=tuple(entries), curation=(*bank.index.curation, why)
+    )
     return write_bank_files(out, index)
 
 
@@ -156,10 +183,14 @@ def _write(
     """Write a bank from ranges of scans (bank, first, one past the last), unless it is complete."""
     if complete:
         return Bank(out).index
-    curation = tuple(dict.fromkeys(why for bank, _, _ in parts for why in bank.index.curation))
+    curation = tuple(
+        dict.fromkeys(why for bank, _, _ in parts for why in bank.index.curation)
+    )
     sources: list[Facts] = []
     entries: list[Entry] = []
-    with tqdm(total=sum(b - a for _, a, b in parts), unit="scan", disable=not progress) as bar:
+    with tqdm(
+        total=sum(b - a for _, a, b in parts), unit="scan", disable=not progress
+    ) as bar:
         for bank, start, stop in parts:
             for number, (entry, end) in enumerate(
                 zip(bank.index.shards, bank.index.ends, strict=True)
@@ -173,14 +204,20 @@ def _write(
                 if facts not in sources:
                     sources.append(facts)
                 new = replace(
-                    entry, file=_name(len(entries), bool(curation)), source=sources.index(facts)
+                    entry,
+                    file=_name(len(entries), bool(curation)),
+                    source=sources.index(facts),
                 )
                 entries.append(_copy_part(bank, number, new, first, last, out))
                 bar.update(last - first)
-    return write_bank_files(out, Index(tuple(sources), tuple(entries), curation=curation))
+    return write_bank_files(
+        out, Index(tuple(sources), tuple(entries), curation=curation)
+    )
 
 
-def _copy_part(bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path) -> Entry:
+def _copy_part(
+    bank: Bank, number: int, entry: Entry, first: int, last: int, out: Path
+) -> Entry:
     """Write the kept scans ``first`` to ``last`` - 1 of a shard as the shard ``entry.file`` of
     another bank."""
     path = out / entry.file
@@ -190,10 +227,16 @@ def _copy_part(bank: Bank, number: int, entry: Entry, first: int, last: int, out
     # A file holds consecutive scans: dropped ones in between are copied too, and stay dropped.
     start = entry.position(first)
     stop = entry.position(last - 1) + 1
-    dropped = tuple(position - start for position in entry.dropped if start <= position < stop)
-    entry = replace(entry, first=entry.first + start, scans=stop - start, dropped=dropped)
+    dropped = tuple(
+        position - start for position in entry.dropped if start <= position < stop
+    )
+    entry = replace(
+        entry, first=entry.first + start, scans=stop - start, dropped=dropped
+    )
     shard = bank.shard(number)
-    names = [name for p in range(start, stop) if (name := shard.condition(p)) is not None]
+    names = [
+        name for p in range(start, stop) if (name := shard.condition(p)) is not None
+    ]
     part = part_of(path)
     with ShardWriter(part, shard.facts, entry, conditions=names) as writer:
         for position in range(start, stop):
@@ -230,7 +273,11 @@ def _making(out: Path, what: str, banks: Sequence[Bank], *more: Any) -> Iterator
         banks: those that it is made from.
         more: the operation's other arguments, plain values.
     """
-    settings = {"made": what, "from": [bank.index.checksum for bank in banks], "arguments": more}
+    settings = {
+        "made": what,
+        "from": [bank.index.checksum for bank in banks],
+        "arguments": more,
+    }
     with claim_bank(out, settings):
         complete = (out / INDEX).is_file()
         if not complete:

@@ -37,7 +37,9 @@ def estimate(plan: BakePlan) -> Estimate:
             images = generate(generator, job, range(job.first, job.first + batch))
             seconds = time.perf_counter() - start
     chunks = sum(
-        len(deflate(a)) for image in images for a in plan.facts.encoding.encode(image).values()
+        len(deflate(a))
+        for image in images
+        for a in plan.facts.encoding.encode(image).values()
     )
     heads = sum(head_size(plan.facts, entry.scans) for entry in plan.shards)
     return Estimate(heads + chunks / batch * job.count, seconds / batch * job.count)

@@ -57,7 +57,9 @@ def refuse_others(root: Path) -> None:
         ConfigError: naming the file.
     """
     if (root / INDEX).exists() or any(root.glob("*.h5")):
-        raise ConfigError(f"{root} holds another bank", "an empty folder for the new one")
+        raise ConfigError(
+            f"{root} holds another bank", "an empty folder for the new one"
+        )
     for name in (CARD, CROISSANT):
         if (root / name).exists():
             raise ConfigError(
@@ -88,7 +90,11 @@ def read_record(plan: BakePlan, number: int) -> Entry | None:
             return entry
     index = _index(plan.out)
     there = None if index is None else index.by_file.get(wanted.file)
-    return there if there is not None and replace(there, bytes=0, sha256="") == wanted else None
+    return (
+        there
+        if there is not None and replace(there, bytes=0, sha256="") == wanted
+        else None
+    )
 
 
 def find_finished(plan: BakePlan, number: int) -> Entry | None:
@@ -109,11 +115,17 @@ def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     Raises:
         FileError: if the folder has vanished or cannot be written.
     """
-    check_folder(plan)  # first, because writing the record would create a vanished folder again
+    check_folder(
+        plan
+    )  # first, because writing the record would create a vanished folder again
     path = plan.out / plan.shards[number].file
     try:
-        entry = replace(plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part))
-        write_file(_note(plan, number), json.dumps(entry.to_dict()).encode(), durable=True)
+        entry = replace(
+            plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part)
+        )
+        write_file(
+            _note(plan, number), json.dumps(entry.to_dict()).encode(), durable=True
+        )
         part.replace(path)
     except OSError as error:
         if isinstance(error, FileError):
@@ -161,12 +173,19 @@ def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
     Raises:
         FileError: if they cannot be written.
     """
-    files = card_files(root.resolve().name, index) | (_settings_file(root, index) if baked else {})
+    files = card_files(root.resolve().name, index) | (
+        _settings_file(root, index) if baked else {}
+    )
     for name, content in files.items():
-        if not _holds(root / name, content):  # do not replace a file that others hold a lock on
+        if not _holds(
+            root / name, content
+        ):  # do not replace a file that others hold a lock on
             write_file(root / name, content)
     index = replace(
-        index, files={name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        index,
+        files={
+            name: hashlib.sha256(content).hexdigest() for name, content in files.items()
+        },
     )
     write_file(root / INDEX, index.to_json(), durable=True)
     sync_folder(root)
@@ -180,7 +199,10 @@ def _settings_file(root: Path, index: Index) -> dict[str, bytes]:
     with suppress(FileError, ValueError, RecursionError):
         there = read_file(root / SETTINGS)
         values = json.loads(there)
-        if values == json.loads(wanted) and json.dumps(values, indent=1).encode() == there:
+        if (
+            values == json.loads(wanted)
+            and json.dumps(values, indent=1).encode() == there
+        ):
             return {SETTINGS: there}
     return {SETTINGS: wanted}
 

@@ -86,7 +86,9 @@ def settings_of(facts: Facts) -> dict[str, Any]:
         "compression": facts.compression,
         "layout": facts.layout,
     }
-    if facts.condition and "content" in facts.condition:  # banks of earlier versions do not have it
+    if (
+        facts.condition and "content" in facts.condition
+    ):  # banks of earlier versions do not have it
         others["condition_content"] = facts.condition["content"]
     return dict(sorted((facts.settings | others | facts.software).items()))
 
@@ -102,9 +104,13 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     choose("solver", job.solver, SOLVERS)
     choose("dtype", job.dtype, DTYPES)
     if job.first + job.count >= 2**63:
-        raise ConfigError(f"scans up to index {job.first + job.count}", "less than 2^63")
+        raise ConfigError(
+            f"scans up to index {job.first + job.count}", "less than 2^63"
+        )
     generator = load_generator(job.model, columns=job.columns)
-    source = conditions_for(generator, job.condition, job.condition_layout, job.condition_split)
+    source = conditions_for(
+        generator, job.condition, job.condition_layout, job.condition_split
+    )
     fields = _fields(job, generator.fields)
     software = {
         "lidar_synth": lidar_synth.__version__,
@@ -118,7 +124,9 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     model = Path(job.model)
     resolved = job.model_copy(
         update={
-            "model": str(model.resolve()) if model.suffix == ".safetensors" else job.model,
+            "model": str(model.resolve())
+            if model.suffix == ".safetensors"
+            else job.model,
             "fields": fields,
             "batch": job.batch or BATCH[job.device],
             "shard_size": job.shard_size or min(1024, max(64, job.count // 8)),

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_synth.bake.folder import refuse_others
-from lidar_synth.errors import ConfigError
-from lidar_synth.files.claims import claim
-from lidar_synth.files.lock import try_lock
+from lidar_synth.files.claims import claim, hold_writing
 
 NOTE = ".made.json"
 """File in the bank's folder with the settings of the call that makes it; a run holds a lock on
@@ -34,9 +32,5 @@ def claim_bank(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     if not (out / NOTE).is_file():
         refuse_others(out)
     claim(out / NOTE, settings)
-    with try_lock(out / NOTE) as exclusive:
-        if not exclusive:
-            raise ConfigError(f"{out}, in which another process works", "a folder for this process")
-        for part in out.glob(".*.part"):
-            part.unlink(missing_ok=True)
+    with hold_writing(out / NOTE):
         yield

@@ -23,10 +23,15 @@ class BakeJob(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    model: str = Field("town", description="name of a shipped model, or a .safetensors checkpoint")
+    model: str = Field(
+        "town", description="name of a shipped model, or a .safetensors checkpoint"
+    )
     count: Count = Field(1000, description="number of scans")
     seed: int = Field(
-        0, ge=0, lt=2**64, description="scan i is a function of the model, the seed and i"
+        0,
+        ge=0,
+        lt=2**64,
+        description="scan i is a function of the model, the seed and i",
     )
     first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
     shard_size: Count | None = Field(
@@ -42,12 +47,17 @@ class BakeJob(BaseModel):
             "layout.yaml"
         ),
     )
-    condition_layout: str | None = Field(None, description="layout of that dataset [detected]")
+    condition_layout: str | None = Field(
+        None, description="layout of that dataset [detected]"
+    )
     condition_split: str | None = Field(
         None, description="split of that dataset, for instance r2flow/train"
     )
     guidance: float = Field(
-        1.0, ge=0, le=100, description="scale of classifier-free guidance; 1 = no guidance"
+        1.0,
+        ge=0,
+        le=100,
+        description="scale of classifier-free guidance; 1 = no guidance",
     )
     fields: tuple[str, ...] | None = Field(
         None,
@@ -56,14 +66,20 @@ class BakeJob(BaseModel):
             "generates]"
         ),
     )
-    batch: Count | None = Field(None, description="scans per batch [1 on a CPU, 16 on a GPU]")
+    batch: Count | None = Field(
+        None, description="scans per batch [1 on a CPU, 16 on a GPU]"
+    )
     columns: Count | None = Field(
-        None, description="columns of the scans, for models that know several [the most]"
+        None,
+        description="columns of the scans, for models that know several [the most]",
     )
     dtype: str = Field(
-        "float32", description="data type of the network's computation: float32 | bfloat16"
+        "float32",
+        description="data type of the network's computation: float32 | bfloat16",
     )
-    device: Literal["cpu", "cuda"] = Field("cpu", description="device of the network: cpu | cuda")
+    device: Literal["cpu", "cuda"] = Field(
+        "cpu", description="device of the network: cpu | cuda"
+    )
     threads: int = Field(
         1,
         ge=1,
@@ -74,5 +90,6 @@ class BakeJob(BaseModel):
         "gzip", description="compression of the shards: gzip | blosc2"
     )
     layout: Literal["plain", "paged"] = Field(
-        "plain", description="layout of the HDF5 files: plain | paged (for reading over a network)"
+        "plain",
+        description="layout of the HDF5 files: plain | paged (for reading over a network)",
     )

@@ -39,7 +39,9 @@ def bake_in_processes(
     stop = context.RawValue("b", 0)
     workers = [
         context.Process(
-            target=_work, args=(plan, numbers, taken, scans, stop, errors, rank), daemon=True
+            target=_work,
+            args=(plan, numbers, taken, scans, stop, errors, rank),
+            daemon=True,
         )
         for rank in range(count)
     ]
@@ -54,7 +56,9 @@ def bake_in_processes(
             reported += _report(progress, sum(scans) - reported)
             if not errors.empty():
                 raise errors.get()
-            if killed := [worker for worker in workers if worker.exitcode not in (None, 0)]:
+            if killed := [
+                worker for worker in workers if worker.exitcode not in (None, 0)
+            ]:
                 raise FileError(
                     f"a worker was killed (exit status {killed[0].exitcode})",
                     "enough memory for all workers",
@@ -66,7 +70,9 @@ def bake_in_processes(
         _report(progress, sum(scans) - reported)
     finally:
         stop.value = 1
-        for worker in filter(attrgetter("pid"), workers):  # skips workers that were not started
+        for worker in filter(
+            attrgetter("pid"), workers
+        ):  # skips workers that were not started
             worker.join(_PATIENCE)
             worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()

@@ -71,7 +71,9 @@ def bake_on_ray(
             ray.shutdown()
 
 
-def _work_off(ray: Any, start: Any, waiting: deque[int], workers: int, progress: Progress) -> None:
+def _work_off(
+    ray: Any, start: Any, waiting: deque[int], workers: int, progress: Progress
+) -> None:
     """Assign shards to actors until all are written."""
     running: dict[
         Any, tuple[Any, int | None]

@@ -11,13 +11,21 @@ from tqdm import tqdm
 from lidar_synth.bake.folder import SETTINGS, sync_folder, write_bank_files
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.shard import load_checked, write_shard
-from lidar_synth.bake.verify import check_scans, check_shard, check_side_files, job_of, read_index
+from lidar_synth.bake.verify import (
+    check_scans,
+    check_shard,
+    check_side_files,
+    job_of,
+    read_index,
+)
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError, LidarSynthError
 from lidar_synth.files.disk import part_of, sha256
 
 
-def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[str, str]:
+def repair(
+    root: Path, model: str | None = None, progress: bool = True
+) -> dict[str, str]:
     """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or
     settings file.
 
@@ -48,7 +56,10 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
         index = _index_from_shards(root, error)
         baked = True
         done[INDEX] = "rebuilt from the shards"
-    done |= {problem.file: "rewritten from the index" for problem in check_side_files(root, index)}
+    done |= {
+        problem.file: "rewritten from the index"
+        for problem in check_side_files(root, index)
+    }
     shards = list(index.shards)
     repairs = list(index.repairs)
     total = sum(entry.scans for entry in shards)
@@ -60,19 +71,27 @@ def repair(root: Path, model: str | None = None, progress: bool = True) -> dict[
                 continue
             shards[number] = new = _regenerate(root, facts, entry, model, bar.update)
             same = entry.sha256 in ("", new.sha256)
-            done[entry.file] = "regenerated" + ("" if same else ", with different bytes")
+            done[entry.file] = "regenerated" + (
+                "" if same else ", with different bytes"
+            )
             if not same:
                 repairs.append(
                     f"{entry.file} was regenerated with torch {torch.__version__}, with different "
                     "bytes"
                 )
     if done:
-        write_bank_files(root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked)
+        write_bank_files(
+            root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked
+        )
     return done
 
 
 def _regenerate(
-    root: Path, facts: Facts, entry: Entry, model: str | None, progress: Callable[[int], object]
+    root: Path,
+    facts: Facts,
+    entry: Entry,
+    model: str | None,
+    progress: Callable[[int], object],
 ) -> Entry:
     """Generate a shard and replace its file."""
     job = job_of(facts, model)
@@ -85,7 +104,8 @@ def _regenerate(
         if isinstance(error, LidarSynthError):
             raise
         raise FileError(
-            f"{root / entry.file} cannot be written ({error.strerror})", "a writable folder"
+            f"{root / entry.file} cannot be written ({error.strerror})",
+            "a writable folder",
         ) from error
     finally:
         with suppress(OSError):
@@ -115,7 +135,8 @@ def _index_from_shards(root: Path, damage: Exception) -> Index:
         e for _, e in found.values()
     } <= set(shards):
         raise DataError(
-            f"{damage}, and the shards of {root} are of different bakes", "a copy of the index"
+            f"{damage}, and the shards of {root} are of different bakes",
+            "a copy of the index",
         ) from damage
     absent = [entry.file for entry in shards if not (root / entry.file).exists()]
     if (

@@ -55,7 +55,8 @@ class Share:
     def __post_init__(self) -> None:
         if not 0 <= self.index < self.of:
             raise ConfigError(
-                f"--shard-index {self.index} of --num-shards {self.of}", "0 <= index < number"
+                f"--shard-index {self.index} of --num-shards {self.of}",
+                "0 <= index < number",
             )
 
 
@@ -102,10 +103,14 @@ def bake(
                 disable=not progress,
                 delay=2,
             )
-            missing = [number for number in checked if find_finished(plan, number) is None]
+            missing = [
+                number for number in checked if find_finished(plan, number) is None
+            ]
             scans = sum(plan.shards[number].scans for number in missing)
             if missing:
-                with tqdm(total=scans, unit="scan", smoothing=0.05, disable=not progress) as bar:
+                with tqdm(
+                    total=scans, unit="scan", smoothing=0.05, disable=not progress
+                ) as bar:
                     run(plan, missing, resources, bar.update)
         return finish(plan)
 

@@ -27,13 +27,17 @@ from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import RangeImage
 
-_PACKED = 0.6  # highest ratio of compressed to plain size, for scans that models generate
+_PACKED = (
+    0.6  # highest ratio of compressed to plain size, for scans that models generate
+)
 
 Progress = Callable[[int], object]
 """Called with the number of newly generated scans; an exception in it aborts the shard."""
 
 
-def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: None) -> Entry:
+def bake_shard(
+    plan: BakePlan, number: int, progress: Progress = lambda scans: None
+) -> Entry:
     """Write one shard, unless it exists.
 
     Args:
@@ -68,7 +72,12 @@ def bake_shard(plan: BakePlan, number: int, progress: Progress = lambda scans: N
 
 
 def write_shard(
-    generator: Generator, path: Path, job: BakeJob, facts: Facts, entry: Entry, progress: Progress
+    generator: Generator,
+    path: Path,
+    job: BakeJob,
+    facts: Facts,
+    entry: Entry,
+    progress: Progress,
 ) -> None:
     """Generate the scans of a shard and write them; the same settings give the same bytes.
 
@@ -95,7 +104,9 @@ def images(generator: Generator, job: BakeJob, entry: Entry) -> Iterator[RangeIm
         yield from generate(generator, job, indices)
 
 
-def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list[RangeImage]:
+def generate(
+    generator: Generator, job: BakeJob, indices: Sequence[int]
+) -> list[RangeImage]:
     """The range images of some indices, with the settings of the job.
 
     Raises:
@@ -103,7 +114,12 @@ def generate(generator: Generator, job: BakeJob, indices: Sequence[int]) -> list
     """
     given = conditions(_source(job), indices)
     return generator.range_images(
-        job.seed, indices, given, steps=job.steps, solver=job.solver, guidance=job.guidance
+        job.seed,
+        indices,
+        given,
+        steps=job.steps,
+        solver=job.solver,
+        guidance=job.guidance,
     )
 
 
@@ -124,8 +140,12 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _load(model: str, device: str, dtype: str, batch: int, columns: int | None) -> Generator:
-    return load_generator(model, device=device, dtype=DTYPES[dtype], batch=batch, columns=columns)
+def _load(
+    model: str, device: str, dtype: str, batch: int, columns: int | None
+) -> Generator:
+    return load_generator(
+        model, device=device, dtype=DTYPES[dtype], batch=batch, columns=columns
+    )
 
 
 def load_checked(job: BakeJob, facts: Facts) -> Generator:
@@ -135,9 +155,17 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         ConfigError: if it is another checkpoint, or the device is not available.
         FileError, DataError: if it cannot be read.
     """
-    settings = job.model, job.device, job.dtype, job.batch or BATCH[job.device], job.columns
+    settings = (
+        job.model,
+        job.device,
+        job.dtype,
+        job.batch or BATCH[job.device],
+        job.columns,
+    )
     generator = _load(*settings)
-    if generator.hash != facts.checkpoint:  # maybe the file was replaced since it was loaded
+    if (
+        generator.hash != facts.checkpoint
+    ):  # maybe the file was replaced since it was loaded
         _load.cache_clear()
         generator = _load(*settings)
     if generator.hash != facts.checkpoint:

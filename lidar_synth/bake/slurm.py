@@ -74,7 +74,9 @@ def bake_on_slurm(
 def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> Any:
     """A submitit executor with the options of a job."""
     share = (
-        {"gpus_per_node": 1} if plan.job.device == "cuda" else {"cpus_per_task": plan.job.threads}
+        {"gpus_per_node": 1}
+        if plan.job.device == "cuda"
+        else {"cpus_per_task": plan.job.threads}
     )
     values = _OPTIONS | share | options
     cluster = values.pop("cluster")

@@ -82,7 +82,9 @@ def check_side_files(root: Path, index: Index) -> list[Problem]:
         try:
             actual = sha256(root / name)
         except OSError as error:
-            problems.append(Problem(name, f"cannot be read ({error.strerror or error})"))
+            problems.append(
+                Problem(name, f"cannot be read ({error.strerror or error})")
+            )
             continue
         if actual != index.files[name]:
             what = (
@@ -191,11 +193,17 @@ def job_of(facts: Facts, model: str | None = None) -> BakeJob:
             "Run lidar-synth bank as-sensor again: it makes again what is damaged. --deep checks "
             "the original bank.",
         )
-    stored = {"compression": facts.compression, "layout": facts.layout, "fields": facts.fields}
+    stored = {
+        "compression": facts.compression,
+        "layout": facts.layout,
+        "fields": facts.fields,
+    }
     try:
         return BakeJob(**facts.settings | stored, model=model or facts.model)
     except (ValueError, TypeError) as error:
-        raise DataError(f"settings {facts.settings} of a bank", "the settings of a bake") from error
+        raise DataError(
+            f"settings {facts.settings} of a bank", "the settings of a bake"
+        ) from error
 
 
 def read_index(root: Path) -> Index:

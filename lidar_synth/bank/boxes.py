@@ -46,10 +46,15 @@ def encode_boxes(boxes: Boxes) -> NDArray[np.int32]:
     if len(boxes) > MOST or not set(boxes.names) <= set(NAMES):
         unknown = sorted(set(boxes.names) - set(NAMES))
         raise DataError(
-            f"{len(boxes)} boxes of a scan, unknown classes {unknown}", f"at most {MOST} of {NAMES}"
+            f"{len(boxes)} boxes of a scan, unknown classes {unknown}",
+            f"at most {MOST} of {NAMES}",
         )
-    if len(boxes) and (boxes.instance.min() < 1 or np.abs(boxes.values).max() > _LARGEST):
-        raise DataError("boxes without instance, or far away", "instances from 1 on, and metres")
+    if len(boxes) and (
+        boxes.instance.min() < 1 or np.abs(boxes.values).max() > _LARGEST
+    ):
+        raise DataError(
+            "boxes without instance, or far away", "instances from 1 on, and metres"
+        )
     rows = np.zeros(SHAPE, np.int32)
     rows[: len(boxes), 0] = [1 + NAMES.index(name) for name in boxes.names]
     rows[: len(boxes), 1] = boxes.instance
@@ -64,7 +69,9 @@ def decode_boxes(rows: NDArray[np.int32]) -> Boxes:
     used = rows[rows[:, 0] > 0]
     values = (used[:, 2:] * _STEPS).astype(np.float32)
     return Boxes(
-        values, tuple(NAMES[code - 1] for code in used[:, 0]), instance=used[:, 1].astype(np.int32)
+        values,
+        tuple(NAMES[code - 1] for code in used[:, 0]),
+        instance=used[:, 1].astype(np.int32),
     )
 
 
@@ -76,8 +83,12 @@ def check_boxes(rows: NDArray[np.int32]) -> None:
     """
     used = rows[:, 0] != 0
     count = int(used.sum())
-    sound = used[:count].all() and not rows[count:].any() and (rows[:count, 1] > 0).all()
-    if not (sound and (rows[:count, 0] > 0).all() and (rows[:count, 0] <= len(NAMES)).all()):
+    sound = (
+        used[:count].all() and not rows[count:].any() and (rows[:count, 1] > 0).all()
+    )
+    if not (
+        sound and (rows[:count, 0] > 0).all() and (rows[:count, 0] <= len(NAMES)).all()
+    ):
         raise DataError(
             "rows of boxes with an unknown class or instance",
             f"classes 1 to {len(NAMES)}, then zeros",

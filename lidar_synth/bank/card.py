@@ -40,12 +40,17 @@ def summary(index: Index) -> dict[str, Any]:
         "fields": ", ".join(facts.fields) or "none",
         "label policy": facts.label_policy,
         "model": _each(
-            f"{source.model}, checkpoint {source.checkpoint}" for source in index.sources
+            f"{source.model}, checkpoint {source.checkpoint}"
+            for source in index.sources
         ),
-        "data": _each(source.provenance.get("data", "unknown") for source in index.sources),
+        "data": _each(
+            source.provenance.get("data", "unknown") for source in index.sources
+        ),
         "data licence": _each(source.data_licence for source in index.sources),
         "licence": _each(source.licence for source in index.sources),
-        "settings": _each(json.dumps(source.settings, sort_keys=True) for source in index.sources),
+        "settings": _each(
+            json.dumps(source.settings, sort_keys=True) for source in index.sources
+        ),
         "made with": _each(
             ", ".join(f"{k} {v}" for k, v in sorted(source.software.items()))
             for source in index.sources
@@ -76,7 +81,10 @@ def dataset_card(name: str, index: Index) -> str:
         "",
         "| | |",
         "|---|---|",
-        *(f"| {what} | {escape_markdown(value)} |" for what, value in summary(index).items()),
+        *(
+            f"| {what} | {escape_markdown(value)} |"
+            for what, value in summary(index).items()
+        ),
         "",
         "```python",
         "from lidar_synth import open_scans",

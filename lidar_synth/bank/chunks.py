@@ -20,7 +20,11 @@ _GZIP_LEVEL = 1
 _DEFLATE_RATIO = 1032  # highest compression ratio that deflate can reach
 
 FILTERS = {
-    "gzip": (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32),
+    "gzip": (
+        h5py.h5z.FILTER_SHUFFLE,
+        h5py.h5z.FILTER_DEFLATE,
+        h5py.h5z.FILTER_FLETCHER32,
+    ),
     "blosc2": (32026, h5py.h5z.FILTER_FLETCHER32),
 }
 """HDF5 numbers of the filters of a chunk, in order, by ``compression``."""
@@ -31,7 +35,9 @@ def checksum(
 ) -> int:
     """CRC-32 of a scan: seed and index (8 bytes each, little-endian), the condition's name, then
     the arrays."""
-    crc = libdeflate.crc32(seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition)
+    crc = libdeflate.crc32(
+        seed.to_bytes(8, "little") + index.to_bytes(8, "little") + condition
+    )
     for values in arrays.values():
         crc = libdeflate.crc32(values.data, crc)
     return crc
@@ -136,4 +142,6 @@ def filters(compression: str) -> Mapping[str, Any]:
             "the extra blosc2",
             "pip install 'lidar_synth[blosc2]', or bake with compression gzip.",
         ) from error
-    return dict(hdf5plugin.Blosc2(cname="zstd", clevel=3, filters=hdf5plugin.Blosc2.BITSHUFFLE))
+    return dict(
+        hdf5plugin.Blosc2(cname="zstd", clevel=3, filters=hdf5plugin.Blosc2.BITSHUFFLE)
+    )

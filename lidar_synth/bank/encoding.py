@@ -68,7 +68,9 @@ class Encoding:
     def __init__(self, sensor: Sensor, fields: Iterable[str] = ()) -> None:
         given = {"range", *fields}
         if unknown := sorted(given - set(TYPES)):
-            raise ConfigError(f"fields {unknown} of a bank", f"some of {', '.join(TYPES)}")
+            raise ConfigError(
+                f"fields {unknown} of a bank", f"some of {', '.join(TYPES)}"
+            )
         self.sensor = sensor
         self.names = tuple(name for name in TYPES if name in given)
         self.scale = sensor.range_max / RANGE_STEPS
@@ -76,7 +78,10 @@ class Encoding:
     def arrays(self) -> dict[str, tuple[tuple[int, int], np.dtype[Any]]]:
         """Shape and type of each array of one scan."""
         return {
-            name: (SHAPE if name == "boxes" else self.sensor.shape, np.dtype(TYPES[name]))
+            name: (
+                SHAPE if name == "boxes" else self.sensor.shape,
+                np.dtype(TYPES[name]),
+            )
             for name in self.names
         }
 
@@ -107,7 +112,9 @@ class Encoding:
         if image.boxes is not None:
             given["boxes"] = image.boxes
         if missing := [name for name in self.names if name not in given]:
-            raise DataError(f"a range image without {missing}", f"channels {list(self.names[1:])}")
+            raise DataError(
+                f"a range image without {missing}", f"channels {list(self.names[1:])}"
+            )
         codes = {
             n: encode_boxes(given[n]) if n == "boxes" else self._code(n, given[n])
             for n in self.names
@@ -125,10 +132,14 @@ class Encoding:
             if name in LEVELS:
                 channels[name] = np.empty(self.sensor.shape, np.float32)
                 _decode_shares(
-                    arrays[name].ravel(), np.float32(LEVELS[name]), channels[name].reshape(-1)
+                    arrays[name].ravel(),
+                    np.float32(LEVELS[name]),
+                    channels[name].reshape(-1),
                 )
             else:
-                channels[name] = arrays[name].astype(np.int32 if name == "instance" else np.uint8)
+                channels[name] = arrays[name].astype(
+                    np.int32 if name == "instance" else np.uint8
+                )
         boxes = decode_boxes(arrays["boxes"]) if "boxes" in self.names else None
         return RangeImage(self.metres(arrays["range"]), self.sensor, channels, boxes)
 
@@ -141,7 +152,8 @@ class Encoding:
         for name in set(LEVELS) & set(arrays):
             if LEVELS[name] < arrays[name].max(initial=0):
                 raise DataError(
-                    f"a {name} with the code {arrays[name].max()}", f"at most {LEVELS[name]}"
+                    f"a {name} with the code {arrays[name].max()}",
+                    f"at most {LEVELS[name]}",
                 )
         if "label" in arrays:
             _train_ids(arrays["label"])
@@ -168,7 +180,9 @@ class Encoding:
             return _train_ids(values)
         if name == "instance":
             if values.min(initial=0) < 0 or values.max(initial=0) > 65535:
-                raise DataError(f"instances from {values.min()} to {values.max()}", "0..65535")
+                raise DataError(
+                    f"instances from {values.min()} to {values.max()}", "0..65535"
+                )
             return values.astype(np.uint16)
         codes = np.empty(values.shape, TYPES[name])
         if name == "range":
@@ -184,8 +198,12 @@ class Encoding:
                     f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of "
                     f"{self.sensor.name!r}, or 0 = no return",
                 )
-        elif not _encode_shares(values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)):
-            raise DataError(f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]")
+        elif not _encode_shares(
+            values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)
+        ):
+            raise DataError(
+                f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]"
+            )
         return codes
 
 
@@ -207,7 +225,10 @@ def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-d
         seen = metres[i] != 0
         sound &= ((metres[i] >= near) & (metres[i] <= far)) | (not seen)
         out[i] = np.uint16(
-            min(max(np.rint(metres[i] * inverse), np.float32(seen)), np.float32(RANGE_STEPS))
+            min(
+                max(np.rint(metres[i] * inverse), np.float32(seen)),
+                np.float32(RANGE_STEPS),
+            )
         )
     return sound
 
@@ -217,7 +238,9 @@ def _decode_range(codes, scale, near, far, out):  # type: ignore[no-untyped-def]
     """The inverse of ``_encode_range``, clipped to near..far."""
     for i in range(len(codes)):
         out[i] = (
-            min(max(np.float32(codes[i]) * scale, near), far) if codes[i] > 0 else np.float32(0)
+            min(max(np.float32(codes[i]) * scale, near), far)
+            if codes[i] > 0
+            else np.float32(0)
         )
 
 

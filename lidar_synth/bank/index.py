@@ -113,7 +113,11 @@ class Facts:
         """The facts as plain values, with format and scale."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {"sensor": self.sensor.to_dict(), "fields": list(self.fields)}
-        return {"format": self.format, "scale": self.sensor.range_max / RANGE_STEPS, **values}
+        return {
+            "format": self.format,
+            "scale": self.sensor.range_max / RANGE_STEPS,
+            **values,
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], where: str) -> "Facts":
@@ -129,7 +133,11 @@ class Facts:
             _check_format(given, where)
             scale = values.pop("scale", None)
             facts = cls(
-                **values | {"sensor": _sensor(values["sensor"]), "fields": tuple(values["fields"])}
+                **values
+                | {
+                    "sensor": _sensor(values["sensor"]),
+                    "fields": tuple(values["fields"]),
+                }
             )
             facts._check_kinds()
             if given != facts.format:
@@ -137,9 +145,16 @@ class Facts:
             expected = facts.encoding.scale
         except DataError:
             raise
-        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+        ) as error:
             raise DataError(
-                f"{where}: facts that do not fit together ({error})", f"those of {FORMAT}"
+                f"{where}: facts that do not fit together ({error})",
+                f"those of {FORMAT}",
             ) from error
         if scale != expected:
             raise DataError(
@@ -155,7 +170,9 @@ class Facts:
         variable-length text without a checksum.
         """
         attributes = {name: _attribute(value) for name, value in self.to_dict().items()}
-        return dict(sorted(attributes.items(), key=lambda item: np.asarray(item[1]).nbytes))
+        return dict(
+            sorted(attributes.items(), key=lambda item: np.asarray(item[1]).nbytes)
+        )
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any], where: str) -> "Facts":
@@ -167,7 +184,8 @@ class Facts:
             raise
         except (ValueError, TypeError, RecursionError) as error:
             raise DataError(
-                f"{where}: attributes that cannot be read ({error})", f"those of {FORMAT}"
+                f"{where}: attributes that cannot be read ({error})",
+                f"those of {FORMAT}",
             ) from error
         return cls.from_dict(values, where)
 
@@ -185,7 +203,9 @@ class Facts:
         if not isinstance(self.condition, dict | None):
             raise TypeError(f"condition is {self.condition!r}")
         if self.compression not in FILTERS or self.layout not in LAYOUTS:
-            raise ValueError(f"compression {self.compression!r}, layout {self.layout!r}")
+            raise ValueError(
+                f"compression {self.compression!r}, layout {self.layout!r}"
+            )
 
 
 @dataclass(frozen=True)
@@ -213,7 +233,9 @@ class Entry:
     dropped: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dropped", tuple(self.dropped))  # a list, where it comes from JSON
+        object.__setattr__(
+            self, "dropped", tuple(self.dropped)
+        )  # a list, where it comes from JSON
 
     @property
     def kept(self) -> int:
@@ -245,7 +267,14 @@ class Entry:
             TypeError, ValueError: on keys or values that a shard cannot have.
         """
         entry = cls(**values)
-        numbers = (entry.seed, entry.first, entry.scans, entry.source, entry.bytes, *entry.dropped)
+        numbers = (
+            entry.seed,
+            entry.first,
+            entry.scans,
+            entry.source,
+            entry.bytes,
+            *entry.dropped,
+        )
         # A JSON number may be 1e30 or 2.0, and Python takes true for a number.
         if not all(type(number) is int and 0 <= number < 1 << 64 for number in numbers):
             raise ValueError(f"numbers of {entry}")
@@ -258,7 +287,9 @@ class Entry:
     @property
     def span(self) -> str:
         """Description of its scans, for messages."""
-        return f"scans {self.first} to {self.first + self.scans - 1} of seed {self.seed}"
+        return (
+            f"scans {self.first} to {self.first + self.scans - 1} of seed {self.seed}"
+        )
 
 
 @dataclass(frozen=True)
@@ -287,12 +318,17 @@ class Index:
         for entry in self.shards:
             if not re.fullmatch(r"[\w.-]+\.h5", entry.file) or entry.file[0] == ".":
                 raise DataError(
-                    f"a bank's shard {entry.file!r}", "the name of an .h5 file in the bank's folder"
+                    f"a bank's shard {entry.file!r}",
+                    "the name of an .h5 file in the bank's folder",
                 )
             if not (
-                0 <= entry.source < len(self.sources) and entry.scans >= 1 and entry.first >= 0
+                0 <= entry.source < len(self.sources)
+                and entry.scans >= 1
+                and entry.first >= 0
             ):
-                raise DataError(f"a bank with {entry}", "at least one scan, of one of its sources")
+                raise DataError(
+                    f"a bank with {entry}", "at least one scan, of one of its sources"
+                )
             steps = pairwise((-1, *entry.dropped, entry.scans))
             if not (
                 entry.kept >= 1
@@ -300,7 +336,8 @@ class Index:
                 and (self.curation or not entry.dropped)
             ):
                 raise DataError(
-                    f"a bank with {entry}", "ascending positions that leave a scan, and the rule"
+                    f"a bank with {entry}",
+                    "ascending positions that leave a scan, and the rule",
                 )
         if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
             raise DataError(
@@ -311,7 +348,9 @@ class Index:
             (f.sensor, f.fields) != (self.sources[0].sensor, self.sources[0].fields)
             for f in self.sources
         ):
-            raise DataError("a bank with several sensors or fields", "the same for all scans")
+            raise DataError(
+                "a bank with several sensors or fields", "the same for all scans"
+            )
 
     @property
     def scans(self) -> int:
@@ -343,7 +382,8 @@ class Index:
         """The content of ``index.json``."""
         values = self._values() | ({"files": self.files} if self.files else {})
         return (
-            json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True) + "\n"
+            json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True)
+            + "\n"
         ).encode()
 
     @classmethod
@@ -359,30 +399,46 @@ class Index:
             given = values.pop("checksum", None)
             if given != _sum(values):
                 raise DataError(
-                    f"{where} does not match its checksum: it was damaged or edited", "an index"
+                    f"{where} does not match its checksum: it was damaged or edited",
+                    "an index",
                 )
             index = cls(
                 tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
                 tuple(Entry.from_dict(entry) for entry in values["shards"]),
                 tuple(values["repairs"]),
                 tuple(values.get("curation", ())),
-                {str(name): str(sha256) for name, sha256 in values.get("files", {}).items()},
+                {
+                    str(name): str(sha256)
+                    for name, sha256 in values.get("files", {}).items()
+                },
             )
             if values["format"] != index.sources[0].format:
                 raise ValueError(
                     f"format {values['format']!r} of scans with {index.sources[0].fields}"
                 )
             if values["scans"] != index.scans:
-                raise ValueError(f"{values['scans']} scans, but its shards hold {index.scans}")
+                raise ValueError(
+                    f"{values['scans']} scans, but its shards hold {index.scans}"
+                )
             for notes in (values["repairs"], values.get("curation", [])):
-                if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+                if not isinstance(notes, list) or not all(
+                    isinstance(note, str) for note in notes
+                ):
                     raise TypeError(f"notes {str(notes)[:80]}")
             return index
         except DataError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             raise DataError(
-                f"{where} is damaged ({error})", f"the index of a bank, {FORMAT}", REPAIR
+                f"{where} is damaged ({error})",
+                f"the index of a bank, {FORMAT}",
+                REPAIR,
             ) from error
 
     def _values(self) -> dict[str, Any]:
@@ -450,7 +506,9 @@ def _check_format(given: Any, where: str) -> None:
 def _attribute(value: Any) -> Any:
     if isinstance(value, float):
         return value
-    text = (value if isinstance(value, str) else json.dumps(value, sort_keys=True)).encode()
+    text = (
+        value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+    ).encode()
     return np.array(text, h5py.string_dtype("utf-8", max(len(text), 1)))
 
 
@@ -458,7 +516,9 @@ def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
-    if not isinstance(value, str | bytes):  # bytes(NUMBER) would allocate that many bytes
+    if not isinstance(
+        value, str | bytes
+    ):  # bytes(NUMBER) would allocate that many bytes
         raise ValueError(f"{name} is a {type(value).__name__}")
     text = value if isinstance(value, str) else value.decode()
     return text if name in _TEXT else _from_json(text)

@@ -100,7 +100,9 @@ def with_hdf5(
         OSError, RuntimeError: from HDF5, if it is not a valid file.
         FileError, DataError: as ``Storage.read``.
     """
-    view = RangedFile(storage, max(storage.window, 0 if facts is None else head_size(facts, scans)))
+    view = RangedFile(
+        storage, max(storage.window, 0 if facts is None else head_size(facts, scans))
+    )
     for _ in range(_PASSES):
         view.fetch_missing()
         try:
@@ -140,7 +142,9 @@ def read_layout(
         *expected,
         CONDITION,
     }:
-        raise ValueError(f"it does not hold {', '.join(sorted(expected))} and nothing else")
+        raise ValueError(
+            f"it does not hold {', '.join(sorted(expected))} and nothing else"
+        )
     # The numbers come first: they are stored uncompressed, so the size of the file bounds the
     # number of scans.
     numbers = {
@@ -189,7 +193,10 @@ def _stored(file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def _one_a_scan(
-    dataset: h5py.Dataset, scans: int, storage: Storage, fits: Callable[[h5py.h5t.TypeID], bool]
+    dataset: h5py.Dataset,
+    scans: int,
+    storage: Storage,
+    fits: Callable[[h5py.h5t.TypeID], bool],
 ) -> NDArray[Any]:
     """(N,) values of a contiguous dataset."""
     found = dataset.id
@@ -225,15 +232,26 @@ def _chunks(
             f"{dataset.name} is {dataset.shape} of {_type_name(kind)}, not {(scans, *shape)} of "
             f"{dtype.name}"
         )
-    if properties.get_layout() != h5py.h5d.CHUNKED or properties.get_chunk() != (1, *shape):
+    if properties.get_layout() != h5py.h5d.CHUNKED or properties.get_chunk() != (
+        1,
+        *shape,
+    ):
         raise ValueError(f"{dataset.name} does not have one chunk for each scan")
-    filters = tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
+    filters = tuple(
+        properties.get_filter(i)[0] for i in range(properties.get_nfilters())
+    )
     if filters != FILTERS[compression]:
-        raise ValueError(f"{dataset.name} has the filters {filters}, not {FILTERS[compression]}")
+        raise ValueError(
+            f"{dataset.name} has the filters {filters}, not {FILTERS[compression]}"
+        )
     if compression == "blosc2" and shape[0] * shape[1] * dtype.itemsize > _BLOSC2_ARRAY:
-        raise ValueError(f"{dataset.name} of one scan takes more than {_BLOSC2_ARRAY >> 20} MiB")
+        raise ValueError(
+            f"{dataset.name} of one scan takes more than {_BLOSC2_ARRAY >> 20} MiB"
+        )
     found = Chunks(
-        np.zeros(scans, np.uint64), np.zeros(scans, np.uint64), np.zeros(scans, np.uint32)
+        np.zeros(scans, np.uint64),
+        np.zeros(scans, np.uint64),
+        np.zeros(scans, np.uint32),
     )
 
     def note(chunk: h5py.h5d.StoreInfo) -> None:

@@ -115,7 +115,9 @@ class Bank:
 
     def facts_of(self, number: int) -> Facts:
         """The facts of the source that a scan comes from."""
-        return self.index.sources[self.index.shards[_place(self.index, number)[0]].source]
+        return self.index.sources[
+            self.index.shards[_place(self.index, number)[0]].source
+        ]
 
     def condition(self, number: int) -> str | None:
         """The name of the scan that conditioned scan ``number``; None for an unconditional one."""

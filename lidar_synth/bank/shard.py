@@ -93,7 +93,11 @@ class ShardReader:
             DataError: if it is not text.
         """
         with self._reading(f"the condition of scan {position}"):
-            return None if self._layout.conditions is None else self._condition(position).decode()
+            return (
+                None
+                if self._layout.conditions is None
+                else self._condition(position).decode()
+            )
 
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
         """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as
@@ -119,14 +123,17 @@ class ShardReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, facts: Facts | None, entry: Entry | None) -> tuple[Facts, Entry, ShardLayout]:
+    def _open(
+        self, facts: Facts | None, entry: Entry | None
+    ) -> tuple[Facts, Entry, ShardLayout]:
         """Facts and entry from the file's attributes, and the addresses of its scans."""
 
         def work(file: h5py.File) -> tuple[Facts, Entry, ShardLayout]:
             with self._reading("its attributes"):
                 attributes = read_attributes(file)
                 numbers = [
-                    int(attributes.pop(key, np.uint64(0))) for key in ("seed", "first", "scans")
+                    int(attributes.pop(key, np.uint64(0)))
+                    for key in ("seed", "first", "scans")
                 ]
             found = Facts.from_attributes(attributes, self.name)
             self._check_facts(found, facts)
@@ -135,7 +142,11 @@ class ShardReader:
             filters(found.compression)
             with self._reading("its datasets"):
                 layout = read_layout(
-                    file, self._file, actual.scans, found.encoding.arrays(), found.compression
+                    file,
+                    self._file,
+                    actual.scans,
+                    found.encoding.arrays(),
+                    found.compression,
                 )
             return found, actual, layout
 
@@ -156,7 +167,9 @@ class ShardReader:
             others = facts.to_dict()
             wrong = ", ".join(key for key in others if mine[key] != others[key])
             raise DataError(
-                f"{self.name}: {wrong} differ from the bank's index", "a shard of this bank", REPAIR
+                f"{self.name}: {wrong} differ from the bank's index",
+                "a shard of this bank",
+                REPAIR,
             )
 
     def _checked_entry(self, numbers: list[int], entry: Entry | None) -> Entry:
@@ -180,7 +193,9 @@ class ShardReader:
                 name: unpack(chunk, *kinds[name], self.facts.compression)
                 for name, chunk in packed.items()
             }
-            seed, index, crc = (int(values[position]) for values in self._layout.numbers.values())
+            seed, index, crc = (
+                int(values[position]) for values in self._layout.numbers.values()
+            )
             if checksum(seed, index, arrays, self._condition(position)) != crc:
                 raise ValueError("its CRC does not match")
             if (seed, index) != (self.entry.seed, self.entry.first + position):
@@ -200,20 +215,29 @@ class ShardReader:
                 raise ValueError(f"filters {skipped:b} were not applied")
             if not size or offset + size > self._file.size:
                 raise ValueError(
-                    f"its {name} is missing" if not size else f"its {name} lies outside the file"
+                    f"its {name} is missing"
+                    if not size
+                    else f"its {name} lies outside the file"
                 )
             places[name] = (offset, offset + size)
         packed: dict[str, bytes] = {}
         for names in _side_by_side(places):
             start = min(places[name][0] for name in names)
-            content = self._file.read(start, max(places[name][1] for name in names) - start)
+            content = self._file.read(
+                start, max(places[name][1] for name in names) - start
+            )
             packed |= {
-                name: content[places[name][0] - start : places[name][1] - start] for name in names
+                name: content[places[name][0] - start : places[name][1] - start]
+                for name in names
             }
         return {name: packed[name] for name in places}
 
     def _condition(self, position: int) -> bytes:
-        return b"" if self._layout.conditions is None else bytes(self._layout.conditions[position])
+        return (
+            b""
+            if self._layout.conditions is None
+            else bytes(self._layout.conditions[position])
+        )
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:
@@ -232,7 +256,9 @@ class ShardReader:
             MemoryError,
         ) as error:
             raise DataError(
-                f"{self.name}: {what} cannot be read ({error})", "an intact shard", REPAIR
+                f"{self.name}: {what} cannot be read ({error})",
+                "an intact shard",
+                REPAIR,
             ) from error
 
 

@@ -90,13 +90,17 @@ class LocalFile:
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
-            raise DataError(f"{self._path} ends before byte {offset + size}", "a complete file")
+            raise DataError(
+                f"{self._path} ends before byte {offset + size}", "a complete file"
+            )
         try:
             content = os.pread(self._descriptor, size, offset)
         except OSError as error:
             raise self._unreadable(error) from error
         if len(content) != size:
-            raise DataError(f"{self._path} was truncated while it was read", "a complete file")
+            raise DataError(
+                f"{self._path} was truncated while it was read", "a complete file"
+            )
         return content
 
     def close(self) -> None:
@@ -118,7 +122,8 @@ class LocalFile:
 
     def _unreadable(self, error: OSError) -> FileError:
         return FileError(
-            f"{self._path} cannot be read ({error.strerror or error})", "a file of a bank"
+            f"{self._path} cannot be read ({error.strerror or error})",
+            "a file of a bank",
         )
 
 
@@ -142,7 +147,9 @@ class RemoteFile:
         self.size = size
         scheme = url.partition("://")[0]
         if scheme not in SCHEMES:  # a chain such as zip::http is not among them either
-            raise FileError(f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}")
+            raise FileError(
+                f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}"
+            )
         try:
             import fsspec
 
@@ -161,7 +168,8 @@ class RemoteFile:
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
             raise DataError(
-                f"{self.url} ends before byte {offset + size}", "the size in the bank's index"
+                f"{self.url} ends before byte {offset + size}",
+                "the size in the bank's index",
             )
         content = self._fetch(offset, offset + size)
         if len(content) != size:
@@ -181,7 +189,9 @@ class RemoteFile:
         """
         content = self._fetch(0, None, at_most)
         if len(content) > at_most:
-            raise DataError(f"{self.url} is longer than {at_most} bytes", "the index of a bank")
+            raise DataError(
+                f"{self.url} is longer than {at_most} bytes", "the index of a bank"
+            )
         return content
 
     def close(self) -> None:
@@ -196,9 +206,17 @@ class RemoteFile:
         began = time.monotonic()
         for wait in (*WAITS, None):
             try:
-                return self._request(start, end, at_most if end is None else end - start)
-            except Exception as error:  # each file system of fsspec raises its own classes
-                if wait is None or not _may_pass(error) or time.monotonic() - began > PATIENCE:
+                return self._request(
+                    start, end, at_most if end is None else end - start
+                )
+            except (
+                Exception
+            ) as error:  # each file system of fsspec raises its own classes
+                if (
+                    wait is None
+                    or not _may_pass(error)
+                    or time.monotonic() - began > PATIENCE
+                ):
                     reason = str(error) or type(error).__name__
                     raise FileError(
                         f"{self.url} cannot be read ({reason})", "a file of a bank"
@@ -211,7 +229,9 @@ class RemoteFile:
             from fsspec.asyn import sync
 
             return bytes(sync(self._system.loop, self._get, start, end, at_most))
-        return bytes(self._system.cat_file(self._path, start=start, end=end or at_most + 1))
+        return bytes(
+            self._system.cat_file(self._path, start=start, end=end or at_most + 1)
+        )
 
     async def _get(self, start: int, end: int | None, at_most: int) -> bytearray:
         """One byte more than ``at_most`` at most; fsspec itself would read an answer of any
@@ -220,8 +240,12 @@ class RemoteFile:
 
         session = await self._system.set_session()
         headers = {} if end is None else {"Range": f"bytes={start}-{end - 1}"}
-        timeout = ClientTimeout(total=4 * PATIENCE, sock_connect=PATIENCE, sock_read=PATIENCE)
-        asked = session.get(self.url, headers=headers, timeout=timeout, max_redirects=_REDIRECTS)
+        timeout = ClientTimeout(
+            total=4 * PATIENCE, sock_connect=PATIENCE, sock_read=PATIENCE
+        )
+        asked = session.get(
+            self.url, headers=headers, timeout=timeout, max_redirects=_REDIRECTS
+        )
         async with asked as answer:
             if self.url.startswith("https") and any(
                 r.url.scheme != "https" for r in (*answer.history, answer)
@@ -283,7 +307,11 @@ class RangedFile(io.RawIOBase):
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         self._position = (
             offset
-            + {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._file.size}[whence]
+            + {
+                io.SEEK_SET: 0,
+                io.SEEK_CUR: self._position,
+                io.SEEK_END: self._file.size,
+            }[whence]
         )
         return self._position
 
@@ -297,7 +325,9 @@ class RangedFile(io.RawIOBase):
         size = min(len(buffer), max(self._file.size - self._position, 0))
         for first, content in self._spans:
             if first <= start and start + size <= first + len(content):
-                buffer[:size] = memoryview(content)[start - first : start - first + size]
+                buffer[:size] = memoryview(content)[
+                    start - first : start - first + size
+                ]
                 break
         else:
             if size:
@@ -315,7 +345,9 @@ class RangedFile(io.RawIOBase):
         self.missing = None
 
     def _fetch(self, start: int, end: int) -> None:
-        self._spans.append((start, self._file.read(start, min(end, self._file.size) - start)))
+        self._spans.append(
+            (start, self._file.read(start, min(end, self._file.size) - start))
+        )
 
 
 def is_url(path: str | Path) -> bool:

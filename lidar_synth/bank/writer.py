@@ -97,7 +97,9 @@ class ShardWriter:
         self._write_ready(0)
         self._pool.shutdown()
         if self._next != self.entry.scans:
-            raise DataError(f"{self._next} scans for {self.path}", f"{self.entry.scans}")
+            raise DataError(
+                f"{self._next} scans for {self.path}", f"{self.entry.scans}"
+            )
         with _on_disk(self.path):
             self._file["crc"][:] = self._crc
             self._file.flush()
@@ -171,24 +173,33 @@ class ShardWriter:
         """CRC and chunks of a scan; runs in a thread."""
         arrays = self.encoding.encode(image)
         plain = {
-            name: arrays[name].astype(dtype, copy=False) for name, dtype in self._types().items()
+            name: arrays[name].astype(dtype, copy=False)
+            for name, dtype in self._types().items()
         }
         condition = self._conditions[position] if self._conditions else b""
         crc = checksum(self.entry.seed, self.entry.first + position, plain, condition)
-        return crc, {name: deflate(a) if self._direct else a.tobytes() for name, a in plain.items()}
+        return crc, {
+            name: deflate(a) if self._direct else a.tobytes()
+            for name, a in plain.items()
+        }
 
     def _types(self) -> dict[str, np.dtype[Any]]:
         return {
-            name: dtype.newbyteorder("<") for name, (_, dtype) in self.encoding.arrays().items()
+            name: dtype.newbyteorder("<")
+            for name, (_, dtype) in self.encoding.arrays().items()
         }
 
     def _write_ready(self, keep: int) -> None:
         """Write scans, in order, until no more than ``keep`` wait."""
         while len(self._waiting) > keep:
             crc, chunks = self._waiting.popleft().result()
-            self._put(self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct)
+            self._put(
+                self._next - len(self._waiting) - 1, crc, chunks, ready=self._direct
+            )
 
-    def _put(self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool) -> None:
+    def _put(
+        self, position: int, crc: int, chunks: Mapping[str, bytes], ready: bool
+    ) -> None:
         """Write a scan: compressed chunks if ``ready``, otherwise plain arrays, which HDF5
         compresses."""
         self._crc[position] = crc
@@ -222,7 +233,9 @@ def _on_disk(path: Path) -> Iterator[None]:
         if isinstance(error, LibraryError):
             raise
         reason = (
-            os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+            os.strerror(error.errno)
+            if isinstance(error, OSError) and error.errno
+            else str(error)
         )
         raise FileError(
             f"{path} cannot be written ({reason})",

@@ -27,10 +27,13 @@ def bake(
     ] = "local",
     workers: Annotated[
         int | None,
-        typer.Option(help="number of processes, actors or jobs [one per CPU core or GPU]"),
+        typer.Option(
+            help="number of processes, actors or jobs [one per CPU core or GPU]"
+        ),
     ] = None,
     address: Annotated[
-        str | None, typer.Option(help="address of a Ray cluster; 'auto' finds a running one")
+        str | None,
+        typer.Option(help="address of a Ray cluster; 'auto' finds a running one"),
     ] = None,
     slurm: Annotated[
         list[str] | None,
@@ -42,12 +45,14 @@ def bake(
         int, typer.Option(help="write only every n-th shard, starting with this one")
     ] = 0,
     num_shards: Annotated[
-        int, typer.Option(help="the n of --shard-index: number of runs that share the work")
+        int,
+        typer.Option(help="the n of --shard-index: number of runs that share the work"),
     ] = 1,
     dry_run: Annotated[
         bool,
         typer.Option(
-            "--dry-run", help="print the size of the bank and the time it takes, without baking"
+            "--dry-run",
+            help="print the size of the bank and the time it takes, without baking",
         ),
     ] = False,
     **settings: Any,
@@ -73,18 +78,25 @@ def bake(
     values = {} if config is None else read_recipe(find_recipe(config))
     values |= {name: value for name, value in settings.items() if value is not None}
     share = Share(shard_index, num_shards)
-    plan = make_plan(out, validate(BakeJob, values, "bake" if config is None else str(config)))
+    plan = make_plan(
+        out, validate(BakeJob, values, "bake" if config is None else str(config))
+    )
     if dry_run:
         _describe(plan)
         return
     quiet = os.environ.get("LOCAL_RANK", "0") != "0"
     try:
         index = run(
-            plan, engine, _resources(plan, workers, address, slurm), share, progress=not quiet
+            plan,
+            engine,
+            _resources(plan, workers, address, slurm),
+            share,
+            progress=not quiet,
         )
     except KeyboardInterrupt:
         typer.echo(
-            f"stopped; finished shards are kept in {out}, the same command resumes", err=True
+            f"stopped; finished shards are kept in {out}, the same command resumes",
+            err=True,
         )
         raise typer.Exit(130) from None
     if index is None:
@@ -125,7 +137,9 @@ def _resources(
     for item in slurm or ():
         key, equals, value = item.partition("=")
         if not (key and equals):
-            raise ConfigError(f"--slurm {item!r}", "KEY=VALUE, such as slurm_partition=gpu")
+            raise ConfigError(
+                f"--slurm {item!r}", "KEY=VALUE, such as slurm_partition=gpu"
+            )
         options[key] = int(value) if value.isdigit() else value
     devices = torch.cuda.device_count() if plan.job.device == "cuda" else os.cpu_count()
     return Resources(workers if workers is not None else devices or 1, address, options)
@@ -138,7 +152,9 @@ def _describe(plan: "BakePlan") -> None:
     job = plan.job
     shards = plan.shards
     expected = estimate(plan)
-    typer.echo(f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}")
+    typer.echo(
+        f"{plan.out}: {job.count} scans in {len(shards)} shards of up to {job.shard_size}"
+    )
     typer.echo(
         f"  model {plan.facts.model} {plan.facts.checkpoint[:12]}, sensor {plan.facts.sensor.name}"
     )

@@ -6,14 +6,19 @@ from typing import Annotated
 import typer
 
 BankFolder = Annotated[Path, typer.Argument(metavar="BANK", help="folder of a bank")]
-Model = Annotated[str | None, typer.Option(help="checkpoint file, if it is not a shipped model")]
+Model = Annotated[
+    str | None, typer.Option(help="checkpoint file, if it is not a shipped model")
+]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder of the new bank")]
 
 
 def verify(
     bank: BankFolder,
     deep: Annotated[
-        bool, typer.Option("--deep", help="also regenerate some scans from their seeds and compare")
+        bool,
+        typer.Option(
+            "--deep", help="also regenerate some scans from their seeds and compare"
+        ),
     ] = False,
     sample: Annotated[
         int, typer.Option(min=1, help="number of scans that --deep regenerates")
@@ -54,7 +59,10 @@ def verify(
     shares = regenerate(bank, model, sample, seed=seed)
     different = {name: share for name, share in shares.items() if share < AGREE}
     for name, share in different.items():
-        typer.echo(f"{name}: {share:.1%} of its cells agree with the regenerated scan", err=True)
+        typer.echo(
+            f"{name}: {share:.1%} of its cells agree with the regenerated scan",
+            err=True,
+        )
     typer.echo(
         f"{bank}: {len(shares)} scans regenerated, at least {min(shares.values()):.2%} of the "
         "cells agree"
@@ -85,7 +93,9 @@ def repair(bank: BankFolder, model: Model = None) -> None:
 
 
 def info(
-    bank: Annotated[str, typer.Argument(metavar="BANK", help="folder or URL of a bank")],
+    bank: Annotated[
+        str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Describes a bank: scans, sensor, model, settings, licences.
@@ -111,7 +121,8 @@ def info(
 def merge(
     out: Out,
     banks: Annotated[
-        list[Path], typer.Argument(metavar="BANK...", help="banks with the same sensor and fields")
+        list[Path],
+        typer.Argument(metavar="BANK...", help="banks with the same sensor and fields"),
     ],
 ) -> None:
     """Merges several banks into one. Shards are hard-linked instead of copied where the file system
@@ -154,7 +165,9 @@ def split(
         try:
             shares[Path(folder)] = float(share)
         except ValueError as error:
-            raise ConfigError(f"part {part!r}", "FOLDER=SHARE, such as train=0.9") from error
+            raise ConfigError(
+                f"part {part!r}", "FOLDER=SHARE, such as train=0.9"
+            ) from error
         if not folder:
             raise ConfigError(f"part {part!r}", "FOLDER=SHARE, such as train=0.9")
     for out, index in run(Bank(bank), shares).items():
@@ -182,15 +195,22 @@ def head(
 def as_sensor(
     bank: BankFolder,
     out: Out,
-    sensor: Annotated[str, typer.Option(help="sensor of the new bank: a preset or a YAML file")],
+    sensor: Annotated[
+        str, typer.Option(help="sensor of the new bank: a preset or a YAML file")
+    ],
     mount: Annotated[
         str | None,
-        typer.Option(metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]"),
+        typer.Option(
+            metavar="Z,PITCH", help="metres higher, degrees looking further down [0,0]"
+        ),
     ] = None,
     like: Annotated[
-        Path | None, typer.Option(help="real scans of that sensor, to match its reflectance")
+        Path | None,
+        typer.Option(help="real scans of that sensor, to match its reflectance"),
     ] = None,
-    range_noise: Annotated[float, typer.Option(help="metres, noise beyond that of the bank")] = 0.0,
+    range_noise: Annotated[
+        float, typer.Option(help="metres, noise beyond that of the bank")
+    ] = 0.0,
     reach: Annotated[
         float | None,
         typer.Option(

@@ -13,16 +13,23 @@ if TYPE_CHECKING:
 def check_mix(
     mix: Annotated[
         Path,
-        typer.Argument(metavar="MIX.yaml", help="settings of a mixture, as trainers take them"),
+        typer.Argument(
+            metavar="MIX.yaml", help="settings of a mixture, as trainers take them"
+        ),
     ],
     real: Annotated[
         Path,
-        typer.Argument(metavar="REAL", help="folder or root of the dataset with the real scans"),
+        typer.Argument(
+            metavar="REAL", help="folder or root of the dataset with the real scans"
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="picture to write: .png (sheet) or .html (interactive page)")
+        Path | None,
+        typer.Option(help="picture to write: .png (sheet) or .html (interactive page)"),
     ] = None,
-    count: Annotated[int, typer.Option(min=4, max=64, help="number of scans of each kind")] = 8,
+    count: Annotated[
+        int, typer.Option(min=4, max=64, help="number of scans of each kind")
+    ] = 8,
     sensor: Annotated[
         str | None, typer.Option(help="sensor of the real scans [named by the files]")
     ] = None,
@@ -53,19 +60,24 @@ def check_mix(
     if out is not None:
         view_suffix(out)
     source = open_scans(real, sensor=sensor)
-    mixture = make_mixture(len(source), read_settings(mix) | {"ratio": 0.5}, lambda scan, rng: scan)
+    mixture = make_mixture(
+        len(source), read_settings(mix) | {"ratio": 0.5}, lambda scan, rng: scan
+    )
     chosen = [i for i in range(len(mixture)) if mixture.domain(i)][:count]
     kinds: list[list[Scan]] = [
         [source[i] for i in spread(len(source), count)],
         [mixture[i] for i in chosen],
     ]
     theirs, ours = (
-        measure_tables([table_of(scan) for scan in scans], USUAL_IGNORE) for scans in kinds
+        measure_tables([table_of(scan) for scan in scans], USUAL_IGNORE)
+        for scans in kinds
     )
     _print(theirs, ours, *(rows_in_use(scans) for scans in kinds))
     if out is not None:
         write_view(
-            out, [*kinds[0][:4], *kinds[1][:4]], title=f"{real.resolve().name}, then {mix.name}"
+            out,
+            [*kinds[0][:4], *kinds[1][:4]],
+            title=f"{real.resolve().name}, then {mix.name}",
         )
         typer.echo(f"{out}: real scans, then synthetic ones")
     report(list(contradictions(theirs, ours)))
@@ -86,14 +98,19 @@ def _print(real: "Meaning", synthetic: "Meaning", *rows: int) -> None:
         lines.append(
             (
                 f"{name}: 1, 50, 99 %",
-                ["  ".join(f"{v:.3g}" for v in each.quantiles[number]) for each in both],
+                [
+                    "  ".join(f"{v:.3g}" for v in each.quantiles[number])
+                    for each in both
+                ],
             )
         )
     for value in sorted(real.classes.keys() | synthetic.classes.keys()):
         looks = [each.classes.get(value) for each in both]
         name = NAMES[value] if value < len(NAMES) else str(value)
         cells = [
-            "-" if k is None else f"{k.share:.1%}  {k.height:.1f} m  {k.range:.0f} m away"
+            "-"
+            if k is None
+            else f"{k.share:.1%}  {k.height:.1f} m  {k.range:.0f} m away"
             for k in looks
         ]
         lines.append((f"{value} {name}", cells))

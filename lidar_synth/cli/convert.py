@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 Source = Annotated[
-    Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")
+    Path,
+    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
 ]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 To = Annotated[
@@ -28,24 +29,34 @@ To = Annotated[
 ]
 InputSensor = Annotated[
     str | None,
-    typer.Option(help="sensor of the input: a preset or a YAML file [named by the files]"),
+    typer.Option(
+        help="sensor of the input: a preset or a YAML file [named by the files]"
+    ),
 ]
 AsSensorName = Annotated[
     str | None,
-    typer.Option(help="scans as this sensor would have recorded them: a preset or a YAML file"),
+    typer.Option(
+        help="scans as this sensor would have recorded them: a preset or a YAML file"
+    ),
 ]
 MountText = Annotated[
     str | None,
     typer.Option(
-        metavar="Z,PITCH", help="of --as-sensor: metres higher, degrees looking further down [0,0]"
+        metavar="Z,PITCH",
+        help="of --as-sensor: metres higher, degrees looking further down [0,0]",
     ),
 ]
 Sweeps = Annotated[
-    int, typer.Option(help="of --as-sensor: scans before and after, which fill gaps by their poses")
+    int,
+    typer.Option(
+        help="of --as-sensor: scans before and after, which fill gaps by their poses"
+    ),
 ]
 Like = Annotated[
     Path | None,
-    typer.Option(help="of --as-sensor: real scans of that sensor, to match its reflectance"),
+    typer.Option(
+        help="of --as-sensor: real scans of that sensor, to match its reflectance"
+    ),
 ]
 RangeNoise = Annotated[
     float, typer.Option(help="of --as-sensor: metres, noise beyond that of the input")
@@ -61,10 +72,15 @@ Reach = Annotated[
 ]
 Unfold = Annotated[
     bool,
-    typer.Option("--unfold", help="assign one row to each laser, from KITTI's order of points"),
+    typer.Option(
+        "--unfold", help="assign one row to each laser, from KITTI's order of points"
+    ),
 ]
 Strict = Annotated[
-    bool, typer.Option("--strict", help="stop at a scan with something that the format cannot hold")
+    bool,
+    typer.Option(
+        "--strict", help="stop at a scan with something that the format cannot hold"
+    ),
 ]
 Jobs = Annotated[int, typer.Option(help="number of worker processes")]
 
@@ -108,8 +124,15 @@ def convert(
 
     writer = choose("--to", to, WRITERS)(out)
     scans = open_scans(source, sensor=sensor, **drop_missing(reading))
-    change = _change(scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach)
-    how: dict[str, Any] = {"jobs": jobs, "on_bad": scans.on_bad, "unfold": unfold, "strict": strict}
+    change = _change(
+        scans, as_sensor, mount, sweeps, like, range_noise=range_noise, reach=reach
+    )
+    how: dict[str, Any] = {
+        "jobs": jobs,
+        "on_bad": scans.on_bad,
+        "unfold": unfold,
+        "strict": strict,
+    }
     report = run(scans, writer, as_sensor=change, **how)
     _print(report, out, to, as_sensor)
 
@@ -128,9 +151,15 @@ def _print(report: "Report", out: Path, to: str, as_sensor: str | None) -> None:
     for name, reason in report.skipped.items():
         print(f"  skipped {name}: {reason}", file=sys.stderr)
     for name, count in report.dropped.items():
-        print(f"  dropped {count} points of {name}, which are NaN or infinite", file=sys.stderr)
+        print(
+            f"  dropped {count} points of {name}, which are NaN or infinite",
+            file=sys.stderr,
+        )
     for name, count in report.lost.items():
-        print(f"  dropped {name} of {count} scans, which {to} cannot hold", file=sys.stderr)
+        print(
+            f"  dropped {name} of {count} scans, which {to} cannot hold",
+            file=sys.stderr,
+        )
     if report.unlabelled:
         print(
             f"  labels of {report.unlabelled} scans are unknown: written as 0, unlabelled",
@@ -154,7 +183,9 @@ def _change(
 
     if as_sensor is None:
         given = {
-            k: v for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items() if v
+            k: v
+            for k, v in {"mount": mount, "sweeps": sweeps, "like": like, **how}.items()
+            if v
         }
         if given:
             raise ConfigError(
@@ -162,7 +193,9 @@ def _change(
                 "the sensor that the scans are turned into",
             )
         return None
-    return AsSensor(make_transfer(as_sensor, read_mount(mount), like, scans, **how), sweeps)
+    return AsSensor(
+        make_transfer(as_sensor, read_mount(mount), like, scans, **how), sweeps
+    )
 
 
 def read_mount(text: str | None) -> tuple[float, float]:
@@ -172,5 +205,7 @@ def read_mount(text: str | None) -> tuple[float, float]:
     try:
         z, pitch = map(float, (text or "0,0").split(","))
     except ValueError:
-        raise ConfigError(f"--mount {text}", "metres and degrees, for instance 0.1,0") from None
+        raise ConfigError(
+            f"--mount {text}", "metres and degrees, for instance 0.1,0"
+        ) from None
     return z, pitch

@@ -90,7 +90,9 @@ def missing_packages() -> list[str]:
     """The Debian packages with libraries that open3d needs and this Linux lacks."""
     if not sys.platform.startswith("linux"):
         return []
-    return [package for library, package in SHARED_OBJECTS.items() if not _loads(library)]
+    return [
+        package for library, package in SHARED_OBJECTS.items() if not _loads(library)
+    ]
 
 
 def report(findings: list[Finding]) -> str:
@@ -106,7 +108,9 @@ def report(findings: list[Finding]) -> str:
             group = finding.group
             lines += ["", group]
         buys = f" (for {finding.buys})" if finding.buys else ""
-        lines.append(f"  {finding.state:<7} {finding.name:<{width}}  {finding.found}{buys}")
+        lines.append(
+            f"  {finding.state:<7} {finding.name:<{width}}  {finding.found}{buys}"
+        )
         if finding.fix:
             lines.append(f"  {'':<7} {'':<{width}}  -> {finding.fix}")
     lines += [
@@ -141,7 +145,13 @@ def _libraries() -> Iterator[Finding]:
     try:
         wanted = requires("lidar_synth") or []
     except PackageNotFoundError:
-        yield Finding("libraries", "lidar_synth", "broken", "not installed", fix="pip install -e .")
+        yield Finding(
+            "libraries",
+            "lidar_synth",
+            "broken",
+            "not installed",
+            fix="pip install -e .",
+        )
         return
     for line in wanted:
         requirement, _, marker = line.partition(";")
@@ -156,18 +166,34 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
     """Check one dependency; those of an extra are optional."""
     buys = OPTIONAL.get(name) or (f"the extra {extra!r}" if extra else "")
     worst: State = "check" if buys else "broken"
-    wheel = f"pip install 'lidar_synth[{extra}]'" if extra else f"pip install '{name}>={minimum}'"
+    wheel = (
+        f"pip install 'lidar_synth[{extra}]'"
+        if extra
+        else f"pip install '{name}>={minimum}'"
+    )
     try:
         module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except ModuleNotFoundError:
         return Finding(
-            "libraries", name, "absent" if buys else "broken", "not installed", buys, wheel
+            "libraries",
+            name,
+            "absent" if buys else "broken",
+            "not installed",
+            buys,
+            wheel,
         )
-    except Exception as error:  # a broken installation may raise anything; it is reported
+    except (
+        Exception
+    ) as error:  # a broken installation may raise anything; it is reported
         if name == "open3d" and (packages := missing_packages()):
             line = "apt-get install -y --no-install-recommends " + " ".join(packages)
             return Finding(
-                "libraries", name, "absent", "lacks system libraries", buys, _as_root(line)
+                "libraries",
+                name,
+                "absent",
+                "lacks system libraries",
+                buys,
+                _as_root(line),
             )
         return Finding(
             "libraries",
@@ -179,7 +205,9 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
         )
     version = str(getattr(module, "__version__", None) or installed_version(name))
     if _numbers(version) < _numbers(minimum):
-        return Finding("libraries", name, worst, f"{version}, older than {minimum}", buys, wheel)
+        return Finding(
+            "libraries", name, worst, f"{version}, older than {minimum}", buys, wheel
+        )
     return Finding("libraries", name, "ok", version)
 
 
@@ -198,7 +226,9 @@ def _geometry() -> Finding:
         back = project(unproject(image))
         same = np.allclose(back.range, image.range, rtol=3e-7)
     except Exception as error:  # any error belongs in the report
-        return Finding("libraries", "projection", "broken", f"{type(error).__name__}: {error}")
+        return Finding(
+            "libraries", "projection", "broken", f"{type(error).__name__}: {error}"
+        )
     if not same:
         return Finding(
             "libraries",
@@ -208,15 +238,22 @@ def _geometry() -> Finding:
             fix="pip install --force-reinstall numba numpy",
         )
     return Finding(
-        "libraries", "projection", "ok", "range image -> points -> range image returns every cell"
+        "libraries",
+        "projection",
+        "ok",
+        "range image -> points -> range image returns every cell",
     )
 
 
 def _devices() -> Iterator[Finding]:
     cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
     )
-    yield Finding("devices", "CPU", "ok", f"{_cpu_name()}, {cores} cores{_instructions()}")
+    yield Finding(
+        "devices", "CPU", "ok", f"{_cpu_name()}, {cores} cores{_instructions()}"
+    )
     if hasattr(os, "sysconf"):
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
         yield Finding("devices", "memory", "ok", f"{total:.1f} GiB")
@@ -227,7 +264,10 @@ def _cuda() -> Iterator[Finding]:
     try:
         import torch
 
-        cards = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+        cards = [
+            torch.cuda.get_device_properties(i)
+            for i in range(torch.cuda.device_count())
+        ]
     except Exception as error:  # an incompatible driver raises various errors
         yield Finding("devices", "CUDA", "check", f"{type(error).__name__}: {error}")
         return
@@ -241,7 +281,9 @@ def _cuda() -> Iterator[Finding]:
     if cards:
         return
     if shutil.which("nvidia-smi") is None:
-        yield Finding("devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU")
+        yield Finding(
+            "devices", "CUDA", "absent", "no NVIDIA driver: everything runs on the CPU"
+        )
     elif torch.version.cuda is None:
         yield Finding(
             "devices",
@@ -307,7 +349,9 @@ def _as_root(line: str) -> str:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3])
+    return tuple(
+        int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3]
+    )
 
 
 def _cpu_name() -> str:

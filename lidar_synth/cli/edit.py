@@ -15,12 +15,15 @@ edit = typer.Typer(
 )
 
 Source = Annotated[
-    Path, typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset")
+    Path,
+    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
 ]
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 Model = Annotated[
     str | None,
-    typer.Option(help="model that draws the holes, for instance town [none: filled by geometry]"),
+    typer.Option(
+        help="model that draws the holes, for instance town [none: filled by geometry]"
+    ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="seed of the model's noise")]
 Format = Annotated[
@@ -43,11 +46,16 @@ Place = Annotated[
 def remove_objects(
     source: Source,
     out: Out,
-    box: Annotated[list[int] | None, typer.Option(help="number of a box; repeatable")] = None,
-    name: Annotated[
-        list[str] | None, typer.Option(help="remove all boxes of this class, for instance Car")
+    box: Annotated[
+        list[int] | None, typer.Option(help="number of a box; repeatable")
     ] = None,
-    scan: Annotated[int | None, typer.Option(min=0, help="number of the scan in IN [all]")] = None,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="remove all boxes of this class, for instance Car"),
+    ] = None,
+    scan: Annotated[
+        int | None, typer.Option(min=0, help="number of the scan in IN [all]")
+    ] = None,
     model: Model = None,
     seed: Seed = 0,
     to: Format = "npz",
@@ -88,9 +96,13 @@ def remove_objects(
 def insert_object(
     source: Source,
     out: Out,
-    objects: Annotated[Path, typer.Option(help="a bank of objects, .npz, of ObjectBank.save")],
+    objects: Annotated[
+        Path, typer.Option(help="a bank of objects, .npz, of ObjectBank.save")
+    ],
     at: Place,
-    number: Annotated[int, typer.Option(min=0, help="number of the object in the bank")] = 0,
+    number: Annotated[
+        int, typer.Option(min=0, help="number of the object in the bank")
+    ] = 0,
     scan: ScanNumber = 0,
     to: Format = "npz",
 ) -> None:
@@ -107,7 +119,9 @@ def insert_object(
     bank = ObjectBank.load(objects)
     if number >= len(bank):
         raise ConfigError(f"--number {number} of {bank}", f"0 to {len(bank) - 1}")
-    _edit_one(source, out, scan, to, lambda given: insert(given, bank[number], _pose(at)))
+    _edit_one(
+        source, out, scan, to, lambda given: insert(given, bank[number], _pose(at))
+    )
 
 
 @edit.command("move")
@@ -130,7 +144,11 @@ def move_object(
     from lidar_synth.labels.edit import move
 
     _edit_one(
-        source, out, scan, to, lambda given: move(given, box, _pose(at), model=model, seed=seed)
+        source,
+        out,
+        scan,
+        to,
+        lambda given: move(given, box, _pose(at), model=model, seed=seed),
     )
 
 
@@ -189,6 +207,7 @@ def _pose(text: str) -> list[float]:
         values = []
     if len(values) not in (2, 3):
         raise ConfigError(
-            f"--at {text}", "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90"
+            f"--at {text}",
+            "X,Y in metres, or X,Y,YAW with degrees, for instance 14,-3 or 14,-3,90",
         )
     return [*values[:2], *map(radians, values[2:])]

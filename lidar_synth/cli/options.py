@@ -14,8 +14,12 @@ class Reading(BaseModel):
     """How scans are read: the options of every command that opens a path."""
 
     layout: str | None = Field(None, description="layout of the input [detected]")
-    split: str | None = Field(None, description="split of the input, for instance r2flow/train")
-    fields: int | None = Field(None, description="floats per point in plain .bin files [4]")
+    split: str | None = Field(
+        None, description="split of the input, for instance r2flow/train"
+    )
+    fields: int | None = Field(
+        None, description="floats per point in plain .bin files [4]"
+    )
     reflectance_max: float | None = Field(
         None,
         description="highest reflectance value in plain files, for instance 255 "
@@ -50,9 +54,13 @@ def options_from(
         parameters = []
         for parameter in inspect.signature(command).parameters.values():
             if parameter.kind is not inspect.Parameter.VAR_KEYWORD:
-                parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+                parameters.append(
+                    parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+                )
             if parameter.name == after:
-                parameters += [_option(name, field) for name, field in kind.model_fields.items()]
+                parameters += [
+                    _option(name, field) for name, field in kind.model_fields.items()
+                ]
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return command
 
@@ -61,11 +69,15 @@ def options_from(
 
 def _option(name: str, field: FieldInfo) -> inspect.Parameter:
     """One field as a parameter that typer reads."""
-    text = f"{field.description}" + ("" if field.default is None else f" [{field.default}]")
+    text = f"{field.description}" + (
+        "" if field.default is None else f" [{field.default}]"
+    )
     base = _base_type(field.annotation)
     annotation: Any
     if base is tuple:
-        annotation = Annotated[Any, typer.Option(help=text, parser=_names, metavar="NAME,...")]
+        annotation = Annotated[
+            Any, typer.Option(help=text, parser=_names, metavar="NAME,...")
+        ]
     else:
         annotation = Annotated[base | None, typer.Option(help=text)]
     return inspect.Parameter(
@@ -78,7 +90,9 @@ def _base_type(annotation: Any) -> Any:
     origin = get_origin(annotation)
     arguments = get_args(annotation)
     if origin in (Union, UnionType):
-        return _base_type(next(argument for argument in arguments if argument is not NoneType))
+        return _base_type(
+            next(argument for argument in arguments if argument is not NoneType)
+        )
     if origin is Annotated:
         return _base_type(arguments[0])
     return str if origin is Literal else origin or annotation

@@ -15,7 +15,8 @@ def sample(
     ] = "town",
     count: Annotated[int, typer.Option(min=1, help="number of scans")] = 16,
     seed: Annotated[
-        int, typer.Option(min=0, help="scan i is a function of the model, the seed and i")
+        int,
+        typer.Option(min=0, help="scan i is a function of the model, the seed and i"),
     ] = 0,
     steps: Annotated[
         int | None, typer.Option(min=1, help="number of steps [the model's own]")
@@ -34,11 +35,14 @@ def sample(
         str | None, typer.Option(help="layout of that dataset [detected]")
     ] = None,
     condition_split: Annotated[
-        str | None, typer.Option(help="split of that dataset, for instance r2flow/train")
+        str | None,
+        typer.Option(help="split of that dataset, for instance r2flow/train"),
     ] = None,
     guidance: Annotated[
         float,
-        typer.Option(min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance"),
+        typer.Option(
+            min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance"
+        ),
     ] = 1.0,
     to: Annotated[
         str,
@@ -49,15 +53,19 @@ def sample(
             )
         ),
     ] = "npz",
-    device: Annotated[str, typer.Option(help="device of the network: cpu | cuda")] = "cpu",
+    device: Annotated[
+        str, typer.Option(help="device of the network: cpu | cuda")
+    ] = "cpu",
     dtype: Annotated[
-        str, typer.Option(help="data type of the network's computation: float32 | bfloat16")
+        str,
+        typer.Option(help="data type of the network's computation: float32 | bfloat16"),
     ] = "float32",
     batch: Annotated[
         int | None, typer.Option(min=1, help="scans per batch; limits the memory")
     ] = None,
     columns: Annotated[
-        int | None, typer.Option(help="columns of the scans, for models that know several")
+        int | None,
+        typer.Option(help="columns of the scans, for models that know several"),
     ] = None,
 ) -> None:
     """Generates scans and writes them in any format. Run it again to resume an interrupted run.
@@ -83,8 +91,12 @@ def sample(
     from lidar_synth.generate.loading import load_generator
 
     writer = choose("--to", to, WRITERS)(out)
-    precision = choose("dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16})
-    generator = load_generator(model, device=device, dtype=precision, batch=batch, columns=columns)
+    precision = choose(
+        "dtype", dtype, {"float32": torch.float32, "bfloat16": torch.bfloat16}
+    )
+    generator = load_generator(
+        model, device=device, dtype=precision, batch=batch, columns=columns
+    )
     given = conditions_for(generator, condition, condition_layout, condition_split)
     settings = {
         "checkpoint": generator.hash,
@@ -118,4 +130,6 @@ def sample(
                     writer.write(scan, index)
                 bar.update(len(indices))
         writer.finish()
-    typer.echo(f"{out}: {len(missing)} scans written, {count - len(missing)} were there already")
+    typer.echo(
+        f"{out}: {len(missing)} scans written, {count - len(missing)} were there already"
+    )

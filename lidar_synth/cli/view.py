@@ -15,16 +15,20 @@ if TYPE_CHECKING:
 
 @options_from(Reading, after="sensor")
 def view(
-    path: Annotated[Path, typer.Argument(help="file, folder, root of a dataset, or bank")],
+    path: Annotated[
+        Path, typer.Argument(help="file, folder, root of a dataset, or bank")
+    ],
     index: Annotated[
         int, typer.Option(help="number of the first scan, from 0; -1 is the last one")
     ] = 0,
     count: Annotated[int, typer.Option(min=1, max=256, help="number of scans")] = 1,
     out: Annotated[
-        Path | None, typer.Option(help="file to write: .png (sheet) or .html (interactive page)")
+        Path | None,
+        typer.Option(help="file to write: .png (sheet) or .html (interactive page)"),
     ] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="sensor: a preset or a YAML file [named by the files]")
+        str | None,
+        typer.Option(help="sensor: a preset or a YAML file [named by the files]"),
     ] = None,
     **reading: Any,
 ) -> None:
@@ -45,7 +49,9 @@ def view(
 
     if out is not None:
         view_suffix(out)
-    scans = _read(open_scans(path, sensor=sensor, **drop_missing(reading)), index, count)
+    scans = _read(
+        open_scans(path, sensor=sensor, **drop_missing(reading)), index, count
+    )
     if out is None:
         if show(scans, title=str(path)):
             return
@@ -65,7 +71,10 @@ def _read(source: "ScanFiles", index: int, count: int) -> "list[Scan]":
     first = index + len(source) if index < 0 else index
     if not 0 <= first < len(source):
         raise ConfigError(
-            f"--index {index}: {source.root} holds {len(source)} scans", f"0 .. {len(source) - 1}"
+            f"--index {index}: {source.root} holds {len(source)} scans",
+            f"0 .. {len(source) - 1}",
         )
     chosen = range(first, min(first + count, len(source)))
-    return [source[i] for i in tqdm(chosen, "reading", unit="scan", disable=len(chosen) < 8)]
+    return [
+        source[i] for i in tqdm(chosen, "reading", unit="scan", disable=len(chosen) < 8)
+    ]

@@ -127,7 +127,9 @@ class Taxonomy:
         table[list(self.to_train)] = list(self.to_train.values())
         return table
 
-    def decode(self, ids: NDArray[np.integer], where: str = "the labels") -> NDArray[np.uint8]:
+    def decode(
+        self, ids: NDArray[np.integer], where: str = "the labels"
+    ) -> NDArray[np.uint8]:
         """Map the dataset's class ids to train ids.
 
         Args:
@@ -144,7 +146,9 @@ class Taxonomy:
         ids = np.asarray(ids)
         if ids.dtype != np.uint16:
             inside = (ids >= 0) & (ids < len(self._table))
-            train = np.where(inside, self._table[np.where(inside, ids, 0)], np.int16(-1))
+            train = np.where(
+                inside, self._table[np.where(inside, ids, 0)], np.int16(-1)
+            )
         else:
             train = self._table[ids]
         unknown = train < 0
@@ -167,19 +171,23 @@ class Taxonomy:
         """
         if self.from_train is None:
             raise DataError(
-                f"no table from train ids to {self.name}", f"one of {', '.join(FILE_CLASSES)}"
+                f"no table from train ids to {self.name}",
+                f"one of {', '.join(FILE_CLASSES)}",
             )
         table = np.zeros(256, np.uint32)
         table[: len(NAMES)] = self.from_train
         bad = (train >= len(NAMES)) & (train != IGNORE)
         if bad.any():
             raise DataError(
-                f"train ids {np.unique(train[bad])[:8].tolist()}", "0..18, or 255 = ignore"
+                f"train ids {np.unique(train[bad])[:8].tolist()}",
+                "0..18, or 255 = ignore",
             )
         return table[train]
 
 
-def _by_name(table: Mapping[str, tuple[int, ...]], known: Iterable[int]) -> dict[int, int]:
+def _by_name(
+    table: Mapping[str, tuple[int, ...]], known: Iterable[int]
+) -> dict[int, int]:
     """{id: train id} from {class name: ids}; the ids of ``known`` that no class names are
     ignored."""
     ids = dict.fromkeys(known, IGNORE)

@@ -93,7 +93,9 @@ class Recordings:
         joined = dict(self.drives)
         for key, frames in other.drives.items():
             own = joined.get(key, ())
-            joined[key] = None if frames is None or own is None else _merged([*own, *frames])
+            joined[key] = (
+                None if frames is None or own is None else _merged([*own, *frames])
+            )
         return Recordings(joined)
 
     def __and__(self, other: "Recordings") -> "Recordings":
@@ -102,12 +104,16 @@ class Recordings:
             for key in self.drives
             if key in other.drives
         }
-        return Recordings({key: frames for key, frames in shared.items() if frames != ()})
+        return Recordings(
+            {key: frames for key, frames in shared.items() if frames != ()}
+        )
 
     def __str__(self) -> str:
         named = [
             f"{dataset} {drive} ({_in_words(frames)})"
-            for (dataset, drive), frames in sorted(self.drives.items(), key=lambda d: d[0])
+            for (dataset, drive), frames in sorted(
+                self.drives.items(), key=lambda d: d[0]
+            )
         ]
         more = f" and {len(named) - _SHOWN} more drives" if len(named) > _SHOWN else ""
         return ", ".join(named[:_SHOWN]) + more
@@ -120,7 +126,9 @@ class Recordings:
             values.setdefault(dataset, {})[drive] = (
                 None if frames is None else [list(run) for run in frames]
             )
-        return [{"dataset": dataset, "drives": drives} for dataset, drives in values.items()]
+        return [
+            {"dataset": dataset, "drives": drives} for dataset, drives in values.items()
+        ]
 
     @classmethod
     def from_list(cls, values: Any) -> "Recordings":
@@ -143,7 +151,8 @@ class Recordings:
             )
         except (TypeError, KeyError, ValueError, AttributeError) as error:
             raise DataError(
-                f"recordings {str(values)[:200]} ({error!r})", "datasets, their drives and frames"
+                f"recordings {str(values)[:200]} ({error!r})",
+                "datasets, their drives and frames",
             ) from error
 
 

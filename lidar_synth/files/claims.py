@@ -3,13 +3,13 @@ others."""
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.files.disk import read_text, write_file
-from lidar_synth.files.lock import lock_shared, try_lock
+from lidar_synth.files.disk import read_text, unwritable, write_file
+from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import parse_json
 
 
@@ -32,7 +32,9 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
         # Another process may create it at the same time.
         write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
     existing = parse_json(
-        read_text(path), f"{path}, which is damaged,", "the settings that this package wrote"
+        read_text(path),
+        f"{path}, which is damaged,",
+        "the settings that this package wrote",
     )
     if not isinstance(existing, dict):
         raise DataError(
@@ -40,7 +42,9 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
             hint="Choose another output folder.",
         )
     other = {
-        name: existing[name] for name, value in wanted.items() if existing.get(name, value) != value
+        name: existing[name]
+        for name, value in wanted.items()
+        if existing.get(name, value) != value
     }
     if other:
         raise ConfigError(
@@ -52,43 +56,55 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
 
 @contextmanager
 def hold_claim(path: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """``claim`` a folder for the block, and take the claim back if the block has written nothing,
-    so that the corrected call may use the folder.
-
-    A claim that was there before is left alone: it may be that of a process that has not written
-    its first file yet.
+    """``claim`` a folder, keep other processes out of it until the block ends, and take
+    the claim back if the block has written nothing, so that the corrected call may use
+    the folder.
 
     Raises:
-        ConfigError, DataError, FileError: as ``claim``.
+        ConfigError, DataError, FileError: as ``claim`` and ``hold_writing``.
     """
     first = not path.is_file()
     claim(path, settings)
-    try:
-        with hold_writing(path):
+    with hold_writing(path):
+        try:
             yield
-        if not _alone(path):
-            # Again: the process that came first may have written nothing and taken it back.
-            claim(path, settings)
-    finally:
-        if first and _alone(path):
-            path.unlink(missing_ok=True)
+        finally:
+            if first and _alone(path):
+                path.unlink(missing_ok=True)
 
 
 @contextmanager
 def hold_writing(path: Path) -> Iterator[None]:
-    """Write into a claimed folder; the last of several runs removes the temporary files that killed
-    ones left.
+    """Write into a claimed folder, which other processes may not do until the block ends:
+    files of the whole folder are gathered from notes that the last one would remove.
+
+    Temporary files that killed runs left are removed.
 
     Args:
         path: the file of the claim.
+
+    Raises:
+        ConfigError: if another process writes into the folder.
+        FileError: if the claim cannot be opened for writing.
     """
-    with lock_shared(path):
-        yield
-    with try_lock(path) as exclusive:
-        for part in path.parent.rglob(".*.part") if exclusive else ():
+    with ExitStack() as held:
+        try:
+            alone = held.enter_context(one_writer(path))
+        except OSError as error:
+            raise unwritable(path, error) from error
+        if not alone:
+            raise ConfigError(
+                f"{path.parent}, in which another process works",
+                "a folder for this process",
+                "Wait for it, or choose another folder.",
+            )
+        for part in path.parent.rglob(".*.part"):
             part.unlink(missing_ok=True)
+        yield
 
 
 def _alone(path: Path) -> bool:
     """Whether there is no other file in the folder of a file, and below."""
-    return not any(other.is_file() and other != path for other in path.parent.rglob("*"))
+    return not any(
+        other.is_file() and other != path for other in path.parent.rglob("*")
+    )

@@ -79,12 +79,7 @@ def write_file(
         if overwrite or not _linked(part, path):
             part.replace(path)
     except OSError as error:
-        raise FileError(
-            f"{path} cannot be written ({error.strerror or error})",
-            "a writable folder on a disk with free space",
-            "Choose another output folder or free some space, then run the same again: complete "
-            "files are kept.",
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -141,7 +136,9 @@ def read_start(path: Path, size: int) -> str:
         raise unreadable(path, error) from error
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+def write_arrays(
+    path: Path, arrays: Mapping[str, Any], *, compressed: bool = False
+) -> None:
     """Write an ``.npz`` file that is the same with every version of numpy; nothing is pickled.
 
     Raises:
@@ -151,7 +148,8 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     values = {name: np.asanyarray(array) for name, array in arrays.items()}
     if objects := [name for name, array in values.items() if array.dtype.hasobject]:
         raise DataError(
-            f"arrays {objects} of Python objects for {path}", "numbers, truth values or text"
+            f"arrays {objects} of Python objects for {path}",
+            "numbers, truth values or text",
         )
     save = np.savez_compressed if compressed else np.savez
     write_file(path, lambda file: save(file, **values))
@@ -176,9 +174,21 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def unreadable(path: Path, error: OSError, expected: str = "a file of the dataset") -> FileError:
+def unreadable(
+    path: Path, error: OSError, expected: str = "a file of the dataset"
+) -> FileError:
     """The error for a path that cannot be read."""
     return FileError(f"{path} cannot be read ({error.strerror or error})", expected)
+
+
+def unwritable(path: Path, error: OSError) -> FileError:
+    """The error for a path that cannot be written."""
+    return FileError(
+        f"{path} cannot be written ({error.strerror or error})",
+        "a writable folder on a disk with free space",
+        "Choose another output folder or free some space, then run the same again: complete "
+        "files are kept.",
+    )
 
 
 def join_inside(folder: Path, name: str) -> Path:
@@ -209,7 +219,10 @@ def _name_fault(name: str) -> str:
         return "it is an absolute path, or has a backslash"
     if any(part.startswith(".") or not part for part in parts):
         return "a part of it is empty, or begins with a dot"
-    if len(name.encode()) > 1000 or max(len(part.encode()) for part in parts) > LONGEST_NAME:
+    if (
+        len(name.encode()) > 1000
+        or max(len(part.encode()) for part in parts) > LONGEST_NAME
+    ):
         return f"it is longer than 1000 bytes, or one of its parts than {LONGEST_NAME}"
     if os.name == "nt" and any(_NOT_ON_WINDOWS.search(part) for part in parts):
         return "Windows has another meaning for it"
@@ -243,7 +256,9 @@ def list_files(folder: Path, *suffixes: str) -> list[Path]:
     """
     try:
         names = sorted(
-            e.name for e in os.scandir(folder) if e.name.endswith(suffixes) and e.name[0] != "."
+            e.name
+            for e in os.scandir(folder)
+            if e.name.endswith(suffixes) and e.name[0] != "."
         )
     except OSError as error:
         raise FileError(
@@ -263,7 +278,9 @@ def read_values(path: Path, dtype: str) -> NDArray[Any]:
     width = np.dtype(dtype).itemsize
     if len(content) % width:
         raise DataError(
-            f"{path} is {len(content)} bytes long", f"a multiple of {width} ({dtype})", SKIP_HINT
+            f"{path} is {len(content)} bytes long",
+            f"a multiple of {width} ({dtype})",
+            SKIP_HINT,
         )
     return np.frombuffer(content, dtype)
 
@@ -280,7 +297,9 @@ def read_text(
     try:
         return read_file(path, expected, at_most).decode()
     except UnicodeDecodeError as error:
-        raise DataError(f"{path} is not a text file ({error.reason})", "UTF-8 text") from error
+        raise DataError(
+            f"{path} is not a text file ({error.reason})", "UTF-8 text"
+        ) from error
 
 
 def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
@@ -297,7 +316,8 @@ def read_matrix(path: Path, columns: int) -> NDArray[np.float64]:
         return np.array(rows, np.float64).reshape(-1, columns)
     except ValueError as error:
         raise DataError(
-            f"{path} does not hold rows of {columns} numbers", f"{columns} numbers per line"
+            f"{path} does not hold rows of {columns} numbers",
+            f"{columns} numbers per line",
         ) from error
 
 
@@ -329,14 +349,17 @@ def read_named_matrices(path: Path) -> dict[str, NDArray[np.float64]]:
     return matrices
 
 
-def write_named_matrices(path: Path, matrices: Mapping[str, NDArray[np.float64]]) -> None:
+def write_named_matrices(
+    path: Path, matrices: Mapping[str, NDArray[np.float64]]
+) -> None:
     """The inverse of ``read_named_matrices``, with KITTI's 12 decimals.
 
     Raises:
         FileError: if it cannot be written.
     """
     lines = [
-        f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n" for name, m in matrices.items()
+        f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(m))}\n"
+        for name, m in matrices.items()
     ]
     write_file(path, "".join(lines).encode())
 
@@ -353,7 +376,9 @@ def png_size(path: Path) -> tuple[int, int] | None:
         return None
     width, height = np.frombuffer(header[16:], ">u4").tolist()
     return (
-        (width, height) if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE else None
+        (width, height)
+        if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE
+        else None
     )
 
 

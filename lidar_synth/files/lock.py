@@ -1,9 +1,10 @@
 """A lock on a file, which the system releases when its process ends or is killed.
 
-Processes that work in one folder hold the lock together (``lock_shared``); only a process that holds it
-exclusively (``try_lock``) removes leftover files. The lock is flock; over NFS, a lock on the server.
-On a file system without locks nothing is ever removed. On Windows every process counts as
-exclusive: an open file cannot be removed there.
+Most commands write a folder alone (``one_writer``). Bakers that work in one folder hold
+the lock together (``lock_shared``); only a process that holds it exclusively
+(``try_lock``) removes leftover files. The lock is flock; over NFS, a lock on the
+server. On a file system without locks nothing is ever removed. On Windows every process
+counts as exclusive: an open file cannot be removed there.
 """
 
 import sys

@@ -74,7 +74,9 @@ def parse_json(text: str | bytes, where: str, expected: str = "JSON") -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"{where} is not JSON ({type(error).__name__}: {error})", expected, SKIP_HINT
+            f"{where} is not JSON ({type(error).__name__}: {error})",
+            expected,
+            SKIP_HINT,
         ) from error
 
 
@@ -91,7 +93,9 @@ def read_facts(path: Path, expected: str) -> dict[str, Any]:
     """
     facts = parse_json(read_text(path, expected), str(path), expected)
     if not isinstance(facts, dict):
-        raise DataError(f"{path} is damaged (it holds {type(facts).__name__})", expected)
+        raise DataError(
+            f"{path} is damaged (it holds {type(facts).__name__})", expected
+        )
     return facts
 
 
@@ -206,10 +210,15 @@ def read_arrays(
         return {"array": parse_npy(content, str(path))}
     members = _unzip(content, str(path), only, most)
     members.pop(STRAY, None)
-    return {name: parse_npy(member, f"{path}, array {name!r}") for name, member in members.items()}
+    return {
+        name: parse_npy(member, f"{path}, array {name!r}")
+        for name, member in members.items()
+    }
 
 
-def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) -> dict[str, bytes]:
+def _unzip(
+    content: bytes, where: str, only: Collection[str] | None, most: int
+) -> dict[str, bytes]:
     """{name without .npy: bytes} of a ZIP file's members."""
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
@@ -220,9 +229,13 @@ def _unzip(content: bytes, where: str, only: Collection[str] | None, most: int) 
                 name = info.filename.removesuffix(".npy")
                 if only is None or name in only:
                     with archive.open(info) as file:
-                        members[name] = file.read(info.file_size)  # read() alone has no limit
+                        members[name] = file.read(
+                            info.file_size
+                        )  # read() alone has no limit
     except DAMAGED_ZIP as error:
-        raise DataError(f"{where}: {error or type(error).__name__}", ARRAYS, SKIP_HINT) from error
+        raise DataError(
+            f"{where}: {error or type(error).__name__}", ARRAYS, SKIP_HINT
+        ) from error
     if fault:
         raise DataError(f"{where} {fault}", ARRAYS, SKIP_HINT)
     return members
@@ -233,9 +246,14 @@ def zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
     names = [info.filename for info in infos]
     if len(set(names)) < len(names):
         return "holds two arrays of one name"
-    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
+    if any(
+        info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+        for info in infos
+    ):
         return "is compressed by another method than deflate"
-    deflated = sum(info.file_size for info in infos if info.compress_type == zipfile.ZIP_DEFLATED)
+    deflated = sum(
+        info.file_size for info in infos if info.compress_type == zipfile.ZIP_DEFLATED
+    )
     stored = sum(info.file_size for info in infos) - deflated
     if deflated > most or stored > size:
         return (
@@ -276,8 +294,12 @@ def parse_npy(content: bytes, where: str) -> NDArray[Any]:
     dtype = _TYPE.fullmatch(found["descr"] or "") if found else None
     if found is None or dtype is None or None in (found["fortran"], found["shape"]):
         raise DataError(f"{where} holds {header[:200]}", ARRAYS, SKIP_HINT)
-    shape = tuple(int(length) for length in found["shape"].replace("L", "").split(",") if length)
-    return _array(content, start, np.dtype(dtype[0]), shape, found["fortran"] == "True", where)
+    shape = tuple(
+        int(length) for length in found["shape"].replace("L", "").split(",") if length
+    )
+    return _array(
+        content, start, np.dtype(dtype[0]), shape, found["fortran"] == "True", where
+    )
 
 
 def _array(
@@ -340,8 +362,12 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
         Image.DecompressionBombError,
     ) as error:
         raise DataError(
-            f"{path} cannot be read ({error or type(error).__name__})", expected, SKIP_HINT
+            f"{path} cannot be read ({error or type(error).__name__})",
+            expected,
+            SKIP_HINT,
         ) from error
     raise DataError(
-        f"{path} has {size} columns and rows", f"at most {MOST_PIXELS} pixels", SKIP_HINT
+        f"{path} has {size} columns and rows",
+        f"at most {MOST_PIXELS} pixels",
+        SKIP_HINT,
     )

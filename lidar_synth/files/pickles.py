@@ -30,7 +30,9 @@ DTYPE = "numpy.dtype"
 ENCODE = "_codecs.encode"
 """Names of the calls with which numpy writes types, and protocol 2 bytes."""
 
-TYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"))
+TYPES = frozenset(
+    ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+)
 """Types of arrays of numbers; arrays of objects (``O8``) may hold text, numbers, truth values and
 None."""
 
@@ -90,7 +92,9 @@ def parse_pickle(
     try:
         for step, (opcode, argument, _) in enumerate(pickletools.genops(content)):
             if step >= most:
-                raise DataError(f"{where} has more than {most} opcodes", expected, SKIP_HINT)
+                raise DataError(
+                    f"{where} has more than {most} opcodes", expected, SKIP_HINT
+                )
             machine.run(opcode.name, argument)
         [value] = machine.stack if not machine.below else []
     except _Unknown as error:
@@ -105,7 +109,9 @@ def parse_pickle(
     except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"{where} is a truncated or damaged pickle", expected, SKIP_HINT) from error
+        raise DataError(
+            f"{where} is a truncated or damaged pickle", expected, SKIP_HINT
+        ) from error
     return value
 
 
@@ -119,7 +125,9 @@ def dtype_of(value: Any) -> "np.dtype[Any]":
         raise TypeError(f"a {type(value).__name__} instead of {DTYPE}")
     [text, *_] = value.args
     _, order, *structure = value.state
-    if order not in ("<", ">", "|", "=") or any(part is not None for part in structure[:3]):
+    if order not in ("<", ">", "|", "=") or any(
+        part is not None for part in structure[:3]
+    ):
         raise ValueError("an array of structures")
     if text in ("O8", "O4", "O"):
         return np.dtype(object)
@@ -252,7 +260,9 @@ class _OpenMachine(_Machine):
         self.call_of(name, args if isinstance(args, tuple) else ())
 
     def call_of(self, name: Any, args: Any) -> None:
-        self.stack.append(Call(name.text if isinstance(name, Name) else _text(name), tuple(args)))
+        self.stack.append(
+            Call(name.text if isinstance(name, Name) else _text(name), tuple(args))
+        )
 
     def call_since_mark(self, name: Any) -> None:
         name, *args = (
@@ -279,7 +289,11 @@ class _OpenMachine(_Machine):
 
 def _key(value: Any) -> Any:
     """A key for a dictionary: a plain value as it is, and text for a class or an object."""
-    return value if value is None or isinstance(value, str | int | float | bytes) else _text(value)
+    return (
+        value
+        if value is None or isinstance(value, str | int | float | bytes)
+        else _text(value)
+    )
 
 
 def _text(value: Any) -> str:

@@ -86,7 +86,13 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 def command_of(values: Collection[str]) -> str:
     """The command that runs a recipe with these keys: "bake", "distill" or "train"."""
-    return "bake" if "recipe" not in values else "distill" if "teacher" in values else "train"
+    return (
+        "bake"
+        if "recipe" not in values
+        else "distill"
+        if "teacher" in values
+        else "train"
+    )
 
 
 def published() -> Iterator[Listed]:
@@ -132,16 +138,24 @@ def _base(path: Path, name: Any) -> Path:
     for candidate in (folder() / "base" / f"{name}.yaml", folder() / f"{name}.yaml"):
         if candidate.is_file() and candidate != path:
             return candidate
-    raise ConfigError(f"{path}: base {name!r}", f"a file beside it, or a recipe of {folder()}")
+    raise ConfigError(
+        f"{path}: base {name!r}", f"a file beside it, or a recipe of {folder()}"
+    )
 
 
 def read_file(path: Path) -> dict[str, Any]:
     """The keys and values of one file, without its bases; raises as ``read_recipe``."""
-    values = read_yaml(path, "a configuration; lidar-synth recipes lists the published ones")
+    values = read_yaml(
+        path, "a configuration; lidar-synth recipes lists the published ones"
+    )
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__}", "keys and values")
     sensor = values.get("sensor")
-    if isinstance(sensor, str) and sensor.endswith(SUFFIXES) and (path.parent / sensor).is_file():
+    if (
+        isinstance(sensor, str)
+        and sensor.endswith(SUFFIXES)
+        and (path.parent / sensor).is_file()
+    ):
         values["sensor"] = str(path.parent / sensor)
     return values
 
@@ -182,6 +196,10 @@ def _first(kind: type[BaseModel], error: ValidationError) -> str:
 def _keys(kind: Any, path: Sequence[int | str]) -> list[str]:
     """Names of the fields at a place of the configuration."""
     for level in path:
-        fields = getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
+        fields = getattr(kind, "model_fields", None) or getattr(
+            kind, "__pydantic_fields__", {}
+        )
         kind = fields[level].annotation
-    return list(getattr(kind, "model_fields", None) or getattr(kind, "__dataclass_fields__", {}))
+    return list(
+        getattr(kind, "model_fields", None) or getattr(kind, "__dataclass_fields__", {})
+    )

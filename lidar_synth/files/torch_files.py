@@ -21,7 +21,14 @@ from torch import Tensor
 
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.parsing import DAMAGED_ZIP, DEEPEST, zip_fault
-from lidar_synth.files.pickles import PERSISTENT, Call, Name, bytes_of, dtype_of, parse_pickle
+from lidar_synth.files.pickles import (
+    PERSISTENT,
+    Call,
+    Name,
+    bytes_of,
+    dtype_of,
+    parse_pickle,
+)
 
 MOST_PICKLE = 64 << 20
 """Maximum size of the pickle in bytes, without the tensors' values."""
@@ -53,7 +60,14 @@ _NUMBERS = {f"numpy.{core}.multiarray.scalar" for core in ("core", "_core")}
 _FAULTS = (*DAMAGED_ZIP, LookupError, TypeError, AttributeError, MemoryError)
 """What a damaged file causes: values of other kinds, and storages that are missing or short."""
 
-MISFITS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError)
+MISFITS = (
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+)
 """What values of other kinds than expected cause, in a configuration or in tensors."""
 
 
@@ -78,7 +92,8 @@ def load_pickle(path: Path, peer: str) -> Any:
     except OSError as error:
         kind = path.suffix or "weight"
         raise FileError(
-            f"{path} cannot be read ({error.strerror or error})", f"a {kind} file of {peer}"
+            f"{path} cannot be read ({error.strerror or error})",
+            f"a {kind} file of {peer}",
         ) from error
     with file:
         return unpickle(file, path, peer)
@@ -115,14 +130,16 @@ def state_of(content: Any, key: str, path: Path) -> dict[str, Tensor]:
         isinstance(value, Tensor) for value in weights.values()
     ):
         raise DataError(
-            f"{path}: its weights are not tensors by name", "the state dictionary of a network"
+            f"{path}: its weights are not tensors by name",
+            "the state dictionary of a network",
         )
     names = [str(name).replace("_orig_mod.", "") for name in weights]
     if all(name.startswith("module.") for name in names):
         names = [name.removeprefix("module.") for name in names]
     if len(set(names)) < len(names):
         raise DataError(
-            f"{path}: several of its weights have one name", "the state dictionary of a network"
+            f"{path}: several of its weights have one name",
+            "the state dictionary of a network",
         )
     return dict(zip(names, weights.values(), strict=True))
 
@@ -134,15 +151,25 @@ def _read_zip(file: BinaryIO, where: str) -> Any:
             archive.infolist(), file.seek(0, os.SEEK_END), 0
         ):  # PyTorch does not compress
             raise DataError(f"it {fault}")
-        [main] = [name for name in infos if name.endswith("/data.pkl") and name.count("/") == 1]
+        [main] = [
+            name
+            for name in infos
+            if name.endswith("/data.pkl") and name.count("/") == 1
+        ]
         folder = main.removesuffix("data.pkl")
-        order = archive.read(f"{folder}byteorder") if f"{folder}byteorder" in infos else b"little"
+        order = (
+            archive.read(f"{folder}byteorder")
+            if f"{folder}byteorder" in infos
+            else b"little"
+        )
         if order != b"little" or infos[main].file_size > MOST_PICKLE:
             raise DataError(
                 f"byte order {order[:10]!r}, or a pickle of more than {MOST_PICKLE} bytes"
             )
         content = parse_pickle(archive.read(main), None, where, "", MOST_STEPS)
-        return _Plain(lambda key, *_: archive.read(f"{folder}data/{key}")).value(content)
+        return _Plain(lambda key, *_: archive.read(f"{folder}data/{key}")).value(
+            content
+        )
 
 
 def _read_pickles(file: BinaryIO, where: str) -> Any:
@@ -204,7 +231,9 @@ class _Plain:
         if isinstance(given, Call):
             return self._object(given, level)
         if isinstance(given, dict):
-            return {_text_of(key): self.value(value, level) for key, value in given.items()}
+            return {
+                _text_of(key): self.value(value, level) for key, value in given.items()
+            }
         return type(given)(self.value(value, level) for value in given)
 
     def _object(self, call: Call, level: int) -> Any:
@@ -213,10 +242,14 @@ class _Plain:
             return self._tensor(*call.args[:4])
         if name in ("_rebuild_parameter", "_rebuild_parameter_with_state"):
             return self.value(call.args[0], level)
-        if name == "torch._tensor._rebuild_from_type_v2":  # a tensor with attributes of its own
+        if (
+            name == "torch._tensor._rebuild_from_type_v2"
+        ):  # a tensor with attributes of its own
             return self.value(Call(_text_of(call.args[0]), call.args[2]), level)
         if name in _NUMBERS:
-            return np.frombuffer(bytes_of(call.args[1]), dtype_of(call.args[0]))[0].item()
+            return np.frombuffer(bytes_of(call.args[1]), dtype_of(call.args[0]))[
+                0
+            ].item()
         if (
             name == "collections.OrderedDict"
         ):  # its state is no part of its items; Python 2 lists the items
@@ -233,11 +266,17 @@ class _Plain:
         if (reference.name, kind) != (PERSISTENT, "storage") or not _are_counts(
             (count, offset, *size, *stride)
         ):
-            raise DataError("a tensor without a storage, or with a size that is no number")
+            raise DataError(
+                "a tensor without a storage, or with a size that is no number"
+            )
         flat = self._storage(key, dtype, count)
-        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+        last = offset + sum(
+            (n - 1) * step for n, step in zip(size, stride, strict=True)
+        )
         if prod(size) > MOST_ELEMENTS or (prod(size) and last >= count):
-            raise DataError(f"a tensor of shape {size} in a storage of {count} elements")
+            raise DataError(
+                f"a tensor of shape {size} in a storage of {count} elements"
+            )
         return flat.as_strided(size, stride, offset)
 
     def _storage(self, key: Any, dtype: torch.dtype, count: int) -> Tensor:

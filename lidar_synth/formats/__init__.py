@@ -136,15 +136,20 @@ def open_scans(
     taken = inspect.signature(reader).parameters
     options: dict[str, Any] = {"sensor": sensor, "split": split}
     if split is not None and "split" not in taken:
-        raise ConfigError(f"split {split!r} of {path}", f"no split: layout {name!r} has none")
+        raise ConfigError(
+            f"split {split!r} of {path}", f"no split: layout {name!r} has none"
+        )
     plain = {"fields": fields, "reflectance_max": reflectance_max}
     if "fields" not in taken and any(v is not None for v in plain.values()):
         wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
         raise ConfigError(
-            f"{wrong} for {path}", f"neither: layout {name!r} has a fixed file format", _AS_FOLDER
+            f"{wrong} for {path}",
+            f"neither: layout {name!r} has a fixed file format",
+            _AS_FOLDER,
         )
     options |= plain
-    return reader(path, on_bad=on_bad, **{k: v for k, v in options.items() if v is not None})  # type: ignore[arg-type]
+    chosen = {name: value for name, value in options.items() if value is not None}
+    return reader(path, on_bad=on_bad, **chosen)  # type: ignore[arg-type]
 
 
 _AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."
@@ -161,7 +166,9 @@ def layout_of(path: Path) -> str:
         raise FileError(
             f"{path} does not exist", "a dataset's root, a folder of scans, or one file"
         )
-    layout = next((name for name, reader in READERS.items() if reader.recognises(path)), None)
+    layout = next(
+        (name for name, reader in READERS.items() if reader.recognises(path)), None
+    )
     if layout is None:
         raise DataError(
             f"{path} holds no scan in a layout that is known",

@@ -11,7 +11,13 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import load_sensor
-from lidar_synth.geometry.transfer import Measurement, Mount, Response, Transfer, Transferred
+from lidar_synth.geometry.transfer import (
+    Measurement,
+    Mount,
+    Response,
+    Transfer,
+    Transferred,
+)
 from lidar_synth.noise import keyed_rng
 
 _SURFACE = 0.1  # metres that returns stick out of their box
@@ -54,14 +60,22 @@ class AsSensor:
         ]
         cast, seen = self.transfer.cast(scan, keyed_rng(0, index), others)
         if cast.boxes is not None:
-            held = cast.boxes.enlarged(_SURFACE).contain(cast.points, above_floor=_FLOOR + _SURFACE)
+            held = cast.boxes.enlarged(_SURFACE).contain(
+                cast.points, above_floor=_FLOOR + _SURFACE
+            )
             cast.boxes = cast.boxes[held.any(axis=1)]
         return Transferred(cast, seen)
 
     def _around(self, source: Source, index: int) -> list[int]:
         """The scans of the same sequence around a scan, without it."""
-        near = range(max(index - self.sweeps, 0), min(index + self.sweeps + 1, len(source)))
-        return [i for i in near if i != index and _sequence(source, i) == _sequence(source, index)]
+        near = range(
+            max(index - self.sweeps, 0), min(index + self.sweeps + 1, len(source))
+        )
+        return [
+            i
+            for i in near
+            if i != index and _sequence(source, i) == _sequence(source, index)
+        ]
 
     def calibration(self, camera: Calibration | None) -> Calibration | None:
         """The camera as seen from the target's mount. The dataset's own matrices hold the recording
@@ -87,7 +101,11 @@ def _sequence(source: Source, index: int) -> str:
 
 
 def make_transfer(
-    sensor: str, mount: tuple[float, float], like: str | Path | None, scans: Any, **measured: Any
+    sensor: str,
+    mount: tuple[float, float],
+    like: str | Path | None,
+    scans: Any,
+    **measured: Any,
 ) -> Transfer:
     """The transfer of scans to a sensor.
 
@@ -129,7 +147,9 @@ def read_transfer(given: Any, scans: Any) -> Any:
         str(key).lower(): value for key, value in given.items()
     }
     mount = values["mount"]
-    numbers = isinstance(mount, list | tuple) and [type(v) in (int, float) for v in mount] == [
+    numbers = isinstance(mount, list | tuple) and [
+        type(v) in (int, float) for v in mount
+    ] == [
         True,
         True,
     ]
@@ -151,4 +171,6 @@ def _some(scans: Any) -> list[Scan]:
     if hasattr(scans, "range_images"):
         return list(scans.scans(0, list(range(4))))
     numbers = sorted({round(k * (len(scans) - 1) / 9) for k in range(10)})
-    return [scans.load(i) if isinstance(scans, ScanFiles) else scans[i] for i in numbers]
+    return [
+        scans.load(i) if isinstance(scans, ScanFiles) else scans[i] for i in numbers
+    ]

@@ -39,9 +39,12 @@ class BankScans(ScanFiles):
         self.bank = Bank(root)
         if sensor is not None and load_sensor(sensor).shape != self.bank.sensor.shape:
             raise ConfigError(
-                f"sensor {sensor} for {root}", f"{self.bank.sensor.name!r}, whose scans it holds"
+                f"sensor {sensor} for {root}",
+                f"{self.bank.sensor.name!r}, whose scans it holds",
             )
-        super().__init__(Path(root), self.bank.ids, None, on_bad, stored=self.bank.sensor)
+        super().__init__(
+            Path(root), self.bank.ids, None, on_bad, stored=self.bank.sensor
+        )
 
     def read(self, index: int) -> Scan:
         return self.bank[index]

@@ -41,7 +41,8 @@ class Calibration:
             value = np.asarray(getattr(self, name), np.float64)
             if value.shape != shape or not np.isfinite(value).all():
                 raise DataError(
-                    f"calibration: {name} of shape {value.shape}", f"{shape}, all values finite"
+                    f"calibration: {name} of shape {value.shape}",
+                    f"{shape}, all values finite",
                 )
             object.__setattr__(self, name, value)
         check_rigid(self.camera_from_sensor, "calibration: camera_from_sensor")
@@ -78,7 +79,9 @@ class Calibration:
         homogeneous = np.asarray(points, np.float64) @ matrix[:, :3].T + matrix[:, 3]
         depth = homogeneous[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = np.where(depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan)
+            pixels = np.where(
+                depth[:, None] > 0, homogeneous[:, :2] / depth[:, None], np.nan
+            )
         return pixels, depth
 
 
@@ -95,7 +98,9 @@ def check_rigid(transforms: Matrix, where: str) -> None:
     """
     rotations = transforms[..., :3, :3].reshape(-1, 3, 3)
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
+        off = np.abs(rotations @ rotations.swapaxes(-1, -2) - np.eye(3)).max(
+            axis=(1, 2), initial=0
+        )
         sound = (off < NOT_RIGID) & (np.linalg.det(rotations) > 0)
     sound &= np.isfinite(transforms).all(axis=(-1, -2)).reshape(-1)
     if not sound.all():
@@ -116,7 +121,9 @@ def read_image_size(values: Matrix, where: str) -> tuple[int, int]:
     """
     if (
         values.shape != (2,)
-        or not ((values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))).all()
+        or not (
+            (values >= 1) & (values <= LARGEST_IMAGE) & (values == np.rint(values))
+        ).all()
     ):
         raise DataError(
             f"{where}: an image of {values.tolist()} pixels",
@@ -148,5 +155,7 @@ def ideal_camera(focal: float, image_size: tuple[int, int]) -> Calibration:
         image_size: (width, height) in pixels; the principal point is the centre.
     """
     width, height = image_size
-    projection = np.array([(focal, 0, width / 2, 0), (0, focal, height / 2, 0), (0, 0, 1, 0)])
+    projection = np.array(
+        [(focal, 0, width / 2, 0), (0, focal, height / 2, 0), (0, 0, 1, 0)]
+    )
     return Calibration(projection, AXES_CAMERA_FROM_SENSOR, image_size)

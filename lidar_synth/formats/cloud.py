@@ -82,7 +82,9 @@ def size_error(where: str, held: int, wanted: int, unit: str = "bytes") -> DataE
     """The error for a file whose size does not match its header."""
     given = "is truncated" if held < wanted else "holds more than its header declares"
     return DataError(
-        f"{where} {given}: {held} {unit} of points", f"{wanted}, by its header", SKIP_HINT
+        f"{where} {given}: {held} {unit} of points",
+        f"{wanted}, by its header",
+        SKIP_HINT,
     )
 
 
@@ -125,7 +127,9 @@ def check_fields(fields: Sequence[Field], count: int, where: str) -> None:
         raise DataError(f"{where} holds no points", "at least one point", SKIP_HINT)
 
 
-def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, NDArray[Any]]:
+def from_records(
+    body: bytes, fields: Sequence[Field], count: int
+) -> dict[str, NDArray[Any]]:
     """{name: (N,)} the wanted fields of points stored as consecutive records; ``body`` must be long
     enough."""
     wanted = []
@@ -135,7 +139,9 @@ def from_records(body: bytes, fields: Sequence[Field], count: int) -> dict[str, 
             wanted.append((field.name, field.type, offset))
         offset += field.width
     names, types, offsets = (list(column) for column in zip(*wanted, strict=True))
-    dtype = np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": offset})
+    dtype = np.dtype(
+        {"names": names, "formats": types, "offsets": offsets, "itemsize": offset}
+    )
     records = np.frombuffer(body, dtype, count)
     return {name: records[name] for name in names}
 
@@ -160,7 +166,9 @@ def from_text(
         ) from error
     if table.shape != (count, columns):
         raise DataError(
-            f"{where} has {table.shape[1]} values in a line", f"{columns}, by its header", SKIP_HINT
+            f"{where} has {table.shape[1]} values in a line",
+            f"{columns}, by its header",
+            SKIP_HINT,
         )
     arrays = {}
     column = 0
@@ -178,9 +186,13 @@ def _typed(values: NDArray[np.float64], field: Field, where: str) -> NDArray[Any
         with np.errstate(over="ignore"):
             return values.astype(dtype)
     limits = np.iinfo(dtype)
-    if not ((values == np.floor(values)) & (values >= limits.min) & (values <= limits.max)).all():
+    if not (
+        (values == np.floor(values)) & (values >= limits.min) & (values <= limits.max)
+    ).all():
         raise DataError(
-            f"{where}: field {field.name!r} holds other values than {dtype}", "integers", SKIP_HINT
+            f"{where}: field {field.name!r} holds other values than {dtype}",
+            "integers",
+            SKIP_HINT,
         )
     return values.astype(dtype)
 
@@ -195,7 +207,9 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         points = np.column_stack([stored[axis] for axis in "xyz"]).astype(np.float32)
         intensity = _first(stored, REFLECTANCES)
         reflectance = (
-            np.zeros(len(points), np.float32) if intensity is None else intensity.astype(np.float32)
+            np.zeros(len(points), np.float32)
+            if intensity is None
+            else intensity.astype(np.float32)
         )
     own = [
         n
@@ -207,14 +221,20 @@ def to_arrays(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     }
     ring = _first(stored, RINGS)
     time = _first(stored, TIMES)
-    if ring is not None and ring.dtype.kind in "iu" and 0 <= ring.min() <= ring.max() < 1 << 15:
+    if (
+        ring is not None
+        and ring.dtype.kind in "iu"
+        and 0 <= ring.min() <= ring.max() < 1 << 15
+    ):
         arrays["ring"] = ring.astype(np.int16)
     if time is not None and "time" not in arrays:
         arrays |= _seconds(time)
     return arrays
 
 
-def _first(stored: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any] | None:
+def _first(
+    stored: Mapping[str, NDArray[Any]], names: Sequence[str]
+) -> NDArray[Any] | None:
     """The first of these fields that a file has."""
     return next((stored[name] for name in names if name in stored), None)
 
@@ -235,9 +255,13 @@ def _seconds(time: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 def to_records(scan: Scan) -> NDArray[np.void]:
     """The points of a scan as consecutive records; ``to_arrays`` is the inverse."""
-    values = dict(zip("xyz", scan.points.T, strict=True)) | {"intensity": scan.reflectance}
+    values = dict(zip("xyz", scan.points.T, strict=True)) | {
+        "intensity": scan.reflectance
+    }
     values |= {
-        name: array.astype(STORED[name]) for name, array in scan.fields().items() if name in STORED
+        name: array.astype(STORED[name])
+        for name, array in scan.fields().items()
+        if name in STORED
     }
     records = np.empty(len(scan), [(name, STORED.get(name, "<f4")) for name in values])
     for name, array in values.items():

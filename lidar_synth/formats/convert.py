@@ -183,7 +183,9 @@ def _count(report: Report, done: Outcome, name: str) -> None:
 def _change(as_sensor: AsSensor | Transfer | Sensor | None) -> AsSensor | None:
     if isinstance(as_sensor, AsSensor | None):
         return as_sensor
-    return AsSensor(as_sensor if isinstance(as_sensor, Transfer) else Transfer(as_sensor))
+    return AsSensor(
+        as_sensor if isinstance(as_sensor, Transfer) else Transfer(as_sensor)
+    )
 
 
 def _compare(source: Source, writer: Writer, on_bad: OnBad) -> tuple[list[int], Report]:
@@ -306,7 +308,10 @@ def _settings(
         "unfold": unfold,
     }
     if isinstance(source, ScanFiles):
-        settings |= {"root": str(source.root.resolve()), "sensor": source.sensor.to_dict()}
+        settings |= {
+            "root": str(source.root.resolve()),
+            "sensor": source.sensor.to_dict(),
+        }
         settings["names"] = hash_of_names(source.ids)
         settings["options"] = source.options
     return settings | {"as_sensor": None if change is None else change.identity}

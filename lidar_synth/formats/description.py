@@ -57,7 +57,14 @@ _OF_A_LAYOUT = re.compile(
     r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
 )
 
-_OF_A_DATASET = ("data_3d_raw", "sequences", "training", "testing", "velodyne", "velodyne_points")
+_OF_A_DATASET = (
+    "data_3d_raw",
+    "sequences",
+    "training",
+    "testing",
+    "velodyne",
+    "velodyne_points",
+)
 # folders in the root of a dataset, whose other folders are not its own
 
 
@@ -115,7 +122,10 @@ class Description:
             if self.sensor is None
             else {"sensor": self.sensor.to_dict(), "grid": list(self.sensor.shape)}
         )
-        origins = [{"domain": names[origin.domain], **origin.provenance} for origin in self.origins]
+        origins = [
+            {"domain": names[origin.domain], **origin.provenance}
+            for origin in self.origins
+        ]
         return {"format": FORMAT, **sensor, "origins": origins}
 
     @classmethod
@@ -126,10 +136,18 @@ class Description:
             ValueError: on another format, a missing or contradictory value, or one of a wrong type.
         """
         if not isinstance(values, dict) or values.get("format") != FORMAT:
-            given = values.get("format") if isinstance(values, dict) else type(values).__name__
-            raise ValueError(f"its format is {shorten(repr(given), 100)}, not {FORMAT!r}")
+            given = (
+                values.get("format")
+                if isinstance(values, dict)
+                else type(values).__name__
+            )
+            raise ValueError(
+                f"its format is {shorten(repr(given), 100)}, not {FORMAT!r}"
+            )
         sensor = _sensor(values["sensor"]) if "sensor" in values else None
-        if sensor is not None and values.get("grid", list(sensor.shape)) != list(sensor.shape):
+        if sensor is not None and values.get("grid", list(sensor.shape)) != list(
+            sensor.shape
+        ):
             raise ValueError(
                 f"its grid is {shorten(repr(values['grid']), 100)}, but its sensor has "
                 f"{sensor.shape}"
@@ -141,14 +159,24 @@ class Description:
             or not all(isinstance(origin, dict) for origin in origins)
         ):
             raise ValueError("its origins are not a list of mappings")
-        if any(not isinstance(o.get("domain"), str) or o["domain"] not in DOMAINS for o in origins):
-            raise ValueError(f"the domain of an origin is not one of {', '.join(DOMAINS)}")
+        if any(
+            not isinstance(o.get("domain"), str) or o["domain"] not in DOMAINS
+            for o in origins
+        ):
+            raise ValueError(
+                f"the domain of an origin is not one of {', '.join(DOMAINS)}"
+            )
         facts = [
-            {key: value for key, value in origin.items() if key != "domain"} for origin in origins
+            {key: value for key, value in origin.items() if key != "domain"}
+            for origin in origins
         ]
         pairs = zip(origins, facts, strict=True)
         return cls(
-            sensor, tuple(Origin(DOMAINS[o["domain"]], check_provenance(kept)) for o, kept in pairs)
+            sensor,
+            tuple(
+                Origin(DOMAINS[o["domain"]], check_provenance(kept))
+                for o, kept in pairs
+            ),
         )
 
 
@@ -158,7 +186,9 @@ def _sensor(value: Any) -> Sensor:
         return Sensor.from_dict(value)
     if value not in presets():
         hint = suggest(value, presets())
-        raise ValueError(f"sensor {value!r} is no preset ({', '.join(presets())}). {hint}".strip())
+        raise ValueError(
+            f"sensor {value!r} is no preset ({', '.join(presets())}). {hint}".strip()
+        )
     return presets()[value]
 
 
@@ -169,7 +199,9 @@ def check_provenance(values: Any) -> dict[str, Any]:
         ValueError: on anything else.
     """
     if not isinstance(values, dict) or len(values) > _MOST_FACTS:
-        raise ValueError(f"a provenance that is not a mapping of at most {_MOST_FACTS} values")
+        raise ValueError(
+            f"a provenance that is not a mapping of at most {_MOST_FACTS} values"
+        )
     for key, value in values.items():
         texts = [text for text in (key, value) if isinstance(text, str)]
         valid = isinstance(value, str | None) or (
@@ -185,7 +217,9 @@ def check_provenance(values: Any) -> dict[str, Any]:
 def same_grid(a: Sensor, b: Sensor) -> bool:
     """Whether two sensors have the same rows and columns, whatever their names, beams and range
     limits."""
-    return a is b or (a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5)))
+    return a is b or (
+        a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5))
+    )
 
 
 def read_description(root: Path, plain: bool = False) -> Description | None:
@@ -202,7 +236,10 @@ def read_description(root: Path, plain: bool = False) -> Description | None:
     root = root.resolve()
     folder = root.parent if root.is_file() else root
     folders = [folder, *folder.parents][:LEVELS]
-    first = sum(1 for _ in takewhile(lambda each: _OF_A_LAYOUT.fullmatch(each.name), folders[:-1]))
+    first = sum(
+        1
+        for _ in takewhile(lambda each: _OF_A_LAYOUT.fullmatch(each.name), folders[:-1])
+    )
     for each in folders[: first + 1]:
         if (each / NAME).is_file():
             return _current(each / NAME)
@@ -222,7 +259,11 @@ def _above(folders: Sequence[Path]) -> Description | None:
         if path.is_file() and _FORMATS in read_start(
             path, LONGEST
         ):  # other programs have files of this name
-            return None if _is_dataset(folder) or any(folder.glob("*.bin")) else _current(path)
+            return (
+                None
+                if _is_dataset(folder) or any(folder.glob("*.bin"))
+                else _current(path)
+            )
     return None
 
 
@@ -262,7 +303,9 @@ def record(root: Path, sensor: Sensor, origin: Origin) -> Description:
         FileError: if it cannot be read or written.
     """
     if not (root / NAME).is_file():  # another process may create it at the same time
-        write_file(root / NAME, _encode(Description(sensor, (origin,))), overwrite=False)
+        write_file(
+            root / NAME, _encode(Description(sensor, (origin,))), overwrite=False
+        )
     require_grid(root, _current(root / NAME), sensor)
     return add_origin(root, origin)
 
@@ -309,8 +352,12 @@ def _encode(description: Description) -> bytes:
 def to_comments(scan: Scan) -> list[str]:
     """The description of a scan as lines of a header, of at most ``LINE`` ASCII characters each and
     a prefix."""
-    text = json.dumps(Description(scan.sensor, (Origin.of(scan),)).to_dict(), separators=(",", ":"))
-    text = text.replace(" ", r"\u0020")  # so that no program that trims or splits a line changes it
+    text = json.dumps(
+        Description(scan.sensor, (Origin.of(scan),)).to_dict(), separators=(",", ":")
+    )
+    text = text.replace(
+        " ", r"\u0020"
+    )  # so that no program that trims or splits a line changes it
     return [f"lidar_synth {text[i : i + LINE]}" for i in range(0, len(text), LINE)]
 
 
@@ -332,4 +379,6 @@ def from_comments(lines: Iterable[str], where: str) -> Description | None:
     except DataError:
         raise
     except ValueError as error:
-        raise DataError(f"{where}: its description is damaged ({error})", expected) from error
+        raise DataError(
+            f"{where}: its description is damaged ({error})", expected
+        ) from error

@@ -26,7 +26,12 @@ from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import Description
-from lidar_synth.formats.npz import check_numbers, decode_scan, read_stored_sensor, write_scan
+from lidar_synth.formats.npz import (
+    check_numbers,
+    decode_scan,
+    read_stored_sensor,
+    write_scan,
+)
 from lidar_synth.formats.pcd import read_pcd, read_pcd_description, write_pcd
 from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
@@ -85,12 +90,17 @@ class Folder(ScanFiles):
     ) -> None:
         if fields < 4 or not (reflectance_max is None or 0 < reflectance_max < np.inf):
             raise ConfigError(
-                f"fields={fields}, reflectance_max={reflectance_max}", "at least 4, and above 0"
+                f"fields={fields}, reflectance_max={reflectance_max}",
+                "at least 4, and above 0",
             )
         root = Path(root)
         base, self._paths = scan_paths(root, SUFFIXES)
-        ids = [path.relative_to(base).with_suffix("").as_posix() for path in self._paths]
-        super().__init__(root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0]))
+        ids = [
+            path.relative_to(base).with_suffix("").as_posix() for path in self._paths
+        ]
+        super().__init__(
+            root, ids, sensor, on_bad, stored=_named_sensor(self._paths[0])
+        )
         self._fields = fields
         self._reflectance_max = reflectance_max
 
@@ -110,12 +120,16 @@ class Folder(ScanFiles):
             points = read_points(path, self._fields, scale)
             beside = path.with_suffix(".label")
             labels = (
-                read_labels(beside, path, len(points), SEMANTIC_KITTI) if beside.is_file() else {}
+                read_labels(beside, path, len(points), SEMANTIC_KITTI)
+                if beside.is_file()
+                else {}
             )
             scan = Scan(points[:, :3], points[:, 3], self.sensor, **labels)
         elif suffix == ".npz":
             scan = decode_scan(
-                read_arrays(path), str(path), self.sensor if self._unknown else self._given
+                read_arrays(path),
+                str(path),
+                self.sensor if self._unknown else self._given,
             )
             check_scan(scan, str(path))
             return scan
@@ -123,7 +137,8 @@ class Folder(ScanFiles):
             arrays: dict[str, Any] = ARRAYS[suffix](path)
             said = _description(path)
             scan = Scan(
-                sensor=self._given or (said.sensor if said else None) or self.sensor, **arrays
+                sensor=self._given or (said.sensor if said else None) or self.sensor,
+                **arrays,
             )
             scan = said.origin.apply(scan) if said else drop_empty_firings(scan)
             scan.boxes = read_boxes(path)
@@ -170,7 +185,9 @@ def write_boxes(path: Path, boxes: Boxes | None) -> None:
         FileError: if they cannot be written.
     """
     if boxes is not None:
-        values = {f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)}
+        values = {
+            f.name: np.asarray(getattr(boxes, f.name)).tolist() for f in fields(Boxes)
+        }
         write_file(path.with_suffix(BOXES), json.dumps(values).encode())
 
 
@@ -190,7 +207,8 @@ def rows_of_rings(scan: Scan) -> NDArray[np.int16]:
     _, number = np.unique(scan.ring, return_inverse=True)
     rows = scan.sensor.shape[0]
     votes = np.bincount(
-        number * rows + assign_beams(scan).ring, minlength=rows * (int(number.max()) + 1)
+        number * rows + assign_beams(scan).ring,
+        minlength=rows * (int(number.max()) + 1),
     )
     nearest = votes.reshape(-1, rows).argmax(axis=1)
     return np.asarray(nearest[number], np.int16)
@@ -200,7 +218,8 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
     array = read_arrays(path)["array"]
     if array.ndim != 2 or array.shape[1] < 4:
         raise DataError(
-            f"{path} holds an array of shape {array.shape}", "(N, 4): x, y, z, reflectance"
+            f"{path} holds an array of shape {array.shape}",
+            "(N, 4): x, y, z, reflectance",
         )
     check_numbers(array, str(path))
     with np.errstate(over="ignore"):
@@ -250,13 +269,17 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
     """
     if root.is_file():
         if root.suffix.lower() not in suffixes:
-            raise ConfigError(f"{root} is not a scan", f"a file with one of {', '.join(suffixes)}")
+            raise ConfigError(
+                f"{root} is not a scan", f"a file with one of {', '.join(suffixes)}"
+            )
         return root.parent, [root]
     if not root.is_dir():
         raise FileError(f"{root} does not exist", "a file or a folder with scans")
     found = (path for path in root.rglob("*") if path.suffix.lower() in suffixes)
     paths = sorted(
-        p for p in found if not any(part[0] == "." for part in p.relative_to(root).parts)
+        p
+        for p in found
+        if not any(part[0] == "." for part in p.relative_to(root).parts)
     )
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
@@ -266,7 +289,9 @@ def scan_paths(root: Path, suffixes: tuple[str, ...]) -> tuple[Path, list[Path]]
             "Give the folder of one of them.",
         )
     if not paths:
-        raise DataError(f"{root} holds no scan", f"files with one of {', '.join(suffixes)}")
+        raise DataError(
+            f"{root} holds no scan", f"files with one of {', '.join(suffixes)}"
+        )
     return root, paths
 
 
@@ -277,10 +302,16 @@ class KITTIWriter(FileWriter):
     keeps = LABELS
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         if scan.label is not None:
-            write_labels(path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI))
+            write_labels(
+                path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI)
+            )
         self._write_points(path, scan)
 
 
@@ -291,7 +322,11 @@ class NPZWriter(FileWriter):
     keeps = frozenset(DETAILS) - {"image_path"}
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         write_scan(path, scan)
 
@@ -304,7 +339,11 @@ class PCDWriter(FileWriter):
     keeps = frozenset({*POINT_FIELDS, "boxes"})
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         write_boxes(path, scan.boxes)
         write_pcd(path, scan)
@@ -318,7 +357,11 @@ class PLYWriter(FileWriter):
     keeps = frozenset({*POINT_FIELDS, "boxes"})
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         write_boxes(path, scan.boxes)
         write_ply(path, scan)

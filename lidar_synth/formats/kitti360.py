@@ -49,7 +49,12 @@ from lidar_synth.formats.kitti360_poses import (
     write_calibration,
     write_poses,
 )
-from lidar_synth.formats.point_labels import decode_labels, encode_labels, mismatch, write_labels
+from lidar_synth.formats.point_labels import (
+    decode_labels,
+    encode_labels,
+    mismatch,
+    write_labels,
+)
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.formats.writer import (
@@ -120,7 +125,9 @@ class KITTI360(ScanFiles):
         root = Path(root)
         drives = drives_of(root, split)
         ids = [
-            f"{d}/{path.stem}" for d in drives for path in list_files(scans_folder(root, d), ".bin")
+            f"{d}/{path.stem}"
+            for d in drives
+            for path in list_files(scans_folder(root, d), ".bin")
         ]
         self._labels = root if labels is None else Path(labels)
         if labels is not None:
@@ -148,7 +155,9 @@ class KITTI360(ScanFiles):
             points[:, 3],
             self.sensor,
             **read_scan_labels(self._labels, drive, frame, path, len(points)),
-            boxes=self._scan_boxes(drive, int(frame), pose) if pose is not None else None,
+            boxes=self._scan_boxes(drive, int(frame), pose)
+            if pose is not None
+            else None,
             pose=pose,
             image_path=image if image.is_file() else None,
             id=self.ids[index],
@@ -157,7 +166,9 @@ class KITTI360(ScanFiles):
     def calibration(self, index: int) -> Calibration | None:
         return self._camera
 
-    def _scan_boxes(self, drive: str, frame: int, pose: NDArray[np.float64]) -> Boxes | None:
+    def _scan_boxes(
+        self, drive: str, frame: int, pose: NDArray[np.float64]
+    ) -> Boxes | None:
         if drive not in self._boxes:
             path = boxes_path(self.root, drive)
             self._boxes[drive] = None if path is None else read_boxes(path)
@@ -192,7 +203,8 @@ class KITTI360Writer(Writer):
         super().__init__(root, calibration=calibration)
         if not drive or "/" in drive:
             raise ConfigError(
-                f"drive {drive!r}", "a folder's name, such as 2013_05_28_drive_0000_sync"
+                f"drive {drive!r}",
+                "a folder's name, such as 2013_05_28_drive_0000_sync",
             )
         self.drive = drive
 
@@ -201,12 +213,18 @@ class KITTI360Writer(Writer):
             r"(?:2013_05_28_drive_00)?([0-9]{2})(?:_sync)?/0*([0-9]{1,10})", name or ""
         )
         drive, frame = (
-            (f"2013_05_28_drive_00{match[1]}_sync", int(match[2])) if match else (self.drive, index)
+            (f"2013_05_28_drive_00{match[1]}_sync", int(match[2]))
+            if match
+            else (self.drive, index)
         )
         return (scans_folder(Path(), drive) / f"{frame:010d}.bin").as_posix()
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         drive = path.parents[2].name
         frame = path.stem
@@ -216,7 +234,9 @@ class KITTI360Writer(Writer):
         if picture is not None:
             write_image(image_path(self.root, drive, frame), picture)
         if scan.label is not None:
-            write_labels(labels_folder(self.root, drive) / f"{frame}.label", label_values(scan))
+            write_labels(
+                labels_folder(self.root, drive) / f"{frame}.label", label_values(scan)
+            )
         self._write_points(path, scan)
 
     def finish(self) -> None:
@@ -224,17 +244,24 @@ class KITTI360Writer(Writer):
             notes = read_notes(folder)
             poses = read_poses(self.root, folder.name, read_calibration(self.root))
             new = {
-                f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None
+                f: np.array(note["pose"])
+                for f, note in notes.items()
+                if note["pose"] is not None
             }
             write_poses(self.root, folder.name, new)
             poses |= new
             boxes = {
-                f: (Boxes(note["boxes"], note["names"], instance=note["instance"]), poses[f])
+                f: (
+                    Boxes(note["boxes"], note["names"], instance=note["instance"]),
+                    poses[f],
+                )
                 for f, note in notes.items()
                 if note["boxes"] is not None
             }
             if boxes:
-                write_boxes(self.root / "data_3d_bboxes" / "train" / f"{folder.name}.xml", boxes)
+                write_boxes(
+                    self.root / "data_3d_bboxes" / "train" / f"{folder.name}.xml", boxes
+                )
             clear_notes(folder)
 
 
@@ -251,9 +278,9 @@ def label_values(scan: Scan) -> NDArray[np.uint32]:
     ids = labels & 0xFFFF
     instances = labels >> 16
     local = (instances > 0) & (instances < MAX_INSTANCES)
-    return np.where(local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels).astype(
-        np.uint32
-    )
+    return np.where(
+        local, ids | ((ids * MAX_INSTANCES + instances) << 16), labels
+    ).astype(np.uint32)
 
 
 def _facts(scan: Scan) -> dict[str, Any]:
@@ -296,10 +323,13 @@ def drives_of(root: Path, split: str) -> list[str]:
         ConfigError: on an unknown split.
         DataError: if it has none of them.
     """
-    hint = "Published works split the drives differently: give the full name of a split."
+    hint = (
+        "Published works split the drives differently: give the full name of a split."
+    )
     wanted = choose("KITTI-360 split", split, SPLITS, hint)
     existing = sorted(
-        p.parent.parent.name for p in (root / "data_3d_raw").glob("*/velodyne_points/data")
+        p.parent.parent.name
+        for p in (root / "data_3d_raw").glob("*/velodyne_points/data")
     )
     drives = [d for d in existing if wanted is None or d in wanted]
     if not drives:
@@ -328,7 +358,9 @@ def confidence_path(root: Path, drive: str, frame: str) -> Path:
 
 def label_file(root: Path, drive: str, frame: str) -> Path | None:
     """The label file of a scan; None if it has none."""
-    paths = (labels_folder(root, drive) / f"{frame}{suffix}" for suffix in (".label", ".bin"))
+    paths = (
+        labels_folder(root, drive) / f"{frame}{suffix}" for suffix in (".label", ".bin")
+    )
     return next((path for path in paths if path.is_file()), None)
 
 

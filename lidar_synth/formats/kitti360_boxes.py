@@ -111,7 +111,9 @@ class WorldBoxes:
             range_max: maximum distance of an object's centre, metres.
         """
         now = (self.windows[:, 0] <= frame) & (frame <= self.windows[:, 1])
-        now &= np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
+        now &= (
+            np.linalg.norm(self.transforms[:, :3, 3] - pose[:3, 3], axis=1) <= range_max
+        )
         local = np.linalg.inv(pose) @ self.transforms[now]
         size = np.linalg.norm(local[:, :3, :3], axis=1)
         yaw = np.arctan2(local[:, 1, 0], local[:, 0, 0])
@@ -138,7 +140,8 @@ def read_boxes(path: Path) -> WorldBoxes:
             if node.find("transform") is None:
                 continue
             semantic = int(
-                node.findtext("semanticId") or BY_LABEL.get(node.findtext("label", ""), -1)
+                node.findtext("semanticId")
+                or BY_LABEL.get(node.findtext("label", ""), -1)
             )
             if semantic in OBJECTS:
                 _, image_id, name = OBJECTS[semantic]
@@ -147,11 +150,16 @@ def read_boxes(path: Path) -> WorldBoxes:
                     @ _unit_cube(_matrix(node, "vertices", (-1, 3)))
                 )
                 names.append(name)
-                instances.append(image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0))
-                frame, first, last = (
-                    int(node.findtext(t) or -1) for t in ("timestamp", "start_frame", "end_frame")
+                instances.append(
+                    image_id * MAX_INSTANCES + int(node.findtext("instanceId") or 0)
                 )
-                windows.append((frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN))
+                frame, first, last = (
+                    int(node.findtext(t) or -1)
+                    for t in ("timestamp", "start_frame", "end_frame")
+                )
+                windows.append(
+                    (frame, frame) if frame >= 0 else (first - MARGIN, last + MARGIN)
+                )
             node.clear()
         found = WorldBoxes(
             np.array(transforms).reshape(-1, 4, 4),
@@ -176,7 +184,9 @@ def read_boxes(path: Path) -> WorldBoxes:
     return found
 
 
-def _matrix(node: ElementTree.Element, tag: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _matrix(
+    node: ElementTree.Element, tag: str, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
     return np.array(node.findtext(f"{tag}/data", "").split(), np.float64).reshape(shape)
 
 
@@ -190,7 +200,9 @@ def _unit_cube(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64]]]) -> None:
+def write_boxes(
+    path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64]]]
+) -> None:
     """Write the boxes of frames, or add them to those of other frames in an existing file.
 
     Args:
@@ -206,7 +218,11 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
     if path.is_file():
         try:
             root = ElementTree.parse(path).getroot()
-            kept = [node for node in root if int(node.findtext("timestamp") or -1) not in frames]
+            kept = [
+                node
+                for node in root
+                if int(node.findtext("timestamp") or -1) not in frames
+            ]
         except OSError as error:
             raise unreadable(path, error) from error
         except (
@@ -215,7 +231,9 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
             LookupError,
         ) as error:  # LookupError: an unknown encoding
             raise DataError(
-                f"{path}: {error}", "KITTI-360's data_3d_bboxes", "Remove it to write a new one."
+                f"{path}: {error}",
+                "KITTI-360's data_3d_bboxes",
+                "Remove it to write a new one.",
             ) from error
     objects = [
         node
@@ -223,28 +241,43 @@ def write_boxes(path: Path, frames: Mapping[int, tuple[Boxes, NDArray[np.float64
         for node in _objects(frame, boxes, pose)
     ]
     # In the order of frames, so that a resumed export has the bytes of one in a single run.
-    root[:] = sorted([*kept, *objects], key=lambda node: int(node.findtext("timestamp") or -1))
+    root[:] = sorted(
+        [*kept, *objects], key=lambda node: int(node.findtext("timestamp") or -1)
+    )
     for index, node in enumerate(root):
         node.tag = f"object{index}"
         _child(node, "index").text = str(index)
     ElementTree.indent(root, " ")
     write_file(
-        path, lambda file: ElementTree.ElementTree(root).write(file, "utf-8", xml_declaration=True)
+        path,
+        lambda file: ElementTree.ElementTree(root).write(
+            file, "utf-8", xml_declaration=True
+        ),
     )
 
 
-def _objects(frame: int, boxes: Boxes, pose: NDArray[np.float64]) -> list[ElementTree.Element]:
+def _objects(
+    frame: int, boxes: Boxes, pose: NDArray[np.float64]
+) -> list[ElementTree.Element]:
     nodes = []
-    for i, (x, y, z, length, width, height, yaw) in enumerate(boxes.values.astype(np.float64)):
+    for i, (x, y, z, length, width, height, yaw) in enumerate(
+        boxes.values.astype(np.float64)
+    ):
         semantic = BY_NAME.get(boxes.names[i], BY_NAME["Misc"])
         label, image_id, _ = OBJECTS[semantic]
         c = np.cos(yaw)
         s = np.sin(yaw)
         local = np.eye(4)
-        local[:3, :3] = np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)]) * (length, width, height)
+        local[:3, :3] = np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)]) * (
+            length,
+            width,
+            height,
+        )
         local[:3, 3] = x, y, z
         instance = int(boxes.instance[i]) if boxes.instance[i] >= 0 else i + 1
-        instance -= image_id * MAX_INSTANCES if instance // MAX_INSTANCES == image_id else 0
+        instance -= (
+            image_id * MAX_INSTANCES if instance // MAX_INSTANCES == image_id else 0
+        )
         node = ElementTree.Element("object")
         _child(node, "label").text = label
         for tag in ("start_frame", "end_frame", "timestamp"):

@@ -42,7 +42,13 @@ STILL = 0.5
 """Maximum distance, metres, that the car moved between two poses for the frames between them to get
 poses, too."""
 
-SIZES = {"P_rect_00": 12, "R_rect_00": 9, "S_rect_00": 2, "image_00": 12, "cam_to_velo": 12}
+SIZES = {
+    "P_rect_00": 12,
+    "R_rect_00": 9,
+    "S_rect_00": 2,
+    "image_00": 12,
+    "cam_to_velo": 12,
+}
 """Number of values of each matrix of the calibration."""
 
 
@@ -55,7 +61,11 @@ def read_calibration(root: Path) -> Calibration | None:
     folder = root / "calibration"
     paths = [
         folder / name
-        for name in ("perspective.txt", "calib_cam_to_velo.txt", "calib_cam_to_pose.txt")
+        for name in (
+            "perspective.txt",
+            "calib_cam_to_velo.txt",
+            "calib_cam_to_pose.txt",
+        )
     ]
     if not all(path.is_file() for path in paths):
         return None
@@ -64,7 +74,9 @@ def read_calibration(root: Path) -> Calibration | None:
     try:
         matrices = {name: found[name] for name in SIZES}
         if wrong := {
-            name: values.size for name, values in matrices.items() if values.size != SIZES[name]
+            name: values.size
+            for name, values in matrices.items()
+            if values.size != SIZES[name]
         }:
             raise ValueError(f"{wrong} values, not {SIZES}")
         for name in ("image_00", "cam_to_velo"):
@@ -73,10 +85,13 @@ def read_calibration(root: Path) -> Calibration | None:
             homogeneous(matrices["cam_to_velo"])
         )
         size = read_image_size(matrices["S_rect_00"], "S_rect_00")
-        return Calibration(matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, size, matrices)
+        return Calibration(
+            matrices["P_rect_00"].reshape(3, 4), camera_from_sensor, size, matrices
+        )
     except (KeyError, ValueError) as error:
         raise DataError(
-            f"{folder}: {error!r}", "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers"
+            f"{folder}: {error!r}",
+            "P_rect_00, R_rect_00, S_rect_00, image_00 and 12 numbers",
         ) from error
 
 
@@ -84,7 +99,9 @@ def write_calibration(root: Path, camera: Calibration) -> None:
     """The inverse of ``read_calibration``: KITTI-360's own matrices unchanged; other cameras as
     unrectified."""
     matrices = camera.matrices
-    if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(matrices):
+    if not {"P_rect_00", "R_rect_00", "S_rect_00", "image_00", "cam_to_velo"} <= set(
+        matrices
+    ):
         matrices = {
             "P_rect_00": camera.projection,
             "R_rect_00": np.eye(3),
@@ -94,9 +111,12 @@ def write_calibration(root: Path, camera: Calibration) -> None:
         }
     folder = root / "calibration"
     write_file(
-        folder / "calib_cam_to_velo.txt", f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode()
+        folder / "calib_cam_to_velo.txt",
+        f"{numbers(matrices['cam_to_velo'].ravel())}\n".encode(),
     )
-    write_named_matrices(folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]})
+    write_named_matrices(
+        folder / "calib_cam_to_pose.txt", {"image_00": matrices["image_00"]}
+    )
     # Last, because its presence marks the calibration as complete.
     write_named_matrices(
         folder / "perspective.txt",
@@ -132,10 +152,15 @@ def read_poses(
     valid = (frames >= 0) & (frames < 1e10) & (frames == np.rint(frames))
     if not valid.all() or len(np.unique(frames)) < len(frames):
         raise DataError(
-            f"{path} has invalid or repeated frame numbers", "each frame once, integers from 0 on"
+            f"{path} has invalid or repeated frame numbers",
+            "each frame once, integers from 0 on",
         )
     check_rigid(matrices, str(path))
-    return dict(zip(frames.astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True))
+    return dict(
+        zip(
+            frames.astype(int).tolist(), matrices @ imu_from_sensor(camera), strict=True
+        )
+    )
 
 
 def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -> None:
@@ -149,9 +174,13 @@ def write_poses(root: Path, drive: str, poses: dict[int, NDArray[np.float64]]) -
         return
     folder = root / "data_poses" / drive
     sensor_from_imu = np.linalg.inv(imu_from_sensor(camera))
-    imu = {frame: numbers((pose @ sensor_from_imu)[:3].ravel()) for frame, pose in poses.items()}
+    imu = {
+        frame: numbers((pose @ sensor_from_imu)[:3].ravel())
+        for frame, pose in poses.items()
+    }
     cam0 = {
-        frame: numbers((pose @ camera.sensor_from_camera).ravel()) for frame, pose in poses.items()
+        frame: numbers((pose @ camera.sensor_from_camera).ravel())
+        for frame, pose in poses.items()
     }
     _add_lines(folder / "poses.txt", imu)
     _add_lines(folder / "cam0_to_world.txt", cam0)
@@ -197,11 +226,15 @@ def fill_poses(
         if np.linalg.norm(poses[last][:3, 3] - poses[first][:3, 3]) <= STILL:
             share = (frame - first) / (last - first)
             filled[frame] = poses[first if share < 0.5 else last].copy()
-            filled[frame][:3, 3] = (1 - share) * poses[first][:3, 3] + share * poses[last][:3, 3]
+            filled[frame][:3, 3] = (1 - share) * poses[first][:3, 3] + share * poses[
+                last
+            ][:3, 3]
     return filled
 
 
-def ego_motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[np.float64]:
+def ego_motion(
+    poses: Mapping[int, NDArray[np.float64]], frame: int
+) -> NDArray[np.float64]:
     """(4, 4) the sensor of the frame before, in the frame of the sensor at ``frame``.
 
     Without a pose of the frame before, the motion to the next frame is taken; without both, the car
@@ -227,12 +260,16 @@ def undo_ego_motion(
         points: (N, 3) metres, as measured.
         motion: (4, 4) from ``ego_motion``.
     """
-    share = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi))[:, None].astype(np.float64)
+    share = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi))[:, None].astype(
+        np.float64
+    )
     skew = (motion[:3, :3] - motion[:3, :3].T) / 2
     sine = np.sqrt((skew**2).sum() / 2)
     moved: NDArray[np.float64] = points + share * motion[:3, 3]
     if sine > 0:  # Rodrigues' formula
         angle = share * np.arcsin(min(sine, 1.0))
         turned = points @ (skew.T / sine)
-        moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (turned @ (skew.T / sine))
+        moved += np.sin(angle) * turned + (1 - np.cos(angle)) * (
+            turned @ (skew.T / sine)
+        )
     return moved

@@ -38,12 +38,15 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     bad = [row for row in rows if len(row) not in (15, 16)]
     if bad:
         raise DataError(
-            f"{path}: a line with {len(bad[0])} fields", "15 fields: a name and 14 numbers"
+            f"{path}: a line with {len(bad[0])} fields",
+            "15 fields: a name and 14 numbers",
         )
     try:
         values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
     except ValueError as error:
-        raise DataError(f"{path}: {error}", "15 fields: a name and 14 numbers") from error
+        raise DataError(
+            f"{path}: {error}", "15 fields: a name and 14 numbers"
+        ) from error
     ignored = np.array([row[0] == "DontCare" for row in rows], bool)
     _check_values(values, ignored, path)
     truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
@@ -61,7 +64,9 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     )
 
 
-def _check_values(values: NDArray[np.float64], ignored: NDArray[np.bool_], path: Path) -> None:
+def _check_values(
+    values: NDArray[np.float64], ignored: NDArray[np.bool_], path: Path
+) -> None:
     """Refuse impossible values: not finite, far beyond any sensor's range, or wrong sizes and
     occlusions."""
     within = np.abs(values) <= FARTHEST  # NaN is not
@@ -92,7 +97,10 @@ def boxes_from_camera(
     height, width, length = size.T
     centre = floor - np.stack([0 * height, height / 2, 0 * height], -1)
     back = camera.sensor_from_camera
-    ahead = np.stack([np.cos(rotation_y), 0 * rotation_y, -np.sin(rotation_y)], -1) @ back[:3, :3].T
+    ahead = (
+        np.stack([np.cos(rotation_y), 0 * rotation_y, -np.sin(rotation_y)], -1)
+        @ back[:3, :3].T
+    )
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     return np.column_stack(
         [centre @ back[:3, :3].T + back[:3, 3], length, width, height, yaw]
@@ -110,7 +118,11 @@ def boxes_to_camera(
     centre = values[:, :3] @ to[:3, :3].T + to[:3, 3]
     ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1) @ to[:3, :3].T
     floor = centre + np.stack([0 * height, height / 2, 0 * height], -1)
-    return floor, np.stack([height, width, length], -1), np.arctan2(-ahead[:, 2], ahead[:, 0])
+    return (
+        floor,
+        np.stack([height, width, length], -1),
+        np.arctan2(-ahead[:, 2], ahead[:, 0]),
+    )
 
 
 def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
@@ -129,7 +141,9 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     floor, size, rotation_y = boxes_to_camera(boxes.values, camera)
     seen = floor - camera.camera_from_sensor[:3, 3]
     alpha = np.where(
-        boxes.alpha > -10, boxes.alpha, _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2]))
+        boxes.alpha > -10,
+        boxes.alpha,
+        _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])),
     )
     lines = []
     listed = np.flatnonzero((image_box >= 0).all(axis=1))
@@ -153,7 +167,9 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     write_file(path, text.encode())
 
 
-def _in_image(boxes: Boxes, camera: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _in_image(
+    boxes: Boxes, camera: Calibration
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(M, 4) image boxes and (M,) truncations; unknown ones are computed from the corners."""
     image_box = boxes.image_box.astype(np.float64)
     truncation = boxes.truncation.astype(np.float64)

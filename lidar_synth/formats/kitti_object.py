@@ -103,9 +103,12 @@ class KITTIObject(ScanFiles):
         image_set = root / "ImageSets" / f"{split}.txt"
         if split != "all" and image_set.is_file():
             frames = read_text(image_set).split()
-            if bad := [frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)]:
+            if bad := [
+                frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)
+            ]:
                 raise DataError(
-                    f"{image_set} lists {bad[0][:100]!r}", "names of frames, such as 000123"
+                    f"{image_set} lists {bad[0][:100]!r}",
+                    "names of frames, such as 000123",
                 )
             ids = [f"{parts[0]}/{frame}" for frame in frames]
         elif split in ("train", "val"):
@@ -135,7 +138,9 @@ class KITTIObject(ScanFiles):
         image = folder / "image_2" / f"{frame}.png"
         boxes = None
         if labels.is_file():
-            boxes = read_label_2(labels, read_calibration(folder / "calib" / f"{frame}.txt"))
+            boxes = read_label_2(
+                labels, read_calibration(folder / "calib" / f"{frame}.txt")
+            )
         return Scan(
             points[:, :3],
             points[:, 3],
@@ -154,7 +159,9 @@ class KITTIObject(ScanFiles):
         path = self.root / part / "calib" / f"{frame}.txt"
         if not path.is_file():
             return None
-        return read_calibration(path, png_size(self.root / part / "image_2" / f"{frame}.png"))
+        return read_calibration(
+            path, png_size(self.root / part / "image_2" / f"{frame}.png")
+        )
 
 
 class KITTIObjectWriter(Writer):
@@ -178,7 +185,11 @@ class KITTIObjectWriter(Writer):
     keeps = frozenset({"boxes", "image_path"})
 
     def __init__(
-        self, root: str | Path, *, part: Part = "training", calibration: Calibration | None = None
+        self,
+        root: str | Path,
+        *,
+        part: Part = "training",
+        calibration: Calibration | None = None,
     ) -> None:
         super().__init__(root, calibration=calibration)
         self.part = part
@@ -191,7 +202,11 @@ class KITTIObjectWriter(Writer):
         return f"{part}/velodyne/{frame:06d}.bin"
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         folder = path.parents[1]
         frame = path.stem
@@ -226,7 +241,9 @@ class KITTIObjectWriter(Writer):
                 )
 
 
-def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> Calibration:
+def read_calibration(
+    path: Path, image_size: tuple[int, int] | None = None
+) -> Calibration:
     """Camera 2 of a ``calib`` file.
 
     Raises:
@@ -235,15 +252,21 @@ def read_calibration(path: Path, image_size: tuple[int, int] | None = None) -> C
     """
     matrices = read_named_matrices(path)
     sizes = {
-        name: matrices.get(name, np.zeros(0)).size for name in ("P2", "R0_rect", "Tr_velo_to_cam")
+        name: matrices.get(name, np.zeros(0)).size
+        for name in ("P2", "R0_rect", "Tr_velo_to_cam")
     }
     if sizes != {"P2": 12, "R0_rect": 9, "Tr_velo_to_cam": 12}:
         raise DataError(
-            f"{path} has {sizes} values", "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12"
+            f"{path} has {sizes} values",
+            "P2 with 12, R0_rect with 9 and Tr_velo_to_cam with 12",
         )
-    camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(matrices["Tr_velo_to_cam"])
+    camera_from_sensor = homogeneous(matrices["R0_rect"]) @ homogeneous(
+        matrices["Tr_velo_to_cam"]
+    )
     with name_errors(path):
-        return Calibration(matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices)
+        return Calibration(
+            matrices["P2"].reshape(3, 4), camera_from_sensor, image_size, matrices
+        )
 
 
 def write_calibration(path: Path, camera: Calibration) -> None:

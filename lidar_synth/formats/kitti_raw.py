@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import list_files, name_errors, png_size, read_file, read_named_matrices
+from lidar_synth.files.disk import (
+    list_files,
+    name_errors,
+    png_size,
+    read_file,
+    read_named_matrices,
+)
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -110,11 +116,14 @@ class KITTIRaw(ScanFiles):
         name, frame = self.ids[index].split("/")
         drive = self._drives[name]
         return read_calibration(
-            drive.resolve().parent, png_size(drive / "image_02" / "data" / f"{frame}.png")
+            drive.resolve().parent,
+            png_size(drive / "image_02" / "data" / f"{frame}.png"),
         )
 
 
-def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) -> Calibration | None:
+def read_calibration(
+    folder: Path, image_size: tuple[int, int] | None = None
+) -> Calibration | None:
     """Camera 2 of a day's calibration; None if its two files are missing.
 
     Raises:
@@ -125,14 +134,17 @@ def read_calibration(folder: Path, image_size: tuple[int, int] | None = None) ->
         return None
     velo, cam = map(read_named_matrices, paths)
     try:
-        to_cam_0 = homogeneous(np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)]))
+        to_cam_0 = homogeneous(
+            np.column_stack([velo["R"].reshape(3, 3), velo["T"].reshape(3, 1)])
+        )
         rectify = homogeneous(cam["R_rect_00"].reshape(3, 3))
         projection = cam["P_rect_02"].reshape(3, 4)
         size = image_size or read_image_size(cam["S_rect_02"], "S_rect_02")
         return Calibration(projection, rectify @ to_cam_0, size)
     except (KeyError, ValueError) as error:
         raise DataError(
-            f"{paths[0]} and {paths[1]}: {error}", "R and T; R_rect_00, P_rect_02 and S_rect_02"
+            f"{paths[0]} and {paths[1]}: {error}",
+            "R and T; R_rect_00, P_rect_02 and S_rect_02",
         ) from error
 
 
@@ -146,7 +158,9 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
         FileError: if it cannot be read.
         DataError: if it is not a tracklet file.
     """
-    rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(list)
+    rows: dict[int, list[tuple[tuple[float, ...], str, int, int, int]]] = defaultdict(
+        list
+    )
     try:
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
         for instance, tracklet in enumerate(tracklets):
@@ -174,7 +188,13 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                 whole = pose.findtext("truncation") == "0"
                 frame = int(tracklet.findtext("first_frame", "")) + k
                 rows[frame].append(
-                    (box, name, hidden if 0 <= hidden <= 2 else -1, 0 if whole else -1, instance)
+                    (
+                        box,
+                        name,
+                        hidden if 0 <= hidden <= 2 else -1,
+                        0 if whole else -1,
+                        instance,
+                    )
                 )
     except (
         ElementTree.ParseError,

@@ -32,13 +32,18 @@ def models_of(path: Path) -> Provenances:
     if (path / NOTE).is_file():
         note = read_facts(path / NOTE, "the settings that lidar-synth sample wrote")
         found.append(
-            {"data": note.get("trained_on")} | ({"seen": note["seen"]} if "seen" in note else {})
+            {"data": note.get("trained_on")}
+            | ({"seen": note["seen"]} if "seen" in note else {})
         )
     if (path / MODELS).is_file():
         expected = "what lidar-synth convert wrote about models"
         models = read_facts(path / MODELS, expected).get("models")
-        if not isinstance(models, list) or not all(isinstance(model, dict) for model in models):
-            raise DataError(f"{path / MODELS} is damaged (no list of mappings)", expected)
+        if not isinstance(models, list) or not all(
+            isinstance(model, dict) for model in models
+        ):
+            raise DataError(
+                f"{path / MODELS} is damaged (no list of mappings)", expected
+            )
         found += models
     return found
 

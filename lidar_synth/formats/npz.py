@@ -27,7 +27,14 @@ from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.files.disk import SKIP_HINT, write_arrays
 from lidar_synth.files.parsing import parse_json, read_arrays
 from lidar_synth.formats.description import check_provenance
-from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Boxes, RangeImage, Scan
+from lidar_synth.geometry.scan import (
+    POINT_FIELDS,
+    REAL,
+    SYNTHETIC,
+    Boxes,
+    RangeImage,
+    Scan,
+)
 from lidar_synth.geometry.sensor import Sensor
 
 FACTS = ("sensor", "id", "domain", "provenance", "pose")
@@ -57,7 +64,9 @@ def read_stored_sensor(path: Path) -> Sensor | None:
         return None  # reading the scan will raise the error
 
 
-def to_stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str, NDArray[Any]]:
+def to_stored(
+    arrays: Mapping[str, NDArray[Any]], where: Path | str
+) -> dict[str, NDArray[Any]]:
     """The arrays of a scan in the types of files; reflectances divided in numpy, for instance, are
     float64.
 
@@ -73,12 +82,15 @@ def to_stored(arrays: Mapping[str, NDArray[Any]], where: Path | str) -> dict[str
         wanted = np.dtype(TYPES.get(name, values.dtype))
         if values.dtype.kind not in "biuf":
             raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
-        with np.errstate(all="ignore"):  # what overflows is refused below, or by ``check_scan``
+        with np.errstate(
+            all="ignore"
+        ):  # what overflows is refused below, or by ``check_scan``
             cast = np.ascontiguousarray(values, wanted)
         if wanted.kind in "iu" and not np.array_equal(cast, values):
             outside = values[cast != values].flat[0]
             raise DataError(
-                f"{where}: {name} holds {outside}", f"whole numbers that {wanted} can hold"
+                f"{where}: {name} holds {outside}",
+                f"whole numbers that {wanted} can hold",
             )
         result[name] = cast
     return result
@@ -91,10 +103,14 @@ def write_scan(path: Path, scan: Scan) -> None:
         DataError: as ``to_stored``.
         FileError: if it cannot be written.
     """
-    write_arrays(path, to_stored({"points": scan.points, **scan.fields()}, path) | _facts(scan))
+    write_arrays(
+        path, to_stored({"points": scan.points, **scan.fields()}, path) | _facts(scan)
+    )
 
 
-def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None) -> Scan:
+def decode_scan(
+    arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | None = None
+) -> Scan:
     """Make a scan from the arrays of an ``.npz`` file.
 
     Args:
@@ -107,11 +123,15 @@ def decode_scan(arrays: dict[str, NDArray[Any]], where: str, sensor: Sensor | No
     """
     try:
         facts = _known(arrays, sensor) | ({} if sensor is None else {"sensor": sensor})
-        known: dict[str, Any] = {name: arrays[name] for name in POINT_FIELDS if name in arrays}
+        known: dict[str, Any] = {
+            name: arrays[name] for name in POINT_FIELDS if name in arrays
+        }
         _check_types({"points": arrays["points"], **known})
         return Scan(arrays["points"], **known, **facts)
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{where}: {error}", "points, reflectance and sensor of a scan") from error
+        raise DataError(
+            f"{where}: {error}", "points, reflectance and sensor of a scan"
+        ) from error
 
 
 def write_range_image(path: Path, image: RangeImage, scan: Scan | None = None) -> None:
@@ -150,16 +170,23 @@ def decode_range_image(
                 f"it was made for sensor {facts['sensor'].name!r}, not for {sensor.name!r}"
             )
         channels = {
-            n: a for n, a in arrays.items() if n not in ("range", *FACTS) and not n.startswith(BOX)
+            n: a
+            for n, a in arrays.items()
+            if n not in ("range", *FACTS) and not n.startswith(BOX)
         }
         _check_types(channels)
         return range_image(arrays["range"], facts["sensor"], channels, where), facts
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{where}: {error}", "range and sensor of a range image") from error
+        raise DataError(
+            f"{where}: {error}", "range and sensor of a range image"
+        ) from error
 
 
 def range_image(
-    distance: NDArray[Any], sensor: Sensor, channels: dict[str, NDArray[Any]], where: str
+    distance: NDArray[Any],
+    sensor: Sensor,
+    channels: dict[str, NDArray[Any]],
+    where: str,
 ) -> RangeImage:
     """Make a range image, after checking the values of all cells.
 
@@ -182,8 +209,13 @@ def range_image(
         values = image.channels[name].copy()
         values[~image.mask] = IGNORE if name == "label" else 0
         image.channels[name] = values
-        if name in ("reflectance", "confidence") and not ((values >= 0) & (values <= 1)).all():
-            raise DataError(f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1")
+        if (
+            name in ("reflectance", "confidence")
+            and not ((values >= 0) & (values <= 1)).all()
+        ):
+            raise DataError(
+                f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1"
+            )
         if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
             raise DataError(
                 f"{where}: labels {np.unique(values)[-8:].tolist()}",
@@ -204,8 +236,12 @@ def check_numbers(array: NDArray[Any], where: str) -> None:
 
 def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
     for name, values in arrays.items():
-        if values.dtype.kind not in "biuf" or values.dtype != TYPES.get(name, values.dtype):
-            raise ValueError(f"{name} is {values.dtype}, not {TYPES.get(name, 'a number')}")
+        if values.dtype.kind not in "biuf" or values.dtype != TYPES.get(
+            name, values.dtype
+        ):
+            raise ValueError(
+                f"{name} is {values.dtype}, not {TYPES.get(name, 'a number')}"
+            )
 
 
 def _sensor(arrays: Mapping[str, NDArray[Any]]) -> Sensor:
@@ -226,20 +262,26 @@ def _facts(scan: Scan, sensor: Sensor | None = None) -> dict[str, Any]:
     if scan.pose is not None:
         facts["pose"] = scan.pose
     if scan.boxes is not None:
-        facts |= {BOX + f.name: np.asarray(getattr(scan.boxes, f.name)) for f in fields(Boxes)}
+        facts |= {
+            BOX + f.name: np.asarray(getattr(scan.boxes, f.name)) for f in fields(Boxes)
+        }
         facts[BOX + "names"] = np.array(scan.boxes.names, np.str_)
     return facts
 
 
 def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, Any]:
     """The inverse of ``_facts``, with the given sensor if the file has none."""
-    known: dict[str, Any] = {"sensor": _sensor(arrays) if "sensor" in arrays else sensor}
+    known: dict[str, Any] = {
+        "sensor": _sensor(arrays) if "sensor" in arrays else sensor
+    }
     if known["sensor"] is None:
         raise KeyError("it has no sensor: pass one")
     for name, kinds in (("id", "U"), ("domain", "iu")):
         if name in arrays:
             if arrays[name].shape or arrays[name].dtype.kind not in kinds:
-                raise ValueError(f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}")
+                raise ValueError(
+                    f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}"
+                )
             known[name] = arrays[name].item()
     if known.get("domain", REAL) not in (REAL, SYNTHETIC):
         raise ValueError(
@@ -252,10 +294,14 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
     if "pose" in arrays:
         known["pose"] = check_pose(arrays["pose"])
     if BOX + "values" in arrays:
-        boxes = {f.name: arrays[BOX + f.name] for f in fields(Boxes) if f.name != "names"}
+        boxes = {
+            f.name: arrays[BOX + f.name] for f in fields(Boxes) if f.name != "names"
+        }
         names = arrays[BOX + "names"]
         if names.ndim != 1 or (names.size and names.dtype.kind != "U"):
-            raise ValueError(f"the boxes' names are {names.dtype} of shape {names.shape}")
+            raise ValueError(
+                f"the boxes' names are {names.dtype} of shape {names.shape}"
+            )
         known["boxes"] = Boxes(**boxes, names=tuple(names.tolist()))
     return known
 
@@ -267,6 +313,12 @@ def check_pose(values: Any) -> NDArray[np.float64]:
         ValueError: on another shape, or values that are not finite numbers.
     """
     pose = np.asarray(values)
-    if pose.shape != (4, 4) or pose.dtype.kind not in "iuf" or not np.isfinite(pose).all():
-        raise ValueError(f"pose is {pose.dtype} of shape {pose.shape}, not (4, 4) finite numbers")
+    if (
+        pose.shape != (4, 4)
+        or pose.dtype.kind not in "iuf"
+        or not np.isfinite(pose).all()
+    ):
+        raise ValueError(
+            f"pose is {pose.dtype} of shape {pose.shape}, not (4, 4) finite numbers"
+        )
     return pose.astype(np.float64, copy=False)

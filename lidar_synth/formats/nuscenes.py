@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NUSCENES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, join_inside, list_files, read_text, read_values
+from lidar_synth.files.disk import (
+    SKIP_HINT,
+    join_inside,
+    list_files,
+    read_text,
+    read_values,
+)
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import read_points
@@ -78,9 +84,13 @@ class NuScenes(ScanFiles):
         root = Path(root)
         folder = root / "samples" / "LIDAR_TOP"
         paths = (
-            [root] if root.is_file() else list_files(folder if folder.is_dir() else root, SUFFIX)
+            [root]
+            if root.is_file()
+            else list_files(folder if folder.is_dir() else root, SUFFIX)
         )
-        super().__init__(root, [path.name.removesuffix(SUFFIX) for path in paths], sensor, on_bad)
+        super().__init__(
+            root, [path.name.removesuffix(SUFFIX) for path in paths], sensor, on_bad
+        )
         self._folder = paths[0].parent
         self._labels = {} if root.is_file() else lidarseg_files(root)
 
@@ -100,7 +110,9 @@ class NuScenes(ScanFiles):
             raw = read_values(self._labels[path.name], "u1")
             if len(raw) != len(points):
                 raise mismatch(self._labels[path.name], len(raw), path, len(points))
-            label = NUSCENES.decode(raw, f"{self._labels[path.name]} (labels of {path})")
+            label = NUSCENES.decode(
+                raw, f"{self._labels[path.name]} (labels of {path})"
+            )
             labels = {"label": label, "raw_label": raw.astype(np.uint32)}
         scan = Scan(
             ahead(points[:, :3]),
@@ -136,16 +148,18 @@ def lidarseg_files(root: Path) -> Mapping[str, Path]:
     for table in sorted(root.glob("*/lidarseg.json")):
         try:
             samples, rows = (
-                _table(table.with_name(name)) for name in ("sample_data.json", table.name)
+                _table(table.with_name(name))
+                for name in ("sample_data.json", table.name)
             )
             names = {row["token"]: row["filename"] for row in samples}
             for row in rows:
-                files[PurePosixPath(names[row["sample_data_token"]]).name] = join_inside(
-                    root, row["filename"]
+                files[PurePosixPath(names[row["sample_data_token"]]).name] = (
+                    join_inside(root, row["filename"])
                 )
         except (KeyError, TypeError, AttributeError) as error:
             raise DataError(
-                f"{table}: {error!r}", "nuScenes' tables lidarseg.json and sample_data.json"
+                f"{table}: {error!r}",
+                "nuScenes' tables lidarseg.json and sample_data.json",
             ) from error
     return files
 

@@ -19,14 +19,27 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import SKIP_HINT, read_file
 from lidar_synth.files.parsing import MOST_BYTES
-from lidar_synth.files.pickles import DTYPE, ENCODE, Call, bytes_of, dtype_of, parse_pickle
+from lidar_synth.files.pickles import (
+    DTYPE,
+    ENCODE,
+    Call,
+    bytes_of,
+    dtype_of,
+    parse_pickle,
+)
 
 EXPECTED = "a pickled pandas table of numbers and text"
 
 GZIP = b"\x1f\x8b"
 
-MANAGERS = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
-BLOCKS = ("pandas._libs.internals._unpickle_block", "pandas.core.internals.blocks.new_block")
+MANAGERS = (
+    "pandas.core.internals.managers.BlockManager",
+    "pandas.core.internals.BlockManager",
+)
+BLOCKS = (
+    "pandas._libs.internals._unpickle_block",
+    "pandas.core.internals.blocks.new_block",
+)
 FRAMES = ("pandas.core.frame.DataFrame", "pandas.DataFrame")
 INDICES = ("pandas.core.indexes.base.Index", "pandas.Index")
 MAKE_INDEX = ("pandas.core.indexes.base._new_Index",)
@@ -96,25 +109,42 @@ def read_table(
     if content.startswith(GZIP):
         content = _gunzip(content, path)
     try:
-        table = _columns(parse_pickle(content, KNOWN, str(path), EXPECTED), {*columns, *optional})
+        table = _columns(
+            parse_pickle(content, KNOWN, str(path), EXPECTED), {*columns, *optional}
+        )
     # What a pickle causes that is no table: values of other kinds, lengths that do not fit.
-    except (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError) as error:
+    except (
+        ValueError,
+        TypeError,
+        IndexError,
+        KeyError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"{path} holds another table ({error})", EXPECTED, SKIP_HINT) from error
+        raise DataError(
+            f"{path} holds another table ({error})", EXPECTED, SKIP_HINT
+        ) from error
     if missing := [name for name in columns if name not in table]:
         raise DataError(
-            f"{path} has no column {', '.join(missing)}", f"a table with {', '.join(columns)}"
+            f"{path} has no column {', '.join(missing)}",
+            f"a table with {', '.join(columns)}",
         )
     if len(lengths := {len(values) for values in table.values()}) > 1:
         raise DataError(
-            f"{path} has columns of {sorted(lengths)} rows", "columns of one length", SKIP_HINT
+            f"{path} has columns of {sorted(lengths)} rows",
+            "columns of one length",
+            SKIP_HINT,
         )
     return table
 
 
 def require_numbers(
-    table: dict[str, NDArray[Any]], columns: Iterable[str], path: Path, kinds: str = "iuf"
+    table: dict[str, NDArray[Any]],
+    columns: Iterable[str],
+    path: Path,
+    kinds: str = "iuf",
 ) -> None:
     """Refuse columns of another type.
 
@@ -134,7 +164,8 @@ def require_numbers(
         if table[name].dtype.kind not in kinds
     ]:
         raise DataError(
-            f"{path} has columns {', '.join(wrong)}", "numbers" if "f" in kinds else "whole numbers"
+            f"{path} has columns {', '.join(wrong)}",
+            "numbers" if "f" in kinds else "whole numbers",
         )
 
 
@@ -145,7 +176,9 @@ def _gunzip(content: bytes, path: Path) -> bytes:
     except zlib.error as error:
         raise DataError(f"{path} is damaged ({error})", EXPECTED, SKIP_HINT) from error
     if len(plain) > MOST_BYTES:
-        raise DataError(f"{path} unpacks into more than {MOST_BYTES} bytes", EXPECTED, SKIP_HINT)
+        raise DataError(
+            f"{path} unpacks into more than {MOST_BYTES} bytes", EXPECTED, SKIP_HINT
+        )
     if not stream.eof:
         raise DataError(f"{path} is truncated", EXPECTED, SKIP_HINT)
     return plain
@@ -172,7 +205,9 @@ def _columns(frame: Any, wanted: set[str]) -> dict[str, NDArray[Any]]:
         if not wanted.isdisjoint(block_names := [names[place] for place in places]):
             block = arrays.make(values)
             rows = block if block.ndim == 2 else block[None]
-            found |= {n: row for n, row in zip(block_names, rows, strict=True) if n in wanted}
+            found |= {
+                n: row for n, row in zip(block_names, rows, strict=True) if n in wanted
+            }
     return found
 
 
@@ -195,7 +230,9 @@ class _Arrays:
         """An array of numbers, or of objects that are numbers, text, truth values or None."""
         if isinstance(value, Call) and value.name in BACKED_ARRAYS:  # text in pandas 3
             [value] = [
-                part for part in value.state if isinstance(part, Call) and part.name in ARRAYS
+                part
+                for part in value.state
+                if isinstance(part, Call) and part.name in ARRAYS
             ]
         if isinstance(value, Call) and value.name in BUFFERS:
             data, dtype, shape, order = value.args

@@ -32,7 +32,13 @@ from lidar_synth.files.disk import list_files, name_errors
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.pandas_table import read_table, require_numbers
 from lidar_synth.formats.pandaset_cuboids import read_cuboids
-from lidar_synth.formats.pandaset_tracks import FORWARD, MOUNTS, Track, read_intrinsics, read_track
+from lidar_synth.formats.pandaset_tracks import (
+    FORWARD,
+    MOUNTS,
+    Track,
+    read_intrinsics,
+    read_track,
+)
 from lidar_synth.formats.point_labels import mismatch
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -107,7 +113,9 @@ class PandaSet(ScanFiles):
         on_bad: OnBad = "error",
     ) -> None:
         if camera not in CAMERAS:
-            raise ConfigError(f"camera {camera!r} of PandaSet", f"one of {', '.join(CAMERAS)}")
+            raise ConfigError(
+                f"camera {camera!r} of PandaSet", f"one of {', '.join(CAMERAS)}"
+            )
         root = Path(root)
         if sequences is None and any(root.glob(FRAMES)):
             root, sequences = root.resolve().parent, (root.resolve().name,)
@@ -119,7 +127,9 @@ class PandaSet(ScanFiles):
                 f"some of {', '.join(existing) or 'none'}",
             )
         frames = [
-            (name, path) for name in wanted for path in list_files(root / name / "lidar", SUFFIX)
+            (name, path)
+            for name in wanted
+            for path in list_files(root / name / "lidar", SUFFIX)
         ]
         super().__init__(
             root,
@@ -141,16 +151,18 @@ class PandaSet(ScanFiles):
         table = read_table(path, "xyzitd")
         require_numbers(table, "xyzitd", path)
         kept = table["d"] == self._device
-        world = np.stack([table[axis][kept] for axis in "xyz"], axis=-1).astype(np.float64)
+        world = np.stack([table[axis][kept] for axis in "xyz"], axis=-1).astype(
+            np.float64
+        )
         time = table["t"][kept].astype(np.float64)
         pose = track.poses[number] @ self._mount
         with name_errors(path):
             measured = from_world(
                 world, interpolate_poses(track.times, track.poses, time) @ self._mount
             )
-        points = (from_world(world, pose) if self.motion_compensated else measured).astype(
-            np.float32
-        )
+        points = (
+            from_world(world, pose) if self.motion_compensated else measured
+        ).astype(np.float32)
         intensity = table["i"][kept].astype(np.float32)
         check_points(points, intensity, str(path), INTENSITY_MAX)
         image = folder / "camera" / self.camera / f"{frame}.jpg"
@@ -187,9 +199,14 @@ class PandaSet(ScanFiles):
             else camera.times[number]
         )
         with name_errors(source / "intrinsics.json"):
-            pose = interpolate_poses(track.times, track.poses, np.array([when]))[0] @ self._mount
+            pose = (
+                interpolate_poses(track.times, track.poses, np.array([when]))[0]
+                @ self._mount
+            )
             projection = read_intrinsics(source)
-            return Calibration(projection, np.linalg.inv(camera.poses[number]) @ pose, IMAGE_SIZE)
+            return Calibration(
+                projection, np.linalg.inv(camera.poses[number]) @ pose, IMAGE_SIZE
+            )
 
     def _place(self, index: int) -> tuple[Path, str]:
         """Folder of the sequence and name of the frame of a scan."""

@@ -71,7 +71,9 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
         "yaw",
     )
     table = read_table(
-        path, (*numbers, "label", "uuid"), ("cuboids.sensor_id", "attributes.rider_status")
+        path,
+        (*numbers, "label", "uuid"),
+        ("cuboids.sensor_id", "attributes.rider_status"),
     )
     require_numbers(table, numbers, path)
     labels = table["label"].tolist()
@@ -82,16 +84,22 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     names = ["Cyclist" if pair == CYCLIST else BOXES[pair[0]] for pair in pairs]
     kept = np.array([name is not None for name in names], bool)
     kept &= table.get("cuboids.sensor_id", np.full(len(labels), -1)) != other_sensor
-    values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)[kept]
+    values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)[
+        kept
+    ]
     # PandaSet's yaw turns a box whose length is along y.
     with np.errstate(invalid="ignore"):  # Boxes refuses what is not finite
         heading = (
-            np.stack([-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1)
+            np.stack(
+                [-np.sin(values[:, 6]), np.cos(values[:, 6]), np.zeros(len(values))], -1
+            )
             @ pose[:3, :3]
         )
     values[:, :3] = from_world(values[:, :3], pose)
     values[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    instance = [crc32(str(uuid).encode("utf-8", "replace")) >> 1 for uuid in table["uuid"][kept]]
+    instance = [
+        crc32(str(uuid).encode("utf-8", "replace")) >> 1 for uuid in table["uuid"][kept]
+    ]
     return Boxes(
         values.astype(np.float32),
         tuple(np.array(names, object)[kept]),

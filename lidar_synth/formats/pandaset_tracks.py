@@ -33,7 +33,11 @@ def _mounts() -> dict[str, Matrix]:
     about_x = -0.0157
     about_y = 0.0005
     tilt = np.array(
-        [(1, 0, 0), (0, np.cos(about_x), -np.sin(about_x)), (0, np.sin(about_x), np.cos(about_x))]
+        [
+            (1, 0, 0),
+            (0, np.cos(about_x), -np.sin(about_x)),
+            (0, np.sin(about_x), np.cos(about_x)),
+        ]
     )
     tilt = tilt @ [
         (np.cos(about_y), 0, np.sin(about_y)),
@@ -67,7 +71,8 @@ class Track:
         """
         if not frame.isdecimal() or int(frame) >= len(self.times):
             raise DataError(
-                f"{where}: frame {frame!r}, but {len(self.times)} poses", "a pose for each frame"
+                f"{where}: frame {frame!r}, but {len(self.times)} poses",
+                "a pose for each frame",
             )
         return int(frame)
 
@@ -92,7 +97,9 @@ def read_track(folder: Path) -> Track:
             )
         seconds = np.array(_numbers(times, *range(len(times))), np.float64)
         if not (np.diff(seconds) > 0).all():
-            raise DataError("timestamps that do not increase", "seconds, one for each frame")
+            raise DataError(
+                "timestamps that do not increase", "seconds, one for each frame"
+            )
         return Track(seconds, np.stack([_transform(pose) for pose in poses]))
 
 
@@ -103,23 +110,30 @@ def read_intrinsics(folder: Path) -> Matrix:
         FileError: if it cannot be read.
         DataError: if it lacks a number.
     """
-    fx, fy, cx, cy = _numbers(_parse(folder / "intrinsics.json"), "fx", "fy", "cx", "cy")
+    fx, fy, cx, cy = _numbers(
+        _parse(folder / "intrinsics.json"), "fx", "fy", "cx", "cy"
+    )
     return np.array([(fx, 0, cx, 0), (0, fy, cy, 0), (0, 0, 1, 0)], np.float64)
 
 
 def _parse(path: Path) -> Any:
-    return parse_json(read_text(path, "a file of PandaSet"), str(path), "a JSON file of PandaSet")
+    return parse_json(
+        read_text(path, "a file of PandaSet"), str(path), "a JSON file of PandaSet"
+    )
 
 
 def _numbers(values: Any, *keys: Any) -> list[float]:
     """The finite numbers under some keys of a JSON object or list."""
     try:
         found = [values[key] for key in keys]
-        if not all(type(value) in (int, float) and abs(value) < 1e12 for value in found):
+        if not all(
+            type(value) in (int, float) and abs(value) < 1e12 for value in found
+        ):
             raise TypeError("something else than finite numbers")
     except (KeyError, TypeError, IndexError) as error:
         raise DataError(
-            f"no numbers {keys[:4]} ({error!r})", "metres, unit quaternions, seconds, pixels"
+            f"no numbers {keys[:4]} ({error!r})",
+            "metres, unit quaternions, seconds, pixels",
         ) from error
     return found
 
@@ -130,7 +144,9 @@ def _transform(pose: Any) -> Matrix:
         raise DataError(f"a pose of type {type(pose).__name__}", "position and heading")
     quaternion = np.array(_numbers(pose.get("heading"), "w", "x", "y", "z"), np.float64)
     if abs(np.linalg.norm(quaternion) - 1) > 0.01:
-        raise DataError(f"a heading of length {np.linalg.norm(quaternion):g}", "a unit quaternion")
+        raise DataError(
+            f"a heading of length {np.linalg.norm(quaternion):g}", "a unit quaternion"
+        )
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     result = np.eye(4)
     result[:3, :3] = [

@@ -76,7 +76,9 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     where = str(path)
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t\r]*\n", content[:LONGEST_HEADER], re.M)
     if end is None:
-        raise DataError(f"{where} has no header of a .pcd file", "a PCD file", SKIP_HINT)
+        raise DataError(
+            f"{where} has no header of a .pcd file", "a PCD file", SKIP_HINT
+        )
     fields, count = _header(content[: end.start()].decode("latin-1"), where)
     check_fields(fields, count, where)
     body = content[end.end() :]
@@ -87,7 +89,8 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         return to_arrays(_from_columns(_decompressed(body, size, where), fields, count))
     if end[1] != b"binary":
         raise DataError(
-            f"{where} holds {end[1].decode('latin-1')!r} data", "ascii, binary or binary_compressed"
+            f"{where} holds {end[1].decode('latin-1')!r} data",
+            "ascii, binary or binary_compressed",
         )
     check_size(body, size, where)
     return to_arrays(from_records(body, fields, count))
@@ -101,13 +104,19 @@ def read_pcd_description(path: Path) -> Description | None:
         DataError: on a damaged description.
     """
     lines = read_start(path, LONGEST_HEADER).split("\nDATA", 1)[0].splitlines()
-    return from_comments((line[1:] for line in lines if line.startswith("#")), str(path))
+    return from_comments(
+        (line[1:] for line in lines if line.startswith("#")), str(path)
+    )
 
 
 def _header(text: str, where: str) -> tuple[list[Field], int]:
     """Parse the fields and the number of points, after checking that all lines exist once and
     agree."""
-    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    rows = [
+        line.split()
+        for line in text.splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     header = {row[0]: row[1:] for row in rows}
     fault = f"{where}: its header cannot be read"
     expected = "one line each of FIELDS, SIZE, TYPE, WIDTH, HEIGHT and POINTS"
@@ -120,7 +129,9 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
         "POINTS",
     } <= set(header):
         raise DataError(
-            f"{fault} (it has {[row[0][:20] for row in rows][:20]})", expected, SKIP_HINT
+            f"{fault} (it has {[row[0][:20] for row in rows][:20]})",
+            expected,
+            SKIP_HINT,
         )
     header.setdefault("COUNT", ["1"] * len(header["FIELDS"]))
     if len({len(header[key]) for key in _PER_FIELD}) > 1:
@@ -135,7 +146,9 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
         not re.fullmatch("[0-9]{1,12}", number) for number in numbers
     ):
         raise DataError(
-            f"{fault}: invalid sizes", "integers, one each for WIDTH, HEIGHT and POINTS", SKIP_HINT
+            f"{fault}: invalid sizes",
+            "integers, one each for WIDTH, HEIGHT and POINTS",
+            SKIP_HINT,
         )
     width, height, points = (int(number) for [number] in single)
     if width * height != points:
@@ -144,24 +157,30 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
             "WIDTH x HEIGHT = POINTS",
         )
     fields = []
-    for name, size, kind, count in zip(*(header[key] for key in _PER_FIELD), strict=True):
+    for name, size, kind, count in zip(
+        *(header[key] for key in _PER_FIELD), strict=True
+    ):
         if size not in _SIZES.get(kind, "") or int(count) < 1:
-            given = (
-                f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
-            )
+            given = f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
             raise DataError(
-                given, "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value", SKIP_HINT
+                given,
+                "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value",
+                SKIP_HINT,
             )
         fields.append(Field(name, f"<{kind.lower()}{size}", int(count)))
     return fields, points
 
 
-def _from_columns(body: bytes, fields: list[Field], count: int) -> dict[str, NDArray[Any]]:
+def _from_columns(
+    body: bytes, fields: list[Field], count: int
+) -> dict[str, NDArray[Any]]:
     """{name: values} of fields that are stored one after another, as in compressed files."""
     arrays = {}
     offset = 0
     for field in fields:
-        arrays[field.name] = np.frombuffer(body, field.type, count * field.count, offset)
+        arrays[field.name] = np.frombuffer(
+            body, field.type, count * field.count, offset
+        )
         offset += count * field.width
     return arrays
 
@@ -178,7 +197,9 @@ def _decompressed(body: bytes, size: int, where: str) -> bytes:
     check_size(body, 8 + packed, where)
     target = np.empty(size, np.uint8)
     if lzf(np.frombuffer(body, np.uint8, packed, 8), target) != size:
-        raise DataError(f"{where}: its compressed points are damaged", "LZF data", SKIP_HINT)
+        raise DataError(
+            f"{where}: its compressed points are damaged", "LZF data", SKIP_HINT
+        )
     return target.tobytes()
 
 

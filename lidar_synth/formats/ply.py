@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, read_file, read_start, unreadable, write_file
+from lidar_synth.files.disk import (
+    SKIP_HINT,
+    read_file,
+    read_start,
+    unreadable,
+    write_file,
+)
 from lidar_synth.formats.cloud import (
     Field,
     check_fields,
@@ -83,9 +89,16 @@ def write_ply(path: Path, scan: Scan) -> None:
 def vertex_header(records: NDArray[np.void], comments: Iterable[str] = ()) -> bytes:
     """The header of a binary file that holds only these records."""
     names = {kind: name for name, kind in reversed(TYPES.items())}
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in comments),
+    ]
     lines += [f"element vertex {len(records)}"]
-    lines += [f"property {names[records.dtype[n].str[1:]]} {n}" for n in records.dtype.names or ()]
+    lines += [
+        f"property {names[records.dtype[n].str[1:]]} {n}"
+        for n in records.dtype.names or ()
+    ]
     return "\n".join([*lines, "end_header\n"]).encode()
 
 
@@ -118,7 +131,9 @@ def map_vertices(path: Path) -> NDArray[np.void]:
     if size - offset != elements[0].size:
         raise size_error(where, size - offset, elements[0].size)
     if len({f.name for f in fields}) < len(fields):
-        raise DataError(f"{where} has a property twice", "each property once", SKIP_HINT)
+        raise DataError(
+            f"{where} has a property twice", "each property once", SKIP_HINT
+        )
     kind = np.dtype([(f.name, f.type) for f in fields])
     if count == 0:
         return np.zeros(0, kind)
@@ -135,8 +150,12 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     content = read_file(path)
     where = str(path)
     encoding, elements, offset = _parse(content[:LONGEST_HEADER], where)
-    [(position, vertex)] = [(i, e) for i, e in enumerate(elements) if e.name == "vertex"]
-    if vertex.lists or (encoding != "ascii" and any(e.lists for e in elements[:position])):
+    [(position, vertex)] = [
+        (i, e) for i, e in enumerate(elements) if e.name == "vertex"
+    ]
+    if vertex.lists or (
+        encoding != "ascii" and any(e.lists for e in elements[:position])
+    ):
         raise DataError(
             f"{where} has lists in its points or before them",
             "the element vertex first, without lists",
@@ -150,13 +169,18 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
         start = sum(e.count for e in elements[:position])
         return to_arrays(
             from_text(
-                "\n".join(lines[start : start + vertex.count]), vertex.fields, vertex.count, where
+                "\n".join(lines[start : start + vertex.count]),
+                vertex.fields,
+                vertex.count,
+                where,
             )
         )
     size = sum(e.size for e in elements)  # a lower bound if there are lists
     check_size(body, size, where, more=any(e.lists for e in elements))
     start = sum(e.size for e in elements[:position])
-    return to_arrays(from_records(body[start : start + vertex.size], vertex.fields, vertex.count))
+    return to_arrays(
+        from_records(body[start : start + vertex.size], vertex.fields, vertex.count)
+    )
 
 
 def read_ply_description(path: Path) -> Description | None:
@@ -168,7 +192,8 @@ def read_ply_description(path: Path) -> Description | None:
     """
     lines = read_start(path, LONGEST_HEADER).split("\nend_header", 1)[0].splitlines()
     return from_comments(
-        (line.removeprefix("comment") for line in lines if line.startswith("comment")), str(path)
+        (line.removeprefix("comment") for line in lines if line.startswith("comment")),
+        str(path),
     )
 
 
@@ -176,7 +201,9 @@ def _parse(start: bytes, where: str) -> tuple[str, list[Element], int]:
     """Encoding, elements, and length of the header in the first bytes of a file."""
     end = re.search(rb"^end_header\r?\n", start, re.M)
     if not start.startswith(b"ply") or end is None:
-        raise DataError(f"{where} has no header of a .ply file", "a PLY file", SKIP_HINT)
+        raise DataError(
+            f"{where} has no header of a .ply file", "a PLY file", SKIP_HINT
+        )
     return *_header(start[: end.start()].decode("latin-1"), where), end.end()
 
 
@@ -190,7 +217,9 @@ def _header(text: str, where: str) -> tuple[str, list[Element]]:
                 pass
             case ["format", name, "1.0"] if name in ORDERS:
                 encodings.append(name)
-            case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count) and encodings:
+            case ["element", name, count] if (
+                re.fullmatch("[0-9]{1,12}", count) and encodings
+            ):
                 elements.append(Element(name, int(count)))
             case ["property", "list", length, kind, _] if (
                 length in TYPES and kind in TYPES and elements
@@ -198,13 +227,19 @@ def _header(text: str, where: str) -> tuple[str, list[Element]]:
                 elements[-1].fields.append(Field("", TYPES[length]))
                 elements[-1].lists = True
             case ["property", kind, name] if kind in TYPES and elements:
-                elements[-1].fields.append(Field(name, ORDERS[encodings[0]] + TYPES[kind]))
+                elements[-1].fields.append(
+                    Field(name, ORDERS[encodings[0]] + TYPES[kind])
+                )
             case _:
                 raise DataError(
-                    f"{where}: its header cannot be read ({line[:100]!r})", "a PLY file", SKIP_HINT
+                    f"{where}: its header cannot be read ({line[:100]!r})",
+                    "a PLY file",
+                    SKIP_HINT,
                 )
     if len(encodings) != 1 or [e.name for e in elements].count("vertex") != 1:
         raise DataError(
-            f"{where}: its header cannot be read", "one format and one element vertex", SKIP_HINT
+            f"{where}: its header cannot be read",
+            "one format and one element vertex",
+            SKIP_HINT,
         )
     return encodings[0], elements

@@ -72,7 +72,9 @@ class RangePNG(ScanFiles):
         paths = [root] if root.is_file() else list_files(root / "range", ".png")
         base = root.absolute().parents[1] if root.is_file() else root
         stored = _stored_sensor(paths[0]) if paths else None
-        super().__init__(base, [path.stem for path in paths], None, on_bad, stored=stored)
+        super().__init__(
+            base, [path.stem for path in paths], None, on_bad, stored=stored
+        )
         self._given = None if sensor is None else load_sensor(sensor)
 
     def image(self, index: int) -> RangeImage:
@@ -98,7 +100,9 @@ class RangePNG(ScanFiles):
         )
         steps, text = read_png(path)
         facts = parse_json(
-            text.get(TEXT, ""), f"{path}: its text", "a range image written by this package"
+            text.get(TEXT, ""),
+            f"{path}: its text",
+            "a range image written by this package",
         )
         try:
             sensor = Sensor.from_dict(facts["sensor"])
@@ -110,7 +114,11 @@ class RangePNG(ScanFiles):
             if facts["domain"] not in (REAL, SYNTHETIC) or not 0 < scale < 1:
                 raise ValueError(f"domain {facts['domain']!r} and scale {scale}")
             check_provenance(facts.get("provenance", {}))
-            channels = {"reflectance": (_steps(reflectance) / np.float32(STEPS)).astype(np.float32)}
+            channels = {
+                "reflectance": (_steps(reflectance) / np.float32(STEPS)).astype(
+                    np.float32
+                )
+            }
             if label.is_file():
                 channels["label"] = read_png(label)[0]
                 if channels["label"].dtype != np.uint8:
@@ -121,7 +129,9 @@ class RangePNG(ScanFiles):
                 _steps(path, steps) * np.float32(scale), sensor, channels, str(path)
             ), facts
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(f"{path}: {error}", "a range image written by this package") from error
+            raise DataError(
+                f"{path}: {error}", "a range image written by this package"
+            ) from error
 
 
 def _stored_sensor(path: Path) -> Sensor | None:
@@ -137,7 +147,11 @@ def _stored_sensor(path: Path) -> Sensor | None:
 def _steps(path: Path, values: NDArray[Any] | None = None) -> NDArray[Any]:
     """The values of a 16-bit grey image."""
     values = read_png(path)[0] if values is None else values
-    if values.dtype.kind not in "iu" or values.ndim != 2 or (values.size and values.max() > STEPS):
+    if (
+        values.dtype.kind not in "iu"
+        or values.ndim != 2
+        or (values.size and values.max() > STEPS)
+    ):
         raise DataError(
             f"{path} holds {values.dtype} of shape {values.shape}",
             "a picture of 16-bit grey",
@@ -157,7 +171,11 @@ class PNGWriter(Writer):
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         image = project_scan(scan)
         scale = image.sensor.range_max / STEPS
@@ -169,7 +187,9 @@ class PNGWriter(Writer):
         }
         facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
         if image.label is not None:
-            write_png(channel_path(self.root, "label", path.stem), image.label, palette=True)
+            write_png(
+                channel_path(self.root, "label", path.stem), image.label, palette=True
+            )
         reflectance = image.channels["reflectance"] * STEPS
         write_png(
             channel_path(self.root, "reflectance", path.stem),
@@ -195,7 +215,9 @@ def read_png(path: Path) -> tuple[NDArray[Any], dict[str, str]]:
     return np.array(picture), dict(getattr(picture, "text", {}))
 
 
-def write_png(path: Path, values: NDArray[Any], text: str = "", palette: bool = False) -> None:
+def write_png(
+    path: Path, values: NDArray[Any], text: str = "", palette: bool = False
+) -> None:
     """The inverse of ``read_png``.
 
     Args:

@@ -17,7 +17,9 @@ from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.geometry.scan import Scan
 
 
-def read_labels(path: Path, points: Path, count: int, taxonomy: Taxonomy) -> dict[str, Any]:
+def read_labels(
+    path: Path, points: Path, count: int, taxonomy: Taxonomy
+) -> dict[str, Any]:
     """The fields ``label``, ``raw_label`` and ``instance`` of a scan from its label file.
 
     Args:
@@ -53,7 +55,9 @@ def mismatch(path: Path, labels: int, points: Path, count: int) -> DataError:
     )
 
 
-def decode_labels(raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str) -> dict[str, Any]:
+def decode_labels(
+    raw: NDArray[np.uint32], taxonomy: Taxonomy, where: str
+) -> dict[str, Any]:
     """Decode the values of a label file to ``label``, ``raw_label`` and ``instance``; the inverse
     of ``encode_labels``.
 
@@ -103,7 +107,9 @@ def write_labels(path: Path, values: NDArray[np.uint32]) -> None:
     write_file(path, values.astype("<u4").tobytes())
 
 
-def _means(raw: NDArray[np.uint32], label: NDArray[np.uint8], taxonomy: Taxonomy) -> bool:
+def _means(
+    raw: NDArray[np.uint32], label: NDArray[np.uint8], taxonomy: Taxonomy
+) -> bool:
     try:
         return bool((taxonomy.decode((raw & 0xFFFF).astype(np.uint16)) == label).all())
     except DataError:

@@ -25,7 +25,9 @@ _FOR_ALL = ", or the largest value of all scans: all are divided by it"
 _bad_points_kept = ContextVar("bad points kept", default=False)
 
 
-def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> NDArray[np.float32]:
+def read_points(
+    path: Path, fields: int = 4, reflectance_max: float = 1.0
+) -> NDArray[np.float32]:
     """Read the points of a raw ``.bin`` file: little-endian float32, ``fields`` per point, no
     header.
 
@@ -47,7 +49,9 @@ def read_points(path: Path, fields: int = 4, reflectance_max: float = 1.0) -> ND
     except OSError as error:
         raise unreadable(path, error) from error
     if size == 0:
-        raise DataError(f"{path} is empty", f"{4 * fields} bytes for each point", SKIP_HINT)
+        raise DataError(
+            f"{path} is empty", f"{4 * fields} bytes for each point", SKIP_HINT
+        )
     if size % (4 * fields):
         fits = [n for n in (4, 5, 6) if size % (4 * n) == 0]
         hint = ""
@@ -74,7 +78,9 @@ def write_points(path: Path, scan: Scan) -> None:
     Raises:
         FileError: if it cannot be written.
     """
-    write_file(path, np.column_stack([scan.points, scan.reflectance]).astype("<f4").tobytes())
+    write_file(
+        path, np.column_stack([scan.points, scan.reflectance]).astype("<f4").tobytes()
+    )
 
 
 def check_points(
@@ -120,7 +126,9 @@ def check_points(
         )
 
 
-def finite(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> NDArray[np.bool_]:
+def finite(
+    points: NDArray[np.float32], reflectance: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """(N,) True for points whose coordinates and reflectance are finite."""
     good: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.isfinite(reflectance)
     return good
@@ -163,18 +171,27 @@ def check_scan(scan: Scan, where: str, reflectance_max: float = 1.0) -> None:
             1], times beyond ``LONGEST``, and a pose that is not rigid.
     """
     check_points(scan.points, scan.reflectance, where, reflectance_max)
-    if scan.label is not None and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any():
+    if (
+        scan.label is not None
+        and ((scan.label >= len(NAMES)) & (scan.label != IGNORE)).any()
+    ):
         raise DataError(
             f"{where}: labels {np.unique(scan.label)[-8:].tolist()}",
             "train ids 0..18, or 255 = ignore",
         )
-    if scan.confidence is not None and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all():
+    if (
+        scan.confidence is not None
+        and not ((scan.confidence >= 0) & (scan.confidence <= 1)).all()
+    ):
         raise DataError(
-            f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}", "0 to 1"
+            f"{where}: confidence from {scan.confidence.min()} to {scan.confidence.max()}",
+            "0 to 1",
         )
     if (
         scan.time is not None
-        and not (np.abs(scan.time[finite(scan.points, scan.reflectance)]) <= LONGEST).all()
+        and not (
+            np.abs(scan.time[finite(scan.points, scan.reflectance)]) <= LONGEST
+        ).all()
     ):
         raise DataError(
             f"{where}: times from {scan.time.min():g} to {scan.time.max():g}",

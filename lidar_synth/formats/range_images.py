@@ -108,9 +108,13 @@ class RangeImages(ScanFiles):
     ) -> None:
         root = Path(root)
         self._base, paths = scan_paths(root, SUFFIXES)
-        ids = [path.relative_to(self._base).with_suffix("").as_posix() for path in paths]
+        ids = [
+            path.relative_to(self._base).with_suffix("").as_posix() for path in paths
+        ]
         stored = read_stored_sensor(paths[0])
-        super().__init__(root, ids, sensor if stored is None else None, on_bad, stored=stored)
+        super().__init__(
+            root, ids, sensor if stored is None else None, on_bad, stored=stored
+        )
         self._suffix = paths[0].suffix
         self._given = None if sensor is None else load_sensor(sensor)
         said = None if self.description is None else self.description.sensor
@@ -149,7 +153,9 @@ class RangeImages(ScanFiles):
     def _path(self, index: int) -> Path:
         return self._base / f"{self.ids[index]}{self._suffix}"
 
-    def _decode(self, index: int) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32] | None]:
+    def _decode(
+        self, index: int
+    ) -> tuple[RangeImage, dict[str, Any], NDArray[np.float32] | None]:
         """The image, further facts of the scan, and (H, W, 3) points if the file holds them."""
         path = self._path(index)
         arrays = read_arrays(path)
@@ -158,7 +164,9 @@ class RangeImages(ScanFiles):
         array = arrays.get("image", arrays.get("array"))
         if array is None or array.ndim not in (2, 3):
             held = {name: values.shape for name, values in arrays.items()}
-            raise DataError(f"{path} holds arrays {held}", "range and sensor, or image (H, W, 6)")
+            raise DataError(
+                f"{path} holds arrays {held}", "range and sensor, or image (H, W, 6)"
+            )
         check_numbers(array, str(path))
         with np.errstate(over="ignore"):
             array = array.astype(np.float32)
@@ -166,11 +174,14 @@ class RangeImages(ScanFiles):
             return decode_stack(array, self._convention, self.sensor, str(path))
         if array.ndim == 3 and len(array) != 2:
             raise DataError(
-                f"{path} holds an array of shape {array.shape}", "(H, W), (2, H, W) or (H, W, 6)"
+                f"{path} holds an array of shape {array.shape}",
+                "(H, W), (2, H, W) or (H, W, 6)",
             )
         channels = {"reflectance": array[1]} if array.ndim == 3 else {}
         return (
-            range_image(array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)),
+            range_image(
+                array[0] if array.ndim == 3 else array, self.sensor, channels, str(path)
+            ),
             {},
             None,
         )
@@ -209,15 +220,20 @@ def decode_stack(
         classes = stack[..., 5]
         if not np.isin(classes, np.arange(20)).all():
             raise DataError(
-                f"{where}: classes up to {classes.max():g}", "SemanticKITTI's 0..19, 0 = unlabelled"
+                f"{where}: classes up to {classes.max():g}",
+                "SemanticKITTI's 0..19, 0 = unlabelled",
             )
         channels["label"] = (classes.astype(np.int16) - 1).astype(np.uint8)
     points = stack[..., :3]
     if convention.turned:
         quarter = stack.shape[1] // 4
-        points = np.roll(ahead(points.reshape(-1, 3)).reshape(points.shape), quarter, axis=1)
+        points = np.roll(
+            ahead(points.reshape(-1, 3)).reshape(points.shape), quarter, axis=1
+        )
         distance = np.roll(distance, quarter, axis=1)
-        channels = {name: np.roll(values, quarter, axis=1) for name, values in channels.items()}
+        channels = {
+            name: np.roll(values, quarter, axis=1) for name, values in channels.items()
+        }
     return range_image(distance, sensor, channels, where), {}, points
 
 
@@ -229,6 +245,10 @@ class RangeWriter(FileWriter):
     keeps = frozenset(DETAILS) - {"image_path"}
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         write_range_image(path, project_scan(scan), scan)

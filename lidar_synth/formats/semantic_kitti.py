@@ -32,7 +32,12 @@ from lidar_synth.files.disk import (
     write_file,
     write_named_matrices,
 )
-from lidar_synth.formats.calibration import Calibration, check_rigid, homogeneous, ideal_camera
+from lidar_synth.formats.calibration import (
+    Calibration,
+    check_rigid,
+    homogeneous,
+    ideal_camera,
+)
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -112,7 +117,9 @@ class SemanticKITTI(ScanFiles):
         root = Path(root)
         self.taxonomy = taxonomy
         wanted = choose("SemanticKITTI split", split, SPLITS)
-        existing = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
+        existing = sorted(
+            p.parent.name for p in (root / "sequences").glob("*/velodyne")
+        )
         sequences = [s for s in existing if wanted is None or s in wanted]
         if not sequences:
             raise DataError(
@@ -126,9 +133,13 @@ class SemanticKITTI(ScanFiles):
             for p in list_files(root / "sequences" / s / "velodyne", ".bin")
         ]
         super().__init__(root, ids, sensor, on_bad)
-        self._labelled = {s for s in sequences if (root / "sequences" / s / "labels").is_dir()}
+        self._labelled = {
+            s for s in sequences if (root / "sequences" / s / "labels").is_dir()
+        }
         self._cameras = {s: read_calibration(root / "sequences" / s) for s in sequences}
-        self._poses = {s: read_poses(root / "sequences" / s, self._cameras[s]) for s in sequences}
+        self._poses = {
+            s: read_poses(root / "sequences" / s, self._cameras[s]) for s in sequences
+        }
 
     def read(self, index: int) -> Scan:
         sequence, frame = self.ids[index].split("/")
@@ -175,7 +186,11 @@ class SemanticKITTIWriter(Writer):
     always_labels = True
 
     def __init__(
-        self, root: str | Path, *, sequence: str = "00", calibration: Calibration | None = None
+        self,
+        root: str | Path,
+        *,
+        sequence: str = "00",
+        calibration: Calibration | None = None,
     ) -> None:
         super().__init__(root, calibration=calibration)
         self.sequence = sequence
@@ -190,7 +205,11 @@ class SemanticKITTIWriter(Writer):
         return f"sequences/{sequence}/velodyne/{frame:06d}.bin"
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         folder = path.parents[1]
         frame = path.stem
@@ -198,11 +217,15 @@ class SemanticKITTIWriter(Writer):
             if not (folder / "calib.txt").is_file():
                 write_calibration(folder, camera or KITTI_CAMERA)
             write_note(
-                folder, int(frame), {"pose": None if scan.pose is None else scan.pose.tolist()}
+                folder,
+                int(frame),
+                {"pose": None if scan.pose is None else scan.pose.tolist()},
             )
         if picture is not None:
             write_image(folder / "image_2" / f"{frame}.png", picture)
-        write_labels(folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI))
+        write_labels(
+            folder / "labels" / f"{frame}.label", encode_labels(scan, SEMANTIC_KITTI)
+        )
         self._write_points(path, scan)
 
     def carry(self, source: ScanFiles) -> list[str]:
@@ -211,7 +234,9 @@ class SemanticKITTIWriter(Writer):
         missing = []
         for sequence in sorted({name.split("/")[0] for name in source.ids}):
             if not all(
-                self._keeps(i, n) for i, n in enumerate(source.ids) if n.startswith(f"{sequence}/")
+                self._keeps(i, n)
+                for i, n in enumerate(source.ids)
+                if n.startswith(f"{sequence}/")
             ):
                 missing.append(
                     f"calibration, poses and times of sequence {sequence}: its scans are renumbered"
@@ -221,22 +246,32 @@ class SemanticKITTIWriter(Writer):
             for name in SIDE_FILES:
                 path = source.root / "sequences" / sequence / name
                 if path.is_file():
-                    write_file(self.root / "sequences" / sequence / name, read_file(path))
+                    write_file(
+                        self.root / "sequences" / sequence / name, read_file(path)
+                    )
                 else:
-                    missing.append(f"sequences/{sequence}/{name}: {source.root} has none")
+                    missing.append(
+                        f"sequences/{sequence}/{name}: {source.root} has none"
+                    )
         return missing
 
     def _keeps(self, index: int, name: str) -> bool:
         """Whether a scan of SemanticKITTI keeps its sequence and its frame."""
         path, (sequence, frame) = self.path(index, name), name.split("/")
-        return path.parents[1].name == sequence and frame.isdigit() and int(path.stem) == int(frame)
+        return (
+            path.parents[1].name == sequence
+            and frame.isdigit()
+            and int(path.stem) == int(frame)
+        )
 
     def finish(self) -> None:
         for folder in sorted((self.root / "sequences").glob("*")):
             notes = read_notes(folder)
             camera = read_calibration(folder)
             poses = {
-                f: np.array(note["pose"]) for f, note in notes.items() if note["pose"] is not None
+                f: np.array(note["pose"])
+                for f, note in notes.items()
+                if note["pose"] is not None
             }
             if notes and camera is not None:
                 write_poses(folder, camera, poses, frames=1 + max(notes))
@@ -267,7 +302,9 @@ def write_calibration(folder: Path, camera: Calibration) -> None:
     write_named_matrices(folder / "calib.txt", camera.matrices if own else lines)
 
 
-def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np.float64]]:
+def read_poses(
+    folder: Path, camera: Calibration | None
+) -> dict[int, NDArray[np.float64]]:
     """{frame: (4, 4) sensor to world}; empty without ``poses.txt`` or a calibration. A line of
     ``nan`` is a frame without a pose.
 
@@ -286,7 +323,10 @@ def read_poses(folder: Path, camera: Calibration | None) -> dict[int, NDArray[np
 
 
 def write_poses(
-    folder: Path, camera: Calibration, poses: dict[int, NDArray[np.float64]], frames: int
+    folder: Path,
+    camera: Calibration,
+    poses: dict[int, NDArray[np.float64]],
+    frames: int,
 ) -> None:
     """The inverse of ``read_poses``, for at least this number of frames; writes nothing if no pose
     is known.

@@ -81,11 +81,14 @@ class ScanFiles(ABC):
             raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}")
         if not ids:
             raise DataError(
-                f"{root} holds no scan", (self.__doc__ or "").splitlines()[0].rstrip(".")
+                f"{root} holds no scan",
+                (self.__doc__ or "").splitlines()[0].rstrip("."),
             )
         self.root = root
         self.ids = tuple(ids)
-        self.description = read_description(root, self.plain) if stored is None else None
+        self.description = (
+            read_description(root, self.plain) if stored is None else None
+        )
         named = stored if self.description is None else self.description.sensor
         self._given = None if sensor is None else load_sensor(sensor)
         self.sensor = self._given or named or load_sensor(self.default_sensor)

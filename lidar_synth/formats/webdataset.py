@@ -80,7 +80,11 @@ class WebDataset(ScanFiles):
         with suppress(DataError):  # reading the scan will raise it
             stored = _decode(*self._places[0], None).sensor if self._places else None
         super().__init__(
-            root, [unquote(key) for _, key, _ in self._places], sensor, on_bad, stored=stored
+            root,
+            [unquote(key) for _, key, _ in self._places],
+            sensor,
+            on_bad,
+            stored=stored,
         )
 
     def read(self, index: int) -> Scan:
@@ -106,7 +110,11 @@ class WebDatasetWriter(Writer):
     keeps = frozenset(DETAILS) - {"image_path"}
 
     def __init__(
-        self, root: str | Path, *, shard_size: int = 1000, calibration: Calibration | None = None
+        self,
+        root: str | Path,
+        *,
+        shard_size: int = 1000,
+        calibration: Calibration | None = None,
     ) -> None:
         super().__init__(root, calibration=calibration)
         if shard_size < 1:
@@ -123,22 +131,36 @@ class WebDatasetWriter(Writer):
 
     def complete(self, index: int, name: str | None = None) -> bool:
         if self._there is None:
-            self._there = {key for path in self.root.glob(f"*{SUFFIX}") for key, _ in _scans(path)}
+            self._there = {
+                key for path in self.root.glob(f"*{SUFFIX}") for key, _ in _scans(path)
+            }
         return _key(index, name) in self._there or super().complete(index, name)
 
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
-        write_file(path, lambda file: _write_tar(file, _encode(self._key_of(path), scan)))
+        write_file(
+            path, lambda file: _write_tar(file, _encode(self._key_of(path), scan))
+        )
 
     def _key_of(self, path: Path) -> str:
         """The key of the scan in a file that is still to be merged."""
-        return Path(*path.relative_to(self.root / NOTES).parts[1:]).with_suffix("").as_posix()
+        return (
+            Path(*path.relative_to(self.root / NOTES).parts[1:])
+            .with_suffix("")
+            .as_posix()
+        )
 
     def finish(self) -> None:
         parts: dict[int, list[Path]] = defaultdict(list)
         for path in sorted((self.root / NOTES).rglob(f"*{SUFFIX}")):
-            parts[int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size].append(path)
+            parts[
+                int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size
+            ].append(path)
         for number, paths in parts.items():
             shard = self.root / f"scans-{number:06d}{SUFFIX}"
             members = _merge(shard, {self._key_of(path): path for path in paths})
@@ -149,18 +171,26 @@ class WebDatasetWriter(Writer):
 
 def _key(index: int, name: str | None) -> str:
     """The key of a scan, without dots: WebDataset separates key and extension at the first dot."""
-    return f"{index:06d}" if name is None else name.replace("%", "%25").replace(".", "%2E")
+    return (
+        f"{index:06d}" if name is None else name.replace("%", "%25").replace(".", "%2E")
+    )
 
 
 def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
     """Names and contents of a scan's members; ``_decode`` is the inverse."""
-    facts: dict[str, Any] = {"id": scan.id, "domain": scan.domain, "sensor": scan.sensor.to_dict()}
+    facts: dict[str, Any] = {
+        "id": scan.id,
+        "domain": scan.domain,
+        "sensor": scan.sensor.to_dict(),
+    }
     facts |= {"provenance": dict(scan.provenance)} if scan.provenance else {}
     facts |= {} if scan.pose is None else {"pose": scan.pose.tolist()}
     facts |= {} if scan.boxes is None else {"names": list(scan.boxes.names)}
     facts |= {} if scan.label is not None else {"labelled": False}
     fields = {"label": np.full(len(scan), IGNORE, np.uint8)} | scan.fields()
-    points = np.column_stack([scan.points, fields.pop("reflectance")]).astype(np.float32)
+    points = np.column_stack([scan.points, fields.pop("reflectance")]).astype(
+        np.float32
+    )
     arrays = {"points": points, **fields}
     arrays |= {} if scan.boxes is None else {"boxes": scan.boxes.values}
     yield f"{key}.json", json.dumps(facts).encode()
@@ -178,7 +208,9 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
     except OSError as error:
         raise unreadable(path, error) from error
     facts = parse_json(
-        contents.pop("json", b""), f"{where}: its json", "the members that this package writes"
+        contents.pop("json", b""),
+        f"{where}: its json",
+        "the members that this package writes",
     )
     arrays = {
         name.removesuffix(".npy"): parse_npy(content, f"{where}: {name}")
@@ -186,17 +218,25 @@ def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Sc
         if name.endswith(".npy")
     }
     try:
-        boxes = Boxes(arrays.pop("boxes"), _texts(facts["names"])) if "boxes" in arrays else None
+        boxes = (
+            Boxes(arrays.pop("boxes"), _texts(facts["names"]))
+            if "boxes" in arrays
+            else None
+        )
         points = arrays.pop("points")
         arrays |= {"points": points[:, :3], "reflectance": points[:, 3]}
         if "labelled" in facts and facts["labelled"] is False:
             del arrays["label"]
         texts = {
-            name: json.dumps(facts[name]) for name in ("sensor", "provenance") if name in facts
+            name: json.dumps(facts[name])
+            for name in ("sensor", "provenance")
+            if name in facts
         }
         arrays |= {name: np.array(text) for name, text in texts.items()}
         arrays |= {
-            name: np.array(facts[name]) for name in ("id", "domain", "pose") if name in facts
+            name: np.array(facts[name])
+            for name in ("id", "domain", "pose")
+            if name in facts
         }
     except (ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise DataError(
@@ -306,11 +346,15 @@ def _open(path: Path) -> Iterator[tarfile.TarFile]:
             tarfile.open(fileobj=file, mode="r:", tarinfo=_Member) as tar,
         ):
             yield tar
-    except (tarfile.TarError, ValueError) as error:  # ValueError: of numbers in pax headers
+    except (
+        tarfile.TarError,
+        ValueError,
+    ) as error:  # ValueError: of numbers in pax headers
         if isinstance(error, LidarSynthError):
             raise
         raise DataError(
-            f"{path} is truncated, damaged or not a tar file ({error})", "a file of a WebDataset"
+            f"{path} is truncated, damaged or not a tar file ({error})",
+            "a file of a WebDataset",
         ) from error
     except OSError as error:
         raise unreadable(path, error) from error

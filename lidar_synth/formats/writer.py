@@ -74,7 +74,9 @@ class Writer(ABC):
     keeps: frozenset[str]
     always_labels = False
 
-    def __init__(self, root: str | Path, *, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self, root: str | Path, *, calibration: Calibration | None = None
+    ) -> None:
         self.root = Path(root)
         self.calibration = calibration
         self._without_links = False
@@ -131,11 +133,15 @@ class Writer(ABC):
         self.require_grid(scan.sensor)
         where = f"scan {scan.id!r}"
         check_facts(scan, where)
-        typed: dict[str, Any] = to_stored({"points": scan.points, **scan.fields()}, where)
+        typed: dict[str, Any] = to_stored(
+            {"points": scan.points, **scan.fields()}, where
+        )
         scan = replace(scan, **typed)
         check_scan(scan, where)
         picture = scan.image_path if image is None else image
-        self._put(scan, self.path(index, name), picture, calibration or self.calibration)
+        self._put(
+            scan, self.path(index, name), picture, calibration or self.calibration
+        )
 
     def require_grid(self, sensor: Sensor) -> None:
         """Refuse a sensor if the folder is described (``scans.json``) as holding scans on another
@@ -161,12 +167,18 @@ class Writer(ABC):
     def loses(self, scan: Scan) -> list[str]:
         """What the scan has, but the layout cannot hold; names of ``DETAILS``."""
         return [
-            name for name in DETAILS if name not in self.keeps and getattr(scan, name) is not None
+            name
+            for name in DETAILS
+            if name not in self.keeps and getattr(scan, name) is not None
         ]
 
     @abstractmethod
     def _put(
-        self, scan: Scan, path: Path, picture: Picture | None, camera: Calibration | None
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
     ) -> None:
         """Write the files of a scan, ``path`` last."""
 
@@ -226,7 +238,9 @@ def project_scan(scan: Scan) -> RangeImage:
     image = project(scan)
     if not image.mask.any():
         given = f"scan {scan.id!r}: none of its {len(scan)} points"
-        raise DataError(given, f"points in the view and range of sensor {scan.sensor.name!r}")
+        raise DataError(
+            given, f"points in the view and range of sensor {scan.sensor.name!r}"
+        )
     return image
 
 
@@ -242,7 +256,11 @@ def write_image(path: Path, picture: Picture) -> None:
         return
     from PIL import Image as pillow
 
-    opened = read_picture(picture) if isinstance(picture, Path) else pillow.fromarray(picture)
+    opened = (
+        read_picture(picture)
+        if isinstance(picture, Path)
+        else pillow.fromarray(picture)
+    )
     write_file(path, lambda file: opened.convert("RGB").save(file, "PNG"))
 
 
@@ -262,12 +280,15 @@ def read_notes(folder: Path) -> dict[int, dict[str, Any]]:
         DataError: on a damaged note.
     """
     notes = {}
-    for path in list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []:
+    for path in (
+        list_files(folder / NOTES, ".json") if (folder / NOTES).is_dir() else []
+    ):
         try:
             notes[int(path.stem)] = parse_json(read_text(path), str(path))
         except ValueError as error:
             raise DataError(
-                f"{path} is not a note of this package ({error})", hint=f"Remove {path.parent}."
+                f"{path} is not a note of this package ({error})",
+                hint=f"Remove {path.parent}.",
             ) from error
     return notes
 

@@ -30,9 +30,14 @@ def boxes_of(given: Any, count: int) -> list[Boxes] | None:
     if isinstance(given, Mapping):
         given = given.get("layout")
     each = list(given) if isinstance(given, Sequence) else [given] * count
-    if not all(isinstance(one, Scan | Layout) and one.boxes is not None for one in each):
+    if not all(
+        isinstance(one, Scan | Layout) and one.boxes is not None for one in each
+    ):
         return None
-    return [one.boxes if isinstance(one, Layout) else select_known_boxes(one) for one in each]
+    return [
+        one.boxes if isinstance(one, Layout) else select_known_boxes(one)
+        for one in each
+    ]
 
 
 def add_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:

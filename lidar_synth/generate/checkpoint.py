@@ -85,7 +85,8 @@ class Header:
     def __post_init__(self) -> None:
         if not {VELOCITY, CODEC} & set(self.networks):
             raise ConfigError(
-                f"networks {sorted(self.networks)}", f"{VELOCITY!r} or {CODEC!r} among them"
+                f"networks {sorted(self.networks)}",
+                f"{VELOCITY!r} or {CODEC!r} among them",
             )
         for grid in (self.time_grid, *self.other_grids):
             if (
@@ -94,20 +95,29 @@ class Header:
                 or any(a <= b for a, b in pairwise(grid))
             ):
                 raise ConfigError(
-                    f"time grid {grid}", "at least two times descending from 1 (noise) to 0 (data)"
+                    f"time grid {grid}",
+                    "at least two times descending from 1 (noise) to 0 (data)",
                 )
         if missing := [
             k for k in ("data", "data_licence", "licence") if not self.provenance.get(k)
         ]:
             raise ConfigError(
-                f"a provenance without {', '.join(missing)}", "data, data_licence and licence"
+                f"a provenance without {', '.join(missing)}",
+                "data, data_licence and licence",
             )
         if unknown := sorted(set(self.conditioning) - set(CONDITIONS)):
-            raise ConfigError(f"conditioning on {unknown}", f"some of {', '.join(CONDITIONS)}")
+            raise ConfigError(
+                f"conditioning on {unknown}", f"some of {', '.join(CONDITIONS)}"
+            )
         shape = (self.tensors.size, *self.sensor.shape)
         # The network that takes range images has the grid of the sensor.
-        arguments = self.networks[CODEC if CODEC in self.networks else VELOCITY].arguments
-        given = (arguments.get("channels", shape[0]), *arguments.get("resolution", shape[1:]))
+        arguments = self.networks[
+            CODEC if CODEC in self.networks else VELOCITY
+        ].arguments
+        given = (
+            arguments.get("channels", shape[0]),
+            *arguments.get("resolution", shape[1:]),
+        )
         if given != shape:
             raise ConfigError(
                 f"a network for {given} channels, rows and columns",
@@ -127,7 +137,9 @@ class Header:
             ConfigError: on fewer than one step.
         """
         known = {len(grid) - 1: grid for grid in (*self.other_grids, self.time_grid)}
-        return self.time_grid if steps is None else known.get(steps) or uniform_grid(steps)
+        return (
+            self.time_grid if steps is None else known.get(steps) or uniform_grid(steps)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as the file stores them, without ``weights`` and ``checksum``."""
@@ -144,7 +156,9 @@ class Header:
             "provenance": self.provenance,
         }
         return values | (
-            {"other_grids": [list(grid) for grid in self.other_grids]} if self.other_grids else {}
+            {"other_grids": [list(grid) for grid in self.other_grids]}
+            if self.other_grids
+            else {}
         )
 
     @classmethod
@@ -163,7 +177,10 @@ class Header:
             )
         try:
             header = cls(
-                networks={name: NetworkSpec(**part) for name, part in values["networks"].items()},
+                networks={
+                    name: NetworkSpec(**part)
+                    for name, part in values["networks"].items()
+                },
                 sensor=Sensor.from_dict(values["sensor"]),
                 normalisation=Normalisation(**values["normalisation"]),
                 channels=tuple(values["channels"]),
@@ -175,7 +192,9 @@ class Header:
                 ),
             )
         except KeyError as error:
-            raise ConfigError(f"a header without {error}", "all keys of the format") from error
+            raise ConfigError(
+                f"a header without {error}", "all keys of the format"
+            ) from error
         except (TypeError, AttributeError) as error:
             raise ConfigError(
                 f"a header with invalid values ({error})", "the values of the format"
@@ -218,7 +237,10 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(
-    path: Path, header: Header, networks: Mapping[str, nn.Module], dtype: torch.dtype | None = None
+    path: Path,
+    header: Header,
+    networks: Mapping[str, nn.Module],
+    dtype: torch.dtype | None = None,
 ) -> str:
     """Write a checkpoint to a temporary file, then rename it; the same content gives the same
     bytes.
@@ -242,7 +264,8 @@ def save_checkpoint(
         raise ConfigError(f"checkpoint {path}", "a name that ends in .safetensors")
     if set(networks) != set(header.networks):
         raise ConfigError(
-            f"networks {sorted(networks)}", f"those of the header: {sorted(header.networks)}"
+            f"networks {sorted(networks)}",
+            f"those of the header: {sorted(header.networks)}",
         )
     tensors = {}
     for name, network in networks.items():
@@ -250,14 +273,17 @@ def save_checkpoint(
         assemble(*header.networks[name], state, f"the network {name!r}")
         parameters = {k for k, _ in network.named_parameters()}
         for key, tensor in state.items():
-            tensors[f"{name}.{key}"] = tensor.to(dtype if key in parameters else None).contiguous()
+            tensors[f"{name}.{key}"] = tensor.to(
+                dtype if key in parameters else None
+            ).contiguous()
     _check_finite(tensors, "the network")
     values = {**header.to_dict(), "weights": weights_hash(tensors)}
     try:
         checksum = _checksum(values)
     except (TypeError, ValueError) as error:
         raise ConfigError(
-            f"a header with a value that JSON cannot store ({error})", "plain, finite values"
+            f"a header with a value that JSON cannot store ({error})",
+            "plain, finite values",
         ) from error
     text = json.dumps({**values, "checksum": checksum}, sort_keys=True)
     write_file(path, save(tensors, {"lidar_synth": text}), durable=True)
@@ -297,7 +323,9 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoin
         }
         networks[name] = assemble(*part, state, f"{path}: the network {name!r}", device)
     if unknown := [k for k in tensors if k.partition(".")[0] not in header.networks]:
-        raise DataError(f"{path}: tensors {unknown}", f"those of {sorted(header.networks)} only")
+        raise DataError(
+            f"{path}: tensors {unknown}", f"those of {sorted(header.networks)} only"
+        )
     return Checkpoint(header, networks, digest)
 
 
@@ -327,7 +355,8 @@ def _read(path: Path, tensors: bool = True) -> _Content:
             start = file.read(2)
     except OSError as error:
         raise FileError(
-            f"checkpoint {path} cannot be read ({error.strerror})", "a .safetensors file"
+            f"checkpoint {path} cannot be read ({error.strerror})",
+            "a .safetensors file",
         ) from error
     if start in (b"PK", b"\x80\x02"):
         raise DataError(
@@ -339,7 +368,8 @@ def _read(path: Path, tensors: bool = True) -> _Content:
     try:
         with safe_open(path, framework="pt") as content:
             text = (content.metadata() or {}).get("lidar_synth")
-            stored = {key: content.get_tensor(key) for key in content.keys()} if tensors else {}  # noqa: SIM118
+            keys = content.keys() if tensors else ()
+            stored = {key: content.get_tensor(key) for key in keys}
     except SafetensorError as error:
         raise DataError(
             f"{path} is truncated, damaged or no .safetensors file ({error})",
@@ -347,13 +377,19 @@ def _read(path: Path, tensors: bool = True) -> _Content:
             "Copy it again.",
         ) from error
     if text is None:
-        raise DataError(f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}")
+        raise DataError(
+            f"{path} has weights but no header of lidar_synth", f"a file of {FORMAT}"
+        )
     try:
         values = json.loads(text)
         digest = _verified(values)
         weights = values.pop("weights", None)
         return _Content(Header.from_dict(values), digest, weights, stored)
-    except (ValueError, AttributeError, RecursionError) as error:  # a ConfigError is a ValueError
+    except (
+        ValueError,
+        AttributeError,
+        RecursionError,
+    ) as error:  # a ConfigError is a ValueError
         raise DataError(f"{path}: {error}") from error
 
 
@@ -363,7 +399,9 @@ def _verified(values: dict[str, Any]) -> str:
     checksum = values.pop("checksum", None)
     if values.get("format") == FORMAT and checksum != _checksum(values):
         raise ConfigError(
-            "a header that does not match its checksum", "an intact file", "Copy it again."
+            "a header that does not match its checksum",
+            "an intact file",
+            "Copy it again.",
         )
     return str(checksum)
 
@@ -378,17 +416,24 @@ def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
     dimensions."""
     if deep := [k for k, v in tensors.items() if v.dim() > _MOST_DIMENSIONS]:
         raise DataError(
-            f"{what} has tensors of more than {_MOST_DIMENSIONS} dimensions: {deep}", "weights"
+            f"{what} has tensors of more than {_MOST_DIMENSIONS} dimensions: {deep}",
+            "weights",
         )
     if bad := [
-        k for k, v in tensors.items() if v.is_complex() or not bool(torch.isfinite(v.float()).all())
+        k
+        for k, v in tensors.items()
+        if v.is_complex() or not bool(torch.isfinite(v.float()).all())
     ]:
-        raise DataError(f"{what} has NaN or infinity in {bad}", "finite weights and ray angles")
+        raise DataError(
+            f"{what} has NaN or infinity in {bad}", "finite weights and ray angles"
+        )
 
 
 def network_hash(network: nn.Module) -> str:
     """``weights_hash`` of a network's state, on any device."""
-    return weights_hash({key: value.cpu() for key, value in network.state_dict().items()})
+    return weights_hash(
+        {key: value.cpu() for key, value in network.state_dict().items()}
+    )
 
 
 def weights_hash(tensors: Mapping[str, Tensor]) -> str:

@@ -123,7 +123,8 @@ class Latent:
         """
         if y.shape[1:] != self.shape:
             raise DataError(
-                f"a latent of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, self.shape))})"
+                f"a latent of shape {tuple(y.shape)}",
+                f"(B, {', '.join(map(str, self.shape))})",
             )
         decode: Callable[..., Tensor] = self.network.decode
         taken = {
@@ -131,7 +132,9 @@ class Latent:
             for name, values in (given or {}).items()
             if name in self.network.decodes_given
         }
-        return expected(decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors)
+        return expected(
+            decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors
+        )
 
 
 def make_codec(
@@ -154,6 +157,7 @@ def make_codec(
     wanted = (tensors.size, *resolution)
     if given != wanted:
         raise DataError(
-            f"an autoencoder for images of shape {given}", f"{wanted} for {tensors.channels}"
+            f"an autoencoder for images of shape {given}",
+            f"{wanted} for {tensors.channels}",
         )
     return Latent(codec, tensors)

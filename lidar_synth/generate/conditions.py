@@ -64,7 +64,11 @@ class Condition(Protocol):
         ...
 
     def read(
-        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+        self,
+        scan: Scan,
+        sensor: Sensor,
+        shape: tuple[int, ...],
+        options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The condition that a real scan provides, with the given shape."""
         ...
@@ -113,7 +117,11 @@ class SemanticMap:
         return tuple(encoder.resolution)  # type: ignore[arg-type]  # every encoder has a resolution
 
     def read(
-        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+        self,
+        scan: Scan,
+        sensor: Sensor,
+        shape: tuple[int, ...],
+        options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see
         ``bridge_gaps``.
@@ -122,7 +130,9 @@ class SemanticMap:
             DataError: on a scan without labels.
         """
         if scan.label is None:
-            raise DataError(f"scan {scan.id!r} has no labels", "a labelled scan, to condition on")
+            raise DataError(
+                f"scan {scan.id!r} has no labels", "a labelled scan, to condition on"
+            )
         return bridge_gaps(project(scan, sensor, ["label"]).channels["label"])
 
     def check(self, values: Tensor) -> None:
@@ -158,7 +168,11 @@ class CameraImage:
         return (3, *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
 
     def read(
-        self, scan: Scan, sensor: Sensor, shape: tuple[int, ...], options: Mapping[str, Any]
+        self,
+        scan: Scan,
+        sensor: Sensor,
+        shape: tuple[int, ...],
+        options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The image taken with the scan, see ``resize_image``.
 
@@ -187,7 +201,10 @@ class CameraImage:
 
 
 def resize_image(
-    image: "PILImage", shape: tuple[int, ...], options: Mapping[str, Any], what: str = "an image"
+    image: "PILImage",
+    shape: tuple[int, ...],
+    options: Mapping[str, Any],
+    what: str = "an image",
 ) -> NDArray[np.uint8]:
     """A camera image as a condition.
 
@@ -329,7 +346,9 @@ def one_view(image: Tensor, views: int) -> Tensor:
     width = image.shape[3] // views
     kept = views // 2
     out = torch.zeros_like(image)
-    out[..., kept * width : (kept + 1) * width] = image[..., kept * width : (kept + 1) * width]
+    out[..., kept * width : (kept + 1) * width] = image[
+        ..., kept * width : (kept + 1) * width
+    ]
     return out
 
 
@@ -369,12 +388,17 @@ def batch_of(
     if isinstance(given, readable):
         given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]  # a layout for layouts only
     elif (
-        isinstance(given, Sequence) and given and all(isinstance(scan, readable) for scan in given)
+        isinstance(given, Sequence)
+        and given
+        and all(isinstance(scan, readable) for scan in given)
     ):
-        given = np.stack([condition.read(scan, sensor, shape, options) for scan in given])
+        given = np.stack(
+            [condition.read(scan, sensor, shape, options) for scan in given]
+        )
     if not isinstance(given, Tensor | np.ndarray):
         raise ConfigError(
-            f"a condition of type {type(given).__name__}", "an array, a Scan, or a list of Scans"
+            f"a condition of type {type(given).__name__}",
+            "an array, a Scan, or a list of Scans",
         )
     values = torch.as_tensor(given)
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
@@ -386,7 +410,8 @@ def batch_of(
         )
     if values.numel() and not 0 <= int(values.min()) <= int(values.max()) <= 255:
         raise DataError(
-            f"a {name} condition from {int(values.min())} to {int(values.max())}", "0..255"
+            f"a {name} condition from {int(values.min())} to {int(values.max())}",
+            "0..255",
         )
     values = values.to(torch.uint8)
     condition.check(values)

@@ -12,7 +12,9 @@ def available_devices() -> list[str]:
     for kind in ("cuda", "xpu"):
         module = getattr(torch, kind)
         names += (
-            [f"{kind}:{i}" for i in range(module.device_count())] if module.is_available() else []
+            [f"{kind}:{i}" for i in range(module.device_count())]
+            if module.is_available()
+            else []
         )
     return [*names, "mps"] if torch.backends.mps.is_available() else names
 
@@ -29,12 +31,12 @@ def check_device(device: str | torch.device) -> torch.device:
     except (RuntimeError, TypeError) as error:  # an unknown name, or not a string
         raise _missing(device, available_devices()) from error
     if given.type == "cpu" and not given.index:
-        return (
-            given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
-        )
+        return given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
     available = available_devices()
     kinds = {name.partition(":")[0] for name in available}
-    if str(given) not in available and (given.type not in kinds or given.index is not None):
+    if str(given) not in available and (
+        given.type not in kinds or given.index is not None
+    ):
         raise _missing(device, available)
     return given
 
@@ -44,7 +46,9 @@ def _missing(device: object, available: list[str]) -> ConfigError:
         "A GPU needs its driver and a build of torch that supports it; `lidar-synth doctor` shows "
         "what is installed."
     )
-    return ConfigError(f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint)
+    return ConfigError(
+        f"device {str(device)!r}", f"an available one: {', '.join(available)}", hint
+    )
 
 
 def refuse_worker(device: torch.device | str) -> None:

@@ -25,7 +25,13 @@ from lidar_synth.generate.flow.path import Velocity, guide
 from lidar_synth.generate.flow.solvers import mean_velocity, solve
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, identity_of, model_provenance
+from lidar_synth.geometry.scan import (
+    SYNTHETIC,
+    RangeImage,
+    Scan,
+    identity_of,
+    model_provenance,
+)
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.noise import gaussian, uniform
 
@@ -86,7 +92,8 @@ class Generator:
         widths = getattr(self.autoencoder, "widths", (own,))
         if self.columns is not None and self.columns not in widths:
             raise ConfigError(
-                f"{self.columns} columns of {self.name!r}", f"one of {', '.join(map(str, widths))}"
+                f"{self.columns} columns of {self.name!r}",
+                f"one of {', '.join(map(str, widths))}",
             )
 
     def __repr__(self) -> str:
@@ -98,7 +105,11 @@ class Generator:
     def sensor(self) -> Sensor:
         """The sensor that defines the grid of the range images."""
         held = self.header.sensor
-        return held if self.columns in (None, held.columns) else replace(held, columns=self.columns)
+        return (
+            held
+            if self.columns in (None, held.columns)
+            else replace(held, columns=self.columns)
+        )
 
     @property
     def tensors(self) -> TensorFormat:
@@ -115,7 +126,9 @@ class Generator:
         """A text of what else than the checkpoint determines the scans: columns and precision; ""
         for its own."""
         dtype = next(self.network.parameters()).dtype
-        columns = "" if self.sensor == self.header.sensor else f":{self.columns} columns"
+        columns = (
+            "" if self.sensor == self.header.sensor else f":{self.columns} columns"
+        )
         return columns + ("" if dtype == torch.float32 else f":{dtype}")
 
     @property
@@ -191,11 +204,17 @@ class Generator:
             and given is not None
         ):
             for image, labels in zip(images, given.cpu().numpy(), strict=True):
-                image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(np.uint8)
-                image.channels["confidence"] = (image.channels["label"] != IGNORE).astype(
-                    np.float32
+                image.channels["label"] = np.where(image.mask, labels, IGNORE).astype(
+                    np.uint8
                 )
-        boxes = boxed.boxes_of(condition, len(indices)) if self.condition == "layout" else None
+                image.channels["confidence"] = (
+                    image.channels["label"] != IGNORE
+                ).astype(np.float32)
+        boxes = (
+            boxed.boxes_of(condition, len(indices))
+            if self.condition == "layout"
+            else None
+        )
         return (
             images
             if boxes is None
@@ -255,14 +274,18 @@ class Generator:
             part = slice(first, first + self.batch)
             noise = gaussian(seed, indices[part], codec.shape, self.device)
             uniform_noise = (
-                uniform(seed, indices[part], noise_shape, self.device) if codec.draws else None
+                uniform(seed, indices[part], noise_shape, self.device)
+                if codec.draws
+                else None
             )
             with torch.inference_mode():
                 own = None if given is None else given[part]
                 velocity, cond = self._flow(own, guidance, grid)
                 state = solve(velocity, noise, grid, solver, cond)
                 yield codec.decode(
-                    state, uniform_noise, None if own is None else {str(self.condition): own}
+                    state,
+                    uniform_noise,
+                    None if own is None else {str(self.condition): own},
                 )
 
     def _flow(
@@ -281,18 +304,22 @@ class Generator:
             return mean_velocity(self.network, grid), condition
         encode: Callable[[Tensor], Tensor] = self.network.encoder
         unconditional = (
-            encode(blank(str(self.condition), condition[:1]))[0] if guidance != 1 else condition
+            encode(blank(str(self.condition), condition[:1]))[0]
+            if guidance != 1
+            else condition
         )
-        return guide(mean_velocity(self.network.velocity, grid), guidance, unconditional), encode(
-            condition
-        )
+        return guide(
+            mean_velocity(self.network.velocity, grid), guidance, unconditional
+        ), encode(condition)
 
     def _condition(self, given: Any, count: int) -> Tensor | None:
         """The conditions (B, ...) as the network takes them, on its device."""
         if given is None and self.condition is None:
             return None
         if self.condition is None:
-            raise ConfigError(f"a condition for {self.name!r}", "none: the model is unconditional")
+            raise ConfigError(
+                f"a condition for {self.name!r}", "none: the model is unconditional"
+            )
         if given is None:
             raise DataError(
                 f"no condition for {self.name!r}",
@@ -305,9 +332,9 @@ class Generator:
             )
         options = self.header.conditioning[self.condition]
         shape = CONDITIONS[self.condition].shape(self.network.encoder)
-        return batch_of(self.condition, given, count, self.header.sensor, shape, options).to(
-            self.device
-        )
+        return batch_of(
+            self.condition, given, count, self.header.sensor, shape, options
+        ).to(self.device)
 
 
 class Generated:

@@ -76,7 +76,9 @@ def inpaint(
     drawn = []
     for first in range(0, len(images), generator.batch):
         part = slice(first, first + generator.batch)
-        drawn += _batch(generator, images[part], holes[part], seed, indices[part], start)
+        drawn += _batch(
+            generator, images[part], holes[part], seed, indices[part], start
+        )
     return drawn
 
 
@@ -131,8 +133,13 @@ def _batch(
     for image, hole, new in zip(
         images, holes, generator.tensors.to_images(state, generator.sensor), strict=True
     ):
-        channels = {n: np.where(hole, v, image.channels.get(n, v)) for n, v in new.channels.items()}
-        results.append(RangeImage(np.where(hole, new.range, image.range), image.sensor, channels))
+        channels = {
+            n: np.where(hole, v, image.channels.get(n, v))
+            for n, v in new.channels.items()
+        }
+        results.append(
+            RangeImage(np.where(hole, new.range, image.range), image.sensor, channels)
+        )
     return results
 
 

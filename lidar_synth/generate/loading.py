@@ -56,7 +56,9 @@ def load_generator(
     checkpoint = load_checkpoint(path, device)
     if VELOCITY not in checkpoint.networks:
         raise DataError(
-            f"{path} is an autoencoder", "a model that generates", f"Train one with codec={path}."
+            f"{path} is an autoencoder",
+            "a model that generates",
+            f"Train one with codec={path}.",
         )
     for network in checkpoint.networks.values():
         network.to(dtype).requires_grad_(False)

@@ -43,7 +43,9 @@ class Axes(NamedTuple):
 
 
 PLACED: dict[str, dict[str, Axes]] = {
-    "surfaces": {name: Axes(2) for name in ("place_stem", "place_latent", "place_outer")},
+    "surfaces": {
+        name: Axes(2) for name in ("place_stem", "place_latent", "place_outer")
+    },
     "hdit": {"position.table": Axes(0, 1)},
     "denoiser": {"position.table": Axes(0, 1)},
     "semantic_map": {},
@@ -65,7 +67,8 @@ def fit_grid(sensor: Sensor, header: Header) -> Sensor:
     rows, columns = unit_of(header)
     if sensor.shape[0] % rows:
         raise ConfigError(
-            f"sensor {sensor.name!r} with {sensor.shape[0]} rows", f"a multiple of {rows} rows"
+            f"sensor {sensor.name!r} with {sensor.shape[0]} rows",
+            f"a multiple of {rows} rows",
         )
     near = max(sensor.range_min, header.normalisation.range_min)
     far = min(sensor.range_max, header.normalisation.range_max)
@@ -85,7 +88,9 @@ def unit_of(header: Header) -> tuple[int, int]:
     levels = len(velocity.get("depths", (3, 3, 3, 3)))
     patch = velocity.get("patch", (1, 4))
     state = velocity["resolution"]
-    rows, columns = (header.sensor.shape[i] // state[i] * patch[i] << (levels - 1) for i in (0, 1))
+    rows, columns = (
+        header.sensor.shape[i] // state[i] * patch[i] << (levels - 1) for i in (0, 1)
+    )
     return rows, columns
 
 
@@ -104,15 +109,21 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
     networks: dict[str, nn.Module] = {}
     parts: dict[str, NetworkSpec] = {}
     state = sensor.shape
-    for name in sorted(model.networks):  # the autoencoder first: it gives the shape of the states
+    for name in sorted(
+        model.networks
+    ):  # the autoencoder first: it gives the shape of the states
         part = model.header.networks[name]
         sizes = {"resolution": list(state if name == VELOCITY else sensor.shape)}
         if name == ENCODER:
             sizes["target"] = list(state)
         parts[name] = NetworkSpec(part.architecture, part.arguments | sizes)
-        networks[name] = _moved(model.networks[name], parts[name], model.header.sensor, sensor)
+        networks[name] = _moved(
+            model.networks[name], parts[name], model.header.sensor, sensor
+        )
         if name == CODEC:
-            state = make_codec(networks[CODEC], model.header.tensors, sensor.shape).shape[1:]
+            state = make_codec(
+                networks[CODEC], model.header.tensors, sensor.shape
+            ).shape[1:]
     return replace(model.header, networks=parts, sensor=sensor), networks
 
 
@@ -122,9 +133,13 @@ def check_movable(header: Header) -> None:
         raise ConfigError("an autoencoder", "a model that generates")
     if not set(header.conditioning) <= set(CONDITIONS):
         wanted = f"an unconditional model, or the condition {', '.join(CONDITIONS)}"
-        raise ConfigError(f"a model with the condition {', '.join(header.conditioning)}", wanted)
+        raise ConfigError(
+            f"a model with the condition {', '.join(header.conditioning)}", wanted
+        )
     if unknown := [
-        part.architecture for part in header.networks.values() if part.architecture not in PLACED
+        part.architecture
+        for part in header.networks.values()
+        if part.architecture not in PLACED
     ]:
         raise ConfigError(
             f"a model with the architecture {', '.join(unknown)}",
@@ -133,12 +148,16 @@ def check_movable(header: Header) -> None:
         )
 
 
-def _moved(network: nn.Module, part: NetworkSpec, old: Sensor, new: Sensor) -> nn.Module:
+def _moved(
+    network: nn.Module, part: NetworkSpec, old: Sensor, new: Sensor
+) -> nn.Module:
     """A network with a new resolution and interpolated weights."""
     made = build_network(*part)
     state = network.state_dict()
     for name, axes in PLACED[part.architecture].items():
-        state[name] = _interpolated(state[name], axes, made.state_dict()[name].shape, old, new)
+        state[name] = _interpolated(
+            state[name], axes, made.state_dict()[name].shape, old, new
+        )
     if ANGLES in state:
         shape = made.state_dict()[ANGLES].shape[1:]
         angles = torch.from_numpy(new.ray_angles())
@@ -155,13 +174,19 @@ def _interpolated(
     before = _elevations(old, weight.shape[axes.rows])
     after = _elevations(new, shape[axes.rows])
     weight = _along(
-        weight, axes.rows, np.interp(after, before[::-1], np.arange(len(before))[::-1]), wraps=False
+        weight,
+        axes.rows,
+        np.interp(after, before[::-1], np.arange(len(before))[::-1]),
+        wraps=False,
     )
     if axes.columns is not None:
         count = weight.shape[axes.columns]
         wanted = shape[axes.columns]
         weight = _along(
-            weight, axes.columns, (np.arange(wanted) + 0.5) * count / wanted - 0.5, wraps=True
+            weight,
+            axes.columns,
+            (np.arange(wanted) + 0.5) * count / wanted - 0.5,
+            wraps=True,
         )
     return weight
 
@@ -174,7 +199,9 @@ def _elevations(sensor: Sensor, groups: int) -> NDArray[np.float64]:
     return means
 
 
-def _along(weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool) -> Tensor:
+def _along(
+    weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool
+) -> Tensor:
     """A weight at fractional ``places`` of an axis, interpolated linearly."""
     count = weight.shape[axis]
     low = np.floor(places)
@@ -184,7 +211,9 @@ def _along(weight: Tensor, axis: int, places: NDArray[np.float64], wraps: bool) 
         for i in (low, low + 1)
     )
     share = share.view(*(-1 if i == axis else 1 for i in range(weight.ndim)))
-    one, other = (weight.index_select(axis, torch.from_numpy(i)) for i in (first, second))
+    one, other = (
+        weight.index_select(axis, torch.from_numpy(i)) for i in (first, second)
+    )
     return torch.lerp(one, other, share)
 
 

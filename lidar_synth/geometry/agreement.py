@@ -34,7 +34,9 @@ tilt is fitted."""
 
 _COMPARED = 20_000  # points; more change the shares by less than 0.01
 _FEWEST = 1000  # points without which nothing can be said
-_PER_LASER = 15  # points of an average laser, without which nothing can be said about lasers
+_PER_LASER = (
+    15  # points of an average laser, without which nothing can be said about lasers
+)
 _SECTORS = 36
 _PER_SECTOR = 60
 _BIN = 0.02  # degrees
@@ -81,7 +83,9 @@ class Agreement(NamedTuple):
             }
             found.append(
                 ", ".join(
-                    f"{_percent(v)} of the points lie {k}" for k, v in places.items() if v >= 0.005
+                    f"{_percent(v)} of the points lie {k}"
+                    for k, v in places.items()
+                    if v >= 0.005
                 )
             )
         rows = sensor.shape[0]
@@ -93,7 +97,9 @@ class Agreement(NamedTuple):
         elif self.unused > MOST_UNUSED:
             found.append(f"{_percent(self.unused)} of the {rows} beams have no points")
         if self.between > MOST_BETWEEN:
-            found.append(f"{_percent(self.between)} of the points lie between the beams")
+            found.append(
+                f"{_percent(self.between)} of the points lie between the beams"
+            )
         return found
 
 
@@ -138,7 +144,9 @@ def agreement(points: NDArray[np.float32], sensor: Sensor) -> Agreement:
         lasers = np.degrees(sensor.laser_elevations.astype(np.float64))
         tables.append((lasers, np.asarray(sensor.heights or np.zeros(len(rows)))))
     exact = sensor.beams is not None or sensor.elevations is not None
-    shares = [_compare(some, table[::-1], heights[::-1], exact) for table, heights in tables]
+    shares = [
+        _compare(some, table[::-1], heights[::-1], exact) for table, heights in tables
+    ]
     above, below, gaps, unused, between = np.min(shares, axis=0).tolist()
     return Agreement(above, below, near, far, gaps, unused, between)
 
@@ -153,22 +161,25 @@ def _compare(
     lowest first."""
     flat = np.hypot(points[:, 0], points[:, 1])
     elevation = np.degrees(np.arctan2(points[:, 2], flat))
-    elevation = np.degrees(np.arctan2(points[:, 2] - np.interp(elevation, beams, heights), flat))
+    elevation = np.degrees(
+        np.arctan2(points[:, 2] - np.interp(elevation, beams, heights), flat)
+    )
     step = np.diff(beams)
     above = float((elevation > beams[-1] + step[-1] / 2 + TILT).mean())
     below = float((elevation < beams[0] - step[0] / 2 - TILT).mean())
     gaps = unused = 0.0
     if len(points) >= _PER_LASER * len(beams):
         count = np.bincount(
-            np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation), minlength=len(beams)
+            np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation),
+            minlength=len(beams),
         )
         used = np.flatnonzero(count > 0.03 * np.median(count[count > 0]))
         gaps = 1 - len(used) / (used[-1] - used[0] + 1)
         unused = 1 - len(used) / len(beams)
     seen = flat > FAR
-    sector = ((np.arctan2(points[seen, 1], points[seen, 0]) / (2 * np.pi) + 0.5) * _SECTORS).astype(
-        int
-    ) % _SECTORS
+    sector = (
+        (np.arctan2(points[seen, 1], points[seen, 0]) / (2 * np.pi) + 0.5) * _SECTORS
+    ).astype(int) % _SECTORS
     return above, below, gaps, unused, _between(elevation[seen], sector, beams, exact)
 
 
@@ -181,7 +192,9 @@ def _between(
     """Share of points between the beams, with the tilt of each sector that leaves the fewest
     there."""
     step = np.diff(beams)
-    width = np.minimum(np.r_[step[0], step], np.r_[step, step[-1]]) / 4  # on either side of a beam
+    width = (
+        np.minimum(np.r_[step[0], step], np.r_[step, step[-1]]) / 4
+    )  # on either side of a beam
     width = width if exact else np.maximum(width, _COARSE)
     low = beams[0] - 3 * TILT
     places = low + _BIN * (np.arange(round((beams[-1] + 3 * TILT - low) / _BIN)) + 0.5)

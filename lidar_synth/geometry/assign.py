@@ -54,6 +54,9 @@ def assign_beams(scan: Scan, sensor: Sensor | None = None) -> Assigned:
     if sensor.azimuths is not None:
         azimuth -= np.asarray(sensor.azimuths, np.float64)[ring] / 360
     unknown = np.isnan(azimuth)
-    firing = np.floor(((np.nan_to_num(azimuth) + 0.5) % 1.0) * count).astype(np.int32) % count
+    firing = (
+        np.floor(((np.nan_to_num(azimuth) + 0.5) % 1.0) * count).astype(np.int32)
+        % count
+    )
     firing[unknown] = -1
     return Assigned(ring.astype(np.int16), firing, off.astype(np.float32))

@@ -46,7 +46,8 @@ class Trajectory:
             raise DataError(given, "(K,) and (K, 4, 4), K >= 2")
         if not np.isfinite(self.times).all() or not (np.diff(self.times) > 0).all():
             raise DataError(
-                "times of poses that do not increase", "finite seconds, one after the other"
+                "times of poses that do not increase",
+                "finite seconds, one after the other",
             )
         turn = self.poses[:, :3, :3]
         if not np.isfinite(self.poses).all() or not np.allclose(
@@ -91,12 +92,20 @@ class Trajectory:
     def _segments(self, times: Floats) -> tuple[NDArray[np.intp], Floats]:
         """The segment of each time and the fraction of it; the first and the last one extend by 1.5
         lengths."""
-        segment = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
-        fraction = (times - self.times[segment]) / (self.times[segment + 1] - self.times[segment])
-        if len(times) and not (fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION):
+        segment = np.clip(
+            np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2
+        )
+        fraction = (times - self.times[segment]) / (
+            self.times[segment + 1] - self.times[segment]
+        )
+        if len(times) and not (
+            fraction.min() >= -EXTENSION and fraction.max() <= 1 + EXTENSION
+        ):
             given = f"points from {times.min():.3f} to {times.max():.3f} s"
             span = f"{self.times[0]:.3f} to {self.times[-1]:.3f} s"
-            raise DataError(given, f"times within those of the poses, {span}", "Check `moment`.")
+            raise DataError(
+                given, f"times within those of the poses, {span}", "Check `moment`."
+            )
         return segment, fraction
 
 
@@ -147,12 +156,16 @@ def deskew(scan: Scan, trajectory: Trajectory, moment: float = 0.0) -> Scan:
     times = _times(scan, moment)
     pose = trajectory.at(moment)
     world = trajectory.to_world(scan.points.astype(np.float64), times)
-    return replace(scan, points=((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32))
+    return replace(
+        scan, points=((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
+    )
 
 
 def _times(scan: Scan, moment: float) -> Floats:
     if scan.time is None:
-        raise DataError(f"scan {scan.id!r} has no time", "seconds for each point in scan.time")
+        raise DataError(
+            f"scan {scan.id!r} has no time", "seconds for each point in scan.time"
+        )
     return moment + scan.time.astype(np.float64)
 
 
@@ -180,5 +193,7 @@ def rotate(points: Floats, vectors: Floats) -> Floats:
     along = np.sum(axis * points, -1, keepdims=True)
     cosine = np.cos(angle)
     return np.asarray(
-        points * cosine + np.cross(axis, points) * np.sin(angle) + axis * along * (1 - cosine)
+        points * cosine
+        + np.cross(axis, points) * np.sin(angle)
+        + axis * along * (1 - cosine)
     )

@@ -78,7 +78,9 @@ class Model:
         return np.asarray((points - self.offset) @ self.turn)
 
 
-def residuals(points: Floats, ring: Integers, tangents: Floats, heights: Floats) -> Floats:
+def residuals(
+    points: Floats, ring: Integers, tangents: Floats, heights: Floats
+) -> Floats:
     """(N,) angle between each point and its beam, radians; upward is positive."""
     rho = np.hypot(points[:, 0], points[:, 1])
     above = points[:, 2] - heights[ring]
@@ -90,8 +92,12 @@ def nearest_beams(points: Floats, tangents: Floats, heights: Floats) -> Integers
     if not np.ptp(heights):
         order = np.argsort(tangents)
         angles = np.arctan(tangents[order])
-        elevation = np.arctan2(points[:, 2] - heights[0], np.hypot(points[:, 0], points[:, 1]))
-        return np.asarray(order[np.searchsorted((angles[1:] + angles[:-1]) / 2, elevation)])
+        elevation = np.arctan2(
+            points[:, 2] - heights[0], np.hypot(points[:, 0], points[:, 1])
+        )
+        return np.asarray(
+            order[np.searchsorted((angles[1:] + angles[:-1]) / 2, elevation)]
+        )
     ring = np.empty(len(points), np.int64)
     cosines = 1 / np.hypot(1, tangents)
     for start in range(0, len(points), CHUNK):
@@ -100,7 +106,9 @@ def nearest_beams(points: Floats, tangents: Floats, heights: Floats) -> Integers
         # The distance from the line; with the same point in each row, it orders beams as the angle
         # does.
         gap = (
-            part[:, 2:] - rho[:, None] * tangents.astype(np.float32) - heights.astype(np.float32)
+            part[:, 2:]
+            - rho[:, None] * tangents.astype(np.float32)
+            - heights.astype(np.float32)
         ) * cosines
         ring[start : start + CHUNK] = np.abs(gap).argmin(1)
     return ring
@@ -123,7 +131,9 @@ def refine(
     for _ in range(steps):
         points = model.aligned(cloud)
         if not cloud.kept:
-            cloud = replace(cloud, ring=nearest_beams(points, model.tangents, model.heights))
+            cloud = replace(
+                cloud, ring=nearest_beams(points, model.tangents, model.heights)
+            )
         model = _step(cloud, points, model, free)
     return model, cloud
 
@@ -135,7 +145,9 @@ def _step(cloud: Cloud, points: Floats, model: Model, free: frozenset[str]) -> M
     spread = _spread_of_scans(residual, cloud.scan, scans)
     scale = float(spread.min())
     jacobian = _jacobian(points, cloud, model)
-    weight = (scale / spread[cloud.scan]) ** 2 / (1 + (residual / spread[cloud.scan]) ** 2)
+    weight = (scale / spread[cloud.scan]) ** 2 / (
+        1 + (residual / spread[cloud.scan]) ** 2
+    )
     size = 2 * beams + 6 + 6 * scans
     normal = np.zeros((size, size))
     right = np.zeros(size)
@@ -160,7 +172,9 @@ def _spread_of_scans(residual: Floats, scan: Integers, scans: int) -> Floats:
     one."""
     spread = np.full(scans, np.inf)
     for number in np.unique(scan):
-        spread[number] = max(2.0 * float(np.median(np.abs(residual[scan == number]))), 1e-7)
+        spread[number] = max(
+            2.0 * float(np.median(np.abs(residual[scan == number]))), 1e-7
+        )
     return spread
 
 
@@ -174,7 +188,15 @@ def _jacobian(points: Floats, cloud: Cloud, model: Model) -> Floats:
     gain = rho / (rho**2 + (z - model.heights[cloud.ring]) ** 2)
     lever = 1 + tangent * z / rho
     shift = np.stack(
-        [tangent * x / rho, tangent * y / rho, -np.ones_like(x), -y * lever, x * lever, 0 * x], 1
+        [
+            tangent * x / rho,
+            tangent * y / rho,
+            -np.ones_like(x),
+            -y * lever,
+            x * lever,
+            0 * x,
+        ],
+        1,
     )
     columns = [-rho[:, None], -np.ones((len(x), 1)), shift, shift * cloud.time[:, None]]
     return np.asarray(np.concatenate(columns, 1) * gain[:, None])
@@ -213,7 +235,9 @@ def _active(beams: int, scans: int, free: frozenset[str]) -> NDArray[np.bool_]:
     """Which unknowns are fitted. A turn about the vertical axis changes no elevation; heights
     include a common one."""
     beam = [True, "heights" in free]
-    mount = np.array([True, True, "heights" not in free, True, True, False]) & ("mount" in free)
+    mount = np.array([True, True, "heights" not in free, True, True, False]) & (
+        "mount" in free
+    )
     motion = np.array([True, True, True, True, True, False]) & ("motion" in free)
     return np.concatenate([np.tile(beam, beams), mount, np.tile(motion, scans)])
 

@@ -42,11 +42,19 @@ def interpolate_poses(
         >>> interpolate_poses(np.array([0.0, 1.0]), poses, np.array([0.25]))[0, :3, 3]
         array([2.5, 0. , 0. ])
     """
-    if len(times) < 2 or poses.shape != (len(times), 4, 4) or not (np.diff(times) > 0).all():
+    if (
+        len(times) < 2
+        or poses.shape != (len(times), 4, 4)
+        or not (np.diff(times) > 0).all()
+    ):
         raise DataError(
-            f"{len(times)} times for {len(poses)} poses", "two or more poses with increasing times"
+            f"{len(times)} times for {len(poses)} poses",
+            "two or more poses with increasing times",
         )
-    if len(at) and not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST:
+    if (
+        len(at)
+        and not times[0] - FARTHEST <= at.min() <= at.max() <= times[-1] + FARTHEST
+    ):
         raise DataError(
             f"times from {at.min() - times[0]:g} s to {at.max() - times[0]:g} s after the first "
             "pose",
@@ -58,14 +66,19 @@ def interpolate_poses(
     steps = poses[:-1, :3, :3].swapaxes(-1, -2) @ poses[1:, :3, :3]
     axes, angles = _axes_and_angles(steps)
     result = np.tile(np.eye(4), (len(at), 1, 1))
-    result[:, :3, :3] = poses[start, :3, :3] @ _rotations(axes[start], fraction * angles[start])
+    result[:, :3, :3] = poses[start, :3, :3] @ _rotations(
+        axes[start], fraction * angles[start]
+    )
     result[:, :3, 3] = (
-        poses[start, :3, 3] + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
+        poses[start, :3, 3]
+        + fraction[:, None] * np.diff(poses[:, :3, 3], axis=0)[start]
     )
     return result
 
 
-def from_world(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_world(
+    points: NDArray[np.float64], poses: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Points of the world in the frame of a pose each.
 
     Args:
@@ -76,7 +89,9 @@ def from_world(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArr
         (N, 3) float64 metres.
     """
     moved = points - poses[..., :3, 3]
-    return np.asarray(np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64)
+    return np.asarray(
+        np.einsum("...ji,...j->...i", poses[..., :3, :3], moved), np.float64
+    )
 
 
 def _axes_and_angles(
@@ -102,7 +117,9 @@ def _axes_and_angles(
     return twice_sine / np.maximum(length, 1e-300)[:, None], angles
 
 
-def _rotations(axes: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotations(
+    axes: NDArray[np.float64], angles: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(N, 3, 3) rotations about unit axes by angles, by Rodrigues' formula."""
     cross = np.zeros((len(axes), 3, 3))
     cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = axes.T

@@ -70,11 +70,13 @@ class Normalisation:
             or min(numbers[2:]) <= 0
         ):
             raise ConfigError(
-                f"normalisation {numbers}", "finite numbers, with a scale and an offset above 0"
+                f"normalisation {numbers}",
+                "finite numbers, with a scale and an offset above 0",
             )
         if not 0 <= self.range_min < self.range_max:
             raise ConfigError(
-                f"range limits {self.range_min}, {self.range_max} m", "0 <= range_min < range_max"
+                f"range limits {self.range_min}, {self.range_max} m",
+                "0 <= range_min < range_max",
             )
 
     @property
@@ -83,7 +85,9 @@ class Normalisation:
         if self.scale is not None:
             return self.scale
         return (
-            float(np.log2(self.range_max + self.offset)) if self.kind == "log" else self.range_max
+            float(np.log2(self.range_max + self.offset))
+            if self.kind == "log"
+            else self.range_max
         )
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
@@ -94,7 +98,9 @@ class Normalisation:
         """Map ranges (any shape, metres, 0 = no return) to [-1, 1]; no return becomes -1."""
         inside = self.inside(distance)
         if self.kind == "inverse":
-            unit = torch.where(inside, self.range_min / torch.where(inside, distance, 1.0), 0.0)
+            unit = torch.where(
+                inside, self.range_min / torch.where(inside, distance, 1.0), 0.0
+            )
         else:
             distance = torch.where(inside, distance, 0.0)
             unit = (
@@ -109,7 +115,9 @@ class Normalisation:
         if self.kind == "log":
             distance = torch.exp2(unit * self.divisor) - self.offset
         else:
-            distance = unit * self.divisor if self.kind == "linear" else self.range_min / unit
+            distance = (
+                unit * self.divisor if self.kind == "linear" else self.range_min / unit
+            )
         return torch.where(self.inside(distance), distance, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
@@ -157,7 +165,9 @@ def encode_labels(label: torch.Tensor) -> torch.Tensor:
             f"train ids {sorted(set(label[code > NO_LABEL].tolist()))[:8]}",
             "0..18, or 255 = ignore",
         )
-    return torch.stack([(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(LABEL_BITS))], 1)
+    return torch.stack(
+        [(code >> b & 1) * 2.0 - 1.0 for b in reversed(range(LABEL_BITS))], 1
+    )
 
 
 def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -214,9 +224,14 @@ class TensorFormat:
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", tuple(self.channels))
         unknown = [name for name in self.channels if name not in CHANNELS]
-        if unknown or "range" not in self.channels or len(set(self.channels)) < len(self.channels):
+        if (
+            unknown
+            or "range" not in self.channels
+            or len(set(self.channels)) < len(self.channels)
+        ):
             raise ConfigError(
-                f"channels {self.channels}", f"range and some of {tuple(CHANNELS)}, each once"
+                f"channels {self.channels}",
+                f"range and some of {tuple(CHANNELS)}, each once",
             )
 
     @property
@@ -239,7 +254,9 @@ class TensorFormat:
             DataError: on a label that is not a train id.
         """
         if missing := [name for name in self.channels if name not in fields]:
-            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+            raise ConfigError(
+                f"range images without {missing}", f"all of {self.channels}"
+            )
         encoders = {
             "range": lambda d: self.normalisation.encode(d)[:, None],
             "reflectance": lambda r: encode_reflectance(r)[:, None],
@@ -262,10 +279,13 @@ class TensorFormat:
         """
         if x.ndim != 4 or x.shape[1] != self.size:
             raise DataError(
-                f"a tensor of shape {tuple(x.shape)}", f"(B, {self.size}, H, W) for {self.channels}"
+                f"a tensor of shape {tuple(x.shape)}",
+                f"(B, {self.size}, H, W) for {self.channels}",
             )
         if not bool(x.abs().amax().isfinite()):
-            raise DataError(f"a tensor for {self.channels} with NaN or infinity", "finite values")
+            raise DataError(
+                f"a tensor for {self.channels} with NaN or infinity", "finite values"
+            )
         part = dict(
             zip(
                 self.channels,
@@ -276,9 +296,9 @@ class TensorFormat:
         fields = {"range": self.normalisation.decode(part["range"][:, 0])}
         empty = fields["range"] == 0
         if "reflectance" in part:
-            fields["reflectance"] = decode_reflectance(part["reflectance"][:, 0]).masked_fill_(
-                empty, 0
-            )
+            fields["reflectance"] = decode_reflectance(
+                part["reflectance"][:, 0]
+            ).masked_fill_(empty, 0)
         if "label" in part:
             label, confidence = decode_labels(part["label"])
             fields["label"] = label.masked_fill_(empty, IGNORE)
@@ -290,10 +310,17 @@ class TensorFormat:
         values: list[dict[str, Any]] = [
             {**image.channels, "range": image.range} for image in images
         ]
-        if missing := [name for name in self.channels if any(name not in v for v in values)]:
-            raise ConfigError(f"range images without {missing}", f"all of {self.channels}")
+        if missing := [
+            name for name in self.channels if any(name not in v for v in values)
+        ]:
+            raise ConfigError(
+                f"range images without {missing}", f"all of {self.channels}"
+            )
         return self.encode(
-            {n: torch.from_numpy(np.stack([v[n] for v in values])) for n in self.channels}
+            {
+                n: torch.from_numpy(np.stack([v[n] for v in values]))
+                for n in self.channels
+            }
         )
 
     def to_images(self, x: torch.Tensor, sensor: Sensor) -> list[RangeImage]:

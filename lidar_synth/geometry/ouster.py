@@ -25,12 +25,19 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text
 from lidar_synth.files.parsing import parse_json
 
-EXPECTED = "the metadata JSON of an Ouster sensor, with beam_altitude_angles and lidar_mode"
+EXPECTED = (
+    "the metadata JSON of an Ouster sensor, with beam_altitude_angles and lidar_mode"
+)
 
 LONGEST = 1 << 20
 """Maximum size of a metadata file in bytes; the SDK's have 10 to 40 thousand."""
 
-RANGES = {"OS-0": (0.5, 100.0), "OS-1": (0.5, 200.0), "OS-2": (1.0, 400.0), "OS-DOME": (0.5, 45.0)}
+RANGES = {
+    "OS-0": (0.5, 100.0),
+    "OS-1": (0.5, 200.0),
+    "OS-2": (1.0, 400.0),
+    "OS-DOME": (0.5, 45.0),
+}
 """{start of the product line: minimum and maximum range in metres}, which the metadata does not
 have."""
 
@@ -51,7 +58,14 @@ def read_metadata(path: Path) -> dict[str, Any]:
     content = parse_json(read_text(path, EXPECTED, LONGEST), str(path), EXPECTED)
     try:
         return _arguments(content, path.stem)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+    ) as error:
         raise DataError(f"{path}: {type(error).__name__}: {error}", EXPECTED) from error
 
 
@@ -61,7 +75,9 @@ def _arguments(content: dict[str, Any], name: str) -> dict[str, Any]:
     data_format = groups.get("lidar_data_format") or groups.get("data_format") or {}
     mode = groups.get("config_params", content).get("lidar_mode", "")
     product = groups.get("sensor_info", content).get("prod_line") or "Ouster"
-    lasers = np.array([beams["beam_altitude_angles"], beams["beam_azimuth_angles"]], np.float64)
+    lasers = np.array(
+        [beams["beam_altitude_angles"], beams["beam_azimuth_angles"]], np.float64
+    )
     if lasers.ndim != 2:
         raise ValueError(
             "beam_altitude_angles and beam_azimuth_angles are not two lists of numbers"
@@ -88,7 +104,9 @@ def _arguments(content: dict[str, Any], name: str) -> dict[str, Any]:
         "columns": columns,
         "range_min": range_min,
         "range_max": range_max,
-        "range_step": next((step for part, step in RANGE_STEPS.items() if part in profile), 0.001),
+        "range_step": next(
+            (step for part, step in RANGE_STEPS.items() if part in profile), 0.001
+        ),
     }
     if height:
         values["heights"] = [height] * lasers.shape[1]

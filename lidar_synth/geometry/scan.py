@@ -63,7 +63,9 @@ class Boxes:
     image_box: NDArray[np.float32] = None  # type: ignore[assignment]
     instance: NDArray[np.int32] = None  # type: ignore[assignment]
     alpha: NDArray[np.float32] = None  # type: ignore[assignment]
-    dont_care: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 4), np.float32))
+    dont_care: NDArray[np.float32] = field(
+        default_factory=lambda: np.zeros((0, 4), np.float32)
+    )
 
     def __post_init__(self) -> None:
         self.values = np.asarray(self.values, np.float32).reshape(-1, 7)
@@ -77,22 +79,35 @@ class Boxes:
             ("alpha", (count,), np.float32, -10),
         ):
             given = getattr(self, name)
-            value = np.full(shape, unknown, dtype) if given is None else np.asarray(given, dtype)
+            value = (
+                np.full(shape, unknown, dtype)
+                if given is None
+                else np.asarray(given, dtype)
+            )
             if count == 0 and value.size == 0:  # an empty list has no second axis
                 value = value.reshape(shape)
             if value.shape != shape:
                 raise DataError(f"boxes: {name} has shape {value.shape}", f"{shape}")
             setattr(self, name, value)
         if len(self.names) != count:
-            raise DataError(f"boxes: {len(self.names)} names for {count} boxes", "one name per box")
+            raise DataError(
+                f"boxes: {len(self.names)} names for {count} boxes", "one name per box"
+            )
         self.dont_care = np.asarray(self.dont_care, np.float32).reshape(-1, 4)
-        known = (self.values, self.truncation, self.image_box, self.alpha, self.dont_care)
+        known = (
+            self.values,
+            self.truncation,
+            self.image_box,
+            self.alpha,
+            self.dont_care,
+        )
         if (
             not all(np.isfinite(values).all() for values in known)
             or (self.values[:, 3:6] <= 0).any()
         ):
             raise DataError(
-                "boxes with a non-finite value or a size that is not positive", "metres and radians"
+                "boxes with a non-finite value or a size that is not positive",
+                "metres and radians",
             )
         if (np.abs(self.values) > FARTHEST).any():
             raise DataError(
@@ -122,17 +137,21 @@ class Boxes:
         """(M, 8, 3) corners in metres: the four of the bottom counter-clockwise from front left,
         then the top's."""
         unit = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
-        unit = np.concatenate([np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]).astype(
-            np.float32
-        )
+        unit = np.concatenate(
+            [np.c_[unit, np.full(4, -0.5)], np.c_[unit, np.full(4, 0.5)]]
+        ).astype(np.float32)
         local = unit[None] * self.values[:, None, 3:6]
         c = np.cos(self.values[:, 6:7])
         s = np.sin(self.values[:, 6:7])
         x = local[..., 0] * c - local[..., 1] * s
         y = local[..., 0] * s + local[..., 1] * c
-        return (np.stack([x, y, local[..., 2]], -1) + self.values[:, None, :3]).astype(np.float32)
+        return (np.stack([x, y, local[..., 2]], -1) + self.values[:, None, :3]).astype(
+            np.float32
+        )
 
-    def contain(self, points: NDArray[np.float32], above_floor: float = 0.0) -> NDArray[np.bool_]:
+    def contain(
+        self, points: NDArray[np.float32], above_floor: float = 0.0
+    ) -> NDArray[np.bool_]:
         """(M, N) bool: which points lie inside each box, its faces included.
 
         Args:
@@ -149,7 +168,11 @@ class Boxes:
             s = np.sin(yaw)
             along = dx * c + dy * s
             across = dy * c - dx * s
-            inside[i] = (abs(along) <= length / 2) & (abs(across) <= width / 2) & (dz <= height / 2)
+            inside[i] = (
+                (abs(along) <= length / 2)
+                & (abs(across) <= width / 2)
+                & (dz <= height / 2)
+            )
             inside[i] &= dz >= above_floor - height / 2
         return inside
 
@@ -228,18 +251,40 @@ class Scan:
     def __getitem__(self, keep: Any) -> "Scan":
         """The scan with the points that a mask or an index array selects; everything else is
         kept."""
-        if isinstance(keep, np.ndarray) and keep.dtype == bool and keep.shape == (len(self),):
+        if (
+            isinstance(keep, np.ndarray)
+            and keep.dtype == bool
+            and keep.shape == (len(self),)
+        ):
             keep = np.flatnonzero(keep)  # several times as fast as masks for points
-        picked = {n: getattr(self, n)[keep] for n in POINT_FIELDS if getattr(self, n) is not None}
-        points = self.points.take(keep, 0) if isinstance(keep, np.ndarray) else self.points[keep]
+        picked = {
+            n: getattr(self, n)[keep]
+            for n in POINT_FIELDS
+            if getattr(self, n) is not None
+        }
+        points = (
+            self.points.take(keep, 0)
+            if isinstance(keep, np.ndarray)
+            else self.points[keep]
+        )
         return replace(self, points=points, **picked)
 
     def fields(self) -> dict[str, NDArray[Any]]:
         """The fields that the scan has for each point besides its position: {name: (N,)}."""
-        return {n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None}
+        return {
+            n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None
+        }
 
 
-POINT_FIELDS = ("reflectance", "label", "raw_label", "instance", "ring", "confidence", "time")
+POINT_FIELDS = (
+    "reflectance",
+    "label",
+    "raw_label",
+    "instance",
+    "ring",
+    "confidence",
+    "time",
+)
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
 
 

@@ -34,7 +34,14 @@ _MOUNT = 1.73
 
 _INTEGERS = ("columns", "rows", "firings", "reflectance_levels")
 _NUMBERS = ("range_min", "range_max", "fov_up", "fov_down", "range_step")
-_OPTIONAL = ("rows", "fov_up", "fov_down", "firings", "range_step", "reflectance_levels")
+_OPTIONAL = (
+    "rows",
+    "fov_up",
+    "fov_down",
+    "firings",
+    "range_step",
+    "reflectance_levels",
+)
 
 
 @dataclass(frozen=True)
@@ -106,12 +113,17 @@ class Sensor:
             )
         for key in ("elevations", "beams"):
             table = getattr(self, key)
-            if table is not None and (not np.all(np.diff(table) < 0) or max(map(abs, table)) >= 90):
-                raise self._error(f"{key} = {table}", "degrees within +-90, highest first")
+            if table is not None and (
+                not np.all(np.diff(table) < 0) or max(map(abs, table)) >= 90
+            ):
+                raise self._error(
+                    f"{key} = {table}", "degrees within +-90, highest first"
+                )
         rows = self.shape[0]
         if rows < 2 or (self.rows is not None and not 90 >= self.up > self.down >= -90):
             raise self._error(
-                f"{rows} rows, {linear[1:]}", "at least 2 rows and 90 >= fov_up > fov_down >= -90"
+                f"{rows} rows, {linear[1:]}",
+                "at least 2 rows and 90 >= fov_up > fov_down >= -90",
             )
         if self.beams is not None and len(self.beams) != rows:
             raise self._error(f"{len(self.beams)} beams", f"one per row ({rows})")
@@ -119,7 +131,8 @@ class Sensor:
             len(self.heights) != rows or not all(abs(h) < 1 for h in self.heights)
         ):
             raise self._error(
-                f"heights = {self.heights}", f"one per row ({rows}), within 1 m of the origin"
+                f"heights = {self.heights}",
+                f"one per row ({rows}), within 1 m of the origin",
             )
         if self.columns < 2 or self.columns % 2:
             raise self._error(f"columns = {self.columns}", "an even number")
@@ -141,12 +154,20 @@ class Sensor:
             len(self.azimuths) != rows or max(known, default=0) > 180
         ):
             raise self._error(
-                f"azimuths = {self.azimuths}", f"one per row ({rows}), within +-180 degrees"
+                f"azimuths = {self.azimuths}",
+                f"one per row ({rows}), within +-180 degrees",
             )
         if self.range_step is not None and not 0 < self.range_step <= 1:
-            raise self._error(f"range_step = {self.range_step}", "metres, 0 < range_step <= 1")
-        if self.reflectance_levels is not None and not 2 <= self.reflectance_levels <= 65536:
-            raise self._error(f"reflectance_levels = {self.reflectance_levels}", "2 to 65536")
+            raise self._error(
+                f"range_step = {self.range_step}", "metres, 0 < range_step <= 1"
+            )
+        if (
+            self.reflectance_levels is not None
+            and not 2 <= self.reflectance_levels <= 65536
+        ):
+            raise self._error(
+                f"reflectance_levels = {self.reflectance_levels}", "2 to 65536"
+            )
 
     def _check_types(self) -> None:
         """Check that values are texts, integers or finite numbers; convert lists to tuples of
@@ -162,7 +183,8 @@ class Sensor:
             valid = _is_integer(value) if integer else _is_finite(value)
             if not valid and not (value is None and key in _OPTIONAL):
                 raise self._error(
-                    f"{key} = {value!r}", "a whole number" if integer else "a finite number"
+                    f"{key} = {value!r}",
+                    "a whole number" if integer else "a finite number",
                 )
             object.__setattr__(self, key, value)
         for key in ("elevations", "beams", "heights", "azimuths"):
@@ -175,11 +197,15 @@ class Sensor:
             values = [_plain(value) for value in table] if is_list else []
             if key == "azimuths":
                 values = [None if _is_nan(value) else value for value in values]
-            numbers = [value for value in values if not (key == "azimuths" and value is None)]
+            numbers = [
+                value for value in values if not (key == "azimuths" and value is None)
+            ]
             if not values or not all(_is_finite(value) for value in numbers):
                 raise self._error(f"{key} = {table!r}", "a list of finite numbers")
             object.__setattr__(
-                self, key, tuple(None if value is None else float(value) for value in values)
+                self,
+                key,
+                tuple(None if value is None else float(value) for value in values),
             )
 
     def _error(self, given: str, expected: str) -> ConfigError:
@@ -190,18 +216,26 @@ class Sensor:
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W) of the range image."""
-        return len(self.elevations) if self.elevations is not None else self.rows or 0, self.columns
+        return len(
+            self.elevations
+        ) if self.elevations is not None else self.rows or 0, self.columns
 
     @property
     def up(self) -> float:
         """The upper edge of row 0, degrees."""
-        return float(self.fov_up) if self.fov_up is not None else float(np.degrees(self.edges[0]))
+        return (
+            float(self.fov_up)
+            if self.fov_up is not None
+            else float(np.degrees(self.edges[0]))
+        )
 
     @property
     def down(self) -> float:
         """The lower edge of the last row, degrees."""
         return (
-            float(self.fov_down) if self.fov_down is not None else float(np.degrees(self.edges[-1]))
+            float(self.fov_down)
+            if self.fov_down is not None
+            else float(np.degrees(self.edges[-1]))
         )
 
     @cached_property
@@ -209,7 +243,9 @@ class Sensor:
         """(H+1,) elevations of the rows' edges, highest first, radians."""
         if self.elevations is None:
             fraction = np.arange(self.shape[0] + 1) / self.shape[0]
-            return np.radians(self.up - fraction * (self.up - self.down)).astype(np.float32)
+            return np.radians(self.up - fraction * (self.up - self.down)).astype(
+                np.float32
+            )
         beams = np.asarray(self.elevations)
         between = (beams[1:] + beams[:-1]) / 2
         outer = 2 * beams[[0, -1]] - between[[0, -1]]
@@ -249,10 +285,14 @@ class Sensor:
         ``fit_sensor`` gives them, are the lasers' own.
         """
         seen = self.laser_elevations.astype(np.float64)
-        heights = np.zeros(len(seen)) if self.heights is None else np.asarray(self.heights)
+        heights = (
+            np.zeros(len(seen)) if self.heights is None else np.asarray(self.heights)
+        )
         if self.beams is None:
             return seen, heights
-        typical = np.minimum(1 / (np.maximum(np.sin(-seen), 1e-3) / _MOUNT + 1 / 110), 20.0)
+        typical = np.minimum(
+            1 / (np.maximum(np.sin(-seen), 1e-3) / _MOUNT + 1 / 110), 20.0
+        )
         return seen - heights / typical, heights
 
     @cached_property
@@ -263,7 +303,11 @@ class Sensor:
         Rows with ``elevations`` and ``heights`` but without ``beams`` are the lasers themselves, as
         ``fit_sensor`` gives them.
         """
-        if self.elevations is None or self.beams is not None or not any(self.heights or ()):
+        if (
+            self.elevations is None
+            or self.beams is not None
+            or not any(self.heights or ())
+        ):
             return np.empty(0, np.float32)
         return np.asarray(self.heights, np.float32)
 
@@ -291,7 +335,9 @@ class Sensor:
 
     def ray_angles(self, rays: Rays = "centre") -> NDArray[np.float32]:
         """(2, H, W) elevation and azimuth of every cell, radians."""
-        grid = np.meshgrid(self.row_elevations(rays), self.column_azimuths(rays), indexing="ij")
+        grid = np.meshgrid(
+            self.row_elevations(rays), self.column_azimuths(rays), indexing="ij"
+        )
         return np.stack(grid)
 
     def ray_directions(self, rays: Rays = "centre") -> NDArray[np.float32]:
@@ -339,11 +385,17 @@ class Sensor:
         """
         known = [f.name for f in fields(cls)]
         if not isinstance(values, dict):
-            raise ConfigError(f"a sensor of type {type(values).__name__}", f"a mapping of {known}")
+            raise ConfigError(
+                f"a sensor of type {type(values).__name__}", f"a mapping of {known}"
+            )
         if unknown := [key for key in values if key not in known]:
-            raise ConfigError(f"sensor keys {shorten(str(unknown), 400)}", f"some of {known}")
+            raise ConfigError(
+                f"sensor keys {shorten(str(unknown), 400)}", f"some of {known}"
+            )
         if missing := [
-            key for key in ("name", "columns", "range_min", "range_max") if key not in values
+            key
+            for key in ("name", "columns", "range_min", "range_max")
+            if key not in values
         ]:
             given = f"sensor {shorten(repr(values.get('name')), 100)} without {', '.join(missing)}"
             raise ConfigError(given, "text and numbers, as in sensors.yaml")
@@ -385,9 +437,12 @@ def _is_integer(value: object) -> bool:
 
 def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:
     """The entries of a YAML file: {name of a sensor: its values}."""
-    if not isinstance(values, dict) or not all(isinstance(v, dict) for v in values.values()):
+    if not isinstance(values, dict) or not all(
+        isinstance(v, dict) for v in values.values()
+    ):
         raise ConfigError(
-            f"{where} holds {type(values).__name__}", "a mapping from a sensor's name to its values"
+            f"{where} holds {type(values).__name__}",
+            "a mapping from a sensor's name to its values",
         )
     return values
 
@@ -395,16 +450,26 @@ def _entries(values: Any, where: str) -> dict[Any, dict[str, Any]]:
 @lru_cache(maxsize=1)
 def presets() -> dict[str, Sensor]:
     """The sensors of ``sensors.yaml`` by name."""
-    text = files("lidar_synth.geometry").joinpath("sensors.yaml").read_text(encoding="utf-8")
+    text = (
+        files("lidar_synth.geometry")
+        .joinpath("sensors.yaml")
+        .read_text(encoding="utf-8")
+    )
     entries = _entries(parse_yaml(text, "sensors.yaml"), "sensors.yaml")
-    return {name: Sensor.from_dict({"name": name, **values}) for name, values in entries.items()}
+    return {
+        name: Sensor.from_dict({"name": name, **values})
+        for name, values in entries.items()
+    }
 
 
 def sensor_yaml(sensor: Sensor) -> str:
     """The YAML text of a sensor, which ``load_sensor`` reads."""
     values = sensor.to_dict()
     return yaml.safe_dump(
-        {values.pop("name"): values}, default_flow_style=None, sort_keys=False, width=120
+        {values.pop("name"): values},
+        default_flow_style=None,
+        sort_keys=False,
+        width=120,
     )
 
 
@@ -446,14 +511,17 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     if path.suffix == ".json":
         return Sensor.from_dict(read_metadata(path))
     if path.suffix not in (".yaml", ".yml"):
-        expected = (
-            f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
+        expected = f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
+        raise ConfigError(
+            f"sensor {str(sensor)!r}", expected, suggest(sensor, presets())
         )
-        raise ConfigError(f"sensor {str(sensor)!r}", expected, suggest(sensor, presets()))
-    entries = _entries(read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path))
+    entries = _entries(
+        read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path)
+    )
     if len(entries) != 1:
         raise ConfigError(
-            f"{path} holds {len(entries)} sensors", "exactly one entry: its name, then its values"
+            f"{path} holds {len(entries)} sensors",
+            "exactly one entry: its name, then its values",
         )
     [(name, values)] = entries.items()
     return Sensor.from_dict({"name": str(name), **values})

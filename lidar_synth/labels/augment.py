@@ -50,7 +50,9 @@ def compose(steps: Sequence[Augmentation]) -> Augmentation:
     return partial(_each, tuple(steps))
 
 
-def _each(steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator) -> Scan:
+def _each(
+    steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator
+) -> Scan:
     for step in steps:
         scan = step(scan, rng)
     return scan
@@ -66,15 +68,21 @@ def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
 
 def flip_x(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror front and back with probability ``chance``."""
-    return mirror_scan(scan, "x") if rng.random() < check_share("chance", chance) else scan
+    return (
+        mirror_scan(scan, "x") if rng.random() < check_share("chance", chance) else scan
+    )
 
 
 def flip_y(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror left and right with probability ``chance``."""
-    return mirror_scan(scan, "y") if rng.random() < check_share("chance", chance) else scan
+    return (
+        mirror_scan(scan, "y") if rng.random() < check_share("chance", chance) else scan
+    )
 
 
-def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float = 1.05) -> Scan:
+def scale(
+    scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float = 1.05
+) -> Scan:
     """Multiply all lengths by a random factor between ``low`` and ``high``."""
     if not 0 < low <= high < np.inf:
         raise ConfigError(f"low={low}, high={high}", "0 < low <= high")
@@ -82,7 +90,10 @@ def scale(scan: Scan, rng: np.random.Generator, low: float = 0.95, high: float =
 
 
 def jitter(
-    scan: Scan, rng: np.random.Generator, spread: float = 0.01, reflectance: float = 0.02
+    scan: Scan,
+    rng: np.random.Generator,
+    spread: float = 0.01,
+    reflectance: float = 0.02,
 ) -> Scan:
     """Add noise along the rays and to the reflectance; a return that would enter or leave a box is
     not moved.
@@ -104,7 +115,9 @@ def jitter(
         points[crossed] = scan.points[crossed]
     brightness = np.clip(scan.reflectance + reflectance * noise[1], 0, 1)
     return replace(
-        scan, points=points.astype(np.float32), reflectance=brightness.astype(np.float32)
+        scan,
+        points=points.astype(np.float32),
+        reflectance=brightness.astype(np.float32),
     )
 
 
@@ -116,7 +129,11 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
     rows, columns = scan.sensor.shape
     most = round(check_share("share", share) * rows)
     dropped = rng.choice(rows, rng.integers(most + 1), replace=False)
-    row = locate(scan.points, scan.sensor).cell // columns if scan.ring is None else scan.ring
+    row = (
+        locate(scan.points, scan.sensor).cell // columns
+        if scan.ring is None
+        else scan.ring
+    )
     return _subset(scan, ~np.isin(row, dropped))
 
 
@@ -134,7 +151,9 @@ def range_drop(
     if not power >= 0:
         raise ConfigError(f"power={power}", "0 or more")
     far = np.minimum(np.linalg.norm(scan.points, axis=1) / scan.sensor.range_max, 1)
-    return _subset(scan, rng.random(len(scan)) >= check_share("share", share) * far**power)
+    return _subset(
+        scan, rng.random(len(scan)) >= check_share("share", share) * far**power
+    )
 
 
 def rotate_scan(scan: Scan, angle: float) -> Scan:
@@ -178,4 +197,6 @@ def _subset(scan: Scan, keep: NDArray[np.bool_]) -> Scan:
     if scan.boxes is None:
         return scan[keep]
     inside = scan.boxes.contain(scan.points)
-    return replace(scan[keep], boxes=scan.boxes[~inside.any(1) | inside[:, keep].any(1)])
+    return replace(
+        scan[keep], boxes=scan.boxes[~inside.any(1) | inside[:, keep].any(1)]
+    )

@@ -72,8 +72,15 @@ class ObjectBank:
     def __post_init__(self) -> None:
         count = len(self.boxes)
         total = len(self.points)
-        rising = len(self.start) == count + 1 and self.start[0] == 0 and self.start[-1] == total
-        if not (rising and (np.diff(self.start) > 0).all()) or self.points.shape != (total, 3):
+        rising = (
+            len(self.start) == count + 1
+            and self.start[0] == 0
+            and self.start[-1] == total
+        )
+        if not (rising and (np.diff(self.start) > 0).all()) or self.points.shape != (
+            total,
+            3,
+        ):
             raise DataError(
                 f"{count} objects, {total} points, starts {self.start.shape}",
                 "starts of all objects and the end of the last, in increasing order",
@@ -87,7 +94,8 @@ class ObjectBank:
         }.items():
             if getattr(self, name).shape != (size,):
                 raise DataError(
-                    f"objects: {name} has shape {getattr(self, name).shape}", f"({size},)"
+                    f"objects: {name} has shape {getattr(self, name).shape}",
+                    f"({size},)",
                 )
         self._check_values()
 
@@ -109,7 +117,8 @@ class ObjectBank:
         for name in ("ground", "points"):
             if not (np.abs(getattr(self, name)) <= FARTHEST).all():  # NaN is not
                 raise DataError(
-                    f"objects: {name} not finite, or too large", f"metres within {FARTHEST:g}"
+                    f"objects: {name} not finite, or too large",
+                    f"metres within {FARTHEST:g}",
                 )
         if not ((self.reflectance >= 0) & (self.reflectance <= 1)).all():
             raise DataError(
@@ -118,7 +127,8 @@ class ObjectBank:
             )
         if ((self.label >= len(NAMES)) & (self.label != IGNORE)).any():
             raise DataError(
-                f"objects: labels up to {self.label.max()}", "train ids 0..18, or 255 = ignore"
+                f"objects: labels up to {self.label.max()}",
+                "train ids 0..18, or 255 = ignore",
             )
 
     @classmethod
@@ -137,7 +147,9 @@ class ObjectBank:
         """
         objects: list[tuple[int, Object]] = []
         chosen = range(len(source)) if scans is None else list(scans)
-        for index in tqdm(chosen, "collecting objects", unit="scan", leave=False, disable=None):
+        for index in tqdm(
+            chosen, "collecting objects", unit="scan", leave=False, disable=None
+        ):
             scan = source[index]
             if scan.boxes is not None:
                 objects += objects_of(scan, least).items()
@@ -148,7 +160,8 @@ class ObjectBank:
             )
         if len(sensors := {o.scan.sensor for _, o in objects}) > 1:
             raise DataError(
-                f"objects of the sensors {sorted(s.name for s in sensors)}", "one sensor"
+                f"objects of the sensors {sorted(s.name for s in sensors)}",
+                "one sensor",
             )
         return cls._of(objects)
 
@@ -162,10 +175,12 @@ class ObjectBank:
             number=np.array([n for n, _ in objects], np.int32),
             ground=np.array([o.ground for _, o in objects], np.float32),
             start=np.cumsum([0, *map(len, parts)], dtype=np.int64),
-            points=np.concatenate([o.scan.points - o.box[:3] for _, o in objects]).astype(
+            points=np.concatenate(
+                [o.scan.points - o.box[:3] for _, o in objects]
+            ).astype(np.float32),
+            reflectance=np.concatenate([p.reflectance for p in parts]).astype(
                 np.float32
             ),
-            reflectance=np.concatenate([p.reflectance for p in parts]).astype(np.float32),
             label=np.concatenate([p.fields()["label"] for p in parts]),
         )
 
@@ -185,12 +200,16 @@ class ObjectBank:
             arrays: dict[str, Any] = read_arrays(path, most=most)
             if str(arrays.pop("format")) != FORMAT:
                 raise ValueError("another format")
-            sensor = Sensor.from_dict(parse_json(str(arrays.pop("sensor")), "its sensor"))
+            sensor = Sensor.from_dict(
+                parse_json(str(arrays.pop("sensor")), "its sensor")
+            )
             boxes = {f.name: arrays.pop(f"box_{f.name}") for f in fields(Boxes)}
             boxes["names"] = tuple(boxes["names"].tolist())
             return cls(sensor=sensor, boxes=Boxes(**boxes), **arrays)
         except (ValueError, TypeError, KeyError) as error:
-            raise DataError(f"{path}: {error}", f"a bank of objects ({FORMAT})") from error
+            raise DataError(
+                f"{path}: {error}", f"a bank of objects ({FORMAT})"
+            ) from error
 
     def save(self, path: str | Path) -> None:
         """Write the bank to a file; ``load`` is the inverse.
@@ -199,9 +218,14 @@ class ObjectBank:
             FileError: if it cannot be written.
         """
         arrays = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("sensor", "boxes")
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if f.name not in ("sensor", "boxes")
         }
-        arrays |= {f"box_{f.name}": np.asarray(getattr(self.boxes, f.name)) for f in fields(Boxes)}
+        arrays |= {
+            f"box_{f.name}": np.asarray(getattr(self.boxes, f.name))
+            for f in fields(Boxes)
+        }
         arrays |= {
             "format": np.array(FORMAT),
             "sensor": np.array(json.dumps(self.sensor.to_dict())),

@@ -11,24 +11,35 @@ from lidar_synth.geometry.scan import Boxes
 _CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
 
 
-def box_frame(points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float32]:
+def box_frame(
+    points: NDArray[np.float32], box: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Transform points into the frame of one box (7,): (N, 3) metres along, across and above its
     centre."""
     offset = points - box[:3]
     c = np.cos(box[6])
     s = np.sin(box[6])
     return np.stack(
-        [offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s, offset[:, 2]], 1
+        [
+            offset[:, 0] * c + offset[:, 1] * s,
+            offset[:, 1] * c - offset[:, 0] * s,
+            offset[:, 2],
+        ],
+        1,
     )
 
 
-def grow_box(box: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.float32]:
+def grow_box(
+    box: NDArray[np.float32], points: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Enlarge a box (7,) about its centre so that it contains points (N, 3).
 
     A margin of one millimetre ensures that it still contains them when both are moved in float32.
     """
     needed = 2 * (np.abs(box_frame(points, box)).max(0, initial=0) + 1e-3)
-    return np.concatenate([box[:3], np.maximum(box[3:6], needed), box[6:]], dtype=np.float32)
+    return np.concatenate(
+        [box[:3], np.maximum(box[3:6], needed), box[6:]], dtype=np.float32
+    )
 
 
 def move_boxes(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
@@ -37,7 +48,10 @@ def move_boxes(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
     values = values.astype(np.float32)
     values[:, 6] = (values[:, 6] + np.pi) % (2 * np.pi) - np.pi
     return Boxes(
-        values, boxes.names, occlusion=boxes.occlusion.copy(), instance=boxes.instance.copy()
+        values,
+        boxes.names,
+        occlusion=boxes.occlusion.copy(),
+        instance=boxes.instance.copy(),
     )
 
 
@@ -54,7 +68,10 @@ def turn_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32
     c = np.cos(angle)
     s = np.sin(angle)
     out = points.copy()
-    out[:, 0], out[:, 1] = points[:, 0] * c - points[:, 1] * s, points[:, 0] * s + points[:, 1] * c
+    out[:, 0], out[:, 1] = (
+        points[:, 0] * c - points[:, 1] * s,
+        points[:, 0] * s + points[:, 1] * c,
+    )
     return out
 
 
@@ -69,7 +86,9 @@ def join_boxes(several: Sequence[Boxes]) -> Boxes:
     return Boxes(names=names, **arrays)
 
 
-def find_overlapping(box: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.bool_]:
+def find_overlapping(
+    box: NDArray[np.float32], others: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
 
     Separating axis theorem: two rectangles are disjoint if a side of one of them separates their

@@ -52,7 +52,9 @@ def swap_sector(scan: Scan, other: Scan, start: int, width: int) -> Scan:
     other = enlarge_boxes(other)
     columns = scan.sensor.columns
     cell, cell_other = (locate(s.points, scan.sensor).cell for s in (scan, other))
-    first = _without_cut_objects(scan, (cell >= 0) & ((cell - start) % columns >= width))
+    first = _without_cut_objects(
+        scan, (cell >= 0) & ((cell - start) % columns >= width)
+    )
     second = _without_cut_objects(
         other, (cell_other >= 0) & ((cell_other - start) % columns < width)
     )

@@ -46,7 +46,9 @@ class Ground(NamedTuple):
     encloses: bool
     free: bool
 
-    def above(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> NDArray[np.float64]:
+    def above(
+        self, points: NDArray[np.float32], box: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
         """(N,) height of points (N, 3) above the plane, metres."""
         local = box_frame(points, box).astype(np.float64)
         heights: NDArray[np.float64] = local @ (-self.along, -self.across, 1.0) + (
@@ -54,7 +56,9 @@ class Ground(NamedTuple):
         )
         return heights
 
-    def find_standing(self, points: NDArray[np.float32], box: NDArray[np.float32]) -> int:
+    def find_standing(
+        self, points: NDArray[np.float32], box: NDArray[np.float32]
+    ) -> int:
         """Number of points (N, 3) above the ground in or beside a box (7,)."""
         local = np.abs(box_frame(points, box)[:, :2])
         near = (local <= box[3:5] / 2 + CLEARANCE).all(1)
@@ -95,7 +99,10 @@ def standing(scan: Scan, boxes: Boxes) -> NDArray[np.bool_]:
     """(M, N) True for points that belong to a box: those inside that are not ground, and those of
     its instance."""
     inside = boxes.contain(scan.points)
-    low = scan.points[:, 2] < (boxes.values[:, 2] - boxes.values[:, 5] / 2 + FLOOR)[:, None]
+    low = (
+        scan.points[:, 2]
+        < (boxes.values[:, 2] - boxes.values[:, 5] / 2 + FLOOR)[:, None]
+    )
     if scan.label is not None:
         low &= GROUND[scan.label] | (scan.label == IGNORE)
     if scan.instance is not None:
@@ -124,7 +131,9 @@ def _survey(points, labels, is_ground, box, reach):  # type: ignore[no-untyped-d
     upper = ROUGH if labelled else ROUGH / 2
     for k in range(len(near)):
         ground[k] &= (
-            -ROUGH < local[k, 2] - height - along * local[k, 0] - across * local[k, 1] < upper
+            -ROUGH
+            < local[k, 2] - height - along * local[k, 0] - across * local[k, 1]
+            < upper
         )
     if ground.sum() < max(LEAST, 0.7 * total if labelled else 0.0):
         return False, 0.0, 0.0, 0.0, 0, False
@@ -154,7 +163,11 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
             across = y * c - x * s
             if abs(along) <= box[3] / 2 + reach and abs(across) <= box[4] / 2 + reach:
                 near[count] = i
-                local[count, 0], local[count, 1], local[count, 2] = along, across, points[i, 2]
+                local[count, 0], local[count, 1], local[count, 2] = (
+                    along,
+                    across,
+                    points[i, 2],
+                )
                 count += 1
     return near[:count], local[:count]
 

@@ -63,7 +63,9 @@ def _with_rings(part: Scan, sensor: Sensor) -> Scan:
 def _complete(scan: Scan) -> Scan:
     label = np.full(len(scan), IGNORE, np.uint8) if scan.label is None else scan.label
     confidence = (
-        (label != IGNORE).astype(np.float32) if scan.confidence is None else scan.confidence
+        (label != IGNORE).astype(np.float32)
+        if scan.confidence is None
+        else scan.confidence
     )
     instance = _of_tracks(scan) if scan.instance is None else scan.instance
     return replace(scan, label=label, confidence=confidence, instance=instance)
@@ -97,9 +99,9 @@ def _renumbered(scan: Scan, used: int) -> Scan:
     old = old[old > 0]
 
     def new(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        return np.where(numbers > 0, np.searchsorted(old, numbers) + used + 1, numbers).astype(
-            np.int32
-        )
+        return np.where(
+            numbers > 0, np.searchsorted(old, numbers) + used + 1, numbers
+        ).astype(np.int32)
 
     assert scan.instance is not None
     boxes: Boxes | None = scan.boxes

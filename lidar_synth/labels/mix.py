@@ -53,16 +53,22 @@ class Objects:
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if self.clear:  # before labels of low confidence are ignored
-            things = {int(label) for label in np.unique(self.bank.label) if label < THINGS}
+            things = {
+                int(label) for label in np.unique(self.bank.label) if label < THINGS
+            }
             scan = remove_unboxed(
-                scan, open_model(self.model), int(rng.integers(1 << 32)), {*BOXED, *things}
+                scan,
+                open_model(self.model),
+                int(rng.integers(1 << 32)),
+                {*BOXED, *things},
             )
         scan = self.own(scan, rng)
         for indices, count in self.groups:
             picks = rng.choice(indices, min(TRIES * count, len(indices)), replace=False)
             angles = np.radians(rng.uniform(-self.turn, self.turn, len(picks)))
             candidates = (
-                self._object(i, a) for i, a in zip(picks.tolist(), angles.tolist(), strict=True)
+                self._object(i, a)
+                for i, a in zip(picks.tolist(), angles.tolist(), strict=True)
             )
             scan = paste(scan, candidates, count=count, least=self.least)
         return scan
@@ -91,10 +97,14 @@ class Polar:
         other = _partner(self.real, scan, rng)
         columns = scan.sensor.columns
         width = round(columns * self.width / 360)
-        mixed = swap_sector(self.own(scan, rng), other, int(rng.integers(columns)), width)
+        mixed = swap_sector(
+            self.own(scan, rng), other, int(rng.integers(columns)), width
+        )
         has_boxes = other.boxes is not None
         if self.objects:
-            objects = list(objects_of(other).values()) if has_boxes else instances_of(other)
+            objects = (
+                list(objects_of(other).values()) if has_boxes else instances_of(other)
+            )
             angles = rng.uniform(-np.pi, np.pi, len(objects))
             turned = (
                 objects[i].turned(a)
@@ -123,7 +133,10 @@ class Laser:
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         other = _partner(self.real, scan, rng)
         return swap_bands(
-            self.own(scan, rng), other, int(rng.choice(self.bands)), bool(rng.integers(2))
+            self.own(scan, rng),
+            other,
+            int(rng.choice(self.bands)),
+            bool(rng.integers(2)),
         )
 
 
@@ -146,7 +159,9 @@ def _partner(real: Source, scan: Scan, rng: np.random.Generator) -> Scan:
     """A random real scan, thinned to the grid of a synthetic one."""
     other = real[int(rng.integers(len(real)))]
     if other.label is None:
-        raise DataError(f"scan {other.id!r} has no labels", "real scans with labels, all of them")
+        raise DataError(
+            f"scan {other.id!r} has no labels", "real scans with labels, all of them"
+        )
     return thin_scan(other, scan.sensor)
 
 
@@ -188,7 +203,9 @@ def objects(
     names = np.array(bank.boxes.names)
     groups = []
     for name, number in limits.items():
-        indices = np.flatnonzero((bank.counts >= least) & ((names == name) | (name == "")))
+        indices = np.flatnonzero(
+            (bank.counts >= least) & ((names == name) | (name == ""))
+        )
         if not len(indices):
             raise ConfigError(
                 f"count={count}, least={least}",
@@ -202,7 +219,9 @@ def objects(
             "for a detector",
             "clear=False, if the scans hold no such objects.",
         )
-    return Objects(_own(fields, threshold), bank, tuple(groups), least, turn, clear, model)
+    return Objects(
+        _own(fields, threshold), bank, tuple(groups), least, turn, clear, model
+    )
 
 
 def polar(
@@ -220,12 +239,14 @@ def polar(
     """
     if not 0 <= width <= 360 or objects < 0:
         raise ConfigError(
-            f"width={width}, objects={objects}", "0..360 degrees, and a number of objects"
+            f"width={width}, objects={objects}",
+            "0..360 degrees, and a number of objects",
         )
     real, first = _labelled(real, "polar")
     if objects and first.boxes is None and first.instance is None:
         raise ConfigError(
-            "kind='polar' with real scans that have neither boxes nor instances", "objects=0"
+            "kind='polar' with real scans that have neither boxes nor instances",
+            "objects=0",
         )
     return Polar(_own(fields, threshold), real, width, objects)
 
@@ -257,7 +278,8 @@ def exchange(
     """Make the policy ``mix`` by PolarMix or LaserMix at random; the arguments and errors are those
     of both."""
     return Exchange(
-        polar(real, fields, width, objects, threshold), laser(real, fields, threshold=threshold)
+        polar(real, fields, width, objects, threshold),
+        laser(real, fields, threshold=threshold),
     )
 
 

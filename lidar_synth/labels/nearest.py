@@ -80,7 +80,9 @@ class NearestLabels:
         found, squared = self.nearest(points, radius)
         count = len(points)
         share, trust = np.zeros((2, count), np.float32)
-        vote = Vote(np.zeros(count, np.uint32), share, trust, np.full(count, np.inf, np.float32))
+        vote = Vote(
+            np.zeros(count, np.uint32), share, trust, np.full(count, np.inf, np.float32)
+        )
         _count_votes(found, squared, self.values, self.confidence, *vote)
         return vote
 
@@ -95,14 +97,24 @@ class NearestLabels:
         """
         reach = int(np.ceil(radius / _COLUMN))
         steps = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
-        bounds = ((np.maximum(np.abs(steps) - 1, 0) * _COLUMN) ** 2).sum(axis=1).astype(np.float32)
+        bounds = (
+            ((np.maximum(np.abs(steps) - 1, 0) * _COLUMN) ** 2)
+            .sum(axis=1)
+            .astype(np.float32)
+        )
         order = np.lexsort([np.abs(steps).sum(axis=1), bounds])  # nearest columns first
         local = (points - self.low).astype(np.float32)
         found = np.empty((len(local), 3), np.int64)
         squared = np.empty((len(local), 3), np.float32)
         cloud = (self.points, self.starts, self.columns)
         _three_nearest(
-            local, *cloud, steps[order], bounds[order], np.float32(radius), found, squared
+            local,
+            *cloud,
+            steps[order],
+            bounds[order],
+            np.float32(radius),
+            found,
+            squared,
         )
         return found, squared
 
@@ -139,11 +151,17 @@ def index_cloud(
         _keys(local, values, deep, keys)
         keys, first = np.unique(keys, return_index=True)
         kept.append((keys, local[first], values[first], confidence[first]))
-    keys, points, values, confidence = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    keys, points, values, confidence = (
+        np.concatenate(parts) for parts in zip(*kept, strict=True)
+    )
     keys, first = np.unique(keys, return_index=True)
     column = keys // (_FLOORS * _SIDE * _SIDE * _CLASSES)
-    starts = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=wide * deep))])
-    return NearestLabels(low, (wide, deep), starts, points[first], values[first], confidence[first])
+    starts = np.concatenate(
+        [[0], np.cumsum(np.bincount(column, minlength=wide * deep))]
+    )
+    return NearestLabels(
+        low, (wide, deep), starts, points[first], values[first], confidence[first]
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -161,7 +179,9 @@ def _keys(points, values, across, keys):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _three_nearest(queries, points, starts, columns, steps, bounds, radius, found, squared):  # type: ignore[no-untyped-def]
+def _three_nearest(  # type: ignore[no-untyped-def]
+    queries, points, starts, columns, steps, bounds, radius, found, squared
+):
     """Fill ``found`` and ``squared`` (N, 3) with the nearest points and their squared distances; -1
     = none.
 
@@ -184,7 +204,13 @@ def _three_nearest(queries, points, starts, columns, steps, bounds, radius, foun
             dy = _gap(ry, steps[s, 1])
             x = cx + steps[s, 0]
             y = cy + steps[s, 1]
-            if dx * dx + dy * dy >= d2 or x < 0 or y < 0 or x >= columns[0] or y >= columns[1]:
+            if (
+                dx * dx + dy * dy >= d2
+                or x < 0
+                or y < 0
+                or x >= columns[0]
+                or y >= columns[1]
+            ):
                 continue
             begin = starts[x * columns[1] + y]
             end = starts[x * columns[1] + y + 1]

@@ -56,7 +56,9 @@ class Object(NamedTuple):
         assert self.scan.boxes is not None
         points = turn_points(self.scan.points, angle)
         return self._replace(
-            scan=replace(self.scan, points=points, boxes=turn_boxes(self.scan.boxes, angle))
+            scan=replace(
+                self.scan, points=points, boxes=turn_boxes(self.scan.boxes, angle)
+            )
         )
 
 
@@ -75,7 +77,9 @@ def objects_of(scan: Scan, least: int = 5) -> dict[int, Object]:
         DataError: if the scan has no boxes.
     """
     if scan.boxes is None:
-        raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
+        raise DataError(
+            f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects"
+        )
     objects = {}
     for number in range(len(scan.boxes)):
         cut = _cut(scan, scan.boxes[[number]])
@@ -93,7 +97,8 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
     """
     if scan.instance is None or scan.label is None:
         raise DataError(
-            f"scan {scan.id!r} has no instances", "labels and instances, as in SemanticKITTI"
+            f"scan {scan.id!r} has no instances",
+            "labels and instances, as in SemanticKITTI",
         )
     things = np.flatnonzero((scan.instance > 0) & (scan.label < THINGS))
     keys = scan.instance[things].astype(np.int64) * THINGS + scan.label[things]
@@ -106,7 +111,9 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
             low = scan.points[part].min(0)
             high = scan.points[part].max(0)
             box = grow_box(
-                np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32),
+                np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(
+                    np.float32
+                ),
                 scan.points[part],
             )
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
@@ -137,7 +144,8 @@ def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for points of a box's instance that lie within it or within ``NOISE`` of it."""
     wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
     return np.asarray(
-        Boxes(wide, box.names).contain(scan.points)[0] & (scan.instance == box.instance[0])
+        Boxes(wide, box.names).contain(scan.points)[0]
+        & (scan.instance == box.instance[0])
     )
 
 
@@ -145,7 +153,11 @@ def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object in one box; None if it contains no points."""
     mine = np.flatnonzero(find_returns(scan, box))
     return (
-        _object(scan, mine, replace(box, values=grow_box(box.values[0], scan.points[mine])[None]))
+        _object(
+            scan,
+            mine,
+            replace(box, values=grow_box(box.values[0], scan.points[mine])[None]),
+        )
         if len(mine)
         else None
     )
@@ -168,9 +180,13 @@ def _object(scan: Scan, mine: NDArray[np.intp], box: Boxes) -> Object:
         scan.points[mine],
         scan.reflectance[mine],
         scan.sensor,
-        label=np.full(len(mine), label, np.uint8) if scan.label is None else scan.label[mine],
+        label=np.full(len(mine), label, np.uint8)
+        if scan.label is None
+        else scan.label[mine],
         ring=None if scan.ring is None else scan.ring[mine],
         boxes=replace(box, dont_care=np.zeros((0, 4), np.float32)),
         id=scan.id,
     )
-    return Object(part, float(values[2] - values[5] / 2) if ground is None else ground.height)
+    return Object(
+        part, float(values[2] - values[5] / 2) if ground is None else ground.height
+    )

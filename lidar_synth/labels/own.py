@@ -20,7 +20,9 @@ class Unlabelled:
     """``none``: an unlabelled pool; labels, instances, confidence and boxes are removed."""
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return replace(scan, label=None, raw_label=None, instance=None, confidence=None, boxes=None)
+        return replace(
+            scan, label=None, raw_label=None, instance=None, confidence=None, boxes=None
+        )
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,13 @@ class Own:
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         if scan.label is None:
             raise DataError(
-                f"scan {scan.id!r} has no labels", "a label for each point", "Use labels='ignore'."
+                f"scan {scan.id!r} has no labels",
+                "a label for each point",
+                "Use labels='ignore'.",
             )
-        return trusted(scan, scan.label, scan.confidence if self.kept else None, self.threshold)
+        return trusted(
+            scan, scan.label, scan.confidence if self.kept else None, self.threshold
+        )
 
 
 def trusted(
@@ -129,7 +135,9 @@ def ignored(real: Source | None, fields: frozenset[str]) -> Ignored:
     return Ignored()
 
 
-def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.0) -> Own:
+def generated(
+    real: Source | None, fields: frozenset[str], threshold: float = 0.0
+) -> Own:
     """Make the policy ``generated``: the labels that the model generated with the scan.
 
     Raises:
@@ -138,7 +146,8 @@ def generated(real: Source | None, fields: frozenset[str], threshold: float = 0.
     _require_label("generated", fields)
     if threshold and "confidence" not in fields:
         raise ConfigError(
-            f"threshold {threshold} for synthetic scans without confidence", "threshold=0"
+            f"threshold {threshold} for synthetic scans without confidence",
+            "threshold=0",
         )
     return Own(check_share("threshold", threshold))
 

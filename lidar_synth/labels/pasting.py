@@ -62,14 +62,18 @@ def paste(
     view = Composition(scan)
     shown = [o for o in placed if view.add(o, least)]
     own = _own(scan, view.parts[0].seen, least)
-    pasted = [_as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)]
+    pasted = [
+        _as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)
+    ]
     return merge_scans(own, [p for p in pasted if len(p) >= least])
 
 
 def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
     """The object placed on the ground of the scan; None if there is no suitable place."""
     box = candidate.box
-    taken = [o.box for o in placed] + ([] if scan.boxes is None else list(scan.boxes.values))
+    taken = [o.box for o in placed] + (
+        [] if scan.boxes is None else list(scan.boxes.values)
+    )
     if taken and find_overlapping(widen_boxes(box, CLEARANCE), np.array(taken)).any():
         return None
     ground = ground_under(scan, box)
@@ -89,7 +93,10 @@ def _raised(candidate: Object, height: float) -> Object:
     values = candidate.scan.boxes.values.copy()
     values[:, :3] += lift
     boxes = replace(forget_images(candidate.scan.boxes), values=values)
-    return Object(replace(candidate.scan, points=candidate.scan.points + lift, boxes=boxes), height)
+    return Object(
+        replace(candidate.scan, points=candidate.scan.points + lift, boxes=boxes),
+        height,
+    )
 
 
 def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
@@ -97,7 +104,8 @@ def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
     assert scan.boxes is not None
     visible = scan[part.seen]
     boxes = replace(
-        update_occlusion(scan.boxes, np.array([part.share])), instance=np.ones(1, np.int32)
+        update_occlusion(scan.boxes, np.array([part.share])),
+        instance=np.ones(1, np.int32),
     )
     return replace(visible, instance=np.ones(len(visible), np.int32), boxes=boxes)
 
@@ -135,7 +143,11 @@ def still_visible(
 def update_occlusion(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:
     """The boxes with occlusion levels updated by the shares (M,) of their returns that are still
     visible."""
-    level = np.select([share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION])
+    level = np.select(
+        [share >= least for least, _ in OCCLUSION], [level for _, level in OCCLUSION]
+    )
     # Good visibility here does not exclude earlier occlusion: unknown (-1 or 3) stays unknown.
     keep = (level == 0) | (boxes.occlusion >= level)
-    return replace(boxes, occlusion=np.where(keep, boxes.occlusion, level).astype(np.int8))
+    return replace(
+        boxes, occlusion=np.where(keep, boxes.occlusion, level).astype(np.int8)
+    )

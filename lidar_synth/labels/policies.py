@@ -32,7 +32,9 @@ def mix(
         ConfigError: on an unknown kind or option, or a kind that the sources cannot support.
     """
     if kind not in KINDS:
-        raise ConfigError(f"labels='mix', kind={kind!r}", f"one of {', '.join(map(repr, KINDS))}")
+        raise ConfigError(
+            f"labels='mix', kind={kind!r}", f"one of {', '.join(map(repr, KINDS))}"
+        )
     return _build(KINDS[kind], f"labels='mix', kind={kind!r}", real, fields, options)
 
 
@@ -80,7 +82,8 @@ def make_policy(
     if not isinstance(labels, str):
         if options:
             raise ConfigError(
-                f"options {sorted(options)} for a policy that is a function", "a policy's name"
+                f"options {sorted(options)} for a policy that is a function",
+                "a policy's name",
             )
         return labels
     if labels not in POLICIES:
@@ -97,7 +100,9 @@ def _build(
     options: dict[str, Any],
 ) -> LabelPolicy:
     module, name = home.split(".")
-    build: Callable[..., LabelPolicy] = getattr(import_module(f"lidar_synth.labels.{module}"), name)
+    build: Callable[..., LabelPolicy] = getattr(
+        import_module(f"lidar_synth.labels.{module}"), name
+    )
     try:
         signature(build).bind(real, fields, **options)
     except TypeError as error:

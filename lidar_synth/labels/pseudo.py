@@ -42,7 +42,9 @@ class Pseudo:
                 f"the teacher's answer {type(answer).__name__} for scan {scan.id!r}",
                 "(labels, confidence), (N,) each, or a scan with labels",
             )
-        label, confidence = (None if values is None else np.asarray(values) for values in answer)
+        label, confidence = (
+            None if values is None else np.asarray(values) for values in answer
+        )
         assert label is not None
         bad = (
             label.shape != (len(scan),)

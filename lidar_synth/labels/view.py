@@ -49,7 +49,9 @@ class Composition:
     def __init__(self, scan: Scan) -> None:
         self.sensor = scan.sensor
         cell, distance, point = locate(scan.points, scan.sensor)
-        self.parts = [VisibleReturns(cell, distance, np.ones(len(scan), bool), len(scan))]
+        self.parts = [
+            VisibleReturns(cell, distance, np.ones(len(scan), bool), len(scan))
+        ]
         empty = point < 0
         self._front = np.full(point.shape, np.inf, np.float32)
         self._height = np.zeros(point.shape, np.float32)
@@ -60,7 +62,10 @@ class Composition:
             height = np.where(
                 GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf)
             )
-        self._front[~empty], self._height[~empty] = distance[point[~empty]], height[point[~empty]]
+        self._front[~empty], self._height[~empty] = (
+            distance[point[~empty]],
+            height[point[~empty]],
+        )
         _close_gaps(self._front, self._height)
 
     def add(self, placed: Object, least: int) -> bool:
@@ -127,12 +132,17 @@ def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None
             before[0], after[-1] = np.inf, np.inf
         farther = np.maximum(before, after)
         gap = np.isinf(front) & np.isfinite(farther)
-        heights = np.where(before >= after, np.roll(height, 1, axis), np.roll(height, -1, axis))
+        heights = np.where(
+            before >= after, np.roll(height, 1, axis), np.roll(height, -1, axis)
+        )
         front[gap], height[gap] = farther[gap], heights[gap]
 
 
 def _outline(
-    row: NDArray[np.intp], column: NDArray[np.intp], depth: NDArray[np.float32], columns: int
+    row: NDArray[np.intp],
+    column: NDArray[np.intp],
+    depth: NDArray[np.float32],
+    columns: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
     """The cells of an object's outline: between its upper and lower returns, in all columns from
     its first to its last.

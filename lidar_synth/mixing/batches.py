@@ -15,7 +15,13 @@ from torch.utils.data import Sampler
 from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
 from lidar_synth.mixing.quotas import Mixture
-from lidar_synth.mixing.state import after_epoch, check_state, check_unshared, make_state, place
+from lidar_synth.mixing.state import (
+    after_epoch,
+    check_state,
+    check_unshared,
+    make_state,
+    place,
+)
 
 AHEAD = 1 << 20
 """Number of positions that are announced at a time to a source that works ahead."""
@@ -180,14 +186,18 @@ class MixedBatches(Sampler[list[int]]):
                 f"{len(steps[-1])} samples left for {self.world_size} ranks: some get none",
                 stacklevel=2,
             )
-        if self.dataset.current.passed.get(self.rank) == (epoch, steps.start) and not self._warned:
+        if (
+            self.dataset.current.passed.get(self.rank) == (epoch, steps.start)
+            and not self._warned
+        ):
             self._warned = True
             warnings.warn(REPEATED.format(epoch), stacklevel=2)
         before, yielded = self._fetched
         fetched = self.dataset.fetched - before
         if self.world_size > 1 and 0 < fetched < yielded * 2 / 3:
             warnings.warn(
-                SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched), stacklevel=2
+                SHARED_TWICE.format(yielded, self.rank, self.world_size, fetched),
+                stacklevel=2,
             )
         self._fetched = (0, 0)
         return self._batches(epoch, steps)
@@ -215,7 +225,8 @@ class MixedBatches(Sampler[list[int]]):
         taken = self._taken[1] if self._taken[0] == epoch else 0
         if not 0 <= (number := taken if done is None else done) <= len(steps):
             raise ConfigError(
-                f"{number} batches done of {len(steps)}", "a number of batches of this epoch"
+                f"{number} batches done of {len(steps)}",
+                "a number of batches of this epoch",
             )
         if number < len(steps):
             position = steps[number].start
@@ -271,4 +282,6 @@ class MixedBatches(Sampler[list[int]]):
     def _steps(self) -> CutSteps:
         epoch = self.dataset.epoch
         start = self._start[1] if self._start[0] == epoch else 0
-        return cut_steps(start, len(self.dataset), self.batch_size, self.world_size, self.drop_last)
+        return cut_steps(
+            start, len(self.dataset), self.batch_size, self.world_size, self.drop_last
+        )

@@ -61,10 +61,13 @@ class Collate:
         for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
             if getattr(self, name) not in get_args(kind):
                 raise ConfigError(
-                    f"{name}={getattr(self, name)!r} of batches", f"one of {get_args(kind)}"
+                    f"{name}={getattr(self, name)!r} of batches",
+                    f"one of {get_args(kind)}",
                 )
         if self.form == "range" and self.sensor is None:
-            raise ConfigError("range images without a sensor", "a sensor, which defines their grid")
+            raise ConfigError(
+                "range images without a sensor", "a sensor, which defines their grid"
+            )
 
     def __call__(self, items: Sequence[Item]) -> dict[str, Any]:
         """Make a batch of the items.
@@ -156,9 +159,15 @@ def _range_images(items: Sequence[Item], sensor: Sensor | None) -> dict[str, Ten
     distance = torch.from_numpy(np.stack([image.range for image in images]))
     names = ("reflectance", "label", "confidence")
     channels = {
-        n: torch.from_numpy(np.stack([image.channels[n] for image in images])) for n in names
+        n: torch.from_numpy(np.stack([image.channels[n] for image in images]))
+        for n in names
     }
-    return {"range": distance, **channels, "label": channels["label"].long(), "mask": distance > 0}
+    return {
+        "range": distance,
+        **channels,
+        "label": channels["label"].long(),
+        "mask": distance > 0,
+    }
 
 
 _FORMS: dict[str, Callable[[Sequence[Item], Sensor | None], dict[str, Any]]] = {

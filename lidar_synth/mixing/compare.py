@@ -22,7 +22,13 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.mixing.meaning import Contradiction, Table, contradictions, measure_tables, spread
+from lidar_synth.mixing.meaning import (
+    Contradiction,
+    Table,
+    contradictions,
+    measure_tables,
+    spread,
+)
 from lidar_synth.mixing.synthetic import Synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -89,11 +95,17 @@ def check_alike(
         expected = _try("real", dataset.__getitem__, 0)
         for number, source in enumerate(synthetic):
             sample = _try(
-                "synthetic", lambda n, s: finish(n, _scan_of(s), keyed_rng(0)), number, source
+                "synthetic",
+                lambda n, s: finish(n, _scan_of(s), keyed_rng(0)),
+                number,
+                source,
             )
             if expected is None or sample is None:
                 continue
-            wrong = [*differences(expected, sample), *_unknown_values(dataset, expected, sample)]
+            wrong = [
+                *differences(expected, sample),
+                *_unknown_values(dataset, expected, sample),
+            ]
             if wrong:
                 raise ConfigError(
                     f"synthetic samples unlike the real ones: {'; '.join(wrong[:4])}",
@@ -103,7 +115,8 @@ def check_alike(
                 )
             if _tables(expected) and not _is_on_demand(source):
                 more = [
-                    _try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]
+                    _try("real", dataset.__getitem__, i)
+                    for i in spread(len(dataset), SEARCHED)[1:]
                 ]
                 numbers = spread(source.length or SEARCHED, SEARCHED)
                 made = [
@@ -118,7 +131,8 @@ def check_alike(
                 ]
                 report(
                     compare_meaning(
-                        [_tables(s) for s in (expected, *more)], [_tables(s) for s in made]
+                        [_tables(s) for s in (expected, *more)],
+                        [_tables(s) for s in made],
                     )
                 )
 
@@ -155,13 +169,22 @@ def compare_meaning(
     for place, first in real[0].items():
         width = first.columns.shape[1]
         ours, theirs = (
-            [each[place]._replace(spatial=first.spatial) for each in samples if place in each]
+            [
+                each[place]._replace(spatial=first.spatial)
+                for each in samples
+                if place in each
+            ]
             for samples in (synthetic, real)
         )
         ours = [table for table in ours if table.columns.shape[1] == width]
         if ours:
-            measured = measure_tables(theirs, USUAL_IGNORE), measure_tables(ours, USUAL_IGNORE)
-            found |= dict.fromkeys(contradictions(*measured, place.removeprefix("sample")))
+            measured = (
+                measure_tables(theirs, USUAL_IGNORE),
+                measure_tables(ours, USUAL_IGNORE),
+            )
+            found |= dict.fromkeys(
+                contradictions(*measured, place.removeprefix("sample"))
+            )
     return list(found)
 
 
@@ -187,10 +210,14 @@ def differences(
         for key in sorted(real.keys() ^ synthetic.keys(), key=str):
             yield f"{place} has {'no' if key in real else 'an additional'} {key!r}"
         for key in [k for k in real if k in synthetic]:
-            yield from differences(real[key], synthetic[key], f"{place}[{key!r}]", depth - 1)
+            yield from differences(
+                real[key], synthetic[key], f"{place}[{key!r}]", depth - 1
+            )
     elif isinstance(real, list | tuple):
         if len(real) == len(synthetic):
-            for i, (x, y) in enumerate(islice(zip(real, synthetic, strict=True), PARTS)):
+            for i, (x, y) in enumerate(
+                islice(zip(real, synthetic, strict=True), PARTS)
+            ):
                 yield from differences(x, y, f"{place}[{i}]", depth - 1)
         elif len({_kind(x) for x in real[:PARTS]}) > 1:
             yield f"{place} has {len(synthetic)} parts instead of {len(real)}"
@@ -212,7 +239,9 @@ def _kind(value: Any) -> str:
     """The type of a value in words, with dtype and rank for arrays; it must be the same for two
     values."""
     if isinstance(value, torch.Tensor):
-        return f"a tensor of {str(value.dtype).removeprefix('torch.')}, rank {value.ndim}"
+        return (
+            f"a tensor of {str(value.dtype).removeprefix('torch.')}, rank {value.ndim}"
+        )
     if isinstance(value, np.ndarray) and value.dtype.kind not in "OSU":
         return f"an array of {value.dtype}, rank {value.ndim}"
     for kinds, words in (
@@ -239,7 +268,9 @@ def _parts(value: Any) -> dict[str, Any]:
     return {
         k: v
         for k, v in members
-        if _is_array(v) or isinstance(v, Mapping | list | tuple) or hasattr(v, "__dict__")
+        if _is_array(v)
+        or isinstance(v, Mapping | list | tuple)
+        or hasattr(v, "__dict__")
     }
 
 
@@ -282,7 +313,9 @@ def _tables(sample: Any) -> dict[str, Table]:
     """{place: points} of the arrays of real numbers that have many rows, with the labels that
     belong to them."""
     arrays = dict(_arrays(sample))
-    named = {p: a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)}
+    named = {
+        p: a for p, a in arrays.items() if a.dtype.kind in "iu" and _may_be_labels(p)
+    }
     found = {}
     for place, array in arrays.items():
         rows = _rows(array) if array.dtype.kind == "f" else None
@@ -294,8 +327,14 @@ def _tables(sample: Any) -> dict[str, Table]:
             )
             label = next(fitting, None)
             reach = np.ptp(np.quantile(rows, (0.01, 0.99), axis=0), axis=0)
-            spatial = array.ndim == 2 and len(reach) > 2 and bool((reach[:3] > (5, 5, 0.5)).all())
-            found[place] = Table(rows, None if label is None else label.astype(np.int64), spatial)
+            spatial = (
+                array.ndim == 2
+                and len(reach) > 2
+                and bool((reach[:3] > (5, 5, 0.5)).all())
+            )
+            found[place] = Table(
+                rows, None if label is None else label.astype(np.int64), spatial
+            )
     return found
 
 
@@ -310,7 +349,11 @@ def _rows(array: NDArray[Any]) -> NDArray[np.float64] | None:
         array = array.reshape(len(array), -1).T
     elif array.ndim == 2 and array.shape[0] <= MOST_COLUMNS:
         array = array.T
-    fits = array.ndim == 2 and 0 < array.shape[1] <= MOST_COLUMNS and len(array) >= LEAST_POINTS
+    fits = (
+        array.ndim == 2
+        and 0 < array.shape[1] <= MOST_COLUMNS
+        and len(array) >= LEAST_POINTS
+    )
     return array.astype(np.float64) if fits and np.isfinite(array).all() else None
 
 
@@ -340,7 +383,11 @@ def _try(kind: str, fetch: Callable[..., Any], *which: Any) -> Any:
     try:
         return fetch(*which)
     except Exception as error:  # a trainer's own code may raise anything
-        log.warning("real and synthetic samples are not compared: no %s sample (%r)", kind, error)
+        log.warning(
+            "real and synthetic samples are not compared: no %s sample (%r)",
+            kind,
+            error,
+        )
         return None
 
 
@@ -365,7 +412,9 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
     """
     rng, (rows, columns) = keyed_rng(0), sensor.shape
     down = np.sin(np.maximum(-sensor.row_elevations(), 0.02))[:, None]
-    distance = np.clip(1.7 / down, sensor.range_min, 0.5 * sensor.range_max).astype(np.float32)
+    distance = np.clip(1.7 / down, sensor.range_min, 0.5 * sensor.range_max).astype(
+        np.float32
+    )
     label = rng.choice(np.array([*range(len(NAMES)), IGNORE], np.uint8), sensor.shape)
     every: dict[str, NDArray[Any]] = {
         "reflectance": rng.random(sensor.shape, np.float32),
@@ -379,7 +428,11 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
     image = RangeImage(
         np.ascontiguousarray(np.broadcast_to(distance, (rows, columns))),
         sensor,
-        {name: values for name, values in every.items() if name in fields | {"reflectance"}},
+        {
+            name: values
+            for name, values in every.items()
+            if name in fields | {"reflectance"}
+        },
     )
     return replace(unproject(image), id="made-up", domain=SYNTHETIC)
 

@@ -75,7 +75,9 @@ class CurrentEpoch:
         # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is
         # used
         self._shared = shared_integers(0, -1, 0, 0)
-        self._fetched = shared_integers(*[0] * _COUNTERS)  # number of positions fetched, by worker
+        self._fetched = shared_integers(
+            *[0] * _COUNTERS
+        )  # number of positions fetched, by worker
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
         # The epoch that this process set, or the current epoch when this process started.
@@ -184,7 +186,10 @@ class CurrentEpoch:
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ |= state | {"_passes": WeakKeyDictionary(), "_followers": WeakSet()}
+        self.__dict__ |= state | {
+            "_passes": WeakKeyDictionary(),
+            "_followers": WeakSet(),
+        }
 
 
 def check_pass(begun: int, epoch: int) -> None:

@@ -29,8 +29,14 @@ class Item(dict[str, Any]):
 
 def copy_scan(scan: Scan) -> Scan:
     """A scan with points, fields and boxes of its own, which may be changed in place."""
-    own: dict[str, Any] = {name: values.copy() for name, values in scan.fields().items()}
-    boxes = None if scan.boxes is None else replace(scan.boxes, values=scan.boxes.values.copy())
+    own: dict[str, Any] = {
+        name: values.copy() for name, values in scan.fields().items()
+    }
+    boxes = (
+        None
+        if scan.boxes is None
+        else replace(scan.boxes, values=scan.boxes.values.copy())
+    )
     return replace(scan, points=scan.points.copy(), boxes=boxes, **own)
 
 
@@ -61,8 +67,14 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
                 "Map the dataset's own ids when they are read (Taxonomy.decode).",
             )
     own = scan.confidence
-    confidence = (label != IGNORE).astype(np.float32) if own is None else np.array(own, np.float32)
-    boxes: Any = np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
+    confidence = (
+        (label != IGNORE).astype(np.float32)
+        if own is None
+        else np.array(own, np.float32)
+    )
+    boxes: Any = (
+        np.empty((0, 7), np.float32) if scan.boxes is None else scan.boxes.values.copy()
+    )
     return Item(
         points=torch.from_numpy(points),
         label=torch.from_numpy(label),

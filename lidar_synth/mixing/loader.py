@@ -43,7 +43,9 @@ class MixedLoader(DataLoader[Any]):
             0,
         )
         options.setdefault("collate_fn", dataset.collate)
-        super().__init__(dataset, batch_sampler=self._batches, num_workers=num_workers, **options)
+        super().__init__(
+            dataset, batch_sampler=self._batches, num_workers=num_workers, **options
+        )
 
     @property
     def epoch(self) -> int:

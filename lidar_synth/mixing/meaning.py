@@ -132,12 +132,18 @@ class Meaning:
 def table_of(scan: Scan) -> Table:
     """The points of a scan with reflectance and labels."""
     columns = np.column_stack([scan.points, scan.reflectance]).astype(np.float64)
-    return Table(columns, None if scan.label is None else scan.label.astype(np.int64), True)
+    return Table(
+        columns, None if scan.label is None else scan.label.astype(np.int64), True
+    )
 
 
 def spread(length: int, count: int) -> list[int]:
     """Up to ``count`` indices from the first to the last of a source."""
-    return sorted({int(index) for index in np.linspace(0, length - 1, count)}) if length else []
+    return (
+        sorted({int(index) for index in np.linspace(0, length - 1, count)})
+        if length
+        else []
+    )
 
 
 def rows_in_use(scans: Sequence[Scan]) -> int:
@@ -157,7 +163,10 @@ def measure_tables(tables: Sequence[Table], ignored: Sequence[int]) -> Meaning:
     thin = [_thinned(table) for table in tables]
     columns = np.concatenate([table.columns for table in thin])
     numbers = np.array(
-        [len(np.unique(column[:: max(1, len(columns) // 4000)])) for column in columns.T]
+        [
+            len(np.unique(column[:: max(1, len(columns) // 4000)]))
+            for column in columns.T
+        ]
     )
     spatial = tables[0].spatial
     grounds = [_floor_height(table.columns) for table in thin] if spatial else []
@@ -166,7 +175,11 @@ def measure_tables(tables: Sequence[Table], ignored: Sequence[int]) -> Meaning:
         for table in thin
         if spatial
     ]
-    distance = np.linalg.norm(columns[:, :3], axis=1) if spatial else np.full(len(columns), np.nan)
+    distance = (
+        np.linalg.norm(columns[:, :3], axis=1)
+        if spatial
+        else np.full(len(columns), np.nan)
+    )
     ground = _median(grounds)
     height = (
         columns[:, 2] - (0 if np.isnan(ground) else ground)
@@ -204,7 +217,9 @@ def _floor_height(points: Floats) -> float:
     there are few."""
     away = np.hypot(points[:, 0], points[:, 1])
     near = points[(away > 3) & (away < 25)]
-    square = (np.floor(near[:, 0] / 2) * 1000 + np.floor(near[:, 1] / 2)).astype(np.int64)
+    square = (np.floor(near[:, 0] / 2) * 1000 + np.floor(near[:, 1] / 2)).astype(
+        np.int64
+    )
     order = np.lexsort((near[:, 2], square))
     _, start, count = np.unique(square[order], return_index=True, return_counts=True)
     lowest = near[order, 2][start + count // 20]
@@ -222,7 +237,10 @@ def _elongation(points: Floats) -> float:
 def _measure_classes(
     tables: Sequence[Table], height: Floats, distance: Floats, ignored: Sequence[int]
 ) -> dict[int, ClassLook]:
-    labels = [np.full(len(t.columns), ignored[0]) if t.label is None else t.label for t in tables]
+    labels = [
+        np.full(len(t.columns), ignored[0]) if t.label is None else t.label
+        for t in tables
+    ]
     label = np.concatenate(labels)
     valid = ~np.isin(label, list(ignored))
     found = {}
@@ -233,7 +251,9 @@ def _measure_classes(
     return found
 
 
-def contradictions(real: Meaning, synthetic: Meaning, place: str = "") -> Iterator[Contradiction]:
+def contradictions(
+    real: Meaning, synthetic: Meaning, place: str = ""
+) -> Iterator[Contradiction]:
     """Describe how the statistics of synthetic samples contradict those of real ones.
 
     Args:
@@ -251,7 +271,11 @@ def contradictions(real: Meaning, synthetic: Meaning, place: str = "") -> Iterat
         )
         yield Contradiction(text, False)
     geometry = unit or [*_heights(real, synthetic), *_axes(real, synthetic)]
-    for found in [*geometry, *_columns(real, synthetic, coordinates), *_classes(real, synthetic)]:
+    for found in [
+        *geometry,
+        *_columns(real, synthetic, coordinates),
+        *_classes(real, synthetic),
+    ]:
         yield Contradiction(named + found.text, found.certain)
 
 
@@ -270,7 +294,9 @@ def _heights(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     offset = abs(synthetic.ground - real.ground)
     if not offset > UNUSUAL_GROUND:  # also if unknown
         return
-    text = f"the ground is at z = {synthetic.ground:.2f} m instead of {real.ground:.2f} m"
+    text = (
+        f"the ground is at z = {synthetic.ground:.2f} m instead of {real.ground:.2f} m"
+    )
     if abs(-synthetic.ceiling - real.ground) < UNUSUAL_GROUND < offset:
         text += ": z points down in one of them"
     else:
@@ -298,11 +324,17 @@ def _direction(along: Sequence[float]) -> int:
     return int(np.sign(mean)) if abs(mean) > max(TURNED, SURE * error) else 0
 
 
-def _columns(real: Meaning, synthetic: Meaning, coordinates: int) -> Iterator[Contradiction]:
+def _columns(
+    real: Meaning, synthetic: Meaning, coordinates: int
+) -> Iterator[Contradiction]:
     """Columns with another scale, or with one value only; of coordinates, ``_unit`` and
     ``_heights`` know more."""
     for number in range(coordinates, len(real.quantiles)):
-        name = NAMES_OF_COLUMNS[number] if coordinates and number < 4 else f"column {number}"
+        name = (
+            NAMES_OF_COLUMNS[number]
+            if coordinates and number < 4
+            else f"column {number}"
+        )
         low, high = synthetic.quantiles[number, [0, 2]]
         told = (
             f"{low:.4g} to {high:.4g} instead of {real.quantiles[number, 0]:.4g} to "
@@ -314,8 +346,13 @@ def _columns(real: Meaning, synthetic: Meaning, coordinates: int) -> Iterator[Co
             yield Contradiction(f"{name} is always {low:.4g}, {told}", number < 4)
         elif real.constant[number] and synthetic.varied[number]:
             yield Contradiction(f"real {name} is always the same: {told}", number < 4)
-        elif min(spread, expected) > 0 and max(spread / expected, expected / spread) > OTHER_SCALE:
-            yield Contradiction(f"{name} is {told} (1st to 99th percentile): another scale", True)
+        elif (
+            min(spread, expected) > 0
+            and max(spread / expected, expected / spread) > OTHER_SCALE
+        ):
+            yield Contradiction(
+                f"{name} is {told} (1st to 99th percentile): another scale", True
+            )
 
 
 def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
@@ -329,8 +366,12 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     for reason, numbers in _renumberings():
         renumbered = {numbers.get(value, -1): look for value, look in ours.items()}
         if _distance(renumbered, theirs) < EXPLAINED * distance:
-            largest = sorted(ours.keys() & numbers.keys(), key=lambda value: -ours[value].share)[:4]
-            text = "; ".join(f"class {value} looks like your {numbers[value]}" for value in largest)
+            largest = sorted(
+                ours.keys() & numbers.keys(), key=lambda value: -ours[value].share
+            )[:4]
+            text = "; ".join(
+                f"class {value} looks like your {numbers[value]}" for value in largest
+            )
             yield Contradiction(f"{text}: {reason}", True)
             return
     pairs = dict(_matches(theirs, ours))
@@ -339,7 +380,8 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     text = f"classes differ for {distance:.0%} of the points"
     if pairs:
         text = "; ".join(
-            f"class {value} looks like your {other}" for value, other in list(pairs.items())[:4]
+            f"class {value} looks like your {other}"
+            for value, other in list(pairs.items())[:4]
         )
     elif unseen > OTHER_SHARES:
         missing = sorted(set(ours) - set(theirs))[:4]
@@ -363,7 +405,9 @@ def _renumberings() -> Iterator[tuple[str, dict[int, int]]]:
 def _distance(ours: dict[int, ClassLook], theirs: dict[int, ClassLook]) -> float:
     """The total variation distance between the shares of classes, 0 to 1."""
     values = ours.keys() | theirs.keys()
-    share = [[look[v].share if v in look else 0.0 for look in (ours, theirs)] for v in values]
+    share = [
+        [look[v].share if v in look else 0.0 for look in (ours, theirs)] for v in values
+    ]
     return sum(abs(one - other) for one, other in share) / 2
 
 

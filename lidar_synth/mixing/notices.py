@@ -52,12 +52,17 @@ class Notices:
         self._unlabelled: str | None = None  # a real scan without labels
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
-        self._sizes: tuple[list[int], list[int]] = ([], [])  # points of real and of synthetic scans
+        self._sizes: tuple[list[int], list[int]] = (
+            [],
+            [],
+        )  # points of real and of synthetic scans
 
     def real(self, scan: Scan) -> None:
         """Note whether real scans have boxes and labels, and their numbers of points."""
         self._real_boxes = self._real_boxes or scan.boxes is not None
-        if self._unlabelled is None and (scan.label is None or not (scan.label != IGNORE).any()):
+        if self._unlabelled is None and (
+            scan.label is None or not (scan.label != IGNORE).any()
+        ):
             self._unlabelled = scan.id
         self._count(0, scan)
 

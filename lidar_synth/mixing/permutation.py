@@ -43,7 +43,8 @@ def permute(
         return np.zeros(len(entries), np.int64)
     keys = _keys(seed, stream)
     order = _mixed(
-        np.broadcast_to(np.asarray(number, np.int64), (len(entries),)).astype(np.uint64) + keys[-1]
+        np.broadcast_to(np.asarray(number, np.int64), (len(entries),)).astype(np.uint64)
+        + keys[-1]
     )
     places = _once(entries.astype(np.uint64), size, keys, order)
     while len(outside := np.flatnonzero(places >= size)):
@@ -52,7 +53,10 @@ def permute(
 
 
 def _once(
-    cells: NDArray[np.uint64], size: int, keys: NDArray[np.uint64], order: NDArray[np.uint64]
+    cells: NDArray[np.uint64],
+    size: int,
+    keys: NDArray[np.uint64],
+    order: NDArray[np.uint64],
 ) -> NDArray[np.uint64]:
     """One pass through all rounds of the network, over a grid of at least ``size`` cells."""
     rows = isqrt(size - 1) + 1

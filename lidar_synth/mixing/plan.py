@@ -37,7 +37,9 @@ from lidar_synth.mixing.schedules import share_of
 VERSION = "lidar-synth-plan/2"
 """Part of every plan's hash; changes when the same mixture gives another order."""
 
-_ORDER, _REALS, _SOURCES = range(3)  # streams of the permutations; each source has its own
+_ORDER, _REALS, _SOURCES = range(
+    3
+)  # streams of the permutations; each source has its own
 _BLOCK = 256  # number of positions computed together, as most are accessed in order
 _BLOCKS = 8  # number of blocks in the cache
 
@@ -96,15 +98,23 @@ class MixingPlan:
             raise IndexError(f"position {position} of {len(self)}")
         block, offset = divmod(int(position), _BLOCK)
         if (entries := self._cache.get(block)) is None:
-            entries = self.at(np.arange(block * _BLOCK, min((block + 1) * _BLOCK, len(self))))
+            entries = self.at(
+                np.arange(block * _BLOCK, min((block + 1) * _BLOCK, len(self)))
+            )
             if len(self._cache) >= _BLOCKS:
                 self._cache.clear()
             self._cache[block] = entries
         return int(entries[0][offset]), int(entries[1][offset])
 
-    def at(self, positions: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def at(
+        self, positions: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The sources and local indices, (N,) each, of (N,) positions, 0 <= position < length."""
-        rank = self._balanced(positions) if self.mixture.balanced else self._shuffled(positions)
+        rank = (
+            self._balanced(positions)
+            if self.mixture.balanced
+            else self._shuffled(positions)
+        )
         source = np.searchsorted(np.cumsum(self.counts), rank, side="right")
         number = (np.array(self.before, np.int64) - self._starts)[source] + rank
         index = np.empty_like(number)
@@ -152,7 +162,9 @@ class MixingPlan:
     @cached_property
     def hash(self) -> str:
         """SHA-256 of ``facts``, as hexadecimal digits."""
-        return hashlib.sha256(json.dumps(self.facts, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps(self.facts, sort_keys=True).encode()
+        ).hexdigest()
 
     @cached_property
     def _starts(self) -> NDArray[np.int64]:
@@ -176,10 +188,14 @@ class MixingPlan:
         seed = self.mixture.seed
         rank = np.empty(len(positions), np.int64)
         real = (positions - before)[~synthetic]
-        rank[~synthetic] = permute(real, len(self) - self.synthetics, seed, _REALS, self.epoch)
+        rank[~synthetic] = permute(
+            real, len(self) - self.synthetics, seed, _REALS, self.epoch
+        )
         if synthetic.any():
             earlier = sum(self.before[self.reals :])
-            source, number = deal(self.mixture.synthetic_weights, before[synthetic] + earlier)
+            source, number = deal(
+                self.mixture.synthetic_weights, before[synthetic] + earlier
+            )
             dealt = np.empty(len(source), np.int64)
             for each, start in enumerate(self._starts.tolist()[self.reals :]):
                 here = source == each
@@ -210,7 +226,11 @@ class MixingPlan:
         if source < self.reals:
             length = mixture.real[source].length or 0
             return permute(
-                number % length, length, mixture.seed, _SOURCES + source, number // length
+                number % length,
+                length,
+                mixture.seed,
+                _SOURCES + source,
+                number // length,
             )
         planned = mixture.synthetic[source - self.reals]
         if mixture.reuse > 1:
@@ -225,4 +245,8 @@ def plan(mixture: Mixture, epoch: int) -> MixingPlan:
 
 
 def _facts_of(source: PlannedSource) -> dict[str, Any]:
-    return {"length": source.length, "weight": source.weight, "identity": source.identity}
+    return {
+        "length": source.length,
+        "weight": source.weight,
+        "identity": source.identity,
+    }

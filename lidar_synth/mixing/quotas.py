@@ -88,18 +88,25 @@ class Mixture:
         if size not in ("add", "replace") and not (
             isinstance(size, int) and not isinstance(size, bool) and size > 0
         ):
-            raise ConfigError(f"epoch_size={size!r}", "'add', 'replace' or a number of samples")
+            raise ConfigError(
+                f"epoch_size={size!r}", "'add', 'replace' or a number of samples"
+            )
         if to_integer(self.reuse, "reuse") < 1:
             raise ConfigError(
-                f"reuse={self.reuse}", "the number of epochs that use a synthetic scan, at least 1"
+                f"reuse={self.reuse}",
+                "the number of epochs that use a synthetic scan, at least 1",
             )
         if not 0 <= self.seed < 2**64:
             raise ConfigError(f"seed {self.seed}", "0 <= seed < 2^64")
         for source in self.real + self.synthetic:
             if source.length == 0:
-                raise DataError(f"a source without scans ({source.identity})", "at least one scan")
+                raise DataError(
+                    f"a source without scans ({source.identity})", "at least one scan"
+                )
             if source.weight is not None and not 0 < source.weight < float("inf"):
-                raise ConfigError(f"weight {source.weight} of a source", "a positive number")
+                raise ConfigError(
+                    f"weight {source.weight} of a source", "a positive number"
+                )
         if size == "add" and any(source.weight is not None for source in self.real):
             raise ConfigError(
                 "weights of real sources with epoch_size='add', which uses every real scan once",
@@ -116,12 +123,16 @@ class Mixture:
     @cached_property
     def real_weights(self) -> tuple[Fraction, ...]:
         """The weights of the real sources, by default their lengths."""
-        return tuple(_exact(s.length or 0 if s.weight is None else s.weight) for s in self.real)
+        return tuple(
+            _exact(s.length or 0 if s.weight is None else s.weight) for s in self.real
+        )
 
     @cached_property
     def synthetic_weights(self) -> tuple[Fraction, ...]:
         """The weights of the synthetic sources, by default all equal."""
-        return tuple(_exact(1 if s.weight is None else s.weight) for s in self.synthetic)
+        return tuple(
+            _exact(1 if s.weight is None else s.weight) for s in self.synthetic
+        )
 
     @cached_property
     def laps(self) -> tuple[int, ...]:
@@ -142,8 +153,14 @@ class Mixture:
                 samples reaches.
         """
         if self.epoch_size != "add":
-            return self.real_length if self.epoch_size == "replace" else int(self.epoch_size)
-        share, epoch = max((share_of(self.ratio, epoch), -epoch) for epoch in self._deciding)
+            return (
+                self.real_length
+                if self.epoch_size == "replace"
+                else int(self.epoch_size)
+            )
+        share, epoch = max(
+            (share_of(self.ratio, epoch), -epoch) for epoch in self._deciding
+        )
         if share == 1:
             raise ConfigError(
                 f"ratio 1 in epoch {-epoch} with epoch_size='add', which keeps every real scan",
@@ -157,7 +174,10 @@ class Mixture:
         """The epochs that determine lengths: all until the schedule settles, the first hundred if
         it never does."""
         last = settled(self.ratio)
-        epochs = [*range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)), last or 0]
+        epochs = [
+            *range(_FIRST_EPOCHS if last is None else min(last, _FIRST_EPOCHS)),
+            last or 0,
+        ]
         return tuple(takewhile(self._has_ratio, epochs))
 
     def _has_ratio(self, epoch: int) -> bool:
@@ -184,7 +204,8 @@ def exact_synthetic(mixture: Mixture, epoch: int) -> Fraction:
     size = mixture.epoch_size
     if share > 0 and not mixture.synthetic:
         raise ConfigError(
-            f"ratio {float(share):g} in epoch {epoch} without a synthetic source", "one, or ratio 0"
+            f"ratio {float(share):g} in epoch {epoch} without a synthetic source",
+            "one, or ratio 0",
         )
     if not mixture.real_length and (share < 1 or not isinstance(size, int)):
         raise DataError(
@@ -285,7 +306,9 @@ def deal(
     sources = np.empty_like(samples)
     numbers = np.empty_like(samples)
 
-    def walk(node: _Node | int, where: NDArray[np.intp], number: NDArray[np.int64]) -> None:
+    def walk(
+        node: _Node | int, where: NDArray[np.intp], number: NDArray[np.int64]
+    ) -> None:
         if isinstance(node, int):
             sources[where] = node
             numbers[where] = number
@@ -332,7 +355,9 @@ def _tree(weights: tuple[Fraction, ...]) -> _Node | int:
             return sources[0]
         left = sources[: len(sources) // 2]
         right = sources[len(sources) // 2 :]
-        share = sum((weights[i] for i in left), Fraction(0)) / sum(weights[i] for i in sources)
+        share = sum((weights[i] for i in left), Fraction(0)) / sum(
+            weights[i] for i in sources
+        )
         p, q = share.limit_denominator(_FINEST).as_integer_ratio()
         return _Node(p, q, grow(left), grow(right))
 

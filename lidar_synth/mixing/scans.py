@@ -146,14 +146,17 @@ class MixedScans(Dataset[Any]):
                     "real scans first, then what synthetic ones come from",
                     "MixedScans(real, synth, ratio)",
                 )
-        synthetics = [(make_synthetic(source, seed), weight) for source, weight in each(synth)]
+        synthetics = [
+            (make_synthetic(source, seed), weight) for source, weight in each(synth)
+        ]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
         self._transfer = _make_transfer(as_sensor)
         suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
         self.mixture = Mixture(
             tuple(
-                PlannedSource(len(source), weight, identity_of(source)) for source, weight in reals
+                PlannedSource(len(source), weight, identity_of(source))
+                for source, weight in reals
             ),
             tuple(
                 PlannedSource(source.length, weight, source.identity + suffix)
@@ -168,7 +171,8 @@ class MixedScans(Dataset[Any]):
         sources = self.synthetic if real_as_is else self.real + self.synthetic
         target = None if self._transfer is None else self._transfer.target
         sensors = check_together(
-            sources, [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics)
+            sources,
+            [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics),
         )
         scans = None if real_as_is else real
         options = dict(label_options or {})
@@ -177,7 +181,9 @@ class MixedScans(Dataset[Any]):
             make_policy(labels, real=scans, fields=s.fields | rings, **options)
             for s in self.synthetic
         ]
-        self._without_unboxed = _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
+        self._without_unboxed = (
+            _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
+        )
         self._notices = Notices(images=collate == "range")
         self._augment = augment
         self._augment_real = augment_real
@@ -191,7 +197,9 @@ class MixedScans(Dataset[Any]):
             )
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
-        self._untold = False  # whether it is made as an earlier one was, and no epoch has been set
+        self._untold = (
+            False  # whether it is made as an earlier one was, and no epoch has been set
+        )
         self._planned: tuple[int, MixingPlan] | None = None
         self.set_epoch(0)
         first = MixingPlan(self.mixture, 0)
@@ -246,15 +254,27 @@ class MixedScans(Dataset[Any]):
             [3, 3, 3, 3]
         """
         return cls(
-            dataset, synth, ratio, to_sample=to_sample, collate=collate, real_as_is=True, **options
+            dataset,
+            synth,
+            ratio,
+            to_sample=to_sample,
+            collate=collate,
+            real_as_is=True,
+            **options,
         )
 
     def __getattr__(self, name: str) -> Any:
         # Called only for missing attributes. Names with double underscores are protocols (copy,
         # __getitems__).
         state = self.__dict__
-        if name.startswith("__") or not state.get("_real_as_is") or len(state["real"]) != 1:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        if (
+            name.startswith("__")
+            or not state.get("_real_as_is")
+            or len(state["real"]) != 1
+        ):
+            raise AttributeError(
+                f"{type(self).__name__!r} object has no attribute {name!r}"
+            )
         return getattr(state["real"][0], name)
 
     @property
@@ -324,7 +344,9 @@ class MixedScans(Dataset[Any]):
         """
         if any(hasattr(source, "expect") for source in self.synthetic):
             plan = self.plan(epoch)
-            upcoming = islice(range(len(plan)) if positions is None else positions, AHEAD)
+            upcoming = islice(
+                range(len(plan)) if positions is None else positions, AHEAD
+            )
             sources, indices = plan.at(np.fromiter(upcoming, np.int64))
             for number, source in enumerate(self.synthetic, plan.reals):
                 if hasattr(source, "expect"):
@@ -367,7 +389,9 @@ class MixedScans(Dataset[Any]):
         """
         plan = self.plan(index.epoch if isinstance(index, Position) else None)
         return (
-            SYNTHETIC if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals else REAL
+            SYNTHETIC
+            if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals
+            else REAL
         )
 
     def epoch_of(self, index: int) -> int:
@@ -386,7 +410,9 @@ class MixedScans(Dataset[Any]):
         plan = self.plan(epoch)
         source, index = plan[position]
         if source >= plan.reals:
-            return self.finish(self.synthetic[source - plan.reals][index], epoch, position)
+            return self.finish(
+                self.synthetic[source - plan.reals][index], epoch, position
+            )
         real = self.real[source][index]
         if self._real_as_is:
             return real
@@ -441,9 +467,13 @@ class MixedScans(Dataset[Any]):
             >>> [sorted(batch["domain"].tolist()) for batch in loader]
             [[0, 1], [0, 1], [0, 1]]
         """
-        return MixedBatches(self, batch_size, rank=rank, world_size=world_size, drop_last=drop_last)
+        return MixedBatches(
+            self, batch_size, rank=rank, world_size=world_size, drop_last=drop_last
+        )
 
-    def loader(self, batch_size: int, num_workers: int = 0, **options: Any) -> MixedLoader:
+    def loader(
+        self, batch_size: int, num_workers: int = 0, **options: Any
+    ) -> MixedLoader:
         """Make a ``DataLoader`` that sets its own epoch and can resume; see ``MixedLoader``.
 
         Args:
@@ -465,7 +495,9 @@ class MixedScans(Dataset[Any]):
 
 
 def _make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
-    from lidar_synth.geometry.transfer import Transfer  # only where a mixture turns its scans
+    from lidar_synth.geometry.transfer import (
+        Transfer,
+    )  # only where a mixture turns its scans
 
     if given is None or isinstance(given, Transfer):
         return given

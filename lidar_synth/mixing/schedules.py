@@ -17,7 +17,9 @@ Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
 1]."""
 
-_FINEST = 10**6  # largest denominator of a share: products with positions stay within 64 bits
+_FINEST = (
+    10**6
+)  # largest denominator of a share: products with positions stay within 64 bits
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,9 @@ class Linear:
         _checked(self.first, 0)
         _checked(self.last, self.epochs - 1)
         if self.epochs < 2:
-            raise ConfigError(f"a linear schedule over {self.epochs} epochs", "at least 2")
+            raise ConfigError(
+                f"a linear schedule over {self.epochs} epochs", "at least 2"
+            )
 
     @property
     def settled(self) -> int:
@@ -96,7 +100,9 @@ class Linear:
         return self.first * (1 - progress) + self.last * progress
 
 
-def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedule) -> Schedule:
+def make_schedule(
+    ratio: float | Sequence[float] | Mapping[int, float] | Schedule,
+) -> Schedule:
     """Make a schedule from a user's argument.
 
     Args:
@@ -112,7 +118,8 @@ def make_schedule(ratio: float | Sequence[float] | Mapping[int, float] | Schedul
         return Steps(
             tuple(
                 sorted(
-                    (to_integer(epoch, "epoch of a ratio"), share) for epoch, share in ratio.items()
+                    (to_integer(epoch, "epoch of a ratio"), share)
+                    for epoch, share in ratio.items()
                 )
             )
         )
@@ -144,7 +151,9 @@ def to_integer(value: Any, name: str) -> int:
     except TypeError:
         pass
     raise ConfigError(
-        f"{name}={shorten(repr(value), 40)}", "an integer", "Write it without quotes or decimals."
+        f"{name}={shorten(repr(value), 40)}",
+        "an integer",
+        "Write it without quotes or decimals.",
     )
 
 
@@ -161,5 +170,6 @@ def _checked(value: Any, epoch: int) -> Fraction:
     except TypeError:
         pass
     raise ConfigError(
-        f"ratio {value!r} in epoch {epoch}", "the share of synthetic samples, a number from 0 to 1"
+        f"ratio {value!r} in epoch {epoch}",
+        "the share of synthetic samples, a number from 0 to 1",
     )

@@ -89,10 +89,13 @@ def read_settings(given: Any = None) -> dict[str, Any]:
     settings = {str(key).lower(): value for key, value in given.items()}
     options = settings.get("label_options")
     if isinstance(options, Mapping):
-        settings["label_options"] = {str(key).lower(): value for key, value in options.items()}
+        settings["label_options"] = {
+            str(key).lower(): value for key, value in options.items()
+        }
     elif options is not None:
         raise ConfigError(
-            f"label_options: {shorten(str(options), 40)}", "options by name, such as threshold: 0.5"
+            f"label_options: {shorten(str(options), 40)}",
+            "options by name, such as threshold: 0.5",
         )
     return settings
 
@@ -151,7 +154,9 @@ def _open_real(where: Any) -> Any:
 
 
 def mix_for_trainer(
-    real: int, settings: Mapping[str, Any], to_sample: Callable[[Scan, np.random.Generator], Any]
+    real: int,
+    settings: Mapping[str, Any],
+    to_sample: Callable[[Scan, np.random.Generator], Any],
 ) -> MixedScans:
     """Make a mixture from settings, for a trainer that loads real samples itself.
 
@@ -168,7 +173,9 @@ def mix_for_trainer(
         ConfigError: on an unknown key, or settings that ``MixedScans`` refuses.
     """
     if unknown := sorted(set(settings) - set(OPTIONS)):
-        raise ConfigError(f"settings {unknown} of a mixture", f"some of {', '.join(OPTIONS)}")
+        raise ConfigError(
+            f"settings {unknown} of a mixture", f"some of {', '.join(OPTIONS)}"
+        )
     if "classes" in settings:
         raise ConfigError(
             f"classes: {settings['classes']} for this trainer",
@@ -184,4 +191,6 @@ def mix_for_trainer(
     synthetic = open_synthetic(settings["synthetic"])
     options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
     # Numbers, no samples.
-    return MixedScans.wrap(range(real), synthetic, to_sample=to_sample, compare=False, **options)
+    return MixedScans.wrap(
+        range(real), synthetic, to_sample=to_sample, compare=False, **options
+    )

@@ -89,7 +89,9 @@ def sensor_of(source: Any) -> Sensor:
     return first.sensor
 
 
-def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) -> list[Sensor]:
+def check_together(
+    sources: Sequence[Any], as_sensors: Sequence[Sensor | None]
+) -> list[Sensor]:
     """Check that scans of several sources fit into one training set, and return the sensors of the
     samples.
 
@@ -105,10 +107,13 @@ def check_together(sources: Sequence[Any], as_sensors: Sequence[Sensor | None]) 
         ConfigError: on different grids or classes.
     """
     sensors = [
-        wanted or sensor_of(source) for source, wanted in zip(sources, as_sensors, strict=True)
+        wanted or sensor_of(source)
+        for source, wanted in zip(sources, as_sensors, strict=True)
     ]
     for sensor in sensors[1:]:
-        if sensor.shape != sensors[0].shape or not np.array_equal(sensor.edges, sensors[0].edges):
+        if sensor.shape != sensors[0].shape or not np.array_equal(
+            sensor.edges, sensors[0].edges
+        ):
             raise ConfigError(
                 f"sources of the sensors {sensors[0].grid_text()} and {sensor.grid_text()}",
                 "one grid for all real and synthetic scans",

@@ -35,16 +35,26 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             return torch.distributed.get_rank(), torch.distributed.get_world_size()
         launched = "RANK" in os.environ and "WORLD_SIZE" in os.environ
-        return (int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])) if launched else (0, 1)
+        return (
+            (int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+            if launched
+            else (0, 1)
+        )
     if rank is None or world_size is None or not 0 <= rank < world_size:
-        raise ConfigError(f"rank {rank} of {world_size}", "both, 0 <= rank < world_size")
+        raise ConfigError(
+            f"rank {rank} of {world_size}", "both, 0 <= rank < world_size"
+        )
     return rank, world_size
 
 
 def count_accelerated() -> int:
     """Number of processes of an ``Accelerator`` that is set up, 0 without one."""
     state = sys.modules.get("accelerate.state")
-    return int(state.PartialState().num_processes) if state and state.is_initialized() else 0
+    return (
+        int(state.PartialState().num_processes)
+        if state and state.is_initialized()
+        else 0
+    )
 
 
 def check_unshared(what: str, rank: int, world_size: int) -> None:
@@ -96,7 +106,10 @@ def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
         ConfigError: on missing or impossible values, or the state of another mixture.
     """
     values = [state.get(key) for key in ("seed", "epoch", "position")]
-    if not all(isinstance(value, int) and value >= 0 for value in values) or "plan" not in state:
+    if (
+        not all(isinstance(value, int) and value >= 0 for value in values)
+        or "plan" not in state
+    ):
         raise ConfigError(
             f"state {dict(state)}",
             "seed, epoch and position, integers of 0 or more, and the hash of the plan",
@@ -119,7 +132,8 @@ def check_state(state: Mapping[str, Any], mixture: Mixture) -> tuple[int, int]:
         )
     if position > len(plan):
         raise ConfigError(
-            f"position {position} of an epoch of {len(plan)} samples", "a state of this mixture"
+            f"position {position} of an epoch of {len(plan)} samples",
+            "a state of this mixture",
         )
     return epoch, position
 

@@ -11,7 +11,13 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_share
 from lidar_synth.mixing.epochs import check_pass, shared_integers
 from lidar_synth.mixing.scans import MixedScans
-from lidar_synth.mixing.state import after_epoch, check_state, check_unshared, make_state, place
+from lidar_synth.mixing.state import (
+    after_epoch,
+    check_state,
+    check_unshared,
+    make_state,
+    place,
+)
 
 
 class MixedStream(IterableDataset[Any]):
@@ -74,7 +80,9 @@ class MixedStream(IterableDataset[Any]):
         self._by_default = rank is None
         self._process = os.getpid()  # the process that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
-        self._given = 0  # samples that this process has yielded since it began to iterate
+        self._given = (
+            0  # samples that this process has yielded since it began to iterate
+        )
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
         self._resume: dict[
             str, Any
@@ -138,7 +146,8 @@ class MixedStream(IterableDataset[Any]):
             if worker == 0 and number >= announced:
                 ahead = chain.from_iterable(self._batches(begin, position, number))
                 self.scans.expect(
-                    epoch, (n - first for n in takewhile(end.__gt__, ahead) if n >= number)
+                    epoch,
+                    (n - first for n in takewhile(end.__gt__, ahead) if n >= number),
                 )
                 announced = min(end, number + AHEAD * self.world_size // 2)
             self._given += 1
@@ -159,10 +168,14 @@ class MixedStream(IterableDataset[Any]):
         if done is not None:
             return make_state(self.scans.mixture, *self._after(epoch, position, done))
         done, part = divmod(given, self.batch_size)
-        batch = next(self._batches(epoch, position, done * self.batch_size * self.world_size), ())
+        batch = next(
+            self._batches(epoch, position, done * self.batch_size * self.world_size), ()
+        )
         if get_worker_info() is not None or part not in (0, len(batch)):
             return (
-                make_state(self.scans.mixture, epoch, position) | self._place() | {"given": given}
+                make_state(self.scans.mixture, epoch, position)
+                | self._place()
+                | {"given": given}
             )
         after = self._after(epoch, position, done + (part > 0))
         if not self.endless and after[0] > epoch:
@@ -193,10 +206,16 @@ class MixedStream(IterableDataset[Any]):
         """Epoch and position where iteration began, or would begin, and the number of samples
         yielded since."""
         in_worker = get_worker_info() is not None
-        if self._begun is not None and (in_worker or self._begun[0] == self.scans.epoch):
+        if self._begun is not None and (
+            in_worker or self._begun[0] == self.scans.epoch
+        ):
             return *self._begun, self._given
         if in_worker and self._resume and self._loaded_by == os.getpid():
-            return self._resume["epoch"], self._resume["position"], self._resume.get("given", 0)
+            return (
+                self._resume["epoch"],
+                self._resume["position"],
+                self._resume.get("given", 0),
+            )
         # A worker that has just started begins in the epoch that the main process had at
         # iter(loader).
         started = in_worker and self._process != os.getpid()
@@ -223,7 +242,9 @@ class MixedStream(IterableDataset[Any]):
         """This rank's batches for all workers, as ranges of sample numbers, from the step with
         number ``since`` on."""
         size = self.batch_size * self.world_size
-        steps: Iterable[range] = (range(i * size, (i + 1) * size) for i in count(since // size))
+        steps: Iterable[range] = (
+            range(i * size, (i + 1) * size) for i in count(since // size)
+        )
         if not self.endless:
             cut = self._steps(0, len(self.scans) - position)
             steps = (cut[i] for i in range(since // size, len(cut)))
@@ -245,7 +266,9 @@ class MixedStream(IterableDataset[Any]):
     def _steps(self, start: int, end: int) -> CutSteps:
         # The loader's batches have a fixed size, so the remainder cannot be added to the last
         # batch.
-        return cut_steps(start, end, self.batch_size, self.world_size, self.drop_last, join=False)
+        return cut_steps(
+            start, end, self.batch_size, self.world_size, self.drop_last, join=False
+        )
 
     def _after(self, epoch: int, position: int, done: int) -> tuple[int, int]:
         """The epoch and position after a number of batches."""
@@ -253,7 +276,8 @@ class MixedStream(IterableDataset[Any]):
             steps = self._steps(position, len(self.scans))
             if not 0 <= done <= len(steps):
                 raise ConfigError(
-                    f"{done} batches done of {len(steps)}", "a number of batches of this epoch"
+                    f"{done} batches done of {len(steps)}",
+                    "a number of batches of this epoch",
                 )
             return (
                 (epoch, steps[done].start)

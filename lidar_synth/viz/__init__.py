@@ -35,12 +35,16 @@ __all__ = [
 ]
 
 
-def _write_png(path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str) -> None:
+def _write_png(
+    path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str
+) -> None:
     figure = sheet(given[0]) if len(given) == 1 else contact_sheet(given, title=title)
     write_file(path, lambda file: figure.savefig(file, format="png"))
 
 
-def _write_html(path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str) -> None:
+def _write_html(
+    path: Path, given: Sequence[Scan | RangeImage], title: str, notes: str
+) -> None:
     write_file(path, html_page(given, title=title, notes=notes).encode())
 
 
@@ -58,7 +62,8 @@ def view_suffix(path: Path) -> str:
     """
     if path.suffix not in _WRITERS:
         raise ConfigError(
-            f"cannot write a view to {path}", f"a file that ends in {' or '.join(_WRITERS)}"
+            f"cannot write a view to {path}",
+            f"a file that ends in {' or '.join(_WRITERS)}",
         )
     return path.suffix
 

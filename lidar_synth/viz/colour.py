@@ -101,7 +101,11 @@ def scales(scans: Sequence[Scan]) -> dict[str, Scale]:
     Heights are scaled between percentiles of all scans, because the height of the sensor above the
     ground is unknown; ranges are scaled to the largest ``range_max`` of the sensors.
     """
-    heights = [z for scan in scans for z in scan.points[:: max(1, len(scan) // 5000), 2].tolist()]
+    heights = [
+        z
+        for scan in scans
+        for z in scan.points[:: max(1, len(scan) // 5000), 2].tolist()
+    ]
     low, high = np.percentile(heights, (2, 99)) if heights else (-2.0, 2.0)
     reach = max((scan.sensor.range_max for scan in scans), default=80.0)
     return {
@@ -111,10 +115,14 @@ def scales(scans: Sequence[Scan]) -> dict[str, Scale]:
             float(low),
             float(max(high, low + 4)),
         ),
-        "range": Scale("range (m)", _colour_map("plasma_r", 0.0, 0.97), 0.0, float(reach), 0.5),
+        "range": Scale(
+            "range (m)", _colour_map("plasma_r", 0.0, 0.97), 0.0, float(reach), 0.5
+        ),
         "reflectance": Scale("reflectance", _colour_map("bone", 0.25), 0.0, 1.0, 0.7),
         "label": Scale("label", _class_table(COLOURS), classes=True),
-        "confidence": Scale("confidence of the label", _colour_map("RdYlGn", 0.0), 0.0, 1.0, 3.0),
+        "confidence": Scale(
+            "confidence of the label", _colour_map("RdYlGn", 0.0), 0.0, 1.0, 3.0
+        ),
         "domain": Scale("domain", _class_table(list(DOMAINS.values())), classes=True),
     }
 
@@ -129,7 +137,9 @@ def point_values(scan: Scan, by: str) -> NDArray[Any]:
         raise ConfigError(f"colour by {by!r}", f"one of {', '.join(VALUES)}")
     values = VALUES[by](scan)
     if values is None:
-        raise ConfigError(f"scan {scan.id!r} has no {by}", f"one of {', '.join(available(scan))}")
+        raise ConfigError(
+            f"scan {scan.id!r} has no {by}", f"one of {', '.join(available(scan))}"
+        )
     return values
 
 

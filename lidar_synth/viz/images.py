@@ -25,7 +25,9 @@ class View(NamedTuple):
     @property
     def channels(self) -> tuple[str, ...]:
         """The members of ``CHANNELS`` that the range image has."""
-        return tuple(name for name in CHANNELS if name == "range" or name in self.image.channels)
+        return tuple(
+            name for name in CHANNELS if name == "range" or name in self.image.channels
+        )
 
     @property
     def classes(self) -> NDArray[np.int64]:
@@ -48,7 +50,9 @@ def views(given: Sequence[Scan | RangeImage]) -> list[View]:
     ]
 
 
-def picture(image: RangeImage, channel: str = "range", scale: Scale | None = None) -> Rgb:
+def picture(
+    image: RangeImage, channel: str = "range", scale: Scale | None = None
+) -> Rgb:
     """(H, W, 3) uint8 picture of one of the ``CHANNELS``; cells without a return are dark.
 
     Args:

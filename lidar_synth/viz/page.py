@@ -87,33 +87,46 @@ def html_page(
     all_views = views(given)
     colours = scales([view.scan for view in all_views])
     content = {
-        "by": "label" if any(view.scan.label is not None for view in all_views) else "height",
+        "by": "label"
+        if any(view.scan.label is not None for view in all_views)
+        else "height",
         "camera": Orbit()._asdict(),
         "empty": EMPTY.tolist(),
         "domains": list(domains),
         "classes": [*NAMES, "unlabelled"],
         "scales": {
-            name: _scale_data(scale, row) for row, (name, scale) in enumerate(colours.items())
+            name: _scale_data(scale, row)
+            for row, (name, scale) in enumerate(colours.items())
         },
-        "table": _base64(np.concatenate([scale.table for scale in colours.values()]).tobytes()),
+        "table": _base64(
+            np.concatenate([scale.table for scale in colours.values()]).tobytes()
+        ),
         "scans": [
             _scan_data(view, colours)
-            for view in tqdm(all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4)
+            for view in tqdm(
+                all_views, "drawing", unit="scan", leave=False, disable=len(given) < 4
+            )
         ],
     }
     paragraphs = (
-        f"<p>{html.escape(part.strip())}</p>" for part in notes.split("\n\n") if part.strip()
+        f"<p>{html.escape(part.strip())}</p>"
+        for part in notes.split("\n\n")
+        if part.strip()
     )
     parts = {
         "title": html.escape(title),
         "notes": "".join(paragraphs),
         # An unescaped "<" in a name could close the script element that contains the data.
-        "data": json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "data": json.dumps(content, separators=(",", ":"), allow_nan=False).replace(
+            "<", "\\u003c"
+        ),
         "panels": "".join(panels),
         "script": "\n".join(_resource(name) for name in SCRIPTS),
     }
     return re.sub(
-        "@(title|notes|data|panels|script)@", lambda mark: parts[mark[1]], _resource("page.html")
+        "@(title|notes|data|panels|script)@",
+        lambda mark: parts[mark[1]],
+        _resource("page.html"),
     )
 
 
@@ -144,7 +157,9 @@ def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
         for name in view.channels
     ]
     if scan.image_path is not None and scan.image_path.is_file():
-        pictures.append({"title": "camera", "uri": _camera_image(scan.image_path), "cells": False})
+        pictures.append(
+            {"title": "camera", "uri": _camera_image(scan.image_path), "cells": False}
+        )
     return {
         "id": scan.id or "scan",
         "sensor": scan.sensor.name,
@@ -154,9 +169,13 @@ def _scan_data(view: View, colours: dict[str, Scale]) -> dict[str, Any]:
         "points": _base64(packed),
         "colours": list(available(scan)),
         "classes": view.classes.tolist(),
-        "boxes": _base64(box_segments(scan.boxes).tobytes()) if scan.boxes is not None else "",
+        "boxes": _base64(box_segments(scan.boxes).tobytes())
+        if scan.boxes is not None
+        else "",
         "rings": _base64(ring_segments(scan).tobytes()),
-        "still": _data_uri(render(scan, by, size=(640, 360), scale=colours[by]), "JPEG"),
+        "still": _data_uri(
+            render(scan, by, size=(640, 360), scale=colours[by]), "JPEG"
+        ),
         "pictures": pictures,
     }
 

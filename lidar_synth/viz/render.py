@@ -62,7 +62,11 @@ class Camera:
         else:
             focal = size[1] / 2 / np.tan(np.radians(self.field) / 2)
             per_metre = (focal / np.maximum(depth, 1e-3)).astype(np.float32)
-        return local[:, :2] * per_metre[:, None] + np.array(size, np.float32) / 2, depth, per_metre
+        return (
+            local[:, :2] * per_metre[:, None] + np.array(size, np.float32) / 2,
+            depth,
+            per_metre,
+        )
 
 
 class Orbit(NamedTuple):
@@ -90,7 +94,9 @@ class Orbit(NamedTuple):
         """The perspective camera at this position."""
         a = np.radians(self.azimuth)
         e = np.radians(self.elevation)
-        away = self.distance * np.array([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)])
+        away = self.distance * np.array(
+            [np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)]
+        )
         x, y, z = (self.target + away).tolist()
         return Camera((x, y, z), self.target, field=self.field)
 
@@ -98,7 +104,9 @@ class Orbit(NamedTuple):
 def bird(extent: float = 50.0) -> Camera:
     """An orthographic camera from above that shows ``extent`` metres on each side; straight ahead
     is up."""
-    return Camera((0.0, 0.0, 100.0), up=(1.0, 0.0, 0.0), field=2 * extent, parallel=True)
+    return Camera(
+        (0.0, 0.0, 100.0), up=(1.0, 0.0, 0.0), field=2 * extent, parallel=True
+    )
 
 
 def _splat(
@@ -119,7 +127,10 @@ def _splat(
         chosen = np.flatnonzero(steps == reach)
         span = np.arange(-reach, reach + 1)
         for dy, dx in (
-            (dy, dx) for dy in span for dx in span if dx * dx + dy * dy <= reach * reach + 0.5
+            (dy, dx)
+            for dy in span
+            for dx in span
+            if dx * dx + dy * dy <= reach * reach + 0.5
         ):
             x = column[chosen] + dx
             y = row[chosen] + dy
@@ -144,12 +155,16 @@ def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) ->
     for reach in (1, 3):
         padded = np.pad(logs, reach, constant_values=np.inf)
         for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            neighbour = padded[reach + dy :, reach + dx :][: buffer.shape[0], : buffer.shape[1]]
+            neighbour = padded[reach + dy :, reach + dx :][
+                : buffer.shape[0], : buffer.shape[1]
+            ]
             # Steps of more than 2 % in depth all count as edges; an empty neighbour does not
             # darken.
             behind += np.clip(np.where(filled, logs, 0) - neighbour, 0, 0.03)
     light = np.where(filled, np.exp(-strength * behind / 8), 1)
-    return np.rint(EMPTY + (picture.astype(np.float32) - EMPTY) * light[..., None]).astype(np.uint8)
+    return np.rint(
+        EMPTY + (picture.astype(np.float32) - EMPTY) * light[..., None]
+    ).astype(np.uint8)
 
 
 def _lines(
@@ -165,14 +180,16 @@ def _lines(
     ends, depth, _ = camera.look(segments.reshape(-1, 3), (width, height))
     in_front = (depth > 0.1).reshape(-1, 2)
     length = np.abs(np.diff(ends.reshape(-1, 2, 2), axis=1)).max((1, 2))
-    counts = np.where(in_front.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0).astype(
-        np.int64
-    )
+    counts = np.where(
+        in_front.any(1), np.clip(np.ceil(2 * length), 2, 8 * width), 0
+    ).astype(np.int64)
     which = np.repeat(np.arange(len(segments)), counts)
-    along = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.maximum(
-        counts[which] - 1, 1
+    along = (
+        np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    ) / np.maximum(counts[which] - 1, 1)
+    points = (
+        segments[which, 0] * (1 - along[:, None]) + segments[which, 1] * along[:, None]
     )
-    points = segments[which, 0] * (1 - along[:, None]) + segments[which, 1] * along[:, None]
     pixels, depth, _ = camera.look(points, (width, height))
     for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
         x, y = np.floor(pixels).astype(np.int64).T + np.array([[dx], [dy]])
@@ -186,11 +203,26 @@ def _lines(
         )
         row, column = np.nonzero(strength)
         share = strength[row, column, None]
-        picture[row, column] = picture[row, column] * (1 - share) + np.array(colour) * share
+        picture[row, column] = (
+            picture[row, column] * (1 - share) + np.array(colour) * share
+        )
 
 
 EDGES = np.array(
-    [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+    [
+        (0, 1),
+        (1, 2),
+        (2, 3),
+        (3, 0),
+        (4, 5),
+        (5, 6),
+        (6, 7),
+        (7, 4),
+        (0, 4),
+        (1, 5),
+        (2, 6),
+        (3, 7),
+    ]
 )
 """The 12 edges of a box, as indices of ``Boxes.corners``."""
 
@@ -202,7 +234,9 @@ def box_segments(boxes: Boxes) -> NDArray[np.float32]:
     roof = corners[:, 4:].mean(1)
     nose = (corners[:, 4] + corners[:, 7]) / 2
     heading = np.stack([roof, nose], 1)
-    return np.concatenate([corners[:, EDGES].reshape(-1, 2, 3), heading]).astype(np.float32)
+    return np.concatenate([corners[:, EDGES].reshape(-1, 2, 3), heading]).astype(
+        np.float32
+    )
 
 
 def ring_segments(scan: Scan) -> NDArray[np.float32]:
@@ -211,8 +245,13 @@ def ring_segments(scan: Scan) -> NDArray[np.float32]:
     ground = float(np.percentile(near, 5)) if len(near) else 0.0
     turn = np.linspace(0, 2 * np.pi, 97)
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
-    rings = [np.c_[radius * circle, np.full(len(turn), ground)] for radius in range(10, 60, 10)]
-    return np.concatenate([np.stack([ring[:-1], ring[1:]], 1) for ring in rings]).astype(np.float32)
+    rings = [
+        np.c_[radius * circle, np.full(len(turn), ground)]
+        for radius in range(10, 60, 10)
+    ]
+    return np.concatenate(
+        [np.stack([ring[:-1], ring[1:]], 1) for ring in rings]
+    ).astype(np.float32)
 
 
 def render(
@@ -250,12 +289,18 @@ def render(
     in_front = depth > 0.1
     gap = 0.015 + 0.003 * np.linalg.norm(scan.points[in_front], axis=1)
     picture, buffer = _splat(
-        pixels[in_front], depth[in_front], gap * per_metre[in_front], colours[in_front], fine
+        pixels[in_front],
+        depth[in_front],
+        gap * per_metre[in_front],
+        colours[in_front],
+        fine,
     )
     picture = _shade(picture, buffer)
     if rings:
         _lines(picture, buffer, ring_segments(scan), camera, (150, 160, 180), 0.35)
     if boxes and scan.boxes is not None and len(scan.boxes):
         _lines(picture, buffer, box_segments(scan.boxes), camera, (255, 255, 255), 0.9)
-    mean: NDArray[np.float64] = picture.reshape(size[1], SAMPLES, size[0], SAMPLES, 3).mean((1, 3))
+    mean: NDArray[np.float64] = picture.reshape(
+        size[1], SAMPLES, size[0], SAMPLES, 3
+    ).mean((1, 3))
     return np.rint(mean).astype(np.uint8)

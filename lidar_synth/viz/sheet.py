@@ -101,11 +101,15 @@ def contact_sheet(
         raise ConfigError("no scans for a sheet", "at least one scan")
     all_views = views(given)
     colours = scales([view.scan for view in all_views])
-    by = by or ("label" if all(view.scan.label is not None for view in all_views) else "height")
+    by = by or (
+        "label" if all(view.scan.label is not None for view in all_views) else "height"
+    )
     columns = columns or int(np.ceil(np.sqrt(len(given))))
     rows = -(-len(given) // columns)
     width = 4.6 * columns
-    legend = 0.25 + 0.22 * -(-(len(NAMES) + 1) // _per_row(width)) if by == "label" else 0.1
+    legend = (
+        0.25 + 0.22 * -(-(len(NAMES) + 1) // _per_row(width)) if by == "label" else 0.1
+    )
     strips = ("range", "label") if by == "label" else ("range",)
     height = (3.2 + 0.6 * len(strips)) * rows + 0.5 + legend
     figure = new_figure(width, height)
@@ -126,7 +130,9 @@ def contact_sheet(
         tile = grid[place].subgridspec(
             1 + len(strips), 1, height_ratios=[5, *[1] * len(strips)], hspace=0.02
         )
-        above, *below = (figure.add_subplot(tile[row]) for row in range(1 + len(strips)))
+        above, *below = (
+            figure.add_subplot(tile[row]) for row in range(1 + len(strips))
+        )
         _show_pixels(above, render(view.scan, by, size=(900, 540), scale=colours[by]))
         for axes, channel in zip(below, strips, strict=True):
             _show_pixels(axes, picture(view.image, channel, colours[channel]))
@@ -174,11 +180,20 @@ def histograms(
     _write_head(figure, title, 0.01, 1 - 0.3 / height)
     for place, (name, numbers) in enumerate(values.items()):
         axes = figure.add_subplot(grid[place], facecolor=BACK)
-        colours = [tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()]
-        axes.hist([numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours)
-        axes.set_yscale("symlog", linthresh=1)  # keeps a single scan among thousands visible
+        colours = [
+            tuple((np.array(colour) / 255).tolist()) for colour in DOMAINS.values()
+        ]
+        axes.hist(
+            [numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours
+        )
+        axes.set_yscale(
+            "symlog", linthresh=1
+        )  # keeps a single scan among thousands visible
         style_axes(
-            axes, name, "\n".join(wrap(meanings[name], 52)), "" if place % columns else "scans"
+            axes,
+            name,
+            "\n".join(wrap(meanings[name], 52)),
+            "" if place % columns else "scans",
         )
     return figure
 
@@ -228,17 +243,33 @@ def _colour_bar(axes: Any, scale: Scale) -> None:
     bar.outline.set_edgecolor("#3a3f4b")
 
 
-def _perspective(axes: Any, view: View, by: str, scale: Scale, camera: Camera | None) -> None:
-    _show_pixels(axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale))
+def _perspective(
+    axes: Any, view: View, by: str, scale: Scale, camera: Camera | None
+) -> None:
+    _show_pixels(
+        axes, render(view.scan, by, camera=camera, size=(1020, 620), scale=scale)
+    )
     axes.set_title(
-        f"3-D, coloured by {scale.title}; circles every 10 m", color=INK, fontsize=11, loc="left"
+        f"3-D, coloured by {scale.title}; circles every 10 m",
+        color=INK,
+        fontsize=11,
+        loc="left",
     )
 
 
 def _from_above(axes: Any, view: View, scale: Scale, extent: float) -> None:
-    pixels = render(view.scan, "height", camera=bird(extent), size=(600, 600), scale=scale)
-    axes.imshow(pixels, extent=(extent, -extent, -extent, extent), interpolation="antialiased")
-    style_axes(axes, f"from above, coloured by {scale.title}", "y, to the left (m)", "x, ahead (m)")
+    pixels = render(
+        view.scan, "height", camera=bird(extent), size=(600, 600), scale=scale
+    )
+    axes.imshow(
+        pixels, extent=(extent, -extent, -extent, extent), interpolation="antialiased"
+    )
+    style_axes(
+        axes,
+        f"from above, coloured by {scale.title}",
+        "y, to the left (m)",
+        "x, ahead (m)",
+    )
     _colour_bar(axes, scale)
 
 
@@ -251,7 +282,17 @@ def _image(axes: Any, view: View, channel: str, scale: Scale) -> None:
         extent=(-180, 180, sensor.shape[0], 0),
     )
     style_axes(axes, scale.title, "", "row")
-    names = ["behind", "-135°", "left", "-45°", "ahead", "45°", "right", "135°", "behind"]
+    names = [
+        "behind",
+        "-135°",
+        "left",
+        "-45°",
+        "ahead",
+        "45°",
+        "right",
+        "135°",
+        "behind",
+    ]
     axes.set_xticks(range(-180, 181, 45), names)
     if not scale.classes:
         _colour_bar(axes, scale)
@@ -261,8 +302,13 @@ def _legend(figure: Figure, all_views: Sequence[View], table: Rgb) -> None:
     """A legend at the bottom: colour and share of each class that occurs in the scans."""
     counts = np.sum([view.classes for view in all_views], axis=0)
     entries = [
-        Patch(color=tuple((table[i] / 255).tolist()), label=f"{name} {count / counts.sum():.1%}")
-        for i, (name, count) in enumerate(zip((*NAMES, "unlabelled"), counts, strict=True))
+        Patch(
+            color=tuple((table[i] / 255).tolist()),
+            label=f"{name} {count / counts.sum():.1%}",
+        )
+        for i, (name, count) in enumerate(
+            zip((*NAMES, "unlabelled"), counts, strict=True)
+        )
         if count
     ]
     columns = min(max(1, len(entries)), _per_row(figure.get_figwidth()))

@@ -135,7 +135,9 @@ def geometries(scan: Scan, colours: dict[str, Scale]) -> list[Any]:
     if scan.boxes is None or not len(scan.boxes):
         return [cloud]
     ends = box_segments(scan.boxes).reshape(-1, 3).astype(np.float64)
-    pairs = open3d.utility.Vector2iVector(np.arange(len(ends), dtype=np.int32).reshape(-1, 2))
+    pairs = open3d.utility.Vector2iVector(
+        np.arange(len(ends), dtype=np.int32).reshape(-1, 2)
+    )
     lines = open3d.geometry.LineSet(points=vectors(ends), lines=pairs)
     lines.paint_uniform_color((1.0, 1.0, 1.0))
     return [cloud, lines]

@@ -108,7 +108,9 @@ def change_shape(content: bytes, rng: Random) -> bytes:
         np.zeros((1,) * 40, array.dtype)[..., 0],
     )
     return dump(
-        np.ascontiguousarray(shapes[i]) if (i := rng.randrange(len(shapes))) != 7 else shapes[7]
+        np.ascontiguousarray(shapes[i])
+        if (i := rng.randrange(len(shapes))) != 7
+        else shapes[7]
     )
 
 
@@ -137,7 +139,11 @@ def lie_in_header(content: bytes, rng: Random) -> bytes:
         )
     )
     told = array.dtype.str if rng.random() < 0.5 else rng.choice(TYPES)
-    kind = rng.choice(kinds).format(*[repr(told)] * 2) if rng.random() < 0.3 else repr(told)
+    kind = (
+        rng.choice(kinds).format(*[repr(told)] * 2)
+        if rng.random() < 0.3
+        else repr(told)
+    )
     header = f"{{'descr': {kind}, 'fortran_order': {rng.choice((False, False, True, 2))}, 'shape': {shape}, }}".encode()
     return join(version, header, body)
 
@@ -184,12 +190,17 @@ def parts(content: bytes) -> tuple[tuple[int, int], bytes, bytes]:
     assert content.startswith(npy.MAGIC_PREFIX)
     start = 10 if content[6] == 1 else 12
     size = int.from_bytes(content[8:start], "little")
-    return (content[6], content[7]), content[start : start + size], content[start + size :]
+    return (
+        (content[6], content[7]),
+        content[start : start + size],
+        content[start + size :],
+    )
 
 
 def join(version: tuple[int, int], header: bytes, body: bytes) -> bytes:
     """The inverse of ``parts``; the header's length fits."""
     length = struct.pack(
-        "<H" if version[0] == 1 else "<I", min(len(header), 65535 if version[0] == 1 else 2**32 - 1)
+        "<H" if version[0] == 1 else "<I",
+        min(len(header), 65535 if version[0] == 1 else 2**32 - 1),
     )
     return npy.MAGIC_PREFIX + bytes(version) + length + header + body

@@ -26,14 +26,18 @@ def seed_files(target: Target, folder: Path) -> Files:
         target.make(part)
         part.rename(folder)
     return {
-        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
     }
 
 
 def mutable(target: Target, files: Files) -> list[str]:
     """The names of the files that may be mutated."""
     return [
-        name for name in files if any(fnmatch(Path(name).name, pattern) for pattern in target.files)
+        name
+        for name in files
+        if any(fnmatch(Path(name).name, pattern) for pattern in target.files)
     ]
 
 
@@ -79,7 +83,9 @@ class Cases:
             self._put(name, content)
         if self.target.mend is not None and rng.random() < 0.5:
             self._changed |= set(self.files)
-            with suppress(Exception):  # what was mutated may have nothing that could be mended
+            with suppress(
+                Exception
+            ):  # what was mutated may have nothing that could be mended
                 self.target.mend(self.root)
         return self.root
 

@@ -121,7 +121,9 @@ def _(boxes: Boxes) -> Iterator[str]:
             yield f"boxes: {name} of {values.dtype}, or not finite"
         if name != "dont_care" and len(values) != len(boxes):
             yield f"boxes: {len(values)} {name} for {len(boxes)} boxes"
-    if len(boxes.names) != len(boxes) or not all(isinstance(name, str) for name in boxes.names):
+    if len(boxes.names) != len(boxes) or not all(
+        isinstance(name, str) for name in boxes.names
+    ):
         yield f"boxes: names {boxes.names[:4]}"
     if not (boxes.values[:, 3:6] > 0).all():
         yield "boxes without a size"
@@ -177,7 +179,10 @@ def _field_flaws(values: Mapping[str, Any], shape: tuple[int, ...]) -> Iterator[
     for name, array in values.items():
         if array.shape != shape or array.dtype != FIELD_TYPES.get(name, array.dtype):
             yield f"{name} of {array.dtype}, {array.shape} for {shape}"
-        elif name in ("reflectance", "confidence") and not ((array >= 0) & (array <= 1)).all():
+        elif (
+            name in ("reflectance", "confidence")
+            and not ((array >= 0) & (array <= 1)).all()
+        ):
             yield f"{name} from {array.min()} to {array.max()}"
         elif name == "label" and not ((array < len(NAMES)) | (array == IGNORE)).all():
             yield f"labels {np.unique(array)[-4:]}"
@@ -185,7 +190,11 @@ def _field_flaws(values: Mapping[str, Any], shape: tuple[int, ...]) -> Iterator[
 
 def _transform_flaws(name: str, matrix: Any) -> Iterator[str]:
     """A rigid transform is finite, and its rotation is one."""
-    if matrix.shape != (4, 4) or matrix.dtype != np.float64 or not np.isfinite(matrix).all():
+    if (
+        matrix.shape != (4, 4)
+        or matrix.dtype != np.float64
+        or not np.isfinite(matrix).all()
+    ):
         yield f"{name} of {matrix.dtype}, {matrix.shape}, or not finite"
     elif (
         np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.1
@@ -204,14 +213,17 @@ def fingerprint(value: Any) -> str:
 def _add(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray):
         digest.update(
-            f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes()
+            f"{value.dtype}{value.shape}".encode()
+            + np.ascontiguousarray(value).tobytes()
         )
     elif isinstance(value, Tensor):
         _add(digest, value.numpy())
     elif isinstance(value, nn.Module):
         _add(digest, dict(value.state_dict()))
     elif is_dataclass(value):
-        _add(digest, {field.name: getattr(value, field.name) for field in fields(value)})
+        _add(
+            digest, {field.name: getattr(value, field.name) for field in fields(value)}
+        )
     elif isinstance(value, Mapping):
         _add(digest, list(value.items()))
     elif isinstance(value, list | tuple):

@@ -88,7 +88,15 @@ def edit_zip(content: bytes, rng: Random) -> bytes:
     return rezip(
         members,
         rng.choice(
-            (stored, stored, stored, deflated, deflated, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+            (
+                stored,
+                stored,
+                stored,
+                deflated,
+                deflated,
+                zipfile.ZIP_BZIP2,
+                zipfile.ZIP_LZMA,
+            )
         ),
     )
 
@@ -98,11 +106,17 @@ def lie_in_zip(content: bytes, rng: Random) -> bytes:
     """Headers of the zip say another size, method, flag, checksum or place."""
     values = bytearray(content)
     directory = content.index(b"PK\x01\x02")
-    starts = [i for i in range(directory, len(content) - 46) if content[i : i + 4] == b"PK\x01\x02"]
+    starts = [
+        i
+        for i in range(directory, len(content) - 46)
+        if content[i : i + 4] == b"PK\x01\x02"
+    ]
     start = rng.choice(starts)
     # Offsets in a central header: flags 8, method 10, CRC 16, sizes 20 and 24, name 28, extra 30,
     # local header 42.
-    at, size = rng.choice(((8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (42, 4)))
+    at, size = rng.choice(
+        ((8, 2), (10, 2), (16, 4), (20, 4), (24, 4), (28, 2), (30, 2), (42, 4))
+    )
     number = rng.choice((*INTEGERS, 8, 9, 12, 14, 93, 97, 99)) % 256**size
     values[start + at : start + at + size] = number.to_bytes(size, "little")
     return bytes(values)
@@ -112,7 +126,10 @@ def lie_in_zip(content: bytes, rng: Random) -> bytes:
 def zeros(megabytes: int) -> bytes:
     """That many megabytes of zeros, deflated, in the format of zip."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
-    return b"".join(packer.compress(bytes(1_000_000)) for _ in range(megabytes)) + packer.flush()
+    return (
+        b"".join(packer.compress(bytes(1_000_000)) for _ in range(megabytes))
+        + packer.flush()
+    )
 
 
 @mutates(".npz", ".pth", ".ckpt")
@@ -131,7 +148,9 @@ def bomb_zip(content: bytes, rng: Random) -> bytes:
     # The bomb is entered by hand: its member's data are a deflated stream that was made once.
     packed = zlib.compressobj(9, zlib.DEFLATED, -15)
     body = packed.compress(begin) + packed.flush(zlib.Z_FULL_FLUSH) + zeros(megabytes)
-    return replace_member(file.getvalue(), name, body, len(begin) + megabytes * 1_000_000)
+    return replace_member(
+        file.getvalue(), name, body, len(begin) + megabytes * 1_000_000
+    )
 
 
 def replace_member(content: bytes, name: str, body: bytes, size: int) -> bytes:
@@ -145,12 +164,14 @@ def replace_member(content: bytes, name: str, body: bytes, size: int) -> bytes:
     central = values.index(name.encode(), directory) - 46
     for start, method, sizes in ((info.header_offset, 8, 18), (central, 10, 20)):
         values[start + method : start + method + 2] = (8).to_bytes(2, "little")
-        values[start + sizes : start + sizes + 8] = len(body).to_bytes(4, "little") + size.to_bytes(
+        values[start + sizes : start + sizes + 8] = len(body).to_bytes(
             4, "little"
-        )
+        ) + size.to_bytes(4, "little")
     moved = bytearray(values)
     for start in [
-        i for i in range(directory, len(values) - 46) if values[i : i + 4] == b"PK\x01\x02"
+        i
+        for i in range(directory, len(values) - 46)
+        if values[i : i + 4] == b"PK\x01\x02"
     ]:
         offset = int.from_bytes(values[start + 42 : start + 46], "little")
         if offset > info.header_offset:
@@ -166,7 +187,9 @@ def untar(content: bytes) -> Members:
 
 
 def retar(
-    members: Members, kinds: dict[int, bytes] | None = None, form: int = tarfile.PAX_FORMAT
+    members: Members,
+    kinds: dict[int, bytes] | None = None,
+    form: int = tarfile.PAX_FORMAT,
 ) -> bytes:
     """A tar of the members; some may be of another kind than a file."""
     file = BytesIO()
@@ -189,7 +212,9 @@ def edit_tar(content: bytes, rng: Random) -> bytes:
         stem, dot, kind = members[i][0].partition(".")
         ends = ("json", "points.npy", "ring.npy", "pose.npy", f"{kind}.npy", kind)
         name = (
-            rng.choice(("x", "../../" + stem, "%2E%2E/x", "/x", "", "a" * 300, "\udcff", stem))
+            rng.choice(
+                ("x", "../../" + stem, "%2E%2E/x", "/x", "", "a" * 300, "\udcff", stem)
+            )
             + dot
             + rng.choice(ends)
         )

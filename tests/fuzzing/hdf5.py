@@ -76,11 +76,15 @@ def edit_json_attributes(content: bytes, rng: Random) -> bytes:
             if isinstance(value, np.bytes_ | bytes)
         }
         texts = {
-            name: text for name, text in texts.items() if text[:1] in (b"{", b"[") and len(text) > 2
+            name: text
+            for name, text in texts.items()
+            if text[:1] in (b"{", b"[") and len(text) > 2
         }
         name = rng.choice(sorted(texts))
         text = edit_json_text(texts[name].decode(), rng)
-        file.attrs[name] = fixed(text if len(text) < 60_000 else json.dumps("a" * 50_000))
+        file.attrs[name] = fixed(
+            text if len(text) < 60_000 else json.dumps("a" * 50_000)
+        )
 
     return edited(content, edit)
 
@@ -102,7 +106,11 @@ def replace_dataset(content: bytes, rng: Random) -> bytes:
             lambda: file.create_group(name),
             lambda: file.create_dataset(name, (shape[0] + 1, *shape[1:]), dtype),
             lambda: file.create_dataset(
-                name, (shape[0] * 3, *shape[1:]), dtype, maxshape=(None, *shape[1:]), chunks=True
+                name,
+                (shape[0] * 3, *shape[1:]),
+                dtype,
+                maxshape=(None, *shape[1:]),
+                chunks=True,
             ),
             lambda: file.create_dataset(
                 name, (600_000_000, *shape[1:]), dtype, chunks=(2**16, *shape[1:])
@@ -114,10 +122,16 @@ def replace_dataset(content: bytes, rng: Random) -> bytes:
                 name, shape, rng.choice(("f4", "c8", "S8", "u8", "i2", "u1", "?", "V3"))
             ),
             lambda: file.create_dataset(name, shape, h5py.string_dtype()),
-            lambda: file.create_dataset(name, shape, "S100000000", chunks=(1,) * len(shape)),
-            lambda: file.create_dataset(name, data=data, chunks=shape, compression="gzip"),
+            lambda: file.create_dataset(
+                name, shape, "S100000000", chunks=(1,) * len(shape)
+            ),
+            lambda: file.create_dataset(
+                name, data=data, chunks=shape, compression="gzip"
+            ),
             lambda: (
-                file.create_dataset(name, data=data, chunks=(1, *shape[1:]), scaleoffset=0)
+                file.create_dataset(
+                    name, data=data, chunks=(1, *shape[1:]), scaleoffset=0
+                )
                 if dtype.kind in "ui"
                 else None
             ),
@@ -143,7 +157,9 @@ def link_elsewhere(content: bytes, rng: Random) -> bytes:
         virtual[...] = h5py.VirtualSource("elsewhere.h5", name, shape)
         others: tuple[Callable[[], object], ...] = (
             lambda: file.__setitem__(name, h5py.ExternalLink("elsewhere.h5", "/x")),
-            lambda: file.__setitem__(name, h5py.ExternalLink("shard-00000.h5", f"/{name}")),
+            lambda: file.__setitem__(
+                name, h5py.ExternalLink("shard-00000.h5", f"/{name}")
+            ),
             lambda: file.__setitem__(name, h5py.ExternalLink("/dev/zero", "/x")),
             lambda: file.__setitem__(name, h5py.SoftLink(f"/{name}")),
             lambda: file.__setitem__(name, h5py.SoftLink("/nowhere")),
@@ -167,20 +183,30 @@ def change_scan(content: bytes, rng: Random) -> bytes:
 
     def edit(file: h5py.File) -> None:
         position = rng.randrange(file["crc"].shape[0])
-        names = [name for name in ("range", "reflectance", "label", "confidence") if name in file]
+        names = [
+            name
+            for name in ("range", "reflectance", "label", "confidence")
+            if name in file
+        ]
         name = rng.choice((*names, "seed", "index"))
         values = file[name][position]
         if name in names:
             for _ in range(rng.choice((1, 10))):
                 row = rng.randrange(values.shape[0])
                 column = rng.randrange(values.shape[1])
-                values[row, column] = rng.choice(INTEGERS) % (int(np.iinfo(values.dtype).max) + 1)
+                values[row, column] = rng.choice(INTEGERS) % (
+                    int(np.iinfo(values.dtype).max) + 1
+                )
             file[name][position] = values
         else:
             file[name][position] = rng.choice(INTEGERS) % 2**64
         if rng.random() < 0.8:
-            condition = bytes(file["condition"][position]) if "condition" in file else b""
-            arrays = {name: np.ascontiguousarray(file[name][position]) for name in names}
+            condition = (
+                bytes(file["condition"][position]) if "condition" in file else b""
+            )
+            arrays = {
+                name: np.ascontiguousarray(file[name][position]) for name in names
+            }
             seed = int(file["seed"][position])
             index = int(file["index"][position])
             file["crc"][position] = checksum(seed, index, arrays, condition)

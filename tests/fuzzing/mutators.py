@@ -118,7 +118,9 @@ def flip_bits(content: bytes, rng: Random) -> bytes:
 def cut_off(content: bytes, rng: Random) -> bytes:
     """The end is missing."""
     return content[
-        : rng.choice((0, 1, len(content) // 2, len(content) - 1, rng.randrange(len(content) + 1)))
+        : rng.choice(
+            (0, 1, len(content) // 2, len(content) - 1, rng.randrange(len(content) + 1))
+        )
     ]
 
 
@@ -133,7 +135,9 @@ def cut_out(content: bytes, rng: Random) -> bytes:
 def repeat(content: bytes, rng: Random) -> bytes:
     """A piece stands there twice or more often."""
     begin, end = span(content, rng)
-    return content[:end] + content[begin:end] * rng.choice((1, 1, 2, 100)) + content[end:]
+    return (
+        content[:end] + content[begin:end] * rng.choice((1, 1, 2, 100)) + content[end:]
+    )
 
 
 @mutates("")
@@ -148,7 +152,9 @@ def splice(content: bytes, rng: Random) -> bytes:
 def overwrite(content: bytes, rng: Random) -> bytes:
     """A piece becomes zeros, ones or noise."""
     begin, end = span(content, rng)
-    filled = rng.choice((bytes(end - begin), b"\xff" * (end - begin), rng.randbytes(end - begin)))
+    filled = rng.choice(
+        (bytes(end - begin), b"\xff" * (end - begin), rng.randbytes(end - begin))
+    )
     return content[:begin] + filled + content[end:]
 
 
@@ -177,7 +183,10 @@ def set_number(content: bytes, rng: Random) -> bytes:
     if len(content) < size:
         return content + bytes(size)
     at = rng.choice(
-        (rng.randrange(len(content) - size + 1), rng.randrange(min(64, len(content) - size + 1)))
+        (
+            rng.randrange(len(content) - size + 1),
+            rng.randrange(min(64, len(content) - size + 1)),
+        )
     )
     if code in ("<f", "<d"):
         number = struct.pack(code, rng.choice(FLOATS))

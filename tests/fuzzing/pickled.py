@@ -21,9 +21,36 @@ from lidar_synth.formats.pandas_table import KNOWN
 
 Put = Callable[[Any], Any]
 
-WORDS = ("", "x", "f8", "O8", "U4", ">", "M8", "Car", "label", "a" * 5000, "0.14.1", "os.system")
+WORDS = (
+    "",
+    "x",
+    "f8",
+    "O8",
+    "U4",
+    ">",
+    "M8",
+    "Car",
+    "label",
+    "a" * 5000,
+    "0.14.1",
+    "os.system",
+)
 
-SHORT = (b"N", b"}", b"]", b")", b"(", b"0", b"2", b"t", b"R", b"b", b"\x81", b"Q", b"1")
+SHORT = (
+    b"N",
+    b"}",
+    b"]",
+    b")",
+    b"(",
+    b"0",
+    b"2",
+    b"t",
+    b"R",
+    b"b",
+    b"\x81",
+    b"Q",
+    b"1",
+)
 """Opcodes without an argument."""
 
 HOSTILE = (
@@ -74,7 +101,9 @@ def edit_opcodes(content: bytes, rng: Random) -> bytes:
 def set_argument(content: bytes, rng: Random) -> bytes:
     """A number of a pickle (a size, a stride, a length) becomes one at the limit of a type."""
     parts, rest = opcodes(content)
-    i = rng.choice([i for i, part in enumerate(parts) if part[:1] in (b"K", b"M", b"J", b"\x8a")])
+    i = rng.choice(
+        [i for i, part in enumerate(parts) if part[:1] in (b"K", b"M", b"J", b"\x8a")]
+    )
     number = rng.choice((*INTEGERS, 2**40, -(2**31), 2**62))
     packed_number = number.to_bytes(9, "little", signed=True)
     parts[i] = b"\x8a\x09" + packed_number
@@ -88,9 +117,13 @@ def opcodes(content: bytes) -> tuple[list[bytes], bytes]:
     end = 0
     try:
         while end < len(content):
-            starts = [end + position for _, _, position in pickletools.genops(stream.read())]
+            starts = [
+                end + position for _, _, position in pickletools.genops(stream.read())
+            ]
             end = starts[-1] + 1
-            parts += [content[a:b] for a, b in zip(starts, [*starts[1:], end], strict=True)]
+            parts += [
+                content[a:b] for a, b in zip(starts, [*starts[1:], end], strict=True)
+            ]
             stream.seek(end)
     except (ValueError, IndexError):  # the storages, which are no pickle
         pass
@@ -109,12 +142,20 @@ def edit_array(content: bytes, rng: Random) -> bytes:
     """Numbers of an array are impossible or unlikely ones."""
     found = places(parse_pickle(unpacked(content), KNOWN, "", ""))
     value, put = rng.choice(
-        [(value, put) for value, put in found if type(value) is bytes and len(value) > 8]
+        [
+            (value, put)
+            for value, put in found
+            if type(value) is bytes and len(value) > 8
+        ]
     )
-    array = np.frombuffer(value[: len(value) // 8 * 8], rng.choice(("<f8", "<i8"))).copy()
+    array = np.frombuffer(
+        value[: len(value) // 8 * 8], rng.choice(("<f8", "<i8"))
+    ).copy()
     for _ in range(rng.choice((1, 1, 5, 50))):
         number = rng.choice(
-            FLOATS if array.dtype.kind == "f" else [n for n in INTEGERS if abs(n) < 2**63]
+            FLOATS
+            if array.dtype.kind == "f"
+            else [n for n in INTEGERS if abs(n) < 2**63]
         )
         array[rng.randrange(len(array))] = number
     return packed(dump(put(array.tobytes())))
@@ -141,7 +182,9 @@ def lie_about_gzip(content: bytes, rng: Random) -> bytes:
 def bomb() -> bytes:
     """700 MB of zeros, in 700 KB."""
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    return b"".join(packer.compress(bytes(1_000_000)) for _ in range(700)) + packer.flush()
+    return (
+        b"".join(packer.compress(bytes(1_000_000)) for _ in range(700)) + packer.flush()
+    )
 
 
 def places(value: Any, put: Put = lambda whole: whole) -> Iterator[tuple[Any, Put]]:
@@ -150,7 +193,8 @@ def places(value: Any, put: Put = lambda whole: whole) -> Iterator[tuple[Any, Pu
     children: list[tuple[Any, Put]] = []
     if isinstance(value, dict):
         children = [
-            (child, lambda new, key=key: value | {key: new}) for key, child in value.items()
+            (child, lambda new, key=key: value | {key: new})
+            for key, child in value.items()
         ]
     elif isinstance(value, list | tuple):
         kind = type(value)
@@ -163,12 +207,15 @@ def places(value: Any, put: Put = lambda whole: whole) -> Iterator[tuple[Any, Pu
             (
                 value.name,
                 lambda new: replace(
-                    value, name=new if isinstance(new, str) and "." in new else "numpy.dtype"
+                    value,
+                    name=new if isinstance(new, str) and "." in new else "numpy.dtype",
                 ),
             ),
             (
                 value.args,
-                lambda new: replace(value, args=new if isinstance(new, tuple) else (new,)),
+                lambda new: replace(
+                    value, args=new if isinstance(new, tuple) else (new,)
+                ),
             ),
             (value.state, lambda new: replace(value, state=new)),
         ]

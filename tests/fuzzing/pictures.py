@@ -27,7 +27,10 @@ def chunks(content: bytes) -> list[Chunk]:
 def join(parts: list[Chunk]) -> bytes:
     """The inverse of ``chunks``."""
     return SIGNATURE + b"".join(
-        len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        len(data).to_bytes(4, "big")
+        + kind
+        + data
+        + zlib.crc32(kind + data).to_bytes(4, "big")
         for kind, data in parts
     )
 
@@ -67,7 +70,9 @@ def grow_picture(content: bytes, rng: Random) -> bytes:
     pixel = header[8] // 8 or 1
     rows = height if rng.random() < 0.3 else min(height, 100)
     return changed(
-        changed(content, b"IHDR", bytes(header)), b"IDAT", zeros(1 + width * pixel, rows)
+        changed(content, b"IHDR", bytes(header)),
+        b"IDAT",
+        zeros(1 + width * pixel, rows),
     )
 
 
@@ -81,11 +86,15 @@ def zeros(row: int, rows: int) -> bytes:
 @mutates(".png")
 def edit_pixels(content: bytes, rng: Random) -> bytes:
     """Rows hold other values, or an unknown filter, or there are too few or too many."""
-    data = zlib.decompress(b"".join(data for kind, data in chunks(content) if kind == b"IDAT"))
+    data = zlib.decompress(
+        b"".join(data for kind, data in chunks(content) if kind == b"IDAT")
+    )
     values = bytearray(data)
     for _ in range(rng.choice((1, 2, 100))):
         values[rng.randrange(len(values))] = rng.choice((0, 1, 5, 19, 128, 254, 255))
-    values = rng.choice((values, values, values, values[: len(values) // 2], values * 2))
+    values = rng.choice(
+        (values, values, values, values[: len(values) // 2], values * 2)
+    )
     return changed(content, b"IDAT", zlib.compress(bytes(values)))
 
 
@@ -103,7 +112,9 @@ def edit_chunks(content: bytes, rng: Random) -> bytes:
         rng.shuffle(parts)
     elif change == 3:
         parts[i] = (
-            rng.choice((b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"acTL", b"xxxx", b"IEND")),
+            rng.choice(
+                (b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"acTL", b"xxxx", b"IEND")
+            ),
             parts[i][1],
         )
     elif change == 4:

@@ -55,7 +55,10 @@ class Report:
         """Count the cases of another report."""
         self.counts += other.counts
         self.flaws = sorted(self.flaws + other.flaws, key=lambda flaw: flaw.number)
-        self.peak, self.slowest = max(self.peak, other.peak), max(self.slowest, other.slowest)
+        self.peak, self.slowest = (
+            max(self.peak, other.peak),
+            max(self.slowest, other.slowest),
+        )
 
 
 def fuzz(
@@ -75,7 +78,9 @@ def fuzz(
     report = Report()
     with TemporaryDirectory(prefix="fuzz-") as folder:
         while len(numbers):
-            for outcome in _until_the_end(name, target, numbers, seed, limits, Path(folder)):
+            for outcome in _until_the_end(
+                name, target, numbers, seed, limits, Path(folder)
+            ):
                 report.add(outcome)
                 progress(outcome)
                 numbers = range(outcome.number + 1, numbers.stop)
@@ -94,7 +99,9 @@ def _until_the_end(
             limit = START if current is None else limits.seconds
             if not connection.poll(limit):
                 if current is None:
-                    raise RuntimeError(f"{name}: the harness did not answer within {limit:g} s")
+                    raise RuntimeError(
+                        f"{name}: the harness did not answer within {limit:g} s"
+                    )
                 found.append(Outcome(current, SLOW, f"more than {limit:g} s", limit))
                 break
             message = connection.recv()
@@ -130,7 +137,9 @@ def _start(
     with _starting:
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(
-            target=work, args=(name, target, seed, numbers, limits, folder, theirs), daemon=True
+            target=work,
+            args=(name, target, seed, numbers, limits, folder, theirs),
+            daemon=True,
         )
         process.start()
         theirs.close()

@@ -17,7 +17,14 @@ import torch
 import yaml
 from conftest import random_scan
 from layouts import some_scan
-from releases import UNCONDITIONAL, config_of, peer_weights, random_weights, release, write_r2flow
+from releases import (
+    UNCONDITIONAL,
+    config_of,
+    peer_weights,
+    random_weights,
+    release,
+    write_r2flow,
+)
 from torch import Tensor, nn
 
 from fuzzing.weights import in_order
@@ -71,14 +78,20 @@ def make_archives(root: Path) -> None:
     torch.save(content, root / "new.pth")
     old = io.BytesIO()
     torch.save(content, old, _use_new_zipfile_serialization=False)
-    address = str(flat.untyped_storage()._cdata).encode()  # the old format's name of the storage
+    address = str(
+        flat.untyped_storage()._cdata
+    ).encode()  # the old format's name of the storage
     (root / "old.pt").write_bytes(old.getvalue().replace(address, b"1" * len(address)))
     torch.save(state, folder / "weights")
-    (folder / "arch_cfg.yaml").write_text(yaml.safe_dump({"backbone": {"name": "x", "OS": 32}}))
+    (folder / "arch_cfg.yaml").write_text(
+        yaml.safe_dump({"backbone": {"name": "x", "OS": 32}})
+    )
     with tarfile.open(root / "judge.tar", "w") as tar:
         for path in sorted(folder.iterdir()):
             tar.add(path, f"judge/{path.name}", filter=without_owner)
-    content = (root / "judge.tar").read_bytes().rstrip(b"\0")  # without the record of zeros
+    content = (
+        (root / "judge.tar").read_bytes().rstrip(b"\0")
+    )  # without the record of zeros
     content += bytes(-len(content) % 512 + 1024)
     (root / "judge.tar").write_bytes(content)
     packed = gzip.compress(content, mtime=0)
@@ -158,7 +171,10 @@ def make_importers(root: Path) -> None:
 def read_importers(root: Path) -> list[Any]:
     """The checkpoints that ``lidar-synth import`` writes."""
     found: list[Any] = []
-    for peer, path in (("r2flow", root / "r2flow.pth"), ("lidm", root / "lidm" / "model.ckpt")):
+    for peer, path in (
+        ("r2flow", root / "r2flow.pth"),
+        ("lidm", root / "lidm" / "model.ckpt"),
+    ):
         header, networks = IMPORTERS[peer](path)
         out = root / f"{peer}.safetensors"
         save_checkpoint(out, header, networks)
@@ -213,7 +229,9 @@ def cached(root: Path) -> list[Any]:
     kept = cache_scans(SCANS, SMALL, CHANNELS, root / "cache", progress=False)
     codec: Any = Identity()
     tensors = TensorFormat(CHANNELS, NORMALISATIONS["r2flow"])
-    latents = cache_latents(kept, tensors, codec, "cpu", root / "cache", "abc", progress=False)
+    latents = cache_latents(
+        kept, tensors, codec, "cpu", root / "cache", "abc", progress=False
+    )
     return [*kept.read(range(len(kept))).values(), latents]
 
 
@@ -253,7 +271,9 @@ def mend_metadata(path: Path) -> None:
     with safetensors.safe_open(path, "pt") as file:
         facts = dict(file.metadata())
     facts.pop("checksum", None)
-    whole = safetensors.torch.save(tensors, facts | {"checksum": _checksum(facts, tensors)})
+    whole = safetensors.torch.save(
+        tensors, facts | {"checksum": _checksum(facts, tensors)}
+    )
     path.write_bytes(in_order(whole))
 
 
@@ -368,7 +388,9 @@ def read_recipes(root: Path) -> list[Any]:
     """The checked configurations, as plain values."""
     teacher = load_config(TrainConfig, root / "teacher.yaml")
     student = load_config(DistillConfig, root / "student.yaml")
-    return [config.model_dump_json().replace(str(root), "") for config in (teacher, student)]
+    return [
+        config.model_dump_json().replace(str(root), "") for config in (teacher, student)
+    ]
 
 
 def make_skins(root: Path) -> None:
@@ -386,7 +408,9 @@ def read_skins(root: Path) -> list[Any]:
     boxed = np.zeros(len(scan), np.bool_)
     return [
         skin.sensor,
-        skin.apply(scan.points, scan.reflectance, ring, boxed, np.random.default_rng(0)),
+        skin.apply(
+            scan.points, scan.reflectance, ring, boxed, np.random.default_rng(0)
+        ),
     ]
 
 
@@ -400,5 +424,7 @@ def mend_skin(root: Path) -> None:
     header.pop("checksum", None)
     header["checksum"] = skins._checksum(header, arrays)
     path.write_bytes(
-        safetensors.numpy.save(arrays, {"lidar_synth": json.dumps(header, sort_keys=True)})
+        safetensors.numpy.save(
+            arrays, {"lidar_synth": json.dumps(header, sort_keys=True)}
+        )
     )

@@ -105,8 +105,12 @@ def make_pcd(root: Path) -> None:
     (root / "text.pcd").write_text(head + "DATA ascii\n" + lines_of(rows))
     columns = [column.tobytes() for column in rows.T.astype("<f4")]
     packed = b"".join(lzf(column[: len(column) // 2]) for column in columns)
-    sizes = len(packed).to_bytes(4, "little") + sum(map(len, columns)).to_bytes(4, "little")
-    (root / "packed.pcd").write_bytes(head.encode() + b"DATA binary_compressed\n" + sizes + packed)
+    sizes = len(packed).to_bytes(4, "little") + sum(map(len, columns)).to_bytes(
+        4, "little"
+    )
+    (root / "packed.pcd").write_bytes(
+        head.encode() + b"DATA binary_compressed\n" + sizes + packed
+    )
 
 
 def lines_of(rows: np.ndarray) -> str:
@@ -120,7 +124,9 @@ def lzf(plain: bytes) -> bytes:
     packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
     back = len(plain) - 1
     assert len(plain) % 100 == 0, "the references are to 100 bytes each"
-    return packed + bytes([7 << 5 | back >> 8, 100 - 9, back & 255]) * (len(plain) // 100)
+    return packed + bytes([7 << 5 | back >> 8, 100 - 9, back & 255]) * (
+        len(plain) // 100
+    )
 
 
 def make_ply(root: Path) -> None:
@@ -128,12 +134,20 @@ def make_ply(root: Path) -> None:
     with faces."""
     write("ply", root)
     rows = some_rows()
-    fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
-    head = f"ply\nformat {{}} 1.0\ncomment by hand\nelement vertex {len(rows)}\n{fields}"
+    fields = "".join(
+        f"property float {name}\n" for name in ("x", "y", "z", "intensity")
+    )
+    head = (
+        f"ply\nformat {{}} 1.0\ncomment by hand\nelement vertex {len(rows)}\n{fields}"
+    )
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (root / "text.ply").write_text(head.format("ascii") + faces + lines_of(rows) + "3 0 1 2\n")
+    (root / "text.ply").write_text(
+        head.format("ascii") + faces + lines_of(rows) + "3 0 1 2\n"
+    )
     body = rows.astype(">f4").tobytes() + b"\x03" + np.arange(3, dtype=">i4").tobytes()
-    (root / "big.ply").write_bytes((head.format("binary_big_endian") + faces).encode() + body)
+    (root / "big.ply").write_bytes(
+        (head.format("binary_big_endian") + faces).encode() + body
+    )
 
 
 def make_npy(root: Path) -> None:
@@ -149,7 +163,9 @@ def make_range_arrays(root: Path) -> None:
     image = some_image()
     assert image.reflectance is not None and image.label is not None
     xyz = SENSOR.ray_directions() * image.range[..., None]
-    classes = (image.label + np.uint8(1)).astype(np.float32)  # 255 = ignore becomes 0 = unlabelled
+    classes = (image.label + np.uint8(1)).astype(
+        np.float32
+    )  # 255 = ignore becomes 0 = unlabelled
     np.save(root / "one.npy", image.range)
     np.save(root / "two.npy", np.stack([image.range, image.reflectance]))
     stack = np.dstack([xyz, image.reflectance, image.range, classes])
@@ -234,7 +250,9 @@ def make_checkpoint(root: Path) -> None:
         conditioning={"semantic": {"classes": 19}},
     )
     torch.manual_seed(0)
-    network = build_network("hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())})
+    network = build_network(
+        "hdit", arguments | {"angles": torch.from_numpy(SENSOR.ray_angles())}
+    )
     save_checkpoint(root / "model.safetensors", header, {VELOCITY: network})
 
 
@@ -377,24 +395,36 @@ TARGETS: dict[str, Target] = {
     "range_npy": Target(make_range_arrays, partial(read, "range", sensor=SENSOR)),
     "png": Target(partial(write, "png"), partial(read, "png")),
     "webdataset": Target(partial(write, "webdataset"), partial(read, "webdataset")),
-    "semantic_kitti": Target(partial(write, "semantic_kitti"), partial(read, "semantic_kitti")),
-    "kitti_object": Target(partial(write, "kitti_object"), partial(read, "kitti_object")),
+    "semantic_kitti": Target(
+        partial(write, "semantic_kitti"), partial(read, "semantic_kitti")
+    ),
+    "kitti_object": Target(
+        partial(write, "kitti_object"), partial(read, "kitti_object")
+    ),
     "kitti_raw": Target(make_kitti_raw, partial(read, "kitti_raw")),
     "kitti360": Target(partial(write, "kitti360"), partial(read, "kitti360")),
     "nuscenes": Target(partial(write_nuscenes, count=2), partial(read, "nuscenes")),
     "pandaset": Target(partial(write_pandaset, count=2), partial(read, "pandaset")),
-    "bank": Target(make_bank, partial(read, "bank"), files=("*.h5", "index.json"), mend=mend_index),
-    "bank_index": Target(make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index),
+    "bank": Target(
+        make_bank, partial(read, "bank"), files=("*.h5", "index.json"), mend=mend_index
+    ),
+    "bank_index": Target(
+        make_bank, partial(read, "bank"), files=("index.json",), mend=mend_index
+    ),
     "bank_shard": Target(make_bank, read_shard, files=("shard-00000.h5",)),
     "sensor": Target(make_sensors, read_sensors),
     "mixture": Target(make_mixture, read_mixture, files=("mix.yaml",)),
     "checkpoint": Target(make_checkpoint, read_checkpoint, mend=mend_checkpoint),
     "archives": Target(
-        saved.make_archives, saved.read_archives, files=("*.pth", "*.pt", "*.tar", "*.tgz")
+        saved.make_archives,
+        saved.read_archives,
+        files=("*.pth", "*.pt", "*.tar", "*.tgz"),
     ),
     "judges": Target(saved.make_judges, saved.read_judges, files=("*.yaml",)),
     "importers": Target(saved.make_importers, saved.read_importers, writes=True),
-    "states": Target(saved.make_states, saved.read_states, mend=saved.mend_states, writes=True),
+    "states": Target(
+        saved.make_states, saved.read_states, mend=saved.mend_states, writes=True
+    ),
     "objects": Target(saved.make_objects, saved.read_objects),
     "layouts": Target(saved.make_layouts, saved.read_layouts),
     "recipes": Target(saved.make_recipes, saved.read_recipes),

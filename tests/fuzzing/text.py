@@ -113,7 +113,9 @@ def replace_number(content: bytes, rng: Random) -> bytes:
     """A number becomes another one, or none."""
     found = list(re.finditer(rb"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", content[:100_000]))
     chosen = rng.choice(found)
-    return content[: chosen.start()] + encoded(rng.choice(WORDS)) + content[chosen.end() :]
+    return (
+        content[: chosen.start()] + encoded(rng.choice(WORDS)) + content[chosen.end() :]
+    )
 
 
 @mutates(*LINES)
@@ -164,11 +166,19 @@ def change_words_of_a_line(content: bytes, rng: Random) -> bytes:
 @mutates(".pcd", ".ply")
 def edit_header(content: bytes, rng: Random) -> bytes:
     """Numbers, words and lines of a header change; what stands below it does not."""
-    end = next(m.end() for m in re.finditer(rb"^(DATA|end_header)[^\n]*\n", content, re.M))
+    end = next(
+        m.end() for m in re.finditer(rb"^(DATA|end_header)[^\n]*\n", content, re.M)
+    )
     header = content[:end]
     for _ in range(rng.choice((1, 1, 2, 3))):
         change = rng.choice(
-            (replace_number, replace_number, replace_word, change_lines, change_words_of_a_line)
+            (
+                replace_number,
+                replace_number,
+                replace_word,
+                change_lines,
+                change_words_of_a_line,
+            )
         )
         header = change(header, rng)
     return header + content[end:]
@@ -215,9 +225,13 @@ def edit(root: Any, rng: Random) -> None:
     if change == 0:
         del node[key]
     elif change == 1 and isinstance(node, dict):
-        node[rng.choice(("", "x", "name", str(key) + " ", *map(str, node)))] = node.pop(key)
+        node[rng.choice(("", "x", "name", str(key) + " ", *map(str, node)))] = node.pop(
+            key
+        )
     elif change == 2 and isinstance(node, dict):
-        node[rng.choice(("x", "", "__class__", "elevations", "self"))] = rng.choice(VALUES)
+        node[rng.choice(("x", "", "__class__", "elevations", "self"))] = rng.choice(
+            VALUES
+        )
     elif change == 3:
         other, name = rng.choice(places(root))
         node[key] = json.loads(json.dumps(other[name]))
@@ -225,7 +239,13 @@ def edit(root: Any, rng: Random) -> None:
         node[key:key] = [node[key]] * rng.choice((1, 2, 1000))
     elif change == 5 and isinstance(node[key], int | float):
         node[key] = rng.choice(
-            (-node[key], node[key] * 2, node[key] + 0.5, str(node[key]), node[key] * 10**9)
+            (
+                -node[key],
+                node[key] * 2,
+                node[key] + 0.5,
+                str(node[key]),
+                node[key] * 10**9,
+            )
         )
     else:
         node[key] = rng.choice(VALUES)
@@ -233,7 +253,9 @@ def edit(root: Any, rng: Random) -> None:
 
 def written(text: str, deep: int = 50_000) -> str:
     """JSON text with what ``DEEP`` and ``LONG`` stand for."""
-    return text.replace(f'"{DEEP}"', "[" * deep + "]" * deep).replace(f'"{LONG}"', "9" * 5000)
+    return text.replace(f'"{DEEP}"', "[" * deep + "]" * deep).replace(
+        f'"{LONG}"', "9" * 5000
+    )
 
 
 def edit_json_text(text: str, rng: Random) -> str:
@@ -257,7 +279,9 @@ def edit_yaml(content: bytes, rng: Random) -> bytes:
     edit(root, rng)
     # Every JSON text is YAML too; nesting is kept shallower, because YAML's own parser takes long
     # for it.
-    return encoded(written(json.dumps(root), 2000) if rng.random() < 0.5 else yaml.safe_dump(root))
+    return encoded(
+        written(json.dumps(root), 2000) if rng.random() < 0.5 else yaml.safe_dump(root)
+    )
 
 
 @mutates(".yaml")
@@ -322,7 +346,15 @@ def edit_xml(content: bytes, rng: Random) -> bytes:
             leaf = rng.choice([node for node in root.iter() if not len(node)])
             words = (leaf.text or "").split()
             leaf.text = " ".join(
-                rng.choice((words[:-1], words * 2, [*words, "1"], words[::-1], ["nan", *words[1:]]))
+                rng.choice(
+                    (
+                        words[:-1],
+                        words * 2,
+                        [*words, "1"],
+                        words[::-1],
+                        ["nan", *words[1:]],
+                    )
+                )
             )
         else:
             parent[:] = rng.sample(list(parent), len(parent))
@@ -344,7 +376,10 @@ def abuse_xml(content: bytes, rng: Random) -> bytes:
     depth = rng.choice((100, 100_000))
     return rng.choice(
         (
-            b"<!DOCTYPE x [" + entities + b"]>" + re.sub(rb">\d", b">&i;", body, count=1),
+            b"<!DOCTYPE x ["
+            + entities
+            + b"]>"
+            + re.sub(rb">\d", b">&i;", body, count=1),
             b'<!DOCTYPE x [<!ENTITY f SYSTEM "file:///etc/hostname">]>'
             + re.sub(rb">\d", b">&f;", body, count=1),
             b"<a>" * depth + body + b"</a>" * depth,

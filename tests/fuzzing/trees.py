@@ -25,7 +25,12 @@ def rearrange(root: Path, rng: Random) -> None:
     """Keep one dataset of a folder, and change its tree in one to three places."""
     datasets = sorted(root.iterdir())
     kept = rng.choice(datasets)
-    others = [path for folder in datasets if folder != kept for path in sorted(folder.rglob("*"))]
+    others = [
+        path
+        for folder in datasets
+        if folder != kept
+        for path in sorted(folder.rglob("*"))
+    ]
     foreign = rng.choice(others)
     for _ in range(rng.choice((1, 1, 2, 3))):
         change_tree(kept, foreign, rng)
@@ -45,7 +50,12 @@ def change_tree(root: Path, foreign: Path, rng: Random) -> None:
     if change == 0:
         remove(path)
     elif change == 1:
-        move(path, path.with_name(rng.choice((*NAMES, other.name, path.stem, path.name.upper()))))
+        move(
+            path,
+            path.with_name(
+                rng.choice((*NAMES, other.name, path.stem, path.name.upper()))
+            ),
+        )
     elif change == 2:
         move(path, other.parent / path.name)
     elif change == 3:
@@ -60,7 +70,9 @@ def change_tree(root: Path, foreign: Path, rng: Random) -> None:
     elif change == 6:
         copy(foreign, rng.choice((path.parent / foreign.name, path)))
     elif change == 7:
-        copy(path, path.with_name(rng.choice((*NAMES, f"{path.stem} (1){path.suffix}"))))
+        copy(
+            path, path.with_name(rng.choice((*NAMES, f"{path.stem} (1){path.suffix}")))
+        )
     else:
         moved = root.with_name("nested")
         root.rename(moved)
@@ -82,7 +94,9 @@ def move(path: Path, to: Path) -> None:
 
 
 def copy(path: Path, to: Path) -> None:
-    inside = Path(os.path.realpath(to.parent))  # links may lead into the folder that is copied
+    inside = Path(
+        os.path.realpath(to.parent)
+    )  # links may lead into the folder that is copied
     given = Path(os.path.realpath(path))
     if to == path or given in (inside, *inside.parents) or to in path.parents:
         return

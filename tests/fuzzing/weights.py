@@ -67,7 +67,13 @@ def edit_tensors(content: bytes, rng: Random) -> bytes:
         lambda: {name: tensor.reshape(-1)},
         lambda: {name: tensor.reshape(-1)[:0]},
         lambda: {name: torch.full_like(tensor, rng.choice(values))},
-        lambda: {rng.choice(("x", f"x.{name}", name + "x", "velocity", "codec.x", "")): tensor},
+        lambda: {
+            rng.choice(
+                ("x", f"x.{name}", name + "x", "velocity", "codec.x", "")
+            ): tensor
+        },
     )
-    tensors |= {key: value.contiguous() for key, value in (rng.choice(changed)() or {}).items()}
+    tensors |= {
+        key: value.contiguous() for key, value in (rng.choice(changed)() or {}).items()
+    }
     return in_order(safetensors.torch.save(tensors, metadata))

@@ -97,18 +97,24 @@ def work(
         cases.restore()
 
 
-def judge(number: int, target: Target, root: Path, expected: str, limits: Limits) -> Outcome:
+def judge(
+    number: int, target: Target, root: Path, expected: str, limits: Limits
+) -> Outcome:
     """Read a case."""
     gc.collect()
     before = reset_peak()
     data = memory("VmData")
-    resource.setrlimit(resource.RLIMIT_DATA, (data + limits.memory, resource.RLIM_INFINITY))
+    resource.setrlimit(
+        resource.RLIMIT_DATA, (data + limits.memory, resource.RLIM_INFINITY)
+    )
     start = time.perf_counter()
     try:
         verdict, detail = attempt(target, root, expected)
     finally:
         seconds = time.perf_counter() - start
-        resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        resource.setrlimit(
+            resource.RLIMIT_DATA, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        )
     peak = max(memory("VmHWM") - before, 0)
     if peak > limits.memory and verdict != MEMORY:
         verdict, detail = MEMORY, f"{verdict}: {detail}"
@@ -146,7 +152,9 @@ def quiet(path: Path) -> None:
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
-        os.dup2(file, stream.fileno() if stream in (sys.__stdout__, sys.__stderr__) else 2)
+        os.dup2(
+            file, stream.fileno() if stream in (sys.__stdout__, sys.__stderr__) else 2
+        )
 
 
 def memory(name: str) -> int:

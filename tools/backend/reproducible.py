@@ -19,7 +19,9 @@ from setuptools.build_meta import *  # noqa: F403  every other hook of PEP 517 a
 os.environ.setdefault("SOURCE_DATE_EPOCH", "1577836800")
 
 
-def build_sdist(sdist_directory: str, config_settings: dict[str, object] | None = None) -> str:
+def build_sdist(
+    sdist_directory: str, config_settings: dict[str, object] | None = None
+) -> str:
     """Build the source archive; the name of its file."""
     name = build_meta.build_sdist(sdist_directory, config_settings)
     path = Path(sdist_directory) / name

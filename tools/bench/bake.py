@@ -74,7 +74,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
+    parser.add_argument(
+        "--model", default="town", help="a shipped model or a checkpoint"
+    )
     parser.add_argument("--count", type=int, default=256, help="scans of a timed bake")
     parser.add_argument(
         "--lengths",
@@ -104,7 +106,9 @@ def main() -> None:
         print(f"| {given.count} scans by one process | {one:.1f} s |")
         print(f"| by two processes | {two:.1f} s, {one / two:.2f} times as fast |")
         few = max(1, given.count // 4)
-        turns = alone(generated_and_baked, root / "turns", given.model, few, given.rounds)
+        turns = alone(
+            generated_and_baked, root / "turns", given.model, few, given.rounds
+        )
         plain, whole = (median(times) for times in zip(*turns, strict=True))
         print(f"| generating only, in one process | {few / plain:.2f} scans/s |")
         print(

@@ -63,13 +63,17 @@ def town_images(count: int) -> list[RangeImage]:
     return images
 
 
-def write(root: Path, images: list[RangeImage], fields: tuple[str, ...], threads: int = 1) -> Bank:
+def write(
+    root: Path, images: list[RangeImage], fields: tuple[str, ...], threads: int = 1
+) -> Bank:
     """A bank of the images, compressed by this many threads."""
     facts = Facts(images[0].sensor, fields, "town", "", {}, "generated", "MIT", "MIT")
     entries = []
     root.mkdir()
     for first in range(0, len(images), SHARD):
-        entry = Entry(f"shard-{len(entries):05d}.h5", 0, first, len(images[first : first + SHARD]))
+        entry = Entry(
+            f"shard-{len(entries):05d}.h5", 0, first, len(images[first : first + SHARD])
+        )
         with ShardWriter(root / entry.file, facts, entry, threads=threads) as writer:
             for image in images[first : first + SHARD]:
                 writer.append(image)
@@ -89,7 +93,9 @@ def sizes(root: Path, images: list[RangeImage]) -> None:
             for name in bank.facts.encoding.names
         }
     print(f"| all arrays | {total / 1e3:.1f} kB a scan |")
-    print(f"| without confidence | {(total - parts['confidence']) / 1e3:.1f} kB a scan |")
+    print(
+        f"| without confidence | {(total - parts['confidence']) / 1e3:.1f} kB a scan |"
+    )
     for name, size in parts.items():
         print(f"| {name} | {size / 1e3:.1f} kB a scan |")
 
@@ -119,11 +125,16 @@ def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
         took = seconds(partial(write, root / f"turn-{turn}", images, fields))
         rates[name] = max(rates.get(name, 0.0), count / took)
     error = max(
-        float(np.abs(plain.image(i).range - image.range).max()) for i, image in enumerate(images)
+        float(np.abs(plain.image(i).range - image.range).max())
+        for i, image in enumerate(images)
     )
-    read = min(seconds(lambda: [plain.image(i) for i in range(count)]) for _ in range(3))
+    read = min(
+        seconds(lambda: [plain.image(i) for i in range(count)]) for _ in range(3)
+    )
     threads = os.cpu_count() or 1
-    clock = max(scans_per_second(root / f"clock-{turn}", images, threads) for turn in range(3))
+    clock = max(
+        scans_per_second(root / f"clock-{turn}", images, threads) for turn in range(3)
+    )
     print(
         f"\n### Size and rate, 64 x 1024, {count} scans of the town\n\n{machine()}\n\n| what | "
         "|\n|---|---:|"
@@ -180,14 +191,17 @@ def stages(image: RangeImage) -> None:
     packed = {name: deflate(values) for name, values in arrays.items()}
     decoded = encoding.decode(arrays)
     planes = [
-        values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes() for values in arrays.values()
+        values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
+        for values in arrays.values()
     ]
     pack = "shuffle, deflate, Fletcher-32"
     calls: dict[str, Callable[[], object]] = {
         "encode": lambda: encoding.encode(image),
         "CRC-32": lambda: checksum(0, 0, arrays),
         pack: lambda: [deflate(values) for values in arrays.values()],
-        "deflate alone": lambda: [libdeflate.zlib_compress(plane, 1) for plane in planes],
+        "deflate alone": lambda: [
+            libdeflate.zlib_compress(plane, 1) for plane in planes
+        ],
         "deflate by zlib": lambda: [zlib.compress(plane, 1) for plane in planes],
         "Fletcher-32, inflate, unshuffle": lambda: [
             inflate(c, *kinds[name]) for name, c in packed.items()
@@ -203,7 +217,9 @@ def stages(image: RangeImage) -> None:
         "unproject": lambda: unproject(decoded),
     }
     print_table(
-        "Stages of a scan with confidence", time_in_turns(calls, 200, time.process_time), pack
+        "Stages of a scan with confidence",
+        time_in_turns(calls, 200, time.process_time),
+        pack,
     )
 
 
@@ -233,7 +249,15 @@ def tree(root: Path, shards: int) -> Bank:
                 file["index"][:] = indices
                 file["crc"][:] = [checksum(0, int(index), arrays) for index in indices]
         entries.append(
-            Entry(path.name, 0, int(indices[0]), LARGE, 0, path.stat().st_size, sha256(path))
+            Entry(
+                path.name,
+                0,
+                int(indices[0]),
+                LARGE,
+                0,
+                path.stat().st_size,
+                sha256(path),
+            )
         )
     write_bank_files(root, Index((facts,), tuple(entries)))
     return Bank(root)
@@ -254,15 +278,16 @@ def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
         bank = Bank(root)
         before = peak_memory()
         opened = (
-            seconds(partial(read_all, bank, [number * LARGE for number in range(count)])) / count
+            seconds(
+                partial(read_all, bank, [number * LARGE for number in range(count)])
+            )
+            / count
         )
         order = np.random.default_rng(0).integers(0, count * LARGE, reads).tolist()
         later = seconds(partial(read_all, bank, order)) / reads
         base = base or later
         memory = peak_memory() - before
-        values = (
-            f"{1e3 * opened:.2f} | {1e3 * later:.3f} | {1e3 * (later - base):.3f} | {memory:.0f}"
-        )
+        values = f"{1e3 * opened:.2f} | {1e3 * later:.3f} | {1e3 * (later - base):.3f} | {memory:.0f}"
         print(f"| {count:,} | {count * LARGE:,} | {values} |", flush=True)
 
 
@@ -284,12 +309,20 @@ def main() -> None:
     )
     parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
     parser.add_argument("--scans", type=int, default=192, help="scans of the town")
-    parser.add_argument("--model", default="town", help="a shipped model or a checkpoint")
     parser.add_argument(
-        "--generated", type=int, default=40, help="scans of the model; 0 omits that table"
+        "--model", default="town", help="a shipped model or a checkpoint"
     )
     parser.add_argument(
-        "--tree", type=int, default=1000, help="shards of the tree of files; 0 omits that table"
+        "--generated",
+        type=int,
+        default=40,
+        help="scans of the model; 0 omits that table",
+    )
+    parser.add_argument(
+        "--tree",
+        type=int,
+        default=1000,
+        help="shards of the tree of files; 0 omits that table",
     )
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -311,7 +344,9 @@ def main() -> None:
                 "|\n|---|---:|"
             )
             rounds = tqdm(range(options.generated), "generated", leave=False)
-            sizes(root / "generated", [generator.range_images(0, [i])[0] for i in rounds])
+            sizes(
+                root / "generated", [generator.range_images(0, [i])[0] for i in rounds]
+            )
 
 
 if __name__ == "__main__":

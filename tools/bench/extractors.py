@@ -18,7 +18,9 @@ from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.lab.town import Town
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "research" / "extractors"))
-from random_archives import write  # the folder of tools/extractors is on the path from here on
+from random_archives import (
+    write,
+)  # the folder of tools/extractors is on the path from here on
 
 
 def main() -> None:
@@ -28,9 +30,13 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument(
-        "--cpu-time", action="store_true", help="time of this process alone, on a busy machine"
+        "--cpu-time",
+        action="store_true",
+        help="time of this process alone, on a busy machine",
     )
-    parser.add_argument("--only", nargs="*", default=list(EXTRACTORS), choices=list(EXTRACTORS))
+    parser.add_argument(
+        "--only", nargs="*", default=list(EXTRACTORS), choices=list(EXTRACTORS)
+    )
     given = parser.parse_args()
     scan = Town(seed=0, scans=1)[0]
     calls: dict[str, Callable[[], object]] = {}

@@ -51,7 +51,9 @@ def table(
     for model in models:
         for batch in batches:
             both = [
-                load_generator(model, device=device, dtype=dtype, batch=batch, compile=c)
+                load_generator(
+                    model, device=device, dtype=dtype, batch=batch, compile=c
+                )
                 for c in (False, True)
             ]
             for steps in (4, 2, 1):
@@ -67,7 +69,9 @@ def table(
     for batch in batches:
         noise = torch.randn(batch, 2, 64, 1024, device=device)
         pair = (lambda v=v, y=noise: solve(v, y, GRID) for v in (net, compiled))
-        yield Row("R2Flow's size, pixels, 4 steps", batch, *pair, 4 * EVALUATION * batch)
+        yield Row(
+            "R2Flow's size, pixels, 4 steps", batch, *pair, 4 * EVALUATION * batch
+        )
 
 
 def seconds(call: Call, device: torch.device, rounds: int) -> float:
@@ -89,7 +93,9 @@ def main() -> None:
     )
     parser.add_argument("model", nargs="*", default=["town"])
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 16, 64])
-    parser.add_argument("--dtype", choices=("bfloat16", "float16", "float32"), default="bfloat16")
+    parser.add_argument(
+        "--dtype", choices=("bfloat16", "float16", "float32"), default="bfloat16"
+    )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--device", default="cuda")
     given = parser.parse_args()
@@ -100,7 +106,9 @@ def main() -> None:
     a = torch.randn(size, size, device=device, dtype=dtype)
     rate = 2 * size**3 / seconds(lambda: a @ a, device, given.rounds)
     card = torch.cuda.get_device_name(device) if device.type == "cuda" else machine()
-    print(f"\n### {card}, {given.dtype}, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n")
+    print(
+        f"\n### {card}, {given.dtype}, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n"
+    )
     print(f"product of {size} x {size}: {rate / 1e12:.2f} TFLOP/s\n")
     print(
         "| model | batch | eager, scans/s | compiled, scans/s | latency, ms | share of the "
@@ -108,10 +116,14 @@ def main() -> None:
     )
     print("|---|---:|---:|---:|---:|---:|")
     for row in tqdm(list(table(given.model, given.batch, device, dtype)), leave=False):
-        times = [seconds(call, device, given.rounds) for call in (row.eager, row.compiled)]
+        times = [
+            seconds(call, device, given.rounds) for call in (row.eager, row.compiled)
+        ]
         share = f"{row.work / min(times) / rate:.0%}" if row.work else ""
         speed = " | ".join(f"{row.batch / t:.1f}" for t in times)
-        tqdm.write(f"| {row.name} | {row.batch} | {speed} | {1e3 * min(times):.1f} | {share} |")
+        tqdm.write(
+            f"| {row.name} | {row.batch} | {speed} | {1e3 * min(times):.1f} | {share} |"
+        )
 
 
 if __name__ == "__main__":

@@ -31,7 +31,12 @@ from timing import machine
 
 from lidar_synth import KITTI360
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.lab.kitti360.accumulated import PROPERTIES, find_windows, read_cloud, write_cloud
+from lidar_synth.lab.kitti360.accumulated import (
+    PROPERTIES,
+    find_windows,
+    read_cloud,
+    write_cloud,
+)
 from lidar_synth.lab.kitti360.labels import label_scans
 from lidar_synth.lab.kitti360.report import LabelReport
 from lidar_synth.lab.town import Town, export_town
@@ -55,8 +60,17 @@ def print_right(report: LabelReport) -> None:
             if (int(frame.split("/")[1]) % STEP > 0) == part
         ]
         known, covered, right, cars, seen, good = np.sum(rows, axis=0)
-        shares = (covered / known, right / covered, seen / max(cars, 1), good / max(seen, 1))
-        print(f"| {name} ({len(rows)}) | " + " | ".join(f"{100 * s:.1f} %" for s in shares) + " |")
+        shares = (
+            covered / known,
+            right / covered,
+            seen / max(cars, 1),
+            good / max(seen, 1),
+        )
+        print(
+            f"| {name} ({len(rows)}) | "
+            + " | ".join(f"{100 * s:.1f} %" for s in shares)
+            + " |"
+        )
 
 
 def print_confidence(town: Path, out: Path) -> None:
@@ -64,9 +78,15 @@ def print_confidence(town: Path, out: Path) -> None:
     edges = np.array([0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.01])
     counts = np.zeros((2, len(edges) - 1))
     for known, scan in zip(KITTI360(town), KITTI360(town, labels=out), strict=True):
-        assert known.label is not None and scan.label is not None and scan.confidence is not None
+        assert (
+            known.label is not None
+            and scan.label is not None
+            and scan.confidence is not None
+        )
         both = (known.label != IGNORE) & (scan.label != IGNORE)
-        for row, mask in zip(counts, (both, both & (known.label == scan.label)), strict=True):
+        for row, mask in zip(
+            counts, (both, both & (known.label == scan.label)), strict=True
+        ):
             row += np.histogram(scan.confidence[mask], edges)[0]
     print("\n| confidence | share of the labels | right |\n|---|---:|---:|")
     for low, high, number, right in zip(edges, edges[1:], *counts, strict=False):
@@ -84,7 +104,11 @@ def fill(root: Path, points: int) -> int:
     rng = np.random.default_rng(0)
     cloud = read_cloud(windows[0].static)
     points = max(points, len(cloud))
-    values = {name: np.resize(cloud[name], points) for name in PROPERTIES if name != "timestamp"}
+    values = {
+        name: np.resize(cloud[name], points)
+        for name in PROPERTIES
+        if name != "timestamp"
+    }
     for axis in "xyz":
         values[axis] = values[axis] + rng.normal(0, COPY, points).astype(np.float32)
         values[axis][: len(cloud)] = cloud[axis]
@@ -99,7 +123,9 @@ def main() -> None:
     )
     parser.add_argument("--scans", type=int, default=200)
     parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument("--interval", type=float, default=0.4, help="seconds between scans")
+    parser.add_argument(
+        "--interval", type=float, default=0.4, help="seconds between scans"
+    )
     parser.add_argument(
         "--points", type=int, default=10_000_000, help="points of the filled window"
     )
@@ -107,7 +133,9 @@ def main() -> None:
     print(f"{machine()}, load {os.getloadavg()[0]:.1f}\n")
     with tempfile.TemporaryDirectory() as folder:
         town, out, again = (Path(folder) / name for name in ("town", "labels", "again"))
-        source = Town(arguments.seed, "hdl64e_kitti360", arguments.scans, arguments.interval)
+        source = Town(
+            arguments.seed, "hdl64e_kitti360", arguments.scans, arguments.interval
+        )
         export_town(source, town, "kitti360", camera=False, accumulate=True)
         used = time.process_time()
         clock = time.perf_counter()

@@ -36,7 +36,9 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--busy", action="store_true", help="measure processor time")
     parser.add_argument(
-        "--width", type=int, help="of narrow networks in place of LiDM's, to try the script"
+        "--width",
+        type=int,
+        help="of narrow networks in place of LiDM's, to try the script",
     )
     given = parser.parse_args()
     torch.set_num_threads(given.threads)

@@ -75,7 +75,10 @@ def write_bank(root: Path, scans: Sequence[Scan]) -> Bank:
             writer.append(project(scan))
     path = root / entry.file
     write_bank_files(
-        root, Index((facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),))
+        root,
+        Index(
+            (facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),)
+        ),
     )
     return Bank(root)
 
@@ -104,7 +107,9 @@ def print_rates(title: str, samples: int, seconds: dict[str, float], base: str) 
 def print_long_plan(bank: Bank, samples: int = 10**8) -> None:
     """Print the time of a long plan to its first batch, and Python's peak memory meanwhile."""
     start = time.perf_counter()
-    train = MixedScans.wrap(range(samples * 3 // 4), bank, 0.25, to_sample=to_item, compare=False)
+    train = MixedScans.wrap(
+        range(samples * 3 // 4), bank, 0.25, to_sample=to_item, compare=False
+    )
     next(iter(train.batches(BATCH)))
     train.plan()[samples // 2]
     seconds = time.perf_counter() - start
@@ -126,7 +131,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--real", type=Path, help="root of SemanticKITTI")
-    parser.add_argument("--scans", type=int, default=32, help="scans, real and synthetic each")
+    parser.add_argument(
+        "--scans", type=int, default=32, help="scans, real and synthetic each"
+    )
     parser.add_argument("--rounds", type=int, default=100)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -145,7 +152,9 @@ def main() -> None:
         scans = MixedScans(real, None, 0)
         wrapped = MixedScans.wrap(Trainer(real), None, 0, to_sample=to_item)
         calls = {
-            "a trainer's dataset alone": epoch(Trainer(real), scans.plan().index.tolist()),
+            "a trainer's dataset alone": epoch(
+                Trainer(real), scans.plan().index.tolist()
+            ),
             "wrapped, ratio 0": epoch(wrapped, range(len(real))),
             "MixedScans of the scans, ratio 0": epoch(scans, range(len(real))),
         }
@@ -153,12 +162,18 @@ def main() -> None:
         print_rates("Overhead at ratio 0", len(real), seconds, next(iter(calls)))
         numbers = MixedScans.wrap(range(1000), None, 0, to_sample=to_item)
         bare = time_in_turns(
-            {"": lambda: [numbers[i] for i in range(1000)]}, arguments.rounds, time.process_time
+            {"": lambda: [numbers[i] for i in range(1000)]},
+            arguments.rounds,
+            time.process_time,
         )
-        print(f"\nWrapping alone, around a dataset of numbers: {1e3 * bare['']:.1f} µs a sample")
+        print(
+            f"\nWrapping alone, around a dataset of numbers: {1e3 * bare['']:.1f} µs a sample"
+        )
         for form, title in (("offsets", "points"), ("range", "range images")):
             only = MixedScans(real, None, 0, collate=form)  # type: ignore[arg-type]
-            half = MixedScans(real, bank, 0.5, epoch_size="replace", balanced=True, collate=form)  # type: ignore[arg-type]
+            half = MixedScans(
+                real, bank, 0.5, epoch_size="replace", balanced=True, collate=form
+            )  # type: ignore[arg-type]
             calls = {
                 "real scans only": epoch(only, range(len(only)), only.collate),
                 "half from a bank": epoch(half, range(len(half)), half.collate),

@@ -53,7 +53,9 @@ def full_network(model: Path | None) -> Any:
     if model is not None:
         return load_checkpoint(model).networks[VELOCITY]
     torch.manual_seed(0)
-    net = HDiT((64, 1024), angles=torch.from_numpy(load_sensor("hdl64e_kitti360").ray_angles()))
+    net = HDiT(
+        (64, 1024), angles=torch.from_numpy(load_sensor("hdl64e_kitti360").ray_angles())
+    )
     for parameter in net.parameters():
         if parameter.ndim == 2 and not parameter.any():
             nn.init.trunc_normal_(parameter, std=0.02)
@@ -88,7 +90,8 @@ def on_cpu(net: Any, rounds: int) -> None:
     )
     print("| what | s | GFLOP/s | share of the product's rate |\n|---|---:|---:|---:|")
     rates = {
-        name: 2 * 4096**3 / f(product) / 1e9 for name, f in (("median", median), ("best", min))
+        name: 2 * 4096**3 / f(product) / 1e9
+        for name, f in (("median", median), ("best", min))
     }
     print(
         f"| product of 4096 x 4096 | {median(product):.3f} ({min(product):.3f}) "
@@ -117,7 +120,8 @@ def breakdown(net: nn.Module, y: Tensor) -> None:
     for event in profiler.key_averages():
         name = event.key.removeprefix("aten::").lstrip("_")
         kind = next(
-            (k for k, names in KINDS.items() if any(name.startswith(n) for n in names)), "other"
+            (k for k, names in KINDS.items() if any(name.startswith(n) for n in names)),
+            "other",
         )
         spent[kind] += event.self_cpu_time_total
     print("\n| kind of operation | share of the time |\n|---|---:|")
@@ -129,7 +133,10 @@ def peak_memory(model: Path | None) -> float:
     """Peak memory of a fresh process in GB, including Python and torch."""
     given = [] if model is None else ["--model", model]
     out = subprocess.run(
-        [sys.executable, __file__, "--peak", *given], check=True, capture_output=True, text=True
+        [sys.executable, __file__, "--peak", *given],
+        check=True,
+        capture_output=True,
+        text=True,
     )
     return float(out.stdout)
 
@@ -208,9 +215,13 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--model", type=Path, help="a checkpoint with a network of this size")
     parser.add_argument(
-        "--peak", action="store_true", help="evaluate once and print the peak memory in GB"
+        "--model", type=Path, help="a checkpoint with a network of this size"
+    )
+    parser.add_argument(
+        "--peak",
+        action="store_true",
+        help="evaluate once and print the peak memory in GB",
     )
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

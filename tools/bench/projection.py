@@ -15,7 +15,13 @@ import torch
 from timing import print_table, time_in_turns
 
 from lidar_synth.formats.points import read_points
-from lidar_synth.geometry.projection import locate, project, project_batch, unfold, unproject
+from lidar_synth.geometry.projection import (
+    locate,
+    project,
+    project_batch,
+    unfold,
+    unproject,
+)
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 
@@ -25,7 +31,8 @@ def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:
     rng = np.random.default_rng(0)
     elevation = np.repeat(sensor.laser_elevations, count // sensor.shape[0])
     azimuth = np.tile(
-        np.linspace(0, 2 * np.pi, count // sensor.shape[0], endpoint=False), sensor.shape[0]
+        np.linspace(0, 2 * np.pi, count // sensor.shape[0], endpoint=False),
+        sensor.shape[0],
     )
     distance = rng.uniform(3, 70, len(elevation))
     x = np.cos(azimuth) * np.cos(elevation)
@@ -35,7 +42,9 @@ def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:
     ].astype(np.float32)
 
 
-def sort_and_scatter(points: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+def sort_and_scatter(
+    points: np.ndarray, sensor: Sensor
+) -> tuple[np.ndarray, np.ndarray]:
     """The plain numpy formula: every angle by numpy, all points sorted by range, far ones
     overwritten."""
     (height, width), up, down = (
@@ -82,8 +91,12 @@ def main() -> None:
         ours = "points -> range image with reflectance"
         calls = {
             ours: lambda: project(scan),
-            "the same, numpy sort-and-scatter": lambda: sort_and_scatter(points, sensor),
-            "the same, torch on the CPU": lambda: project_batch(tensor, offsets, sensor),
+            "the same, numpy sort-and-scatter": lambda: sort_and_scatter(
+                points, sensor
+            ),
+            "the same, torch on the CPU": lambda: project_batch(
+                tensor, offsets, sensor
+            ),
             "index map of points and cells": lambda: locate(scan.points, sensor),
             "scan unfolding": lambda: unfold(scan),
             "range image -> points with reflectance": lambda: unproject(image),

@@ -133,7 +133,10 @@ def main() -> None:
     print("|---|---:|---:|---:|")
     for kind in kinds(given.model, given.steps):
         rate, memory = together(kind)
-        print(f"| {kind} | {rate:.2f} | {rate * seconds[base]:.1f} | {memory:.0f} |", flush=True)
+        print(
+            f"| {kind} | {rate:.2f} | {rate * seconds[base]:.1f} | {memory:.0f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

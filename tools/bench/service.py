@@ -26,14 +26,19 @@ def main() -> None:
     )
     parser.add_argument("--model", help="a shipped model or a checkpoint")
     parser.add_argument(
-        "--threads", type=int, default=1, help="threads of torch in the generator process"
+        "--threads",
+        type=int,
+        default=1,
+        help="threads of torch in the generator process",
     )
     parser.add_argument("--rounds", type=int, default=200)
     options = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         model = options.model or write_untrained(Path(folder) / "untrained.safetensors")
-        with RollingBank(model, slots=16, starved="reuse", threads=options.threads) as bank:
+        with RollingBank(
+            model, slots=16, starved="reuse", threads=options.threads
+        ) as bank:
             arrays = bank.read(0)[1]
             image = bank._slots.encoding.decode(arrays)
             size = sum(values.nbytes for values in arrays.values())
@@ -56,7 +61,9 @@ def main() -> None:
             bank.expect(range(10**6))
             numbers = count()
             busy = {
-                "copied scan (ask, copy, check the sum)": lambda: bank.read(next(numbers)),
+                "copied scan (ask, copy, check the sum)": lambda: bank.read(
+                    next(numbers)
+                ),
                 "bank[n], all of it": lambda: bank[next(numbers)],
             }
             print_table(

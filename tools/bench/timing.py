@@ -36,7 +36,11 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     text = info.read_text() if info.exists() else ""
     model = next(
-        (line.split(":")[1].strip() for line in text.splitlines() if line.startswith("model name")),
+        (
+            line.split(":")[1].strip()
+            for line in text.splitlines()
+            if line.startswith("model name")
+        ),
         "",
     )
     cores = text.count("processor\t") or 1

@@ -38,7 +38,12 @@ def make(stretches: list[int]) -> tuple[float, float]:
     return time.process_time() - used, time.perf_counter() - clock
 
 
-PARTS = ("sample and build the stretch", "its Embree BVH", "ray casting, returns, boxes", "image")
+PARTS = (
+    "sample and build the stretch",
+    "its Embree BVH",
+    "ray casting, returns, boxes",
+    "image",
+)
 SKIN = "a skin on its returns, if there is one"
 
 
@@ -94,7 +99,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--stretches", type=int, default=10, help=f"stretches of {STRETCH_FRAMES} scans each"
+        "--stretches",
+        type=int,
+        default=10,
+        help=f"stretches of {STRETCH_FRAMES} scans each",
     )
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args()
@@ -105,7 +113,10 @@ def main() -> None:
         print(f"| {name} | {1e3 * seconds:.1f} |")
     whole = sum(used.values()) - used["image"] - used[SKIN]
     print(f"| **a scan without image** | **{1e3 * whole:.1f}** |")
-    shares = [list(range(j, arguments.stretches, arguments.jobs)) for j in range(arguments.jobs)]
+    shares = [
+        list(range(j, arguments.stretches, arguments.jobs))
+        for j in range(arguments.jobs)
+    ]
     with multiprocessing.get_context("spawn").Pool(arguments.jobs) as pool:
         results = pool.map(make, shares, chunksize=1)
     count = STRETCH_FRAMES * arguments.stretches

@@ -53,9 +53,15 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     from lidar_synth.lab.town import Town, export_town
 
     export_town(
-        Town(seed=1, scans=SCANS), root / "real", "semantic_kitti", camera=False, progress=False
+        Town(seed=1, scans=SCANS),
+        root / "real",
+        "semantic_kitti",
+        camera=False,
+        progress=False,
     )
-    convert(Town(seed=2, scans=SCANS), WRITERS["npz"](root / "synthetic"), progress=False)
+    convert(
+        Town(seed=2, scans=SCANS), WRITERS["npz"](root / "synthetic"), progress=False
+    )
     listed = semantic_kitti_list(root / "real", root / "real" / "train.json")
     settings = {"synthetic": root / "synthetic", "ratio": 0.5}
     mixed = write_infos(root / "mixed", listed, settings, data_root=root / "real")
@@ -64,7 +70,10 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
         str(Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py")
     )
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
-    ours["pipeline"] = [*ours["pipeline"][:3], *ours["pipeline"][-2:]]  # without random partners
+    ours["pipeline"] = [
+        *ours["pipeline"][:3],
+        *ours["pipeline"][-2:],
+    ]  # without random partners
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
     stock = DATASETS.build(theirs)
     dataset = DATASETS.build(ours)
@@ -81,7 +90,8 @@ def of_tests(trainer: str, root: Path) -> dict[str, Callable[[], Any]]:
     tests = import_module(f"test_integrations_{trainer}")
     own, ours = tests.both(tests.make(root))
     where = [
-        next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain) for domain in (0, 1)
+        next(i for i in range(len(ours)) if ours.mixed.domain(i) == domain)
+        for domain in (0, 1)
     ]
     load = "get_data" if trainer == "open3d_ml" else "__getitem__"
     theirs = getattr(own, load)
@@ -110,7 +120,11 @@ def main() -> None:
             )
         return
     for trainer in ("mmdet3d", *VARIABLES):
-        if os.environ.get(VARIABLES[trainer]) if trainer in VARIABLES else find_spec(trainer):
+        if (
+            os.environ.get(VARIABLES[trainer])
+            if trainer in VARIABLES
+            else find_spec(trainer)
+        ):
             subprocess.run([sys.executable, __file__, trainer], check=True)
         else:
             print(f"{trainer} is not installed (docs/how-to/trainers/): not measured")

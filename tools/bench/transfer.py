@@ -43,7 +43,9 @@ def main() -> None:
     torch.set_num_threads(1)
     sensor = replace(load_sensor("hdl64e_semantic_kitti"), firings=HDL64E_FIRINGS)
     if path is None:
-        scans = {"the shipped model": load_generator("town").scans(seed=0, indices=[0])[0]}
+        scans = {
+            "the shipped model": load_generator("town").scans(seed=0, indices=[0])[0]
+        }
         scans["the town"] = Town(seed=0, scans=1)[0]
     else:
         points = read_points(path)
@@ -52,7 +54,8 @@ def main() -> None:
     sensors["HDL-64E, 64 x 2170"] = sensor
     for name, scan in scans.items():
         calls: dict[str, Callable[[], object]] = {
-            f"as {one}": partial(Transfer(target), scan) for one, target in sensors.items()
+            f"as {one}": partial(Transfer(target), scan)
+            for one, target in sensors.items()
         }
         calls["as HDL-64E, 64 x 2170, 1 m higher, pitched by 0.2 degrees"] = partial(
             Transfer(sensor, MOUNT), scan
@@ -64,7 +67,9 @@ def main() -> None:
             grid: partial(_through_cells, scan, sensors["OS1-128"]),
         }
         seconds = time_in_turns(calls, given.rounds, time.process_time)
-        print_table(f"A scan of {name}, {len(scan):,} points, one core", seconds, surfaces)
+        print_table(
+            f"A scan of {name}, {len(scan):,} points, one core", seconds, surfaces
+        )
 
 
 def _through_cells(scan: Scan, sensor: Sensor) -> Scan:

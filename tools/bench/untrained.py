@@ -4,7 +4,12 @@ from pathlib import Path
 
 import torch
 
-from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    VELOCITY,
+    Header,
+    NetworkSpec,
+    save_checkpoint,
+)
 from lidar_synth.generate.models import build_network
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.sensor import load_sensor
@@ -25,9 +30,13 @@ def write_untrained(path: Path) -> Path:
         "window": (3, 3),
     }
     torch.manual_seed(0)
-    network = build_network("hdit", arguments | {"angles": torch.from_numpy(sensor.ray_angles())})
+    network = build_network(
+        "hdit", arguments | {"angles": torch.from_numpy(sensor.ray_angles())}
+    )
     for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.2)  # the output of a fresh network is zero
+        torch.nn.init.normal_(
+            parameter, std=0.2
+        )  # the output of a fresh network is zero
     header = Header(
         networks={VELOCITY: NetworkSpec("hdit", arguments)},
         sensor=sensor,

@@ -16,7 +16,9 @@ BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.S)
 
 def on_page_content(content: str, **_: Any) -> str:
     """Called by mkdocs with the HTML of a page."""
-    content = INLINE.sub(lambda found: convert(html.unescape(found[1]).strip()), content)
+    content = INLINE.sub(
+        lambda found: convert(html.unescape(found[1]).strip()), content
+    )
     return BLOCK.sub(
         lambda found: convert(html.unescape(found[1]).strip(), display="block"), content
     )

@@ -33,9 +33,14 @@ def page_of(path: Path) -> tuple[str, dict[str, bytes]]:
                 pictures[name] = base64.b64decode(data[kind])
                 parts.append(f"![Output of the cell above]({name})")
             else:
-                parts.append(f"```text\n{(output.get('text') or data['text/plain']).rstrip()}\n```")
+                parts.append(
+                    f"```text\n{(output.get('text') or data['text/plain']).rstrip()}\n```"
+                )
     title, _, rest = "\n\n".join(parts).partition("\n")
-    return f"{title}\n\n[Download the notebook]({path.name}){{ download }}\n{rest}\n", pictures
+    return (
+        f"{title}\n\n[Download the notebook]({path.name}){{ download }}\n{rest}\n",
+        pictures,
+    )
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

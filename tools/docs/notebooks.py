@@ -34,18 +34,25 @@ def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
     book = nbformat.read(path, as_version=4)
     environment = os.environ | {"IPYTHONDIR": str(folder / ".ipython")}
     client = NotebookClient(
-        book, timeout=600, record_timing=False, resources={"metadata": {"path": str(folder)}}
+        book,
+        timeout=600,
+        record_timing=False,
+        resources={"metadata": {"path": str(folder)}},
     )
     client.execute(env=environment)
     for cell in book.cells:
         if cell.cell_type == "code":
-            cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
+            cell.outputs = [
+                output for output in cell.outputs if output.get("name") != "stderr"
+            ]
     return book
 
 
 def main() -> None:
     """Executes the given notebooks, or all."""
-    for path in [Path(given) for given in sys.argv[1:]] or sorted(FOLDER.glob("*.ipynb")):
+    for path in [Path(given) for given in sys.argv[1:]] or sorted(
+        FOLDER.glob("*.ipynb")
+    ):
         with TemporaryDirectory() as folder:
             book = execute(path, Path(folder))
         kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}

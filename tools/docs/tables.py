@@ -95,7 +95,9 @@ besides, "models" = those of a model of several stages."""
 
 def topic_of(home: str) -> str:
     """The heading of a module."""
-    return next(topic for folder, topic in TOPICS.items() if f"{home}.".startswith(f"{folder}."))
+    return next(
+        topic for folder, topic in TOPICS.items() if f"{home}.".startswith(f"{folder}.")
+    )
 
 
 def api() -> str:
@@ -135,7 +137,9 @@ def recipes() -> str:
     rows = ["| command | data | parameters | time |", "|---|---|---:|---|"]
     for one in (*published_models(), *published()):
         command = "bake OUT --config" if one.command == "bake" else one.command
-        rows.append(f"| `{command} {one.name}` | {one.data} | {one.size} | {one.time} |")
+        rows.append(
+            f"| `{command} {one.name}` | {one.data} | {one.size} | {one.time} |"
+        )
     return "\n".join(rows)
 
 
@@ -159,7 +163,9 @@ def recipe_keys() -> str:
 def _keys(model: type) -> Iterator[str]:
     """A row for each key that the docstring of a model explains."""
     fields = getattr(model, "model_fields", None) or model.__dataclass_fields__  # type: ignore[attr-defined]
-    docstring = griffe.Docstring(inspect.getdoc(model) or "").parse("google", warnings=False)
+    docstring = griffe.Docstring(inspect.getdoc(model) or "").parse(
+        "google", warnings=False
+    )
     for section in docstring:
         if section.kind is griffe.DocstringSectionKind.parameters:
             for one in section.value:
@@ -170,7 +176,9 @@ def _default(fields: Any, names: str) -> str:
     """The defaults of one or several keys; those of a section are shown in its own table."""
     plain = (str, int, float, tuple, type(None))
     given = [fields[name].default for name in names.split(", ")]
-    return ", ".join("none" if v is None else f"`{v}`" for v in given if isinstance(v, plain))
+    return ", ".join(
+        "none" if v is None else f"`{v}`" for v in given if isinstance(v, plain)
+    )
 
 
 GENERATED: dict[str, Callable[[], str]] = {
@@ -184,5 +192,8 @@ GENERATED: dict[str, Callable[[], str]] = {
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by mkdocs with the Markdown of a page."""
     return re.sub(
-        r"^<!-- generated: (.*?) -->$", lambda found: GENERATED[found[1]](), markdown, flags=re.M
+        r"^<!-- generated: (.*?) -->$",
+        lambda found: GENERATED[found[1]](),
+        markdown,
+        flags=re.M,
     )

@@ -82,10 +82,14 @@ def students(selected: dict[int, Grid]) -> list[Student]:
     for strategy in STRATEGIES:
         for steps in STEPS:
             grid = (
-                selected[steps] if strategy == "adaptive_piecewise" else tuple(uniform_grid(steps))
+                selected[steps]
+                if strategy == "adaptive_piecewise"
+                else tuple(uniform_grid(steps))
             )
             if strategy in WHOLE or steps > 1:
-                found.append(Student(strategy, grid, (1.0, 0.0) if strategy in WHOLE else grid))
+                found.append(
+                    Student(strategy, grid, (1.0, 0.0) if strategy in WHOLE else grid)
+                )
     return found
 
 
@@ -122,8 +126,12 @@ class Ablation:
                 batch=2 * BATCH,
             )
             times = np.asarray(selection.candidates)
-            torch.save({n: times[best_path(selection.costs, n)].tolist() for n in STEPS}, path)
-        return {n: tuple(grid) for n, grid in torch.load(path, weights_only=True).items()}
+            torch.save(
+                {n: times[best_path(selection.costs, n)].tolist() for n in STEPS}, path
+            )
+        return {
+            n: tuple(grid) for n, grid in torch.load(path, weights_only=True).items()
+        }
 
     def parts(self, grid: Grid) -> dict[str, Tensor]:
         """Parts of the teacher's trajectories: data ``y0``, noise ``y1``, the index of the
@@ -140,7 +148,9 @@ class Ablation:
                 index = part % len(intervals)
                 start, end = intervals[index]
                 y0 = torch.from_numpy(
-                    self.latents[rng.integers(2), rng.choice(self.latents.shape[1], BATCH)]
+                    self.latents[
+                        rng.integers(2), rng.choice(self.latents.shape[1], BATCH)
+                    ]
                 ).float()
                 y1 = torch.randn(y0.shape, generator=noise)
                 y = torch.lerp(y0, y1, start)
@@ -152,9 +162,13 @@ class Ablation:
                     None,
                 )
                 slope = (after - y) / (end - start)
-                found.append((y0.half(), y1.half(), torch.full((BATCH,), index), slope.half()))
+                found.append(
+                    (y0.half(), y1.half(), torch.full((BATCH,), index), slope.half())
+                )
             columns = (torch.cat(column) for column in zip(*found, strict=True))
-            save_file(dict(zip(("y0", "y1", "interval", "slope"), columns, strict=True)), path)
+            save_file(
+                dict(zip(("y0", "y1", "interval", "slope"), columns, strict=True)), path
+            )
         return load_file(path)
 
     def train(self, student: Student, seed: int) -> dict[str, Tensor]:
@@ -197,10 +211,15 @@ class Ablation:
     def end(self, generator: Generator, grid: Grid) -> Tensor:
         """(n, C, h, w) the latents that a flow makes of the same noise."""
         noise = torch.randn(
-            TRAJECTORIES, *self.latents.shape[2:], generator=torch.Generator().manual_seed(5)
+            TRAJECTORIES,
+            *self.latents.shape[2:],
+            generator=torch.Generator().manual_seed(5),
         )
         return torch.cat(
-            [solve(velocity(generator), y, grid, "euler", None) for y in noise.split(BATCH)]
+            [
+                solve(velocity(generator), y, grid, "euler", None)
+                for y in noise.split(BATCH)
+            ]
         )
 
 
@@ -208,7 +227,10 @@ def velocity(generator: Generator) -> Callable[..., Tensor]:
     """The flow, without gradients."""
 
     def flow(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16()):
+        with (
+            torch.no_grad(),
+            torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16()),
+        ):
             return generator.network(y, t.expand(len(y))).float()
 
     return flow
@@ -222,18 +244,26 @@ def supervision(
     picks = torch.randint(len(parts["y0"]), (BATCH,), generator=draws)
     y0, y1, slope = (parts[name][picks].float() for name in ("y0", "y1", "slope"))
     u = torch.rand(BATCH, generator=draws)
-    if student.strategy == "piecewise_reflow":  # u is the time: within the recorded interval
+    if (
+        student.strategy == "piecewise_reflow"
+    ):  # u is the time: within the recorded interval
         times = torch.tensor(student.grid)
-        u = torch.lerp(times[parts["interval"][picks] + 1], times[parts["interval"][picks]], u)
+        u = torch.lerp(
+            times[parts["interval"][picks] + 1], times[parts["interval"][picks]], u
+        )
     elif student.strategy not in WHOLE:  # u selects the interval
         u = (parts["interval"][picks] + u) / (len(student.grid) - 1)
-    example = STRATEGIES[student.strategy](lambda y, t, c: slope, y0, y1, u, student.grid, 1, None)
+    example = STRATEGIES[student.strategy](
+        lambda y, t, c: slope, y0, y1, u, student.grid, 1, None
+    )
     return example.y, example.t, example.velocity
 
 
 def sample(generator: Generator, grid: Grid, count: int) -> list[Scan]:
     """Scans on a time grid; all generators get the same noise."""
-    known = replace(generator, header=replace(generator.header, time_grid=grid, other_grids=()))
+    known = replace(
+        generator, header=replace(generator.header, time_grid=grid, other_grids=())
+    )
     made = [
         known.scans(SEED, [i])[0]
         for i in tqdm(range(count), desc=f"{len(grid) - 1} steps", unit="scan")
@@ -241,10 +271,15 @@ def sample(generator: Generator, grid: Grid, count: int) -> list[Scan]:
     return [replace(scan, sensor=load_sensor("town")) for scan in made]
 
 
-def row(name: str, steps: int, measured: Sequence[Measured], errors: Sequence[float]) -> str:
+def row(
+    name: str, steps: int, measured: Sequence[Measured], errors: Sequence[float]
+) -> str:
     """Means and standard deviations over the seeds."""
     columns = [
-        [next(s.value for s in one.scores if s.metric.startswith(start)) for one in measured]
+        [
+            next(s.value for s in one.scores if s.metric.startswith(start))
+            for one in measured
+        ]
         for start in SHOWN.values()
     ]
     columns += [[one.classes[BEND] for one in measured], list(errors)]
@@ -265,18 +300,28 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=1000, help="of each student")
     parser.add_argument(
-        "--pairs", type=int, default=3072, help="parts of trajectories for each time grid"
+        "--pairs",
+        type=int,
+        default=3072,
+        help="parts of trajectories for each time grid",
     )
     parser.add_argument("--count", type=int, default=64, help="scans in each set")
     parser.add_argument(
-        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+        "--intervals",
+        type=int,
+        default=200,
+        help="resamples for 95 %% intervals; 0 = none",
     )
     given = parser.parse_args()
 
     given.work.mkdir(parents=True, exist_ok=True)
     teacher = load_generator(str(given.teacher))
     ablation = Ablation(
-        teacher, np.load(given.latents, mmap_mode="r"), given.work, given.pairs, given.iterations
+        teacher,
+        np.load(given.latents, mmap_mode="r"),
+        given.work,
+        given.pairs,
+        given.iterations,
     )
     every = students(ablation.selected())
     for seed in range(given.seeds):
@@ -287,7 +332,10 @@ def main() -> None:
     plain = Comparison(real, judge)
     exact = Comparison(real, judge, given.intervals)
     columns = (*SHOWN, BEND, ERROR)
-    lines = [f"| strategy | steps | {' | '.join(columns)} |", f"|---|---:|{'---:|' * len(columns)}"]
+    lines = [
+        f"| strategy | steps | {' | '.join(columns)} |",
+        f"|---|---:|{'---:|' * len(columns)}",
+    ]
     kept = []
     whole = ablation.end(teacher, uniform_grid(50))
 
@@ -298,7 +346,9 @@ def main() -> None:
             100 * float((ablation.end(g, grid) - whole).square().mean() / whole.var())
             for g in generators
         ]
-        lines.append(row(name, steps, [plain.measure(name, scans) for scans in sets], errors))
+        lines.append(
+            row(name, steps, [plain.measure(name, scans) for scans in sets], errors)
+        )
         if steps == max(STEPS):
             kept.append(exact.measure(name, sets[0]))
 

@@ -66,9 +66,15 @@ def main() -> None:
     write.add_argument("out", type=Path)
     of = commands.add_parser("measure", help="the figures of an adapted checkpoint")
     of.add_argument("checkpoint", type=Path)
-    of.add_argument("--train", type=Path, required=True, help="the scans that it was adapted to")
-    of.add_argument("--test", type=Path, required=True, help="scans that it has not seen")
-    of.add_argument("--before", default="town", help="the model that it was adapted from")
+    of.add_argument(
+        "--train", type=Path, required=True, help="the scans that it was adapted to"
+    )
+    of.add_argument(
+        "--test", type=Path, required=True, help="scans that it has not seen"
+    )
+    of.add_argument(
+        "--before", default="town", help="the model that it was adapted from"
+    )
     of.add_argument("--judge", type=Path, help="an archive of lidar-bonnetal")
     of.add_argument(
         "--columns", type=int, help="width at which the judge looks [the archive's own]"
@@ -112,14 +118,17 @@ def measure(given: argparse.Namespace) -> None:
     print("|---|---:|---:|---:|---:|")
     models = {"before": given.before, "adapted": given.checkpoint}
     tables = {
-        name: autoencoder_row(name, str(model), sensor, test) for name, model in models.items()
+        name: autoencoder_row(name, str(model), sensor, test)
+        for name, model in models.items()
     }
     there = np.flatnonzero(~np.isnan(tables["adapted"]))
     print("\n| IoU of decoded labels, % |", " | ".join(NAMES[i] for i in there), "|")
     print("|---|" + "---:|" * len(there))
     for name, ious in tables.items():
         print(f"| {name} |", " | ".join(f"{100 * ious[i]:.0f}" for i in there), "|")
-    generated = {name: generate(str(model), given.count) for name, model in models.items()}
+    generated = {
+        name: generate(str(model), given.count) for name, model in models.items()
+    }
     extractors: dict[str, Features] = {"the shipped segmenter": load_judge().features}
     if given.judge is not None:
         extractors["the archive"] = load_archive(given.judge, given.columns).features
@@ -138,7 +147,9 @@ def autoencoder_row(
     """
     checkpoint = load_checkpoint(find_model(model))
     networks = (
-        checkpoint.networks if checkpoint.header.sensor == sensor else regrid(checkpoint, sensor)[1]
+        checkpoint.networks
+        if checkpoint.header.sensor == sensor
+        else regrid(checkpoint, sensor)[1]
     )
     tensors = checkpoint.header.tensors
     codec = Latent(networks[CODEC], tensors)  # type: ignore[arg-type]
@@ -165,7 +176,9 @@ def autoencoder_row(
         decoded = known & (label != IGNORE)
         np.add.at(table, (real[decoded], label[decoded]), 1)
     returns, labels, near, error = sums[:4] / sums[4]
-    print(f"| {name} | {100 * returns:.1f} | {100 * labels:.1f} | {100 * near:.1f} | {error:.2f} |")
+    print(
+        f"| {name} | {100 * returns:.1f} | {100 * labels:.1f} | {100 * near:.1f} | {error:.2f} |"
+    )
     return np.where(table.sum(1) > 0, class_ious(table), np.nan)
 
 

@@ -42,15 +42,17 @@ def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
     """A line of the table, in per cent."""
     a, b = (np.stack([image.range for image in images]) for images in (real, made))
     labels, decoded = (
-        np.stack([image.channels["label"] for image in images]) for images in (real, made)
+        np.stack([image.channels["label"] for image in images])
+        for images in (real, made)
     )
     both = (a > 0) & (b > 0)
     off = np.abs(np.divide(b, a, where=both, out=np.ones_like(a)) - 1)
-    right = [((a > 0) == (b > 0)).mean(), (labels == decoded)[both & (labels != IGNORE)].mean()]
+    right = [
+        ((a > 0) == (b > 0)).mean(),
+        (labels == decoded)[both & (labels != IGNORE)].mean(),
+    ]
     medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
-    return (
-        f"| {escape_markdown(name)} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
-    )
+    return f"| {escape_markdown(name)} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
 
 
 def main() -> None:
@@ -61,7 +63,10 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=24, help="scans")
     given = parser.parse_args()
 
-    images = [project(scan, channels=["reflectance", "label"]) for scan in town(SEED, given.count)]
+    images = [
+        project(scan, channels=["reflectance", "label"])
+        for scan in town(SEED, given.count)
+    ]
     lines = []
     for text in given.models:
         name, model = text.split("=", 1)

@@ -53,7 +53,9 @@ SHOWN = 8
 """Examples in the picture."""
 
 
-def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> str:
+def verdict(
+    name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], judge: Judge
+) -> str:
     """A line of the second table: the agreement with the own condition, and with another one."""
     measure, agreement = AGREEMENTS[kind]
     other = [*real[len(real) // 2 :], *real[: len(real) // 2]]
@@ -61,7 +63,9 @@ def verdict(name: str, kind: str, scans: Sequence[Scan], real: Sequence[Scan], j
     return f"| {escape_markdown(name)} | {measure} | {' | '.join(values)} |"
 
 
-def generate(model: str, steps: int | None, real: Sequence[Scan]) -> tuple[str, list[Scan]]:
+def generate(
+    model: str, steps: int | None, real: Sequence[Scan]
+) -> tuple[str, list[Scan]]:
     """The kind of condition, and one generated scan for the condition of each real scan."""
     generator = load_generator(model)
     if generator.condition is None:
@@ -84,7 +88,9 @@ def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
 
 def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
     """Write conditions, generated scans and the scans of the conditions side by side."""
-    figure = Figure(figsize=(15, 3.05 * len(made)), facecolor="#1e1014", layout="constrained")
+    figure = Figure(
+        figsize=(15, 3.05 * len(made)), facecolor="#1e1014", layout="constrained"
+    )
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(made), 3, squeeze=False, width_ratios=[1.25, 1, 1])
     for axes, a, b in zip(grid, made, real, strict=True):
@@ -95,10 +101,14 @@ def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> N
             render(b, "label", size=(900, 540)),
         )
         for axis, image, title in zip(
-            axes, images, ("condition", "generated", "scan of the condition"), strict=True
+            axes,
+            images,
+            ("condition", "generated", "scan of the condition"),
+            strict=True,
         ):
             axis.imshow(
-                image, aspect="equal" if kind == "camera" or title != "condition" else "auto"
+                image,
+                aspect="equal" if kind == "camera" or title != "condition" else "auto",
             )
             axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
             axis.set_axis_off()
@@ -112,11 +122,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
-    parser.add_argument("--root", help="a dataset with labels or images [default: a town]")
+    parser.add_argument(
+        "--root", help="a dataset with labels or images [default: a town]"
+    )
     parser.add_argument("--split", help="split of ROOT")
     parser.add_argument("--count", type=int, default=64, help="scans in each row")
     parser.add_argument(
-        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+        "--intervals",
+        type=int,
+        default=200,
+        help="resamples for 95 %% intervals; 0 = none",
     )
     parser.add_argument(
         "--picture",
@@ -139,7 +154,9 @@ def report(given: argparse.Namespace, folder: Path) -> None:
         real = town(REFERENCE, given.count)
         if needs_images(given.models):
             real = with_images(
-                real, Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0), folder
+                real,
+                Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0),
+                folder,
             )
     comparison = Comparison(real, judge, given.intervals)
     sets: list[Measured] = []
@@ -154,7 +171,9 @@ def report(given: argparse.Namespace, folder: Path) -> None:
         verdicts.append(verdict(name, kind, scans, real, judge))
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
-            draw(given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart])
+            draw(
+                given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart]
+            )
     print(f"{len(real)} scans in each set\n\n{table(sets)}")
     print(
         "\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n"

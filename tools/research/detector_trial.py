@@ -88,22 +88,35 @@ ARMS = {
     "real": Arm("labelled scans only", "none"),
     "gt_sampling": Arm("GT sampling", "none", pasted=True),
     "unboxed": Arm(
-        "unconditional scans with unboxed objects, objects pasted", _MODEL, "unboxed", "mix"
+        "unconditional scans with unboxed objects, objects pasted",
+        _MODEL,
+        "unboxed",
+        "mix",
     ),
     "closed": Arm(
-        "unconditional scans without unboxed objects, objects pasted", _MODEL, "closed", "mix"
+        "unconditional scans without unboxed objects, objects pasted",
+        _MODEL,
+        "closed",
+        "mix",
     ),
     "layout": Arm("layout scans", _LAYOUT, "layout"),
     "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
     "layout_quarter": Arm(
-        "layout scans in a quarter, GT sampling", _LAYOUT, "layout", pasted=True, share=0.25
+        "layout scans in a quarter, GT sampling",
+        _LAYOUT,
+        "layout",
+        pasted=True,
+        share=0.25,
     ),
     "layout_first": Arm(
         "layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True
     ),
     "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
     "town_gt": Arm(
-        "town scans of the same layouts, GT sampling (upper bound)", _TOWN, "town", pasted=True
+        "town scans of the same layouts, GT sampling (upper bound)",
+        _TOWN,
+        "town",
+        pasted=True,
     ),
     "town_first": Arm(
         "these first, GT sampling (upper bound)", _TOWN, "town", pasted=True, first=True
@@ -121,7 +134,9 @@ class Work:
         model: the layout model's checkpoint.
     """
 
-    def __init__(self, folder: Path, iterations: int, count: int, model: str | None) -> None:
+    def __init__(
+        self, folder: Path, iterations: int, count: int, model: str | None
+    ) -> None:
         self.folder = folder
         self.iterations = iterations
         self.count = count
@@ -138,13 +153,18 @@ class Work:
     def labelled(self, seed: int) -> Source:
         """The labelled scans of a seed."""
         return pools.streets(
-            self.folder / "pools" / f"labelled-{seed}", TRAIN_TOWN, LABELLED * seed, LABELLED
+            self.folder / "pools" / f"labelled-{seed}",
+            TRAIN_TOWN,
+            LABELLED * seed,
+            LABELLED,
         )
 
     def tested(self) -> list[Source]:
         """The tested scans of each town."""
         return [
-            pools.streets(self.folder / "pools" / f"test-{t}", t, 0, TESTED, every_box=True)
+            pools.streets(
+                self.folder / "pools" / f"test-{t}", t, 0, TESTED, every_box=True
+            )
             for t in TEST_TOWNS
         ]
 
@@ -157,7 +177,9 @@ class Work:
         if name == "layout":
             model = str(self.model)
             return pools.laid_out(
-                folder.with_name(f"{name}-{self.tag}-{self.count}"), model, self.pool("town")
+                folder.with_name(f"{name}-{self.tag}-{self.count}"),
+                model,
+                self.pool("town"),
             )
         towns = [folder.with_name(f"town-{t}-{self.count}") for t in LAYOUT_TOWNS]
         parts = [
@@ -172,14 +194,23 @@ class Work:
         return self.folder / f"results-{self.iterations}" / f"{key}-{seed}.json"
 
 
-def mixture(arm: Arm, labelled: Source, pool: Source | None, seed: int, count: int) -> MixedScans:
+def mixture(
+    arm: Arm, labelled: Source, pool: Source | None, seed: int, count: int
+) -> MixedScans:
     """The training set of an arm, of ``count`` samples, as a user of the package makes it."""
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
-    options: dict[str, Any] = {"objects": objects, "count": there, "turn": 180.0, "clear": False}
+    options: dict[str, Any] = {
+        "objects": objects,
+        "count": there,
+        "turn": 180.0,
+        "clear": False,
+    }
     steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
-        steps.insert(0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options))
+        steps.insert(
+            0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options)
+        )
     share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
         labelled,
@@ -210,12 +241,24 @@ def run(
     torch.manual_seed(seed)
     network = Detector()
     mixed = mixture(arm, labelled, pool, seed, work.iterations * BATCH)
-    losses = train(network, endless_batches(mixed, BATCH), work.iterations, RATE, f"{name} {seed}")
+    losses = train(
+        network, endless_batches(mixed, BATCH), work.iterations, RATE, f"{name} {seed}"
+    )
     seconds = time.process_time() - start
     base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
     found = test(settled(network, _one_epoch(base)))
-    parts = [round(float(np.mean(part)), 3) for part in np.array_split(losses, 10) if len(part)]
-    return {"arm": name, "seed": seed, "ap": found, "losses": parts, "seconds": round(seconds, 1)}
+    parts = [
+        round(float(np.mean(part)), 3)
+        for part in np.array_split(losses, 10)
+        if len(part)
+    ]
+    return {
+        "arm": name,
+        "seed": seed,
+        "ap": found,
+        "losses": parts,
+        "seconds": round(seconds, 1),
+    }
 
 
 def _one_epoch(mixed: MixedScans) -> Iterator[Sample]:
@@ -227,14 +270,22 @@ def make_test(work: Work) -> Callable[[Detector], list[float]]:
     """The test of a network: average precision of every class on all tested scans."""
     scans = [source[i] for source in work.tested() for i in range(len(source))]
     truths = [Truth.of(scan) for scan in tqdm(scans, "tested boxes", unit="scan")]
-    counts = [sum(int(t.wanted[t.classes == c].sum()) for t in truths) for c in range(len(CLASSES))]
+    counts = [
+        sum(int(t.wanted[t.classes == c].sum()) for t in truths)
+        for c in range(len(CLASSES))
+    ]
     print(
-        f"{len(scans)} tested scans; boxes: {dict(zip(CLASSES, counts, strict=True))}", flush=True
+        f"{len(scans)} tested scans; boxes: {dict(zip(CLASSES, counts, strict=True))}",
+        flush=True,
     )
 
     def test(network: Detector) -> list[float]:
         return precisions(
-            detect(network, lambda i: view(scans[i].points, scans[i].reflectance), len(scans)),
+            detect(
+                network,
+                lambda i: view(scans[i].points, scans[i].reflectance),
+                len(scans),
+            ),
             truths,
         )
 
@@ -252,10 +303,16 @@ def report(results: Mapping[str, Mapping[int, list[float]]]) -> str:
     base = {seed: np.mean(ap) for seed, ap in results.get(BASE, {}).items()}
     for name, found in results.items():
         table = 100 * np.array([[*ap, np.mean(ap)] for ap in found.values()])
-        paired = [100 * (np.mean(ap) - base[seed]) for seed, ap in found.items() if seed in base]
+        paired = [
+            100 * (np.mean(ap) - base[seed])
+            for seed, ap in found.items()
+            if seed in base
+        ]
         cells = [_spread(column) for column in table.T]
         difference = _spread(paired, "+") if name != BASE and paired else "-"
-        lines.append(f"| {ARMS[name].title} | {' | '.join(cells)} | {difference} | {len(found)} |")
+        lines.append(
+            f"| {ARMS[name].title} | {' | '.join(cells)} | {difference} | {len(found)} |"
+        )
     lines += ["", "| | labels used besides those of the 30 scans |", "|---|---|"]
     return "\n".join(
         [*lines, *(f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results)]
@@ -274,14 +331,22 @@ def main() -> None:
     )
     parser.add_argument("work", type=Path, help="folder for scans and results")
     parser.add_argument(
-        "--arm", action="append", choices=ARMS, help="by default all; layout arms only with a model"
+        "--arm",
+        action="append",
+        choices=ARMS,
+        help="by default all; layout arms only with a model",
     )
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=1600)
-    parser.add_argument("--pool", type=int, default=200, help="synthetic scans of each kind")
+    parser.add_argument(
+        "--pool", type=int, default=200, help="synthetic scans of each kind"
+    )
     parser.add_argument("--layout-model", metavar="CHECKPOINT")
     parser.add_argument(
-        "--minutes", type=float, default=float("inf"), help="no training begins after these"
+        "--minutes",
+        type=float,
+        default=float("inf"),
+        help="no training begins after these",
     )
     parser.add_argument("--out", type=Path, help="file for the table")
     given = parser.parse_args()
@@ -291,7 +356,11 @@ def main() -> None:
     arms = [
         n
         for n in ARMS
-        if (n in given.arm if given.arm else given.layout_model or ARMS[n].pool != "layout")
+        if (
+            n in given.arm
+            if given.arm
+            else given.layout_model or ARMS[n].pool != "layout"
+        )
     ]
     test: Callable[[Detector], list[float]] | None = None
     for seed, name in ((seed, name) for seed in range(given.seeds) for name in arms):
@@ -302,7 +371,10 @@ def main() -> None:
         test = test or make_test(work)
         found = run(work, name, seed, test)
         write_file(path, json.dumps(found).encode())
-        print(f"{name}, seed {seed}: AP {np.round(100 * np.array(found['ap']), 1)}", flush=True)
+        print(
+            f"{name}, seed {seed}: AP {np.round(100 * np.array(found['ap']), 1)}",
+            flush=True,
+        )
     results = {}
     for name in arms:
         paths = {seed: work.result(name, seed) for seed in range(given.seeds)}

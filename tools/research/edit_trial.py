@@ -71,13 +71,19 @@ def outside_share(scans: Sequence[Scan], targets: Sequence[str]) -> float:
             result = Transfer(load_sensor(name), Mount(z=0.1))(scan)
             assert result.label is not None and result.boxes is not None
             points = result.points[np.isin(result.label, VEHICLES)]
-            wide = result.boxes.values + np.array([0, 0, 0, *3 * [2 * FAR], 0], np.float32)
+            wide = result.boxes.values + np.array(
+                [0, 0, 0, *3 * [2 * FAR], 0], np.float32
+            )
             total += len(points)
-            outside += int((~Boxes(wide, result.boxes.names).contain(points).any(0)).sum())
+            outside += int(
+                (~Boxes(wide, result.boxes.names).contain(points).any(0)).sum()
+            )
     return outside / max(total, 1)
 
 
-def tried(scans: Sequence[Scan], factor: float) -> tuple[Counter[str], Counter[str], Counter[str]]:
+def tried(
+    scans: Sequence[Scan], factor: float
+) -> tuple[Counter[str], Counter[str], Counter[str]]:
     """Numbers of objects, by class: all, and those that were moved by a factor; and reasons of the
     others.
 
@@ -107,15 +113,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--inserts", type=int, default=500, help="inserts of all sensors together")
+    parser.add_argument(
+        "--inserts", type=int, default=500, help="inserts of all sensors together"
+    )
     parser.add_argument("--scans", type=int, default=8, help="scans of each sensor")
     parser.add_argument(
-        "--folder", nargs="*", default=[], help="folders of scans with boxes, in place of the town"
+        "--folder",
+        nargs="*",
+        default=[],
+        help="folders of scans with boxes, in place of the town",
     )
     arguments = parser.parse_args()
     sources: dict[str, Source] = {root: open_scans(root) for root in arguments.folder}
     if not sources:
-        sources = {n: Town(seed=40, scans=arguments.scans, sensor=load_sensor(n)) for n in SENSORS}
+        sources = {
+            n: Town(seed=40, scans=arguments.scans, sensor=load_sensor(n))
+            for n in SENSORS
+        }
     for name, source in sources.items():
         scans = [source[i] for i in range(min(len(source), arguments.scans))]
         growth = grown_by(scans, -(-arguments.inserts // len(sources)))

@@ -35,7 +35,9 @@ Picture = NDArray[np.uint8]
 
 UNSEEN = 1
 """Seed of a town that no model was trained on."""
-NEAR = Orbit(azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)).camera()
+NEAR = Orbit(
+    azimuth=160, elevation=22, distance=27, field=45, target=(5, 0, -1)
+).camera()
 """A camera from which cars and poles are distinguishable."""
 SIZE = (760, 400)
 """Width and height of one scan, in pixels."""
@@ -60,7 +62,10 @@ def pairs() -> list[list[tuple[str, Picture]]]:
     return [
         [
             (f"generated, 4 steps: town/0/{i}", near(scan)),
-            (f"the town, street {i}", near(street(i, sensor="hdl64e_lasers", motion=False))),
+            (
+                f"the town, street {i}",
+                near(street(i, sensor="hdl64e_lasers", motion=False)),
+            ),
         ]
         for i, scan in enumerate(made)
     ]
@@ -75,7 +80,10 @@ def from_map() -> list[list[tuple[str, Picture]]]:
     return [
         [("condition: a label map", np.repeat(labels, 4, axis=0))],
         [("the town's scan with this map", near(scan)), ("generated", near(made[0]))],
-        [("generated, other noise", near(made[1])), ("generated, other noise", near(made[2]))],
+        [
+            ("generated, other noise", near(made[1])),
+            ("generated, other noise", near(made[2])),
+        ],
     ]
 
 
@@ -93,7 +101,10 @@ def from_camera() -> list[list[tuple[str, Picture]]]:
             [("condition: a camera image", image)],
             [
                 ("generated", near(made)),
-                ("the town's scan taken with the image", near(town[i * STRETCH_FRAMES])),
+                (
+                    "the town's scan taken with the image",
+                    near(town[i * STRETCH_FRAMES]),
+                ),
             ],
         ]
     return rows
@@ -120,22 +131,38 @@ def pasted() -> list[list[tuple[str, Picture]]]:
     ``mix``)."""
     generator = load_generator("town")
     scans = Town(0, "hdl64e_lasers", 5 * STRETCH_FRAMES, motion=False)
-    bank = ObjectBank.from_scans([scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)])
-    policy = make_policy("mix", fields=generator.fields, objects=bank, count=12, clear=True)
+    bank = ObjectBank.from_scans(
+        [scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)]
+    )
+    policy = make_policy(
+        "mix", fields=generator.fields, objects=bank, count=12, clear=True
+    )
     [scan] = generator.scans(0, [0])
     mixed = policy(scan, np.random.default_rng(0))
     return [
         [
             ("generated", near(scan)),
-            ("its objects replaced by pasted ones, with boxes", near(mixed, boxes=True)),
+            (
+                "its objects replaced by pasted ones, with boxes",
+                near(mixed, boxes=True),
+            ),
         ]
     ]
 
 
 def sensors() -> list[list[tuple[str, Picture]]]:
     """One street as three sensors see it."""
-    names = {"town": "HDL-64E", "os1_128": "Ouster OS1-128", "hdl32e_nuscenes": "HDL-32E"}
-    return [[(f"{title}: {name}", near(street(1, sensor=name))) for name, title in names.items()]]
+    names = {
+        "town": "HDL-64E",
+        "os1_128": "Ouster OS1-128",
+        "hdl32e_nuscenes": "HDL-32E",
+    }
+    return [
+        [
+            (f"{title}: {name}", near(street(1, sensor=name)))
+            for name, title in names.items()
+        ]
+    ]
 
 
 PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
@@ -153,7 +180,8 @@ def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Rows of images with their titles, all rows of the same width."""
     title = 0.36  # inches
     heights = [
-        12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title for row in rows
+        12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title
+        for row in rows
     ]
     figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
     FigureCanvasAgg(figure)
@@ -161,9 +189,14 @@ def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     for part, row, height in zip(parts, rows, heights, strict=True):
         part.set_facecolor("#101218")
         grid = part.subplots(
-            1, len(row), squeeze=False, width_ratios=[i.shape[1] / i.shape[0] for _, i in row]
+            1,
+            len(row),
+            squeeze=False,
+            width_ratios=[i.shape[1] / i.shape[0] for _, i in row],
         )
-        part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01)
+        part.subplots_adjust(
+            left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01
+        )
         for axes, (name, image) in zip(grid[0], row, strict=True):
             axes.imshow(image, interpolation="lanczos")
             axes.set_title(name, color="#9aa0ad", fontsize=14, loc="left", pad=4)
@@ -188,7 +221,9 @@ def save(path: Path, pixels: Picture) -> None:
         (WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS
     )
     # Few pixels are cars or poles: a palette by number of pixels would lose their colours.
-    image = image.quantize(96, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    image = image.quantize(
+        96, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     image.save(path, optimize=True)
 
@@ -199,15 +234,21 @@ def main() -> None:
     )
     names = ["channels", *PICTURES]
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"pictures to make: {', '.join(names)} [all]"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"pictures to make: {', '.join(names)} [all]",
     )
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"))
     given = parser.parse_args()
     if unknown := set(given.names) - set(names):
-        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(names)}")
+        parser.error(
+            f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(names)}"
+        )
     for name in given.names or names:
         save(
-            given.out / f"{name}.png", channels() if name == "channels" else draw(PICTURES[name]())
+            given.out / f"{name}.png",
+            channels() if name == "channels" else draw(PICTURES[name]()),
         )
         print(given.out / f"{name}.png")
 

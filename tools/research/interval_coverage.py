@@ -13,7 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.lab.evaluate.distances import frechet_of_moments, jensen_shannon_distance
+from lidar_synth.lab.evaluate.distances import (
+    frechet_of_moments,
+    jensen_shannon_distance,
+)
 from lidar_synth.lab.evaluate.intervals import bootstrap
 from lidar_synth.lab.evaluate.measures import normalised_rows
 from lidar_synth.lab.evaluate.statistics import (
@@ -45,9 +48,13 @@ class Simulation(NamedTuple):
     truth: float | None = None
 
 
-def features(shift: float, compare: Callable[..., Statistic]) -> Callable[[Rng, int], Statistic]:
+def features(
+    shift: float, compare: Callable[..., Statistic]
+) -> Callable[[Rng, int], Statistic]:
     """Gaussian features; those of the second set are shifted and wider."""
-    return lambda rng, n: compare(rng.normal(size=(n, WIDTH)), rng.normal(shift, 1.2, (n, WIDTH)))
+    return lambda rng, n: compare(
+        rng.normal(size=(n, WIDTH)), rng.normal(shift, 1.2, (n, WIDTH))
+    )
 
 
 def gaussian_truth(shift: float) -> float:
@@ -57,7 +64,9 @@ def gaussian_truth(shift: float) -> float:
 
 def counts(rng: Rng, n: int, slope: float) -> list[NDArray[np.int64]]:
     """Histograms of scans, which differ from one another by more than counting does."""
-    return list(rng.poisson(5 * rng.gamma(2, 1, (n, BINS)) * np.linspace(1, slope, BINS)))
+    return list(
+        rng.poisson(5 * rng.gamma(2, 1, (n, BINS)) * np.linspace(1, slope, BINS))
+    )
 
 
 def jsd(rng: Rng, n: int) -> Statistic:
@@ -69,7 +78,9 @@ def mmd(rng: Rng, n: int) -> Statistic:
     return gaussian_mmd(rows[0], rows[1], (n, n), BINS)
 
 
-JSD_TRUTH = jensen_shannon_distance(np.linspace(1, 3, BINS), np.linspace(1, 1 / 3, BINS))
+JSD_TRUTH = jensen_shannon_distance(
+    np.linspace(1, 3, BINS), np.linspace(1, 1 / 3, BINS)
+)
 
 SIMULATIONS = {
     "JSD, 30 scans": Simulation(jsd, 30, JSD_TRUTH),
@@ -89,11 +100,15 @@ SIMULATIONS = {
         features(0.3, frechet), 40 * WIDTH, gaussian_truth(0.3)
     ),
     "unbiased squared MMD, 100 samples": Simulation(features(1.0, polynomial_mmd), 100),
-    "unbiased squared MMD, small, 300 samples": Simulation(features(0.3, polynomial_mmd), 300),
+    "unbiased squared MMD, small, 300 samples": Simulation(
+        features(0.3, polynomial_mmd), 300
+    ),
 }
 
 
-def coverage(simulation: Simulation, trials: int, replicates: int) -> tuple[float, float]:
+def coverage(
+    simulation: Simulation, trials: int, replicates: int
+) -> tuple[float, float]:
     """Share of the trials whose interval holds the truth, and the mean width of the intervals."""
     truth = simulation.truth
     if truth is None:

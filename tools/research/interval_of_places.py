@@ -13,12 +13,16 @@ import numpy as np
 from lidar_synth.lab.proof.scores import interval
 
 
-def coverage(places: int, seeds: int, between: float, within: float, trials: int) -> float:
+def coverage(
+    places: int, seeds: int, between: float, within: float, trials: int
+) -> float:
     """Share of the simulated comparisons whose 95 % interval holds the true mean."""
     rng = np.random.default_rng(0)
     held = 0
     for trial in range(trials):
-        values = rng.normal(0, between, (places, 1)) + rng.normal(0, within, (places, seeds))
+        values = rng.normal(0, between, (places, 1)) + rng.normal(
+            0, within, (places, seeds)
+        )
         ends = interval(values, seed=trial, draws=1500)
         held += ends is not None and ends[0] <= 0 <= ends[1]
     return held / trials
@@ -36,7 +40,9 @@ def main() -> None:
         "mostly places": (1, 0.2),
         "mostly seeds": (0.2, 1),
     }
-    print(f"| places | seeds | {' | '.join(spreads)} |\n|---:|---:|{'---:|' * len(spreads)}")
+    print(
+        f"| places | seeds | {' | '.join(spreads)} |\n|---:|---:|{'---:|' * len(spreads)}"
+    )
     for places in (6, 7, 11):
         for seeds in (1, 2, 3):
             cells = [

@@ -19,7 +19,15 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from model_card import SEED, Comparison, Measured, needs_images, shrink, table, with_images
+from model_card import (
+    SEED,
+    Comparison,
+    Measured,
+    needs_images,
+    shrink,
+    table,
+    with_images,
+)
 from tqdm import tqdm
 
 from lidar_synth import Scan, Town, layout_of, load_generator
@@ -52,14 +60,17 @@ def line(name: str, found: LayoutAgreement | None) -> str:
     if found is None:
         return f"| {escape_markdown(name)} | - | - | - | - | - | - |"
     shares = " | ".join(
-        f"{100 * s:.2f}" for s in (found.inside_share, found.filled_share, found.kept_share)
+        f"{100 * s:.2f}"
+        for s in (found.inside_share, found.filled_share, found.kept_share)
     )
     return f"| {escape_markdown(name)} | {shares} | {found.points} | {found.boxes} | {found.seen} |"
 
 
 def draw(path: Path, made: list[Scan], real: list[Scan], layouts: list[Layout]) -> None:
     """Write generated scans with the boxes of their layouts beside the scans of the layouts."""
-    figure = Figure(figsize=(15, 4.6 * len(made)), facecolor="#1e1014", layout="constrained")
+    figure = Figure(
+        figsize=(15, 4.6 * len(made)), facecolor="#1e1014", layout="constrained"
+    )
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(made), 2, squeeze=False)
     for axes, scan, own, layout in zip(grid, made, real, layouts, strict=True):
@@ -88,7 +99,10 @@ def main() -> None:
     )
     parser.add_argument("--picture", type=Path, help="PNG of the first model's scans")
     parser.add_argument(
-        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+        "--intervals",
+        type=int,
+        default=200,
+        help="resamples for 95 %% intervals; 0 = none",
     )
     parser.add_argument("--dump", type=Path, help="JSON of the counts")
     given = parser.parse_args()
@@ -99,30 +113,50 @@ def main() -> None:
 def report(given: argparse.Namespace, folder: Path) -> None:
     """Print the tables; images of the town go to a folder."""
     town = Town(
-        given.seed, "hdl64e_lasers", given.count * STRETCH_FRAMES, interval=2.0, motion=False
+        given.seed,
+        "hdl64e_lasers",
+        given.count * STRETCH_FRAMES,
+        interval=2.0,
+        motion=False,
     )
-    real = [town[i * STRETCH_FRAMES] for i in tqdm(range(given.count), desc="town", unit="scan")]
+    real = [
+        town[i * STRETCH_FRAMES]
+        for i in tqdm(range(given.count), desc="town", unit="scan")
+    ]
     layouts = [layout_of(scan) for scan in real]
     real = with_images(real, town, folder) if needs_images(given.models) else real
-    comparison = Comparison(real, load_judge(), given.intervals) if given.distances else None
-    counts: dict[str, Any] = {"the town's own scans": layout_agreement(real, layouts, real)}
+    comparison = (
+        Comparison(real, load_judge(), given.intervals) if given.distances else None
+    )
+    counts: dict[str, Any] = {
+        "the town's own scans": layout_agreement(real, layouts, real)
+    }
     distances: list[Measured] = []
     for i, text in enumerate(given.models):
         name, model = text.split("=", 1)
         model, _, steps = model.partition(":")
-        kind, scans = generate(model, int(steps) if steps else None, given.guidance, real)
-        counts[name] = layout_agreement(scans, layouts, real) if kind == "layout" else None
+        kind, scans = generate(
+            model, int(steps) if steps else None, given.guidance, real
+        )
+        counts[name] = (
+            layout_agreement(scans, layouts, real) if kind == "layout" else None
+        )
         if comparison is not None:
             distances.append(comparison.measure(name, scans))
         if i == 0 and given.picture:
             apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
-            draw(given.picture, *([some[k] for k in apart] for some in (scans, real, layouts)))
+            draw(
+                given.picture,
+                *([some[k] for k in apart] for some in (scans, real, layouts)),
+            )
     print(f"{given.count} layouts of the town of seed {given.seed}\n")
     print(
         "| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, %",
         end=" ",
     )
-    print("| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |")
+    print(
+        "| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |"
+    )
     print(
         "|---|---:|---:|---:|---:|---:|---:|\n"
         + "\n".join(line(name, found) for name, found in counts.items())
@@ -132,7 +166,8 @@ def report(given: argparse.Namespace, folder: Path) -> None:
     if given.dump:
         given.dump.write_text(
             json.dumps(
-                {name: found and found._asdict() for name, found in counts.items()}, indent=1
+                {name: found and found._asdict() for name, found in counts.items()},
+                indent=1,
             )
         )
 

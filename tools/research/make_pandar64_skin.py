@@ -26,9 +26,7 @@ LICENCE = (
     "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of "
     "their names or marks beyond attribution; no attempt to identify persons"
 )
-SOURCE = (
-    "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
-)
+SOURCE = "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
 
 
 def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:
@@ -87,7 +85,9 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
     rng = np.random.default_rng(0)
 
     def domain(scans: list[Scan], step: float, centred: bool) -> Domain:
-        return Domain.of([returns_of(scan, sensor, step, rng, centred) for scan in scans])
+        return Domain.of(
+            [returns_of(scan, sensor, step, rng, centred) for scan in scans]
+        )
 
     real = domain(frames(folder, sensor, FIRST_MEASURED, 99), 1 / 255, True)
     count = streets * STRETCH_FRAMES
@@ -106,9 +106,13 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
         "points |"
     )
     print("|---|---:|---:|---:|---:|")
-    rows = {"frames 00 to 30": domain(frames(folder, sensor, 0, LAST_LEARNT), 1 / 255, True)}
+    rows = {
+        "frames 00 to 30": domain(frames(folder, sensor, 0, LAST_LEARNT), 1 / 255, True)
+    }
     for name, (town, step, centred) in towns.items():
-        rows[name] = domain([town[k * STRETCH_FRAMES + 7] for k in range(streets)], step, centred)
+        rows[name] = domain(
+            [town[k * STRETCH_FRAMES + 7] for k in range(streets)], step, centred
+        )
     for name, found in rows.items():
         a, b, c = distances(real, found)
         points = np.mean([len(s.bright) for s in found.scans])
@@ -122,13 +126,17 @@ def main() -> None:
     )
     parser.add_argument("frames", type=Path)
     parser.add_argument("--measure", action="store_true")
-    parser.add_argument("--streets", type=int, default=12, help="of the town that is measured")
+    parser.add_argument(
+        "--streets", type=int, default=12, help="of the town that is measured"
+    )
     given = parser.parse_args()
     sensor = load_sensor("pandar64")
     if given.measure:
         measure(given.frames, sensor, given.streets, seed=7)
         return
-    fit_skin(frames(given.frames, sensor, 0, LAST_LEARNT), licence=LICENCE, source=SOURCE).save(OUT)
+    fit_skin(
+        frames(given.frames, sensor, 0, LAST_LEARNT), licence=LICENCE, source=SOURCE
+    ).save(OUT)
 
 
 if __name__ == "__main__":

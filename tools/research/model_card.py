@@ -47,7 +47,12 @@ from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.evaluate import Metric, Score, bootstrap
-from lidar_synth.lab.evaluate.segmentation import Judge, class_ious, load_judge, mean_iou
+from lidar_synth.lab.evaluate.segmentation import (
+    Judge,
+    class_ious,
+    load_judge,
+    mean_iou,
+)
 from lidar_synth.lab.evaluate.statistics import Counts, Statistic
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.noise import uniform
@@ -58,7 +63,17 @@ OTHER = 2
 """Seeds of the two towns that generated scans are compared with."""
 SEED = 1
 """Seed of the noise."""
-CLASSES = ("road", "sidewalk", "terrain", "car", "building", "fence", "vegetation", "trunk", "pole")
+CLASSES = (
+    "road",
+    "sidewalk",
+    "terrain",
+    "car",
+    "building",
+    "fence",
+    "vegetation",
+    "trunk",
+    "pole",
+)
 BEND = "bend of walls, %"
 SPAN = 8
 """Columns to either side over which the bend of a wall is measured."""
@@ -70,7 +85,12 @@ class Autoguided(nn.Module):
     """A flow that is autoguided by a weaker one."""
 
     def __init__(
-        self, network: nn.Module, weaker: nn.Module, scale: float, low: float, high: float
+        self,
+        network: nn.Module,
+        weaker: nn.Module,
+        scale: float,
+        low: float,
+        high: float,
     ) -> None:
         super().__init__()
         self.network = network
@@ -82,11 +102,15 @@ class Autoguided(nn.Module):
         return autoguide(self.network, self.weaker, *self.how)(y, t, cond)
 
 
-def generate(model: str, steps: int | None, count: int, weaker: str = "", *how: str) -> list[Scan]:
+def generate(
+    model: str, steps: int | None, count: int, weaker: str = "", *how: str
+) -> list[Scan]:
     """Scans of one model, measured on the town's grid; all models get the same noise."""
     generator = load_generator(model)
     if weaker:
-        guided = Autoguided(generator.network, load_generator(weaker).network, *map(float, how))
+        guided = Autoguided(
+            generator.network, load_generator(weaker).network, *map(float, how)
+        )
         generator = replace(generator, network=guided)
     indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
     return [
@@ -104,7 +128,8 @@ def open_codec(model: str) -> Latent:
     checkpoint = load_checkpoint(find_model(model))
     if CODEC not in checkpoint.networks:
         raise ConfigError(
-            f"{model} without an autoencoder", "the checkpoint of one, or of a latent model"
+            f"{model} without an autoencoder",
+            "the checkpoint of one, or of a latent model",
         )
     return Latent(checkpoint.networks[CODEC].eval(), checkpoint.header.tensors)
 
@@ -114,12 +139,16 @@ def resampled(model: str, scans: Sequence[Scan]) -> list[Scan]:
     predicts."""
     codec = open_codec(model)
     made = []
-    for i, scan in enumerate(tqdm(scans, desc=f"{Path(model).stem}, autoencoder", unit="scan")):
+    for i, scan in enumerate(
+        tqdm(scans, desc=f"{Path(model).stem}, autoencoder", unit="scan")
+    ):
         image = project(scan, channels=["reflectance", "label"])
         noise = uniform(SEED, [i], (codec.draws, *image.sensor.shape), "cpu")
         x = codec.decode(codec.encode(codec.tensors.from_images([image])), noise)
         made.append(
-            replace(unproject(codec.tensors.to_images(x, image.sensor)[0]), domain=SYNTHETIC)
+            replace(
+                unproject(codec.tensors.to_images(x, image.sensor)[0]), domain=SYNTHETIC
+            )
         )
     return made
 
@@ -129,7 +158,8 @@ def town(seed: int, count: int) -> list[Scan]:
     four streets."""
     source = Town(seed, scans=count * STRETCH_FRAMES, interval=1.0)
     return [
-        source[i * STRETCH_FRAMES] for i in tqdm(range(count), desc=f"town {seed}", unit="scan")
+        source[i * STRETCH_FRAMES]
+        for i in tqdm(range(count), desc=f"town {seed}", unit="scan")
     ]
 
 
@@ -186,16 +216,22 @@ class Comparison:
         replicates: resamples for 95 % intervals; 0 = none.
     """
 
-    def __init__(self, scans: Sequence[Scan], judge: Judge, replicates: int = 0) -> None:
+    def __init__(
+        self, scans: Sequence[Scan], judge: Judge, replicates: int = 0
+    ) -> None:
         self._judge = judge
         self._replicates = replicates
         self._count = len(scans)
         own = {"the town segmenter": judge.features}
         more = (Metric(name, replicates=replicates) for name in ("lidm", "general"))
-        self._metrics = [Metric("town", own, replicates=replicates, extended=True), *more]
+        self._metrics = [
+            Metric("town", own, replicates=replicates, extended=True),
+            *more,
+        ]
         for metric in self._metrics:
             metric.update(
-                tqdm(scans, desc=f"reference, {metric.protocol.name}", unit="scan"), real=True
+                tqdm(scans, desc=f"reference, {metric.protocol.name}", unit="scan"),
+                real=True,
             )
 
     def measure(self, name: str, scans: Sequence[Scan]) -> Measured:
@@ -204,11 +240,14 @@ class Comparison:
         for metric in self._metrics:
             metric.reset(real=False)
             metric.update(
-                tqdm(scans, desc=f"{name}, {metric.protocol.name}", unit="scan"), real=False
+                tqdm(scans, desc=f"{name}, {metric.protocol.name}", unit="scan"),
+                real=False,
             )
             # LiDM's distances of features need weights that do not belong to the card.
             own = metric.protocol.name == "town"
-            scores += [s for s in metric.scores() if own or not s.metric.startswith("Frechet")]
+            scores += [
+                s for s in metric.scores() if own or not s.metric.startswith("Frechet")
+            ]
         columns = (*CLASSES, BEND)
         if any(scan.label is None for scan in scans):
             return Measured(name, scores, dict.fromkeys(columns, float("nan")))
@@ -216,17 +255,25 @@ class Comparison:
         ious = 100 * class_ious(tables.sum(0))
         values = [ious[TRAIN_ID[one]] for one in CLASSES] + [100 * bend(scans)]
         agreement = _agreement(tables, self._count, self._replicates)
-        return Measured(name, [*scores, agreement], dict(zip(columns, values, strict=True)))
+        return Measured(
+            name, [*scores, agreement], dict(zip(columns, values, strict=True))
+        )
 
 
 def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
     """The mIoU of (N, 19, 19) confusions, one per scan."""
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
-        return np.array([100 * mean_iou(np.tensordot(counts, tables, 1)) for counts in b])
+        return np.array(
+            [100 * mean_iou(np.tensordot(counts, tables, 1)) for counts in b]
+        )
 
     statistic = Statistic(at, (real, len(tables)))
-    interval = bootstrap(statistic, replicates, smallest=0, largest=100) if replicates else None
+    interval = (
+        bootstrap(statistic, replicates, smallest=0, largest=100)
+        if replicates
+        else None
+    )
     low, high = interval or (None, None)
     return Score(
         "mIoU with the town segmenter, %",
@@ -242,7 +289,9 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
 def table(sets: Sequence[Measured]) -> str:
     """Figures as rows, sets as columns; then IoU between the labels and the segmenter's prediction
     by class, and the bend of walls."""
-    titles = list(dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores))
+    titles = list(
+        dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores)
+    )
     lines = [
         f"| figure | {' | '.join(escape_markdown(one.name) for one in sets)} |",
         f"|---|{'---:|' * len(sets)}",
@@ -263,7 +312,8 @@ def table(sets: Sequence[Measured]) -> str:
     ]
     for one in sets:
         values = [
-            f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}" for c in columns
+            f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}"
+            for c in columns
         ]
         lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
     return "\n".join(lines)
@@ -278,7 +328,9 @@ def bend(scans: Sequence[Scan]) -> float:
         image = project(scan, scan.sensor, ["label"])
         wall = image.mask & (image.channels["label"] == TRAIN_ID["building"])
         near = np.divide(1, image.range, where=wall, out=np.zeros_like(image.range))
-        inside = np.logical_and.reduce([np.roll(wall, k, 1) for k in range(-SPAN, SPAN + 1)])
+        inside = np.logical_and.reduce(
+            [np.roll(wall, k, 1) for k in range(-SPAN, SPAN + 1)]
+        )
         second = np.roll(near, SPAN, 1) - 2 * near + np.roll(near, -SPAN, 1)
         found.append(np.abs(second[inside]) / near[inside])
     return float(np.median(np.concatenate(found)))
@@ -307,16 +359,18 @@ def shrink(path: Path) -> None:
     )
     # Few cells are cars or poles: a palette by number of pixels would lose their colours, a palette
     # by coverage alone those of the background.
-    image.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
+    image.quantize(
+        256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
+    ).save(path, optimize=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]")
+    parser.add_argument(
+        "models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]"
+    )
     parser.add_argument("--count", type=int, default=512, help="scans in each row")
     parser.add_argument(
         "--real",
@@ -326,10 +380,15 @@ def main() -> None:
         help="folders of scans instead of two towns",
     )
     parser.add_argument(
-        "--intervals", type=int, default=200, help="resamples for 95 %% intervals; 0 = none"
+        "--intervals",
+        type=int,
+        default=200,
+        help="resamples for 95 %% intervals; 0 = none",
     )
     parser.add_argument(
-        "--pictures", type=Path, help="folder for sheets of the first model and of the town"
+        "--pictures",
+        type=Path,
+        help="folder for sheets of the first model and of the town",
     )
     given = parser.parse_args()
 
@@ -341,7 +400,9 @@ def main() -> None:
 
     def add(name: str, scans: Sequence[Scan]) -> None:
         sets.append(comparison.measure(name, scans))
-        print("\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True)
+        print(
+            "\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True
+        )
 
     comparison = Comparison(real(0), load_judge(), given.intervals)
     sets: list[Measured] = []
@@ -351,7 +412,9 @@ def main() -> None:
         if steps == "0":
             scans = resampled(model, real(1))
         else:
-            scans = generate(model, int(steps) if steps else None, given.count, *guidance)
+            scans = generate(
+                model, int(steps) if steps else None, given.count, *guidance
+            )
         add(name, scans)
         if i == 0 and given.pictures:
             apart = np.linspace(0, len(real(0)) - 1, TILES).astype(int)

@@ -26,18 +26,26 @@ CONFIGS = ("frnet_semantickitti.py", "minkunet_semantickitti.py")
 """Of configs/mmdet3d: FRNet with FrustumMix, MinkUNet with LaserMix and PolarMix."""
 
 
-def write(root: Path, bank: str, out: Path, share: float, order: str, ratio: float) -> list[Path]:
+def write(
+    root: Path, bank: str, out: Path, share: float, order: str, ratio: float
+) -> list[Path]:
     """Write the real and the mixed list; returns their paths."""
     listed = semantic_kitti_list(root, out / "labelled.json", share=share, order=order)
     mixed = write_infos(
-        out / "mixed", listed, {"synthetic": bank, "ratio": ratio, "seed": 0}, data_root=root
+        out / "mixed",
+        listed,
+        {"synthetic": bank, "ratio": ratio, "seed": 0},
+        data_root=root,
     )
     values = json.loads(listed.read_text())
     values["data_list"] *= round(1 / (1 - ratio))
     repeated = out / "repeated.json"
     repeated.write_text(json.dumps(values))
     real = write_infos(
-        out / "real", repeated, {"synthetic": bank, "ratio": 0.0, "seed": 0}, data_root=root
+        out / "real",
+        repeated,
+        {"synthetic": bank, "ratio": 0.0, "seed": 0},
+        data_root=root,
     )
     return [real, mixed]
 
@@ -50,15 +58,25 @@ def main() -> None:
     parser.add_argument("bank")
     parser.add_argument("out", type=Path)
     parser.add_argument(
-        "--share", type=float, nargs="+", default=[1, 10, 20], help="per cent of the scans"
+        "--share",
+        type=float,
+        nargs="+",
+        default=[1, 10, 20],
+        help="per cent of the scans",
     )
     parser.add_argument("--order", nargs="+", choices=ORDERS, default=list(ORDERS))
     parser.add_argument(
-        "--ratio", type=float, default=0.5, help="share of synthetic scans: 1/2, 2/3 or 3/4"
+        "--ratio",
+        type=float,
+        default=0.5,
+        help="share of synthetic scans: 1/2, 2/3 or 3/4",
     )
     given = parser.parse_args()
 
-    if not 0 < given.ratio < 1 or abs(1 / (1 - given.ratio) - round(1 / (1 - given.ratio))) > 0.03:
+    if (
+        not 0 < given.ratio < 1
+        or abs(1 / (1 - given.ratio) - round(1 / (1 - given.ratio))) > 0.03
+    ):
         raise ConfigError(
             f"ratio {given.ratio}",
             "0.5, 0.667 or 0.75, with which real scans occur a whole number of times",

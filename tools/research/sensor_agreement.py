@@ -22,11 +22,13 @@ from lidar_synth.geometry.agreement import MOST_OUTSIDE, Agreement, agreement
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import Town
 
-REAL, LABELLED = (Path(os.environ[f"LIDAR_SYNTH_{name}_SCANS"]) for name in ("REAL", "LABELLED"))
+REAL, LABELLED = (
+    Path(os.environ[f"LIDAR_SYNTH_{name}_SCANS"]) for name in ("REAL", "LABELLED")
+)
 
-TABLE = np.loadtxt(LABELLED / "pandaset" / "pandar64_elevations.csv", delimiter=",", skiprows=1)[
-    :, 1
-]
+TABLE = np.loadtxt(
+    LABELLED / "pandaset" / "pandar64_elevations.csv", delimiter=",", skiprows=1
+)[:, 1]
 HDL64 = "HDL-64E"
 OWN = "its own sensor"
 SENSORS = {
@@ -35,7 +37,11 @@ SENSORS = {
     "OS1-128": load_sensor("os1_128"),
     "Pandar64": Sensor("pandar64", 1800, 0.3, 200.0, elevations=tuple(TABLE)),
     "VLP-16": Sensor(
-        "vlp16", 1800, 0.5, 100.0, elevations=tuple(float(e) for e in range(15, -16, -2))
+        "vlp16",
+        1800,
+        0.5,
+        100.0,
+        elevations=tuple(float(e) for e in range(15, -16, -2)),
     ),
 }
 SHARES = ("outside", "gaps", "unused", "between")
@@ -48,19 +54,30 @@ def scans() -> Iterator[tuple[str, NDArray[np.float32], Sensor]]:
         KITTIObject(REAL / "kitti_object"),
         KITTIRaw(REAL / "kitti_raw"),
     ):
-        yield from (("KITTI, KITTI-360 (HDL-64E)", scan.points, scan.sensor) for scan in source)
+        yield from (
+            ("KITTI, KITTI-360 (HDL-64E)", scan.points, scan.sensor) for scan in source
+        )
     for root in (REAL, LABELLED):
         for scan in SemanticKITTI(root / "semantic_kitti"):
             yield "SemanticKITTI (HDL-64E, compensated)", scan.points, scan.sensor
     yield from (
-        ("nuScenes (HDL-32E)", scan.points, scan.sensor) for scan in NuScenes(REAL / "nuscenes")
+        ("nuScenes (HDL-32E)", scan.points, scan.sensor)
+        for scan in NuScenes(REAL / "nuscenes")
     )
     for path in sorted((LABELLED / "pandaset" / "sensor_frame").glob("*.npz")):
-        yield "PandaSet (Pandar64)", np.load(path)["points"].astype(np.float32), SENSORS["Pandar64"]
-    yield from (("town (OS1-128)", scan.points, scan.sensor) for scan in Town(0, "os1_128", 4))
+        yield (
+            "PandaSet (Pandar64)",
+            np.load(path)["points"].astype(np.float32),
+            SENSORS["Pandar64"],
+        )
+    yield from (
+        ("town (OS1-128)", scan.points, scan.sensor) for scan in Town(0, "os1_128", 4)
+    )
     for scan in KITTI360(REAL / "kitti360"):
         beams = np.sort(scan.sensor.laser_elevations)
-        elevation = np.arctan2(scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1]))
+        elevation = np.arctan2(
+            scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])
+        )
         number = np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation)
         yield "every 4th beam of an HDL-64E", scan.points[number % 4 == 0], scan.sensor
         yield (
@@ -80,7 +97,9 @@ def verdicts(found: list[tuple[Agreement, Sensor]]) -> str:
         else "accepted"
         for shares, sensor in found
     ]
-    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(sorted(kinds)))
+    return ", ".join(
+        f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(sorted(kinds))
+    )
 
 
 def main() -> None:
@@ -99,13 +118,17 @@ def main() -> None:
         f"|\n|---|---|{'---|' * len(SHARES)}---|"
     )
     for (name, claimed), pairs in found.items():
-        values = np.array([[getattr(shares, share) for share in SHARES] for shares, _ in pairs])
+        values = np.array(
+            [[getattr(shares, share) for share in SHARES] for shares, _ in pairs]
+        )
         cells = [
             f"{low:.2f} to {high:.2f}"
             for low, high in zip(values.min(0), values.max(0), strict=True)
         ]
         print(f"| {name} | {claimed} | {' | '.join(cells)} | {verdicts(pairs)} |")
-    print(f"\n{1000 * np.median(seconds):.1f} ms per comparison (median of {len(seconds)})")
+    print(
+        f"\n{1000 * np.median(seconds):.1f} ms per comparison (median of {len(seconds)})"
+    )
 
 
 if __name__ == "__main__":

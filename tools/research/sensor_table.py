@@ -25,14 +25,22 @@ SENSOR = load_sensor("town")
 FRAMES = (0, 20, 40, 60, 70)
 
 
-def pandar(labelled: Path, frames: Sequence[int] = FRAMES, rings: int = 1) -> list[Scan]:
+def pandar(
+    labelled: Path, frames: Sequence[int] = FRAMES, rings: int = 1
+) -> list[Scan]:
     """Frames of the Pandar64 without rings, or every so many rings of them."""
     scans = []
     for frame in frames:
         with np.load(labelled / f"pandaset/sensor_frame/{frame:02d}.npz") as file:
             kept = file["ring"] % rings == 0
             reflectance = file["reflectance"].astype(np.float32) / 255
-            scan = Scan(file["points"], reflectance, SENSOR, time=file["time"], id=f"{frame:02d}")
+            scan = Scan(
+                file["points"],
+                reflectance,
+                SENSOR,
+                time=file["time"],
+                id=f"{frame:02d}",
+            )
         scans.append(scan[kept])
     return scans
 
@@ -41,7 +49,8 @@ def raw(files: Sequence[Path]) -> list[Scan]:
     """Scans of KITTI's order of points."""
     points = [read_points(path) for path in files]
     return [
-        Scan(p[:, :3], p[:, 3], SENSOR, id=path.stem) for p, path in zip(points, files, strict=True)
+        Scan(p[:, :3], p[:, 3], SENSOR, id=path.stem)
+        for p, path in zip(points, files, strict=True)
     ]
 
 
@@ -60,7 +69,9 @@ def largest_error(fit: SensorFit, table: Sequence[float]) -> float:
     return float(np.abs(found - np.asarray(table)).max())
 
 
-def row(name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None) -> SensorFit:
+def row(
+    name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None
+) -> SensorFit:
     """Fit, and print a line of the table."""
     scans = make()
     start = time.process_time()
@@ -86,16 +97,20 @@ def main() -> None:
     given = parser.parse_args()
     real = given.real
     labelled = given.labelled
-    hesai = np.loadtxt(labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1)[
-        :, 1
-    ].tolist()
+    hesai = np.loadtxt(
+        labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1
+    )[:, 1].tolist()
     print(
         "| scans | frames | beams | error (degrees) | within 0.05 | firings | offsets by | range "
         "step | seconds |"
     )
     print("|---|---:|---:|---:|---:|---:|---|---:|---:|")
     row("Pandar64 (PandaSet), sensor frame", lambda: pandar(labelled), hesai)
-    row("the same without times", lambda: [replace(s, time=None) for s in pandar(labelled)], hesai)
+    row(
+        "the same without times",
+        lambda: [replace(s, time=None) for s in pandar(labelled)],
+        hesai,
+    )
     row(
         "the same, forward quarter",
         lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in pandar(labelled)],
@@ -105,13 +120,19 @@ def main() -> None:
     tables: dict[str, Sequence[float]] = {}
     for name, files in {
         "KITTI-360": sorted((real / "kitti360").rglob("*.bin")),
-        "KITTI": sorted((real / "kitti_object" / "training" / "velodyne").glob("*.bin")),
+        "KITTI": sorted(
+            (real / "kitti_object" / "training" / "velodyne").glob("*.bin")
+        ),
         "SemanticKITTI": sorted((labelled / "semantic_kitti").rglob("*.bin")),
     }.items():
-        first = row(f"HDL-64E ({name}), even frames", lambda files=files: raw(files[::2]), None)  # type: ignore[misc]
+        first = row(
+            f"HDL-64E ({name}), even frames", lambda files=files: raw(files[::2]), None
+        )  # type: ignore[misc]
         table = first.sensor.elevations or ()
         tables[name] = table
-        row(f"HDL-64E ({name}), odd frames", lambda files=files: raw(files[1::2]), table)  # type: ignore[misc]
+        row(
+            f"HDL-64E ({name}), odd frames", lambda files=files: raw(files[1::2]), table
+        )  # type: ignore[misc]
     row(
         "HDL-64E (KITTI-360), points shuffled",
         lambda: without_rings(raw(sorted((real / "kitti360").rglob("*.bin"))[:5])),

@@ -61,12 +61,18 @@ def cars_of(scan: Scan) -> list[Boxes]:
         ]
     else:
         found = [
-            scan.boxes[[i]] for i, name in enumerate(scan.boxes.names) if name in ("Car", "Van")
+            scan.boxes[[i]]
+            for i, name in enumerate(scan.boxes.names)
+            if name in ("Car", "Van")
         ]
-    return [b for b in found if b is not None and NEAR < np.hypot(*b.values[0, :2]) < FAR]
+    return [
+        b for b in found if b is not None and NEAR < np.hypot(*b.values[0, :2]) < FAR
+    ]
 
 
-def control(scan: Scan, box: Boxes, rng: np.random.Generator) -> NDArray[np.float32] | None:
+def control(
+    scan: Scan, box: Boxes, rng: np.random.Generator
+) -> NDArray[np.float32] | None:
     """The box at a free place at the same distance, that with the most similar surroundings, or
     None."""
     best = None
@@ -103,7 +109,10 @@ class Emptied(Town):
         kept = ~np.isin(world.surfaces.instance[world.faces], self._gone)
         movers = [mover for mover in world.movers if mover.instance not in self._gone]
         return replace(
-            world, triangles=world.triangles[kept], faces=world.faces[kept], movers=movers
+            world,
+            triangles=world.triangles[kept],
+            faces=world.faces[kept],
+            movers=movers,
         )
 
 
@@ -139,7 +148,9 @@ def places_of(scan: Scan, anywhere: bool, number: int) -> list[Place]:
     return found[:MOST]
 
 
-def fidelity(scan: Scan, places: list[Place], result: Scan, truth: Scan) -> NDArray[np.float64]:
+def fidelity(
+    scan: Scan, places: list[Place], result: Scan, truth: Scan
+) -> NDArray[np.float64]:
     """(n, 3) for each cell of the holes: whether the edited scan and the truth agree on having a
     return; and, nan without both returns, whether they are at the same range (to 0.3 m or 3 %) and
     of the same class."""
@@ -152,7 +163,12 @@ def fidelity(scan: Scan, places: list[Place], result: Scan, truth: Scan) -> NDAr
     both = (a > 0) & (c > 0)
     near = np.abs(a - c) < np.maximum(0.3, 0.03 * c)
     return np.stack(
-        [(a > 0) == (c > 0), np.where(both, near, np.nan), np.where(both, b == d, np.nan)], 1
+        [
+            (a > 0) == (c > 0),
+            np.where(both, near, np.nan),
+            np.where(both, b == d, np.nan),
+        ],
+        1,
     )
 
 
@@ -162,7 +178,10 @@ def surroundings(scan: Scan, box: Boxes) -> NDArray[np.float64]:
     if scan.label is None:
         return np.zeros(20)
     inner, outer = (
-        Boxes(box.values + np.array([0, 0, 0, 2 * m, 2 * m, 2 * m, 0], np.float32), box.names)
+        Boxes(
+            box.values + np.array([0, 0, 0, 2 * m, 2 * m, 2 * m, 0], np.float32),
+            box.names,
+        )
         for m in (0.1, 2.5)
     )
     around = outer.contain(scan.points)[0] & ~inner.contain(scan.points)[0]
@@ -191,13 +210,17 @@ def patch(scan: Scan, box: NDArray[np.float32]) -> NDArray[np.float32]:
         .clip(0, rows - 1)
     )
     at = np.ix_(down, column)
-    count = np.bincount(cells[cells >= 0], minlength=rows * columns).reshape(rows, columns)
+    count = np.bincount(cells[cells >= 0], minlength=rows * columns).reshape(
+        rows, columns
+    )
     seen = image.range[at] > 0
     relative = np.where(
         seen, np.log(np.maximum(image.range[at], 0.1) / np.hypot(*box[:2])), 0
     ).clip(-1.5, 1.5)
     assert image.reflectance is not None
-    return np.stack([relative, image.reflectance[at], seen, count[at] / 2]).astype(np.float32)
+    return np.stack([relative, image.reflectance[at], seen, count[at] / 2]).astype(
+        np.float32
+    )
 
 
 def edits(model: Generator | None, starts: list[float]) -> dict[str, object]:
@@ -206,11 +229,16 @@ def edits(model: Generator | None, starts: list[float]) -> dict[str, object]:
     def hole(scan: Scan, parts: list, number: int) -> Scan:
         return scan[~np.any([mine for mine, _ in parts], 0)]
 
-    def filled(scan: Scan, parts: list, number: int, start: float | None = None) -> Scan:
-        return remove_returns(scan, parts, None if start is None else model, number, start)
+    def filled(
+        scan: Scan, parts: list, number: int, start: float | None = None
+    ) -> Scan:
+        return remove_returns(
+            scan, parts, None if start is None else model, number, start
+        )
 
     return {"hole left open": hole, "filled by geometry": filled} | {
-        f"drawn by the flow from t = {start}": partial(filled, start=start) for start in starts
+        f"drawn by the flow from t = {start}": partial(filled, start=start)
+        for start in starts
     }
 
 
@@ -218,7 +246,11 @@ def collect(source: Source, ways: dict) -> Collected:
     """All places of a source; those of the town have their controls in the scan that it casts
     without the cars."""
     found = Collected(
-        {name: [] for name in ways}, [], [], dict.fromkeys(ways, 0.0), {n: [] for n in ways}
+        {name: [] for name in ways},
+        [],
+        [],
+        dict.fromkeys(ways, 0.0),
+        {n: [] for n in ways},
     )
     number = 0
     for i in tqdm(range(len(source)), leave=False, disable=None):
@@ -230,7 +262,8 @@ def collect(source: Source, ways: dict) -> Collected:
         if isinstance(source, Town):
             assert scan.instance is not None
             truth = Emptied(
-                source, [int(np.bincount(scan.instance[p.mine]).argmax()) for p in places]
+                source,
+                [int(np.bincount(scan.instance[p.mine]).argmax()) for p in places],
             )[i]
         for name, way in ways.items():
             before = time.perf_counter()
@@ -251,16 +284,21 @@ def auc(edited: list, controls: list, groups: list, epochs: int, seed: int) -> f
     """Area under the ROC curve on unseen scans, all folds together."""
     x = torch.from_numpy(np.stack(edited + controls))
     y = torch.tensor([1.0] * len(edited) + [0.0] * len(controls))
-    fold = torch.from_numpy(keyed_rng(1).permutation(max(groups) + 1)[np.array(groups * 2)] % FOLDS)
+    fold = torch.from_numpy(
+        keyed_rng(1).permutation(max(groups) + 1)[np.array(groups * 2)] % FOLDS
+    )
     scores = torch.zeros(len(y))
     for k in range(FOLDS):
-        scores[fold == k] = _scores(x[fold != k], y[fold != k], x[fold == k], epochs, seed)
+        scores[fold == k] = _scores(
+            x[fold != k], y[fold != k], x[fold == k], epochs, seed
+        )
     order = scores.argsort()
     rank = torch.empty(len(y))
     rank[order] = torch.arange(1.0, len(y) + 1)
     positive = y.sum()
     return float(
-        (rank[y == 1].sum() - positive * (positive + 1) / 2) / (positive * (len(y) - positive))
+        (rank[y == 1].sum() - positive * (positive + 1) / 2)
+        / (positive * (len(y) - positive))
     )
 
 
@@ -297,7 +335,9 @@ def _scores(
     for _ in range(epochs):
         for part in torch.randperm(len(x)).split(32):
             batch = x[part] if torch.rand(()) < 0.5 else x[part].flip(-1)
-            loss = nn.functional.binary_cross_entropy_with_logits(net(batch)[:, 0], y[part])
+            loss = nn.functional.binary_cross_entropy_with_logits(
+                net(batch)[:, 0], y[part]
+            )
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -313,12 +353,18 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--town", type=int, default=0, help="scans of the town")
-    parser.add_argument("--labelled", nargs="*", default=[], help="SemanticKITTI's folders")
-    parser.add_argument("--boxed", nargs="*", default=[], help="folders of KITTI's object set")
+    parser.add_argument(
+        "--labelled", nargs="*", default=[], help="SemanticKITTI's folders"
+    )
+    parser.add_argument(
+        "--boxed", nargs="*", default=[], help="folders of KITTI's object set"
+    )
     parser.add_argument("--model", default="town")
     parser.add_argument("--starts", type=float, nargs="*", default=[0.6])
     parser.add_argument("--epochs", type=int, default=25)
-    parser.add_argument("--save", help="beginning of the names of files for the patches")
+    parser.add_argument(
+        "--save", help="beginning of the names of files for the patches"
+    )
     parser.add_argument("--seeds", type=int, default=3)
     arguments = parser.parse_args()
     ways = edits(load_generator(arguments.model), arguments.starts)
@@ -339,16 +385,26 @@ def main() -> None:
         print(f"{name}: {len(found.controls)} cars in {max(found.groups) + 1} scans")
 
         def show(
-            name: str, edited: list, controls: list, more: str, groups: list[int] = found.groups
+            name: str,
+            edited: list,
+            controls: list,
+            more: str,
+            groups: list[int] = found.groups,
         ) -> None:
             values = [
                 auc(edited, controls, groups, arguments.epochs, seed)
                 for seed in range(arguments.seeds)
             ]
-            print(f"  {name:<36} AUC {np.mean(values):.3f} +- {np.std(values):.3f}{more}")
+            print(
+                f"  {name:<36} AUC {np.mean(values):.3f} +- {np.std(values):.3f}{more}"
+            )
 
         around = found.edited["filled by geometry"], found.controls
-        show("surroundings alone", *(surroundings_alone(patches) for patches in around), more="")
+        show(
+            "surroundings alone",
+            *(surroundings_alone(patches) for patches in around),
+            more="",
+        )
         for way, patches in found.edited.items():
             show(
                 way,

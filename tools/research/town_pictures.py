@@ -49,9 +49,15 @@ def from_above(town: Town, index: int) -> np.ndarray:
         (np.arange(2 * height) + 0.5) / width - height / width,
     )
     rays = ahead + 0.62 * (x[..., None] * right - y[..., None] * np.cross(right, ahead))
-    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
+    rays = (
+        (rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        .reshape(-1, 3)
+        .astype(np.float32)
+    )
     light = sample_light(rng_for(LIGHT, town.seed, index // STRETCH_FRAMES))
-    image, _ = shade(snapshot, eye.astype(np.float32), rays, town.world(index).surfaces, light)
+    image, _ = shade(
+        snapshot, eye.astype(np.float32), rays, town.world(index).surfaces, light
+    )
     linear = np.minimum(image, 1.2).reshape(height, 2, width, 2, 3).mean((1, 3))
     return tone_map(linear * float(0.23 / np.median(linear.mean(-1))))
 
@@ -63,7 +69,9 @@ def save(path: Path, pixels: np.ndarray, width: int, colours: int) -> None:
         (width, round(image.height * width / image.width)), Image.Resampling.LANCZOS
     )
     image.quantize(
-        colours, Image.Quantize.FASTOCTREE if colours > 128 else None, dither=Image.Dither.NONE
+        colours,
+        Image.Quantize.FASTOCTREE if colours > 128 else None,
+        dither=Image.Dither.NONE,
     ).save(path, optimize=True)
 
 

@@ -56,9 +56,9 @@ def statistics(scan: Scan) -> dict[str, float]:
     distance = np.linalg.norm(scan.points, axis=1)
     assert sensor.firings is not None
     rings = (
-        np.bincount(ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64)[
-            :64
-        ]
+        np.bincount(
+            ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64
+        )[:64]
         / sensor.firings
     )
     figures = {"points": float(len(scan)), "cells filled of 65,536": filled.sum()}
@@ -127,7 +127,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--scans", type=int, default=120, help="scans of the town, spread over stretches"
+        "--scans",
+        type=int,
+        default=120,
+        help="scans of the town, spread over stretches",
     )
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -145,7 +148,9 @@ def main() -> None:
         sides["real"] = gather(scans, len(scans), "KITTI-360")  # type: ignore[arg-type]
     print(
         "| figure | "
-        + " | ".join(f"{name} ({len(next(iter(s.values())))} scans)" for name, s in sides.items())
+        + " | ".join(
+            f"{name} ({len(next(iter(s.values())))} scans)" for name, s in sides.items()
+        )
         + (" | real, lowest to highest | town / real |" if folder else " |")
     )
     print("| --- |" + " ---: |" * (len(sides) + 2 * bool(folder)))

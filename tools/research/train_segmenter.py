@@ -30,7 +30,12 @@ def town(seed: int, count: int) -> list[Scan]:
 
 
 def fit(
-    train: MixedScans, validation: Source, steps: int, batch: int, workers: int, seed: int
+    train: MixedScans,
+    validation: Source,
+    steps: int,
+    batch: int,
+    workers: int,
+    seed: int,
 ) -> tuple[Judge, np.ndarray]:
     """A trained segmenter and its confusion matrix on held-out scans."""
     torch.manual_seed(seed)
@@ -39,7 +44,9 @@ def fit(
     network = RangeSegmenter()
     train_segmenter(network, endless_batches(train, batch, workers), height, steps)
     held_out = MixedScans(validation, ratio=0, collate="range")
-    loader = DataLoader(held_out, batch, collate_fn=held_out.collate, num_workers=workers)
+    loader = DataLoader(
+        held_out, batch, collate_fn=held_out.collate, num_workers=workers
+    )
     table = confusion(network, tqdm(loader, desc="held out"), height)
     return Judge(network, sensor, {}), table
 
@@ -48,12 +55,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("root", nargs="?", help="a labelled dataset [default: the town]")
+    parser.add_argument(
+        "root", nargs="?", help="a labelled dataset [default: the town]"
+    )
     parser.add_argument("--split", default="train")
     parser.add_argument("--val-split", default="val")
     parser.add_argument("--scans", type=int, default=400, help="scans of the town")
-    parser.add_argument("--held-out", type=int, default=200, help="held-out scans, of another town")
-    parser.add_argument("--ratio", type=float, default=0.0, help="share of synthetic scans")
+    parser.add_argument(
+        "--held-out", type=int, default=200, help="held-out scans, of another town"
+    )
+    parser.add_argument(
+        "--ratio", type=float, default=0.0, help="share of synthetic scans"
+    )
     parser.add_argument("--model", default="town", help="model of the synthetic scans")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--batch", type=int, default=4)
@@ -78,7 +91,9 @@ def main() -> None:
         balanced=True,
         collate="range",
     )
-    judge, table = fit(train, validation, given.steps, given.batch, given.workers, given.seed)
+    judge, table = fit(
+        train, validation, given.steps, given.batch, given.workers, given.seed
+    )
     for name, iou in zip(NAMES, class_ious(table), strict=True):
         print(f"{name:>16} {100 * iou:6.1f}")
     print(f"{'mIoU':>16} {100 * mean_iou(table):6.1f}")

@@ -28,15 +28,23 @@ def knn_query(
         (M, K) int32 indices into ``xyz``, -1 where a sample has fewer points, and their distances.
     """
     new_xyz, new_offset = (
-        (xyz, offset) if new_xyz is None or new_offset is None else (new_xyz, new_offset)
+        (xyz, offset)
+        if new_xyz is None or new_offset is None
+        else (new_xyz, new_offset)
     )
-    index = torch.full((len(new_xyz), nsample), -1, dtype=torch.int32, device=xyz.device)
+    index = torch.full(
+        (len(new_xyz), nsample), -1, dtype=torch.int32, device=xyz.device
+    )
     distance = torch.full((len(new_xyz), nsample), 1e5, device=xyz.device)
     ends, new_ends = ([0, *each.tolist()] for each in (offset, new_offset))
-    for start, end, first, last in zip(ends, ends[1:], new_ends, new_ends[1:], strict=False):
+    for start, end, first, last in zip(
+        ends, ends[1:], new_ends, new_ends[1:], strict=False
+    ):
         count = min(nsample, end - start)
         for chunk in torch.split(torch.arange(first, last, device=xyz.device), 4096):
-            near = torch.cdist(new_xyz[chunk], xyz[start:end]).topk(count, largest=False)
+            near = torch.cdist(new_xyz[chunk], xyz[start:end]).topk(
+                count, largest=False
+            )
             index[chunk, :count], distance[chunk, :count] = (
                 (near.indices + start).int(),
                 near.values,

@@ -9,27 +9,41 @@ from torch import Tensor
 
 
 def scatter_max(
-    src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
+    src: Tensor,
+    index: Tensor,
+    dim: int = -1,
+    out: None = None,
+    dim_size: int | None = None,
 ) -> list[Tensor]:
     """The largest value for each index, and None for its position; gradients flow to the value."""
     return [_reduce(src, index, dim, dim_size, "amax")]
 
 
 def scatter_mean(
-    src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
+    src: Tensor,
+    index: Tensor,
+    dim: int = -1,
+    out: None = None,
+    dim_size: int | None = None,
 ) -> Tensor:
     """The mean of the values for each index; 0 for an index without values."""
     return _reduce(src, index, dim, dim_size, "mean")
 
 
 def segment_coo(
-    src: Tensor, index: Tensor, out: None = None, dim_size: int | None = None, reduce: str = "sum"
+    src: Tensor,
+    index: Tensor,
+    out: None = None,
+    dim_size: int | None = None,
+    reduce: str = "sum",
 ) -> Tensor:
     """Reduce rows that belong to the same segment; ``index`` (N,) is sorted."""
     return _reduce(src, index, 0, dim_size, KINDS[reduce])
 
 
-def segment_csr(src: Tensor, indptr: Tensor, out: None = None, reduce: str = "sum") -> Tensor:
+def segment_csr(
+    src: Tensor, indptr: Tensor, out: None = None, reduce: str = "sum"
+) -> Tensor:
     """Reduce rows of consecutive segments; segment i has the rows from ``indptr[i]`` to ``indptr[i
     + 1]``."""
     lengths = indptr.diff()
@@ -42,7 +56,11 @@ KINDS = {"sum": "sum", "add": "sum", "mean": "mean", "min": "amin", "max": "amax
 
 
 def scatter_min(
-    src: Tensor, index: Tensor, dim: int = -1, out: None = None, dim_size: int | None = None
+    src: Tensor,
+    index: Tensor,
+    dim: int = -1,
+    out: None = None,
+    dim_size: int | None = None,
 ) -> tuple[Tensor, None]:
     """The smallest value for each index, and None for its position."""
     return _reduce(src, index, dim, dim_size, "amin"), None

@@ -31,7 +31,10 @@ def rows(trial: Trial) -> Iterator[Row]:
 def one(trial: Trial, python: Path, tree: Path, network: str) -> Row:
     """Train and validate for an epoch."""
     log = trial.folder / f"log-{network}"
-    names = configure(trial, tree, ARCH, epochs=1, width=512) | {"LOG": log, "NAME": "mixed"}
+    names = configure(trial, tree, ARCH, epochs=1, width=512) | {
+        "LOG": log,
+        "NAME": "mixed",
+    }
     names["/data/mix.yaml"] = mixture(trial)
     expect = [EPOCH, r"Loss \d", "Validation set:", "IoU avg"]
     skip = r" -p |^pip" if network == "fid" else " -p "
@@ -42,4 +45,6 @@ def one(trial: Trial, python: Path, tree: Path, network: str) -> Row:
         raise Failed("a loss of NaN, or no checkpoint")
     left_out = "mixed precision; it cannot resume an epoch"
     ran = ["training", "validation", "checkpoint"]
-    return trial.row(f"rangenet train.py -ac senet-512.yml, pipeline {network}", ran, left_out)
+    return trial.row(
+        f"rangenet train.py -ac senet-512.yml, pipeline {network}", ran, left_out
+    )

@@ -22,13 +22,24 @@ def rows(trial: Trial) -> Iterator[Row]:
             "num_workers": 1,
             "batch_size": 1,
         }
-    own["model_params"] |= {"output_shape": [120, 90, 16], "init_size": 8, "out_fea_dim": 64}
+    own["model_params"] |= {
+        "output_shape": [120, 90, 16],
+        "init_size": 8,
+        "out_fea_dim": 64,
+    }
     model = trial.folder / "model.pt"
     own["train_params"] |= {"max_num_epochs": 2, "eval_every_n_steps": 8}
-    own["train_params"] |= {"model_load_path": str(model), "model_save_path": str(model)}
+    own["train_params"] |= {
+        "model_load_path": str(model),
+        "model_save_path": str(model),
+    }
     config = trial.folder / "mixed.yaml"
     config.write_text(yaml.safe_dump(own))
-    names = {"Cylinder3D": tree, "/data/mix.yaml": mixture(trial), "config/mixed.yaml": config}
+    names = {
+        "Cylinder3D": tree,
+        "/data/mix.yaml": mixture(trial),
+        "config/mixed.yaml": config,
+    }
     trial.type_page(
         "train",
         python,
@@ -43,8 +54,6 @@ def rows(trial: Trial) -> Iterator[Row]:
     )
     if not model.is_file():
         raise Failed("no checkpoint")
-    left_out = (
-        "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch"
-    )
+    left_out = "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch"
     script = "cylinder3d train_cylinder_asym.py"
     yield trial.row(script, ["training", "validation", "checkpoint"], left_out)

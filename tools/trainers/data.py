@@ -51,7 +51,9 @@ class Data:
         streets of the town."""
         out = self.folder / "semantic_kitti"
         recorded = (
-            Path(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS", "")) / "semantic_kitti" / "sequences"
+            Path(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS", ""))
+            / "semantic_kitti"
+            / "sequences"
         )
         use = bool(os.environ.get("LIDAR_SYNTH_LABELLED_SCANS"))
         for number in (*TRAINING, VALIDATION):
@@ -59,7 +61,11 @@ class Data:
             target = out / "sequences" / number
             if target.is_dir():
                 continue
-            if use and source.is_dir() and (number == VALIDATION or number != REAL_VALIDATION):
+            if (
+                use
+                and source.is_dir()
+                and (number == VALIDATION or number != REAL_VALIDATION)
+            ):
                 self._copy_sequence(source, target)
             else:
                 self._town_sequence(int(number), target)
@@ -76,18 +82,38 @@ class Data:
         if out.is_dir():
             return out
         made = self.folder / "kitti.part"
-        export_town(Town(seed=1, scans=self.scans + 1), made, "kitti", camera=True, progress=False)
-        town = sorted(path.stem for path in (made / "training" / "velodyne").glob("*.bin"))
-        for path in sorted(made.glob("training/*/*")):  # KITTI's own numbers end below 007481
+        export_town(
+            Town(seed=1, scans=self.scans + 1),
+            made,
+            "kitti",
+            camera=True,
+            progress=False,
+        )
+        town = sorted(
+            path.stem for path in (made / "training" / "velodyne").glob("*.bin")
+        )
+        for path in sorted(
+            made.glob("training/*/*")
+        ):  # KITTI's own numbers end below 007481
             path.rename(path.with_name(f"{int(path.stem) + 7500:06d}{path.suffix}"))
         town = [f"{int(frame) + 7500:06d}" for frame in town]
         real: list[str] = []
-        recorded = Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", "")) / "kitti_object" / "training"
+        recorded = (
+            Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", ""))
+            / "kitti_object"
+            / "training"
+        )
         if os.environ.get("LIDAR_SYNTH_REAL_SCANS") and recorded.is_dir():
-            kinds = {"velodyne": ".bin", "label_2": ".txt", "calib": ".txt", "image_2": ".png"}
+            kinds = {
+                "velodyne": ".bin",
+                "label_2": ".txt",
+                "calib": ".txt",
+                "image_2": ".png",
+            }
             for path in sorted((recorded / "velodyne").glob("*.bin")):
                 files = {
-                    kind: recorded / kind / f"{path.stem}{ending}" for kind, ending in kinds.items()
+                    kind: recorded / kind / f"{path.stem}{ending}"
+                    for kind, ending in kinds.items()
                 }
                 if all(file.is_file() for file in files.values()):
                     real.append(path.stem)
@@ -139,7 +165,8 @@ class Data:
         for frame in frames:
             shutil.copyfile(frame, target / "velodyne" / frame.name)
             shutil.copyfile(
-                source / "labels" / f"{frame.stem}.label", target / "labels" / f"{frame.stem}.label"
+                source / "labels" / f"{frame.stem}.label",
+                target / "labels" / f"{frame.stem}.label",
             )
         for name in ("calib.txt", "poses.txt", "times.txt"):
             if (source / name).is_file():
@@ -148,7 +175,9 @@ class Data:
     def _town_sequence(self, number: int, target: Path) -> None:
         made = self.folder / f"town-{number:02d}"
         town = Town(seed=number, scans=self.scans)
-        export_town(town, made, "semantic_kitti", sequence=number, camera=False, progress=False)
+        export_town(
+            town, made, "semantic_kitti", sequence=number, camera=False, progress=False
+        )
         target.parent.mkdir(parents=True, exist_ok=True)
         (made / "sequences" / f"{number:02d}").rename(target)
         shutil.rmtree(made)

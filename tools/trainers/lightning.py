@@ -21,7 +21,9 @@ def rows(trial: Trial) -> Iterator[Row]:
     """A small segmenter on SemanticKITTI and a bank."""
     python = trial.environment(extras=("lightning",))
 
-    def fit(title: str, out: str, limit: str = "max_epochs=2", resumed: bool = False) -> list[str]:
+    def fit(
+        title: str, out: str, limit: str = "max_epochs=2", resumed: bool = False
+    ) -> list[str]:
         folder = trial.folder / out
         checkpoint = str(folder / "last.ckpt") if resumed else None
         names = {
@@ -33,13 +35,18 @@ def rows(trial: Trial) -> Iterator[Row]:
         }
         env = {"PYTHONPATH": str(SCRIPTS)}
         expect = [r"validation loss \d"] if out == "whole" else []
-        said = trial.type_page(title, python, "lightning", names, env=env, expect=expect)
+        said = trial.type_page(
+            title, python, "lightning", names, env=env, expect=expect
+        )
         return [line for line in said.splitlines() if line.startswith("sample ")]
 
     seen = fit("train", "whole")
     if not {"domain 0", "domain 1"} <= {" ".join(line.split()[3:5]) for line in seen}:
         raise Failed("no real or no synthetic sample in the uninterrupted run")
-    for name, limit in {"middle": "max_epochs=2, max_steps=3", "end": "max_epochs=1"}.items():
+    for name, limit in {
+        "middle": "max_epochs=2, max_steps=3",
+        "end": "max_epochs=1",
+    }.items():
         first = fit(f"stop in the {name} of an epoch", name, limit)
         rest = fit(f"resume from the {name} of an epoch", name, resumed=True)
         if not rest or first + rest != seen:

@@ -61,7 +61,9 @@ def rows(trial: Trial) -> Iterator[Row]:
         yield one(trial, python, config, metric, env)
 
 
-def prepare(trial: Trial, python: Path, configs: list[str], env: dict[str, str]) -> None:
+def prepare(
+    trial: Trial, python: Path, configs: list[str], env: dict[str, str]
+) -> None:
     """Write data, lists and short configurations to the trial's folder; the page writes
     SemanticKITTI's lists."""
     nuscenes = trial.folder / "nuscenes"
@@ -70,16 +72,29 @@ def prepare(trial: Trial, python: Path, configs: list[str], env: dict[str, str])
     frame = Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", "")) / "nuscenes"
     if (frame / "info.json").is_file():
         data += ["--frame", frame]
-    command = [python, SCRIPTS / "mmdet3d_prepare.py", trial.folder, *data, "--configs", *configs]
+    command = [
+        python,
+        SCRIPTS / "mmdet3d_prepare.py",
+        trial.folder,
+        *data,
+        "--configs",
+        *configs,
+    ]
     trial.run("prepare", command, env=env)
     shutil.copytree(trial.data.semantic_kitti, trial.folder / "data" / "semantickitti")
     names = {'"bank"': repr(str(trial.data.bank))}
     trial.type_page(
-        "lists", python, PAGE, names, skip="^bash|^python VENV|custom_imports|data/nuscenes"
+        "lists",
+        python,
+        PAGE,
+        names,
+        skip="^bash|^python VENV|custom_imports|data/nuscenes",
     )
 
 
-def one(trial: Trial, python: Path, config: str, metric: str, env: dict[str, str]) -> Row:
+def one(
+    trial: Trial, python: Path, config: str, metric: str, env: dict[str, str]
+) -> Row:
     """Train with a configuration, and for the first one resume from the middle."""
     name = config.removesuffix(".py")
     ran = ["training", "validation", "checkpoint"]
@@ -88,7 +103,14 @@ def one(trial: Trial, python: Path, config: str, metric: str, env: dict[str, str
     def train(title: str, arguments: str, expect: list[str]) -> list[str]:
         names = {"VENV": python.parent.parent, "CONFIG": f"{config} {arguments}"}
         said = trial.type_page(
-            title, python, PAGE, names, skip="^(?!python VENV)", env=env, expect=expect, minutes=120
+            title,
+            python,
+            PAGE,
+            names,
+            skip="^(?!python VENV)",
+            env=env,
+            expect=expect,
+            minutes=120,
         )
         return [line for line in said.splitlines() if line.startswith("samples ")]
 
@@ -107,5 +129,7 @@ def one(trial: Trial, python: Path, config: str, metric: str, env: dict[str, str
         if rest != seen[ITERATIONS // 2 :]:
             raise Failed(f"{name}: the resumed run saw {rest} instead of {seen}")
         ran.append("resume")
-    left_out = "; ".join(filter(None, ["mixed precision, several GPUs", LEFT_OUT.get(config)]))
+    left_out = "; ".join(
+        filter(None, ["mixed precision, several GPUs", LEFT_OUT.get(config)])
+    )
     return trial.row(f"python tools/train.py {config}", ran, left_out)

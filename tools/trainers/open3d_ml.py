@@ -22,15 +22,21 @@ def rows(trial: Trial) -> Iterator[Row]:
     data.mkdir()
     (data / "dataset").symlink_to(trial.data.semantic_kitti)
     names = {"/data/SemanticKitti": data, "/data/mix.yaml": mixture(trial)}
-    names["randlanet_semantickitti.yml"] = shorten(trial, next(python.parent.parent.glob(STOCK)))
-    expect = [r"epoch 1: \d+ samples, [1-9]\d* of them synthetic", r"Loss train: \d", r"eval: \d"]
+    names["randlanet_semantickitti.yml"] = shorten(
+        trial, next(python.parent.parent.glob(STOCK))
+    )
+    expect = [
+        r"epoch 1: \d+ samples, [1-9]\d* of them synthetic",
+        r"Loss train: \d",
+        r"eval: \d",
+    ]
     trial.type_page("train", python, PAGE, names, skip=PIP, expect=expect, minutes=90)
     if not list(trial.folder.rglob("ckpt_00001.pth")):
         raise Failed("no checkpoint")
-    left_out = (
-        "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch"
+    left_out = "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch"
+    yield trial.row(
+        "pipeline.run_train()", ["training", "validation", "checkpoint"], left_out
     )
-    yield trial.row("pipeline.run_train()", ["training", "validation", "checkpoint"], left_out)
 
 
 def shorten(trial: Trial, stock: Path) -> Path:

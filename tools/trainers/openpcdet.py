@@ -25,7 +25,9 @@ LEFT_OUT = (
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs and a resumed one on KITTI; two on nuScenes."""
-    python = trial.environment("setuptools", "ninja")  # to compile its functions for a CPU
+    python = trial.environment(
+        "setuptools", "ninja"
+    )  # to compile its functions for a CPU
     trial.type_page("install", python, PAGE, {}, skip=NOT_PIP)
     tree = trial.tree("OPENPCDET_ROOT")
     yield kitti(trial, python, tree)
@@ -38,7 +40,14 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     shutil.copytree(trial.data.kitti, data)
     trial.run(
         "KITTI's lists",
-        [python, SCRIPTS / "openpcdet_prepare.py", tree, "kitti", data, trial.data.objects],
+        [
+            python,
+            SCRIPTS / "openpcdet_prepare.py",
+            tree,
+            "kitti",
+            data,
+            trial.data.objects,
+        ],
     )
     mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "mix"}
     mixture |= {"label_options": {"objects": str(trial.data.objects)}}
@@ -46,7 +55,9 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     def train(title: str, out: str) -> str:
         changes = f"DATA_CONFIG.DATA_PATH {data}"
         expect = [r"Loss: \d", r"Car AP_R40@0.70, 0.70, 0.70"]
-        return type_training(trial, python, title, "MixedKitti", mixture, changes, out, expect)
+        return type_training(
+            trial, python, title, "MixedKitti", mixture, changes, out, expect
+        )
 
     whole = train("PointPillars", "whole")
     first = next((trial.folder / "whole").rglob("checkpoint_epoch_1.pth"), None)
@@ -60,7 +71,9 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
     if rest != batches(whole)[half:]:
         raise Failed(f"the resumed run saw {rest} instead of {batches(whole)[half:]}")
     script = "openpcdet train.py --cfg_file cfgs/kitti_models/pointpillar.yaml"
-    return trial.row(script, ["training", "validation", "checkpoint", "resume"], LEFT_OUT)
+    return trial.row(
+        script, ["training", "validation", "checkpoint", "resume"], LEFT_OUT
+    )
 
 
 def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
@@ -70,26 +83,42 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     trial.run("nuScenes", [python, SCRIPTS / "nuscenes_town.py", data / "v1.0-mini"])
     synthetic = trial.folder / "synthetic"
     convert(
-        Town(seed=9, sensor="hdl32e_nuscenes", scans=4), WRITERS["npz"](synthetic), progress=False
+        Town(seed=9, sensor="hdl32e_nuscenes", scans=4),
+        WRITERS["npz"](synthetic),
+        progress=False,
     )
     trial.run(
         "nuScenes' lists",
-        [python, SCRIPTS / "openpcdet_prepare.py", tree, "nuscenes", data, trial.data.objects],
+        [
+            python,
+            SCRIPTS / "openpcdet_prepare.py",
+            tree,
+            "nuscenes",
+            data,
+            trial.data.objects,
+        ],
     )
     mixture = {"synthetic": str(synthetic), "ratio": 0.5}
-    small = yaml.safe_load((tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text())
+    small = yaml.safe_load(
+        (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").read_text()
+    )
     # It divides by the number of objects of each class; the town has four.
     small |= {"BALANCED_RESAMPLING": False}
-    small["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]["SAMPLE_GROUPS"] = ["car:2", "pedestrian:2"]
-    (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").write_text(yaml.safe_dump(small))
+    small["DATA_AUGMENTOR"]["AUG_CONFIG_LIST"][0]["SAMPLE_GROUPS"] = [
+        "car:2",
+        "pedestrian:2",
+    ]
+    (tree / "tools/cfgs/dataset_configs/nuscenes_dataset.yaml").write_text(
+        yaml.safe_dump(small)
+    )
     changes = f"DATA_CONFIG.DATA_PATH {data} DATA_CONFIG.VERSION v1.0-mini"
     expect = [r"Loss: \d", r"NDS: \d"]
-    type_training(trial, python, "CenterPoint", "MixedNuScenes", mixture, changes, "nus", expect)
+    type_training(
+        trial, python, "CenterPoint", "MixedNuScenes", mixture, changes, "nus", expect
+    )
     if not list((trial.folder / "nus").rglob("checkpoint_epoch_1.pth")):
         raise Failed("no checkpoint")
-    script = (
-        "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
-    )
+    script = "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
     return trial.row(script, ["training", "validation", "checkpoint"], LEFT_OUT)
 
 
@@ -107,7 +136,9 @@ def type_training(
     names."""
     file = trial.folder / f"{dataset}.yaml"
     file.write_text(yaml.safe_dump(mixture))
-    options = "--epochs 2 --batch_size 2 --workers 1 --logger_iter_interval 1 --wo_gpu_stat"
+    options = (
+        "--epochs 2 --batch_size 2 --workers 1 --logger_iter_interval 1 --wo_gpu_stat"
+    )
     names = {
         "OpenPCDet/tools": trial.folder / "tree" / "tools",
         "/data/mix.yaml": file,
@@ -118,7 +149,14 @@ def type_training(
     other = "MixedNuScenes" if dataset == "MixedKitti" else "MixedKitti"
     env = {"OPENPCDET_OUTPUT": str(trial.folder / out)}
     return trial.type_page(
-        title, python, PAGE, names, skip=f"{PIP}|{other}", env=env, expect=expect, minutes=90
+        title,
+        python,
+        PAGE,
+        names,
+        skip=f"{PIP}|{other}",
+        env=env,
+        expect=expect,
+        minutes=90,
     )
 
 

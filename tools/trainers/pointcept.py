@@ -53,7 +53,9 @@ def rows(trial: Trial) -> Iterator[Row]:
     def train(name: str, more: str = "") -> str:
         own = names | {"exp/mixed": f"{trial.folder / name} {more}"}
         expect = [r"loss: \d", r"Val result: mIoU"]
-        return trial.type_page(name, python, PAGE, own, skip=PIP, expect=expect, minutes=120)
+        return trial.type_page(
+            name, python, PAGE, own, skip=PIP, expect=expect, minutes=120
+        )
 
     whole = train("segmentation")
     saved = trial.folder / "segmentation" / "model" / "epoch_1.pth"
@@ -61,21 +63,33 @@ def rows(trial: Trial) -> Iterator[Row]:
         raise Failed("no checkpoint after the first epoch")
     rest = train("resumed", f"resume=True weight={saved}")
     if samples(rest) != {1: samples(whole)[1]}:
-        raise Failed(f"the resumed run saw {samples(rest)} instead of {samples(whole)[1]}")
+        raise Failed(
+            f"the resumed run saw {samples(rest)} instead of {samples(whole)[1]}"
+        )
     yield trial.row(
-        f"tools/train.py, {stock}", ["training", "validation", "checkpoint", "resume"], LEFT_OUT
+        f"tools/train.py, {stock}",
+        ["training", "validation", "checkpoint", "resume"],
+        LEFT_OUT,
     )
 
     sonata = ROOT / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
     config = trial.folder / "sonata.py"
     unlabelled = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "none"}
-    config.write_text(PRETRAINING.format(stock=str(sonata), root=str(root), mix=unlabelled))
+    config.write_text(
+        PRETRAINING.format(stock=str(sonata), root=str(root), mix=unlabelled)
+    )
     names = common(tree) | {
         "configs/semantic_kitti/mixed.py": config,
         "exp/mixed": trial.folder / "sonata",
     }
     trial.type_page(
-        "pretraining", python, PAGE, names, skip=f"{PIP}|^cat", expect=[r"loss: \d"], minutes=120
+        "pretraining",
+        python,
+        PAGE,
+        names,
+        skip=f"{PIP}|^cat",
+        expect=[r"loss: \d"],
+        minutes=120,
     )
     if not (trial.folder / "sonata" / "model" / "model_last.pth").is_file():
         raise Failed("no checkpoint")
@@ -83,7 +97,9 @@ def rows(trial: Trial) -> Iterator[Row]:
         f"{LEFT_OUT}; flash attention; the stock width: 24 GB of memory; Pointcept has no "
         "validation in pretraining"
     )
-    yield trial.row(f"tools/train.py, {sonata.name}", ["training", "checkpoint"], left_out)
+    yield trial.row(
+        f"tools/train.py, {sonata.name}", ["training", "checkpoint"], left_out
+    )
 
 
 def common(tree: Path) -> dict[str, object]:

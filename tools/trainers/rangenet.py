@@ -29,17 +29,23 @@ def rows(trial: Trial) -> Iterator[Row]:
     }
     names["/data/mix.yaml"] = mixture(trial)
     expect = ["empty cell to the right", f"width: {WIDTH}"]
-    trial.type_page("1024 columns", python, PAGE, names, skip=" -p ", fails=True, expect=expect)
+    trial.type_page(
+        "1024 columns", python, PAGE, names, skip=" -p ", fails=True, expect=expect
+    )
     names["/data/mix.yaml"] = mixture(trial, trial.data.dense_bank)
     expect = [EPOCH, r"Loss \d", "Validation set:", "IoU avg"]
     said = trial.type_page(
         "train", python, PAGE, names, skip=" -p |^pip", expect=expect, minutes=60
     )
-    if "Loss nan" in said or not list((trial.folder / "log").glob("segmentation_head*")):
+    if "Loss nan" in said or not list(
+        (trial.folder / "log").glob("segmentation_head*")
+    ):
         raise Failed("a loss of NaN, or no checkpoint")
     left_out = "Darknet-53: time; it cannot resume an epoch"
     yield trial.row(
-        "rangenet train.py -ac squeezeseg.yaml", ["training", "validation", "checkpoint"], left_out
+        "rangenet train.py -ac squeezeseg.yaml",
+        ["training", "validation", "checkpoint"],
+        left_out,
     )
 
 
@@ -47,7 +53,9 @@ def mixture(trial: Trial, bank: Path | None = None) -> Path:
     """The file of a mixture with a bank, by default that of ``town``."""
     out = trial.folder / "mix.yaml"
     out.write_text(
-        yaml.safe_dump({"synthetic": str(bank or trial.data.bank), "ratio": 0.4, "seed": 3})
+        yaml.safe_dump(
+            {"synthetic": str(bank or trial.data.bank), "ratio": 0.4, "seed": 3}
+        )
     )
     return out
 
@@ -57,12 +65,17 @@ def clone(trial: Trial, variable: str) -> Path:
     it."""
     tree = trial.tree(variable)
     who = ["-c", "user.name=trial", "-c", "user.email=trial@localhost"]
-    for arguments in (["init", "-q"], [*who, "commit", "-q", "--allow-empty", "-m", "copy"]):
+    for arguments in (
+        ["init", "-q"],
+        [*who, "commit", "-q", "--allow-empty", "-m", "copy"],
+    ):
         subprocess.run(["git", *arguments], cwd=tree, check=True)
     return tree
 
 
-def configure(trial: Trial, tree: Path, arch: str, *, epochs: int, width: int) -> dict[str, Any]:
+def configure(
+    trial: Trial, tree: Path, arch: str, *, epochs: int, width: int
+) -> dict[str, Any]:
     """What the reader has in place of the page's names: the stock configuration with another width
     and batch size.
 

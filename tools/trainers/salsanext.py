@@ -25,15 +25,21 @@ def rows(trial: Trial) -> Iterator[Row]:
         names |= {"/data/mix.yaml": mixture(trial)} | (
             {'-p ""': f"-p {resumed}"} if resumed else {}
         )
-        return trial.type_page(title, python, PAGE, names, skip="NAME", expect=expect, minutes=120)
+        return trial.type_page(
+            title, python, PAGE, names, skip="NAME", expect=expect, minutes=120
+        )
 
     said = train("train", 1)
     (log,) = (trial.folder / "log" / "logs").iterdir()
     if not re.search(EPOCH, said) or not (log / "SalsaNext").is_file():
         raise Failed("no synthetic scans, or no checkpoint")
     resumed = train("resume", 2, log)
-    if not re.search(r"lidar_synth: epoch 1: \d+ samples, [1-9]\d* of them synthetic", resumed):
+    if not re.search(
+        r"lidar_synth: epoch 1: \d+ samples, [1-9]\d* of them synthetic", resumed
+    ):
         raise Failed("the resumed run did not begin with epoch 1")
     if re.search(r"Epoch: \[0\]", resumed):
         raise Failed("the resumed run trained epoch 0 again")
-    yield trial.row("rangenet train.py -ac salsanext.yml", STEPS, "the uncertainty version: time")
+    yield trial.row(
+        "rangenet train.py -ac salsanext.yml", STEPS, "the uncertainty version: time"
+    )

@@ -66,7 +66,9 @@ class Trial:
         folder: ``work/<name>``, for everything that this trainer writes.
     """
 
-    def __init__(self, name: str, title: str, work: Path, data: Data, reuse: bool = False) -> None:
+    def __init__(
+        self, name: str, title: str, work: Path, data: Data, reuse: bool = False
+    ) -> None:
         self.name = name
         self.title = title
         self.data = data
@@ -113,11 +115,21 @@ class Trial:
             self.install(python, *packages, options=options)
         return python
 
-    def install(self, python: Path, *packages: str, options: Sequence[str] = ()) -> None:
+    def install(
+        self, python: Path, *packages: str, options: Sequence[str] = ()
+    ) -> None:
         """``pip install`` into an environment."""
         self.run(
             "install",
-            [python, "-m", "pip", "install", "--disable-pip-version-check", *options, *packages],
+            [
+                python,
+                "-m",
+                "pip",
+                "install",
+                "--disable-pip-version-check",
+                *options,
+                *packages,
+            ],
         )
 
     def tree(self, variable: str) -> Path:
@@ -134,7 +146,9 @@ class Trial:
             )
         out = self.folder / "tree"
         if not out.exists():
-            shutil.copytree(given, out, symlinks=True, ignore=shutil.ignore_patterns(".git"))
+            shutil.copytree(
+                given, out, symlinks=True, ignore=shutil.ignore_patterns(".git")
+            )
         return out
 
     def run(
@@ -187,7 +201,9 @@ class Trial:
                     check=False,
                 ).returncode
             except subprocess.TimeoutExpired:
-                raise Failed(f"{title}: not finished after {minutes:g} minutes; {log}") from None
+                raise Failed(
+                    f"{title}: not finished after {minutes:g} minutes; {log}"
+                ) from None
         output = log.read_text(errors="replace")
         if (code != 0) != fails:
             raise Failed(f"{title}: exit status {code}; {_last_line(output)}; {log}")
@@ -224,7 +240,9 @@ class Trial:
         Raises:
             Failed: if the page lacks one of the names, or a command fails.
         """
-        script = "\n".join(command for command in commands_of(page) if not re.search(skip, command))
+        script = "\n".join(
+            command for command in commands_of(page) if not re.search(skip, command)
+        )
         for name, own in names.items():
             pattern = rf"(?<![\w./-]){re.escape(name)}(?![\w.-])"
             if not re.search(pattern, script):
@@ -232,11 +250,19 @@ class Trial:
             script = re.sub(pattern, str(own).replace("\\", r"\\"), script)
         path = {"PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
         return self.run(
-            title, ["bash", "-euxc", script], env=path | dict(options.pop("env", {})), **options
+            title,
+            ["bash", "-euxc", script],
+            env=path | dict(options.pop("env", {})),
+            **options,
         )
 
     def row(
-        self, script: str, ran: Sequence[str], left_out: str = "", *, failed: bool = False
+        self,
+        script: str,
+        ran: Sequence[str],
+        left_out: str = "",
+        *,
+        failed: bool = False,
     ) -> Row:
         """A line of the table, with the minutes since the line before."""
         assert set(ran) <= set(STEPS), ran
@@ -254,7 +280,9 @@ def commands_of(page: str) -> list[str]:
     """
     text = (ROOT / "docs" / "how-to" / "trainers" / f"{page}.md").read_text()
     commands: list[str] = []
-    for language, code in re.findall(r"^```(sh|python|yaml)\n(.*?)^```$", text, re.S | re.M):
+    for language, code in re.findall(
+        r"^```(sh|python|yaml)\n(.*?)^```$", text, re.S | re.M
+    ):
         file = re.match(r"# ([\w./-]+\.(?:py|yaml))\b", code)
         if file:
             commands.append(f"cat > {file[1]} <<'END'\n{code}END")
@@ -262,7 +290,9 @@ def commands_of(page: str) -> list[str]:
             commands.append(f"python - <<'END'\n{code}END")
         elif language == "sh":
             lines = code.replace("\\\n", " ").splitlines()
-            commands += filter(None, (re.sub(r"(^|\s+)#.*", "", line) for line in lines))
+            commands += filter(
+                None, (re.sub(r"(^|\s+)#.*", "", line) for line in lines)
+            )
     return commands
 
 
@@ -293,7 +323,9 @@ def wheel_of_checkout(folder: Path) -> Path:
 def _environment(further: Mapping[str, str]) -> dict[str, str]:
     """The environment of a command: that of a user, without this interpreter's own variables."""
     own = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "LIDAR_SYNTH_MIX")
-    return {name: text for name, text in os.environ.items() if name not in own} | dict(further)
+    return {name: text for name, text in os.environ.items() if name not in own} | dict(
+        further
+    )
 
 
 def _last_line(output: str) -> str:

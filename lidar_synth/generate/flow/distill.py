@@ -35,7 +35,9 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.generate.flow.path import Example, Velocity, interpolate, per_sample
 from lidar_synth.generate.flow.solvers import check_grid, solve, uniform_grid
 
-Strategy = Callable[[Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any], Example]
+Strategy = Callable[
+    [Velocity, Tensor, Tensor, Tensor, Sequence[float], int, Any], Example
+]
 """``strategy(teacher, y0, y1, u, grid, steps, cond)``. All strategies have the same arguments and
 raise a ``ConfigError`` on a grid or a number of steps that they do not support:
 
@@ -66,7 +68,9 @@ def adaptive_piecewise(
     interval = (u * (len(grid) - 1)).long().clamp_(max=len(grid) - 2)
     start, end = _bounds(interval, grid, u)
     y = interpolate(y0, y1, start)
-    return Example(y, start, _slope(teacher, y, start, end, steps, cond), steps * len(y))
+    return Example(
+        y, start, _slope(teacher, y, start, end, steps, cond), steps * len(y)
+    )
 
 
 def uniform_piecewise(
@@ -101,7 +105,9 @@ def piecewise_reflow(
     start, end = _bounds(interval_of(u, grid), grid, u)
     y_start = interpolate(y0, y1, start)
     slope = _slope(teacher, y_start, start, end, steps, cond)
-    return Example(y_start + per_sample(u - start, y0) * slope, u, slope, steps * len(y0))
+    return Example(
+        y_start + per_sample(u - start, y0) * slope, u, slope, steps * len(y0)
+    )
 
 
 def reflow(
@@ -182,7 +188,9 @@ def every_piece(
 
     with torch.no_grad():
         from_noise = {1.0: y1}
-        for a, b in pairwise(sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)):
+        for a, b in pairwise(
+            sorted({1.0, *(b for a, b in pieces if a == 1)}, reverse=True)
+        ):
             from_noise[b] = follow(from_noise[a], a, b)
         start, end = (
             torch.cat([y1.new_full((len(y1),), t) for t in side])
@@ -196,7 +204,9 @@ def every_piece(
     y = torch.cat(states)
     y_end = torch.cat(ends)
     repeated = None if cond is None else torch.cat([cond] * len(pieces))
-    return Example(y, start, (y_end - y) / per_sample(end - start, y), evaluations, repeated, end)
+    return Example(
+        y, start, (y_end - y) / per_sample(end - start, y), evaluations, repeated, end
+    )
 
 
 STRATEGIES: dict[str, Strategy] = {
@@ -217,7 +227,9 @@ def interval_of(t: Tensor, grid: Sequence[float]) -> Tensor:
     return len(grid) - 1 - above
 
 
-def _bounds(interval: Tensor, grid: Sequence[float], like: Tensor) -> tuple[Tensor, Tensor]:
+def _bounds(
+    interval: Tensor, grid: Sequence[float], like: Tensor
+) -> tuple[Tensor, Tensor]:
     """(B,) start and end times of the intervals."""
     times = _times(grid, like)
     return times[interval], times[interval + 1]
@@ -238,13 +250,19 @@ def _slope(
     ``end``."""
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
-    weights = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[:, None]
+    weights = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[
+        :, None
+    ]
     with torch.no_grad():
-        y_end = solve(teacher, y, torch.lerp(start[None], end[None], weights), "euler", cond)
+        y_end = solve(
+            teacher, y, torch.lerp(start[None], end[None], weights), "euler", cond
+        )
         return (y_end - y) / per_sample(end - start, y)
 
 
-def _straight(teacher: Velocity, y1: Tensor, t: Tensor, steps: int, cond: Any) -> Example:
+def _straight(
+    teacher: Velocity, y1: Tensor, t: Tensor, steps: int, cond: Any
+) -> Example:
     """The example at t on the straight line from noise to the teacher's data."""
     slope = _slope(teacher, y1, torch.ones_like(t), torch.zeros_like(t), steps, cond)
     return Example(y1 + per_sample(t - 1, y1) * slope, t, slope, steps * len(y1))
@@ -254,5 +272,7 @@ def _check_uniform(grid: Sequence[float]) -> None:
     uniform = uniform_grid(len(check_grid(grid)) - 1)
     if max(abs(a - b) for a, b in zip(grid, uniform, strict=True)) > 1e-6:
         raise ConfigError(
-            f"time grid {tuple(grid)}", f"{uniform}, which is uniform", "Or use adaptive_piecewise."
+            f"time grid {tuple(grid)}",
+            f"{uniform}, which is uniform",
+            "Or use adaptive_piecewise.",
         )

@@ -88,7 +88,9 @@ def velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tenso
     return _errors(velocity, example, metric).mean()
 
 
-def balanced_velocity_loss(velocity: Velocity, example: Example, metric: Metric) -> Tensor:
+def balanced_velocity_loss(
+    velocity: Velocity, example: Example, metric: Metric
+) -> Tensor:
     """``velocity_loss`` with each sample divided by its own error, so that long steps, whose errors
     are tens of times larger, do not outweigh short ones (Geng et al., "Mean Flows for One-step
     Generative Modeling", NeurIPS 2025: p = 1, c = 0.001)."""
@@ -116,7 +118,9 @@ def guide(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
         blanks = blank.expand(len(y), *blank.shape)
         # One evaluation of twice the batch, so that the network computes what does not depend on
         # the batch once.
-        both = velocity(torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, blanks.to(cond))))
+        both = velocity(
+            torch.cat((y, y)), torch.cat((t, t)), torch.cat((cond, blanks.to(cond)))
+        )
         with_condition, without = both.chunk(2)
         return torch.lerp(without, with_condition, scale)
 
@@ -124,7 +128,10 @@ def guide(velocity: Velocity, scale: float, blank: Tensor) -> Velocity:
 
 
 def autoguide(
-    velocity: Velocity, weaker: Velocity, scale: float, within: tuple[float, float] = (0.0, 1.0)
+    velocity: Velocity,
+    weaker: Velocity,
+    scale: float,
+    within: tuple[float, float] = (0.0, 1.0),
 ) -> Velocity:
     """Autoguidance (Karras et al., "Guiding a Diffusion Model with a Bad Version of Itself",
     NeurIPS 2024): v_weaker + scale (v - v_weaker), which reduces errors that both share, with or
@@ -172,13 +179,18 @@ def _error(a: Tensor, b: Tensor) -> Tensor:
     """(B, elements) a - b in float32 or higher precision."""
     if a.shape != b.shape:
         raise DataError(
-            f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}", "one shape (B, ...)"
+            f"a metric of shapes {tuple(a.shape)} and {tuple(b.shape)}",
+            "one shape (B, ...)",
         )
     error = a - b
     return error.to(torch.promote_types(error.dtype, torch.float32)).flatten(1)
 
 
-METRICS: dict[str, Metric] = {"squared_l2": squared_l2, "pseudo_huber": pseudo_huber, "l1": l1}
+METRICS: dict[str, Metric] = {
+    "squared_l2": squared_l2,
+    "pseudo_huber": pseudo_huber,
+    "l1": l1,
+}
 """Training metrics m by name."""
 
 

@@ -37,7 +37,9 @@ class State(NamedTuple):
     velocity: Tensor | None
 
 
-def euler(velocity: Velocity, y: Tensor, t: Tensor, t_next: Tensor, cond: Any) -> Tensor:
+def euler(
+    velocity: Velocity, y: Tensor, t: Tensor, t_next: Tensor, cond: Any
+) -> Tensor:
     """v(y, t): one evaluation, first order."""
     return velocity(y, t, cond).to(y.dtype)
 
@@ -143,7 +145,10 @@ def mean_velocity(velocity: Velocity, grid: Sequence[float]) -> Velocity:
     def mean_velocity(y: Tensor, t: Tensor, cond: Any = None) -> Tensor:
         times = ascending.to(t.device, t.dtype)
         return velocity(
-            y, t, cond, times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)]
+            y,
+            t,
+            cond,
+            times[(torch.searchsorted(times, t.contiguous()) - 1).clamp_min(0)],
         )  # type: ignore[call-arg]
 
     return mean_velocity

@@ -119,7 +119,9 @@ def select_timesteps(
         for first in range(0, trajectories, batch):
             part = range(first, min(first + batch, trajectories))
             start = gaussian(seed, part, shape, device)
-            costs = cost_matrix(velocity, start, times, m, condition(part) if condition else None)
+            costs = cost_matrix(
+                velocity, start, times, m, condition(part) if condition else None
+            )
             total += costs.sum(0)
             optima.append(best_path(costs, intervals))
             bar.update(len(part))
@@ -142,7 +144,11 @@ def _selection(
 
 
 def cost_matrix(
-    velocity: Velocity, start: Tensor, times: tuple[float, ...], metric: Metric, cond: Any = None
+    velocity: Velocity,
+    start: Tensor,
+    times: tuple[float, ...],
+    metric: Metric,
+    cond: Any = None,
 ) -> Costs:
     """The cost matrices of a batch of trajectories, solved by Euler's method.
 
@@ -177,7 +183,9 @@ def cost_matrix(
                 costs[b, i, part] = metric(straight, y[b, part])
     if not costs.triu(1).isfinite().all():
         raise DataError(
-            "the teacher's trajectory is not finite", "finite velocities", "Check the checkpoint."
+            "the teacher's trajectory is not finite",
+            "finite velocities",
+            "Check the checkpoint.",
         )
     return costs.double().cpu().numpy()
 

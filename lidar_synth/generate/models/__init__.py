@@ -53,7 +53,9 @@ def network_class(architecture: str) -> type[Network]:
         ConfigError: on a name that is not in ``NETWORKS``.
     """
     if not isinstance(architecture, str) or architecture not in NETWORKS:
-        raise ConfigError(f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}")
+        raise ConfigError(
+            f"architecture {architecture!r}", f"one of {', '.join(NETWORKS)}"
+        )
     return NETWORKS[architecture]
 
 
@@ -61,7 +63,9 @@ def encoders_of(condition: str) -> tuple[str, ...]:
     """The architectures that encode a kind of condition, in the order of ``NETWORKS``; the first is
     the default."""
     return tuple(
-        k for k, cls in NETWORKS.items() if issubclass(cls, Encoder) and cls.condition == condition
+        k
+        for k, cls in NETWORKS.items()
+        if issubclass(cls, Encoder) and cls.condition == condition
     )
 
 
@@ -102,7 +106,8 @@ def limit_modules(most: int) -> Iterator[None]:
         built += 1
         if built > most:
             raise ConfigError(
-                f"a network of more than {most} modules", "a network that its weights can fill"
+                f"a network of more than {most} modules",
+                "a network that its weights can fill",
             )
 
     hook = register_module_module_registration_hook(count)
@@ -144,10 +149,15 @@ def assemble(
             f"{what} has missing keys {missing} and unexpected keys {unexpected}",
             "exactly its own keys",
         )
-    if wrong := {key: tuple(v.shape) for key, v in state.items() if v.shape != expected[key]}:
-        shapes = ", ".join(f"{key} {shape} for {expected[key]}" for key, shape in wrong.items())
+    if wrong := {
+        key: tuple(v.shape) for key, v in state.items() if v.shape != expected[key]
+    }:
+        shapes = ", ".join(
+            f"{key} {shape} for {expected[key]}" for key, shape in wrong.items()
+        )
         raise DataError(
-            f"{what} has weights of other shapes: {shapes}", "the shapes that its arguments give"
+            f"{what} has weights of other shapes: {shapes}",
+            "the shapes that its arguments give",
         )
     network.load_state_dict(
         {key: v.to(device, torch.float32) for key, v in state.items()}, assign=True

@@ -53,7 +53,8 @@ class NeighbourhoodAttention(nn.Module):
             or window[1] // 2 > grid[1]
         ):
             raise ConfigError(
-                f"window {window} on a grid of {grid} tokens", "odd, and within the grid"
+                f"window {window} on a grid of {grid} tokens",
+                "odd, and within the grid",
             )
         tile = (_divisor(grid[0], TILE[0]), _divisor(grid[1], TILE[1]))
         span = (tile[0] + window[0] - 1, tile[1] + window[1] - 1)
@@ -66,7 +67,9 @@ class NeighbourhoodAttention(nn.Module):
                 _padded(numbers, window), span, tile
             ),  # (tiles, m) tokens of each tile and its margin
             "place": tokens.flatten().argsort(),  # (N,) position of each token in ``tokens``
-            "mask": _in_window(tile, window),  # (n, m) whether a key is in a query's window
+            "mask": _in_window(
+                tile, window
+            ),  # (n, m) whether a key is in a query's window
         }
         for name, buffer in buffers.items():
             self.register_buffer(name, buffer, persistent=False)
@@ -77,7 +80,9 @@ class NeighbourhoodAttention(nn.Module):
         length = piece_length(q, len(self.keys), self.keys.shape[1] * q[:, 0].numel())
         out = []
         for tokens, keys in zip(
-            torch.split(self.tokens, length), torch.split(self.keys, length), strict=True
+            torch.split(self.tokens, length),
+            torch.split(self.keys, length),
+            strict=True,
         ):
             tiles = _tiled(q, tokens), _tiled(k, keys), _tiled(v, keys)
             h = attention(*tiles, self.mask)
@@ -99,7 +104,11 @@ def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Te
 
 def _tiled(x: Tensor, index: Tensor) -> Tensor:
     """The tokens (tiles, n) of x (B, N, heads, D) as (B tiles, heads, n, D)."""
-    return _pick(x, index.flatten()).reshape(-1, index.shape[1], *x.shape[2:]).transpose(1, 2)
+    return (
+        _pick(x, index.flatten())
+        .reshape(-1, index.shape[1], *x.shape[2:])
+        .transpose(1, 2)
+    )
 
 
 def _pick(x: Tensor, index: Tensor) -> Tensor:
@@ -107,7 +116,11 @@ def _pick(x: Tensor, index: Tensor) -> Tensor:
     # The gradient of one flat index is several times faster on a CPU than that of an index along
     # dimension 1.
     rows = index + x.shape[1] * torch.arange(len(x), device=x.device)[:, None]
-    return x.flatten(0, 1).index_select(0, rows.flatten()).reshape(*rows.shape, *x.shape[2:])
+    return (
+        x.flatten(0, 1)
+        .index_select(0, rows.flatten())
+        .reshape(*rows.shape, *x.shape[2:])
+    )
 
 
 def _divisor(size: int, limit: int) -> int:
@@ -126,7 +139,12 @@ def _padded(x: Tensor, window: Grid) -> Tensor:
 
 def _tiles(x: Tensor, size: Grid, step: Grid) -> Tensor:
     """(H, W) to (tiles, rows columns), overlapping where ``size`` is larger than ``step``."""
-    return x.unfold(0, size[0], step[0]).unfold(1, size[1], step[1]).flatten(2).flatten(0, 1)
+    return (
+        x.unfold(0, size[0], step[0])
+        .unfold(1, size[1], step[1])
+        .flatten(2)
+        .flatten(0, 1)
+    )
 
 
 def _in_window(tile: Grid, window: Grid) -> Tensor:
@@ -134,7 +152,10 @@ def _in_window(tile: Grid, window: Grid) -> Tensor:
     axes = []
     for size, reach in zip(tile, window, strict=True):
         offset = (
-            torch.arange(size + reach - 1, device="cpu") - torch.arange(size, device="cpu")[:, None]
+            torch.arange(size + reach - 1, device="cpu")
+            - torch.arange(size, device="cpu")[:, None]
         )
         axes.append((offset >= 0) & (offset < reach))
-    return (axes[0][:, None, :, None] & axes[1][None, :, None, :]).flatten(2).flatten(0, 1)
+    return (
+        (axes[0][:, None, :, None] & axes[1][None, :, None, :]).flatten(2).flatten(0, 1)
+    )

@@ -52,7 +52,12 @@ class BoundedAutoencoder(Autoencoder):
     scale: Tensor
 
     def add_encoder(
-        self, stem: nn.Module, widths: Sequence[int], rows: int, depth: int, latent_channels: int
+        self,
+        stem: nn.Module,
+        widths: Sequence[int],
+        rows: int,
+        depth: int,
+        latent_channels: int,
     ) -> None:
         """Add the modules of the encoder.
 
@@ -69,7 +74,9 @@ class BoundedAutoencoder(Autoencoder):
         self.stem = stem
         self.encode_outer = NormedResidual(outer)
         self.merge = nn.Conv2d(outer, inner, 2, 2)
-        self.encode_inner = nn.Sequential(*(NormedResidual(inner) for _ in range(depth)))
+        self.encode_inner = nn.Sequential(
+            *(NormedResidual(inner) for _ in range(depth))
+        )
         self.to_latent = nn.Conv2d(inner, latent_channels, 1)
         # Latents have mean 0 and variance 1 per channel, as a flow from standard normal noise
         # needs.
@@ -107,7 +114,9 @@ class BoundedAutoencoder(Autoencoder):
         if objective.losses.unlabelled:
             blank = encode_labels(torch.full_like(x[:, 0], IGNORE, dtype=torch.uint8))
             hidden = torch.cat([x[:, : -self.bits], blank.to(x)], 1)
-            chosen = torch.special.ndtr(noise[:, -1, -1, -1]) < objective.losses.unlabelled
+            chosen = (
+                torch.special.ndtr(noise[:, -1, -1, -1]) < objective.losses.unlabelled
+            )
             shown = torch.where(chosen.view(-1, 1, 1, 1), hidden, x)
         return self.nll(self(shown, objective.losses.noise * some), x, objective)
 
@@ -118,8 +127,17 @@ class BoundedAutoencoder(Autoencoder):
 
     def encoder(self) -> list[nn.Parameter]:
         """The weights of the encoder; all others belong to the decoder."""
-        parts = self.stem, self.encode_outer, self.merge, self.encode_inner, self.to_latent
-        return [self.place_stem, *(weight for part in parts for weight in part.parameters())]
+        parts = (
+            self.stem,
+            self.encode_outer,
+            self.merge,
+            self.encode_inner,
+            self.to_latent,
+        )
+        return [
+            self.place_stem,
+            *(weight for part in parts for weight in part.parameters()),
+        ]
 
     def squeeze(self, x: Tensor) -> Tensor:
         """Images (B, C, H, W) to bounded latents in (-1, 1), float32."""

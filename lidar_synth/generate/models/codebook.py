@@ -34,7 +34,9 @@ class Codebook(nn.Module):
 
     def __init__(self, count: int, channels: int, kind: str) -> None:
         super().__init__()
-        self.codes = nn.Parameter(torch.empty(count, channels), requires_grad=kind == "gradient")
+        self.codes = nn.Parameter(
+            torch.empty(count, channels), requires_grad=kind == "gradient"
+        )
         if count:
             nn.init.uniform_(self.codes, -1 / count, 1 / count)
         moving = count if kind == "ema" else 0
@@ -58,10 +60,14 @@ class Codebook(nn.Module):
         2."""
         codes = self.codes.float()
         half = codes.square().sum(1) / -2
-        length = max(1, PIECE // len(codes)) if tokens.device.type == "cpu" else len(tokens)
+        length = (
+            max(1, PIECE // len(codes)) if tokens.device.type == "cpu" else len(tokens)
+        )
         pieces = torch.split(tokens.float(), length)
         with torch.autocast(tokens.device.type, enabled=False):
-            return torch.cat([torch.addmm(half, piece, codes.T).argmax(1) for piece in pieces])
+            return torch.cat(
+                [torch.addmm(half, piece, codes.T).argmax(1) for piece in pieces]
+            )
 
     @torch.no_grad()
     def follow(self, z: Tensor, index: Tensor) -> None:
@@ -80,7 +86,9 @@ class Codebook(nn.Module):
         self.sums.lerp_(sums, 1 - DECAY)
         dead = self.counts < _LEAST
         # Evenly spaced vectors of the batch replace dead codes: a deterministic choice.
-        places = torch.linspace(0, len(tokens) - 1, len(self), device=tokens.device).long()
+        places = torch.linspace(
+            0, len(tokens) - 1, len(self), device=tokens.device
+        ).long()
         self.sums[dead] = tokens[places][dead]
         self.counts[dead] = 1.0
         self.codes.copy_(self.sums / self.counts[:, None])

@@ -56,13 +56,21 @@ class WrapConv(nn.Conv2d):
         # The convolution itself adds symmetric padding of rows, without a copy.
         self.below = 0 if above == below else below - above
         super().__init__(
-            inputs, outputs, kernel, stride, padding=(above, 0), dilation=dilation, bias=bias
+            inputs,
+            outputs,
+            kernel,
+            stride,
+            padding=(above, 0),
+            dilation=dilation,
+            bias=bias,
         )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
         if self.left or self.right:
-            x = torch.cat((x[..., x.shape[-1] - self.left :], x, x[..., : self.right]), -1)
+            x = torch.cat(
+                (x[..., x.shape[-1] - self.left :], x, x[..., : self.right]), -1
+            )
         if self.below:
             x = F.pad(x, (0, 0, 0, self.below))
         return super().forward(x)
@@ -161,7 +169,12 @@ class ContextBlock(nn.Module):
     """
 
     def __init__(
-        self, channels: int, heads: int, context: int, groups: int = GROUPS, ratio: int = 4
+        self,
+        channels: int,
+        heads: int,
+        context: int,
+        groups: int = GROUPS,
+        ratio: int = 4,
     ) -> None:
         super().__init__()
         self.heads = heads
@@ -213,7 +226,9 @@ def fold(x: Tensor, patch: Grid) -> Tensor:
     """(B, C, H, W) to (B, C p q, H / p, W / q): the cells of a patch become channels. Channels
     last."""
     batch, channels, rows, columns = x.shape
-    x = x.reshape(batch, channels, rows // patch[0], patch[0], columns // patch[1], patch[1])
+    x = x.reshape(
+        batch, channels, rows // patch[0], patch[0], columns // patch[1], patch[1]
+    )
     return x.permute(0, 2, 4, 1, 3, 5).flatten(3).permute(0, 3, 1, 2)
 
 
@@ -256,7 +271,9 @@ def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
         DataError: if the shape is not (B, *shape).
     """
     if x.ndim != len(shape) + 1 or x.shape[1:] != shape:
-        raise DataError(f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})")
+        raise DataError(
+            f"{what} of shape {tuple(x.shape)}", f"(B, {', '.join(map(str, shape))})"
+        )
 
 
 def check_condition(
@@ -273,12 +290,18 @@ def check_condition(
     Raises:
         DataError: on a missing or unexpected condition, or one of another shape.
     """
-    given = "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
+    given = (
+        "no condition" if cond is None else f"a condition of shape {tuple(cond.shape)}"
+    )
     if maps[0]:
         if cond is None or cond.shape != (count, *maps):
             raise DataError(given, str((count, *maps)))
     elif tokens:
-        if cond is None or cond.ndim != 3 or (len(cond), cond.shape[2]) != (count, tokens):
+        if (
+            cond is None
+            or cond.ndim != 3
+            or (len(cond), cond.shape[2]) != (count, tokens)
+        ):
             raise DataError(given, f"({count}, tokens, {tokens})")
     elif cond is not None:
         raise DataError(given, "none: the network takes no condition")

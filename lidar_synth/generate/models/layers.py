@@ -30,7 +30,11 @@ def piece_length(x: Tensor, items: int, floats: int) -> int:
         items: number of items.
         floats: size of the temporary array per item.
     """
-    if x.device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
+    if (
+        x.device.type != "cpu"
+        or torch.is_grad_enabled()
+        or torch.compiler.is_compiling()
+    ):
         return items
     pieces = -(-items * floats // PIECE)
     return -(-items // pieces)

@@ -81,7 +81,12 @@ class Objective:
         """The weighted sum over channels, a scalar: the metric, or cross-entropy of label bits."""
         sizes = [CHANNELS[name] for name in self.tensors.channels]
         loss = output.new_zeros(())
-        parts = zip(self.tensors.channels, output.split(sizes, 1), x.split(sizes, 1), strict=True)  # type: ignore[no-untyped-call]
+        parts = zip(
+            self.tensors.channels,
+            output.split(sizes, 1),  # type: ignore[no-untyped-call]
+            x.split(sizes, 1),  # type: ignore[no-untyped-call]
+            strict=True,
+        )
         for name, a, b in parts:
             error = _cross_entropy if name == "label" else self.metric
             part = error(a, b).mean()

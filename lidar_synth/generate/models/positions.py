@@ -64,12 +64,15 @@ class Rotary(Exact):
         )
         # (2, heads, D / 4): neighbouring harmonics are assigned to different heads.
         self.register_buffer(
-            "harmonics", spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous()
+            "harmonics",
+            spread.reshape(2, width // 4, heads).transpose(1, 2).contiguous(),
         )
 
     def forward(self, angles: Tensor) -> tuple[Tensor, Tensor]:
         """Angles (2, H, W) to the tokens' cosines and sines, each (N, heads, D / 2)."""
-        turn = torch.cat(tuple(angles.flatten(1)[..., None, None] * self.harmonics[:, None]), -1)
+        turn = torch.cat(
+            tuple(angles.flatten(1)[..., None, None] * self.harmonics[:, None]), -1
+        )
         return turn.cos(), turn.sin()
 
 
@@ -99,12 +102,24 @@ def spherical_harmonics(angles: Tensor, degree: int = 4) -> Tensor:
         below = torch.zeros_like(z)
         legendre = across**m * math.prod(range(1, 2 * m, 2))
         for n in range(m, degree + 1):
-            norm = (2 * n + 1) / (2 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
+            norm = (
+                (2 * n + 1)
+                / (2 * math.pi)
+                * math.factorial(n - m)
+                / math.factorial(n + m)
+            )
             # y = cos(elevation) sin(-azimuth), since azimuth increases clockwise.
             components[n, -m] = math.sqrt(norm) * legendre * (m * -azimuth).sin()
-            components[n, m] = math.sqrt(norm if m else norm / 2) * legendre * (m * azimuth).cos()
-            below, legendre = legendre, ((2 * n + 1) * z * legendre - (n + m) * below) / (n - m + 1)
-    return torch.stack([components[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1)
+            components[n, m] = (
+                math.sqrt(norm if m else norm / 2) * legendre * (m * azimuth).cos()
+            )
+            below, legendre = (
+                legendre,
+                ((2 * n + 1) * z * legendre - (n + m) * below) / (n - m + 1),
+            )
+    return torch.stack(
+        [components[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], -1
+    )
 
 
 def fourier_features(angles: Tensor) -> Tensor:
@@ -117,9 +132,12 @@ def fourier_features(angles: Tensor) -> Tensor:
         (H, W, 2 (ceil(log2 H) + ceil(log2 W))).
     """
     octaves = [
-        torch.arange(math.ceil(math.log2(size)), device=angles.device) for size in angles.shape[1:]
+        torch.arange(math.ceil(math.log2(size)), device=angles.device)
+        for size in angles.shape[1:]
     ]
-    turn = torch.cat([a[..., None] * n.exp2() for a, n in zip(angles, octaves, strict=True)], -1)
+    turn = torch.cat(
+        [a[..., None] * n.exp2() for a, n in zip(angles, octaves, strict=True)], -1
+    )
     return torch.cat((turn.sin(), turn.cos()), -1)
 
 
@@ -168,15 +186,21 @@ class AnglePosition(nn.Module):
         ratio, depth: arguments of the mapping network.
     """
 
-    def __init__(self, basis: str, grid: Sequence[int], dim: int, ratio: float, depth: int) -> None:
+    def __init__(
+        self, basis: str, grid: Sequence[int], dim: int, ratio: float, depth: int
+    ) -> None:
         super().__init__()
         self.basis = BASES[basis]
-        self.linear = nn.Linear(self.basis(torch.zeros(2, *grid)).shape[-1], dim, bias=False)
+        self.linear = nn.Linear(
+            self.basis(torch.zeros(2, *grid)).shape[-1], dim, bias=False
+        )
         self.mapping = Mapping(dim, ratio, depth)
 
     def forward(self, angles: Tensor) -> Tensor:
         """Angles (2, H, W) to (H, W, C)."""
-        out: Tensor = self.mapping(self.linear(self.basis(angles).to(self.linear.weight.dtype)))
+        out: Tensor = self.mapping(
+            self.linear(self.basis(angles).to(self.linear.weight.dtype))
+        )
         return out
 
 
@@ -215,7 +239,9 @@ class TimeEmbedding(nn.Module):
 
     def forward(self, t: Tensor) -> Tensor:
         """Times (B,) to (B, E)."""
-        out: Tensor = self.mapping(self.linear(self.features(t).to(self.linear.weight.dtype)))
+        out: Tensor = self.mapping(
+            self.linear(self.features(t).to(self.linear.weight.dtype))
+        )
         return out
 
 

@@ -7,10 +7,20 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.layout.layout import CLASSES, Layout, Outline, around_sensor, overlaps
+from lidar_synth.geometry.layout.layout import (
+    CLASSES,
+    Layout,
+    Outline,
+    around_sensor,
+    overlaps,
+)
 from lidar_synth.geometry.scan import Boxes, Scan
 
-KINDS = {"building": ("building",), "vegetation": ("vegetation", "trunk"), "fence": ("fence",)}
+KINDS = {
+    "building": ("building",),
+    "vegetation": ("vegetation", "trunk"),
+    "fence": ("fence",),
+}
 """The classes of points behind each kind of outline."""
 
 SECTORS = 512
@@ -26,7 +36,9 @@ _EDGE = 0.05  # metres between the outermost return and the edge of an outline
 _FLAT = 0.3
 _CLEAR = 0.3  # metres above the ground of what stands on it, without labels
 _NEAR = 30.0  # metres around the sensor in which the ground is a plane
-_CUBE = 1.0  # metres; side of the columns whose lowest return may be ground, without labels
+_CUBE = (
+    1.0  # metres; side of the columns whose lowest return may be ground, without labels
+)
 
 
 def layout_of(scan: Scan, reach: float | None = None) -> Layout:
@@ -48,12 +60,24 @@ def layout_of(scan: Scan, reach: float | None = None) -> Layout:
         (True, True)
     """
     if scan.boxes is None:
-        raise DataError(f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects")
-    label = scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
-    ground = _plane(_lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id)
-    outlines = list(_unlabelled(scan, ground) if label is None else _labelled(scan.points, label))
+        raise DataError(
+            f"scan {scan.id!r} has no boxes", "a scan with boxes around its objects"
+        )
+    label = (
+        scan.label if scan.label is not None and (scan.label != IGNORE).any() else None
+    )
+    ground = _plane(
+        _lowest(scan.points) if label is None else scan.points[GROUND[label]], scan.id
+    )
+    outlines = list(
+        _unlabelled(scan, ground) if label is None else _labelled(scan.points, label)
+    )
     return Layout(
-        select_known_boxes(scan), ground, outlines, reach or scan.sensor.range_max, scan.id
+        select_known_boxes(scan),
+        ground,
+        outlines,
+        reach or scan.sensor.range_max,
+        scan.id,
     )
 
 
@@ -62,7 +86,9 @@ def select_known_boxes(scan: Scan) -> Boxes:
     range, of overlapping ones the first, and none around the sensor."""
     assert scan.boxes is not None
     boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
-    boxes = boxes[np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)]
+    boxes = boxes[
+        np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
+    ]
     later: set[int] = set()
     for first, second in overlaps(
         boxes
@@ -77,7 +103,9 @@ def _plane(points: NDArray[np.float32], name: str) -> tuple[float, float, float]
     squares."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < _NEAR].astype(np.float64)
     if len(near) < 20:
-        raise DataError(f"scan {name!r} with {len(near)} returns of the ground", "20 or more")
+        raise DataError(
+            f"scan {name!r} with {len(near)} returns of the ground", "20 or more"
+        )
     plane = np.zeros(3)
     kept = near
     for limit in (0.5, 0.2):
@@ -101,16 +129,22 @@ def _lowest(points: NDArray[np.float32]) -> NDArray[np.float32]:
     return below[order[first]]
 
 
-def _labelled(points: NDArray[np.float32], label: NDArray[np.uint8]) -> Iterator[Outline]:
+def _labelled(
+    points: NDArray[np.float32], label: NDArray[np.uint8]
+) -> Iterator[Outline]:
     for kind, classes in KINDS.items():
-        for profile in _profiles(points[np.isin(label, [TRAIN_ID[name] for name in classes])]):
+        for profile in _profiles(
+            points[np.isin(label, [TRAIN_ID[name] for name in classes])]
+        ):
             yield Outline(kind, profile[:, :2], profile[:, 2], profile[:, 3])
 
 
 def _unlabelled(scan: Scan, ground: tuple[float, float, float]) -> Iterator[Outline]:
     """Outlines of what stands on the ground outside all boxes: flat things are buildings, others
     vegetation."""
-    height = scan.points[:, 2] - (ground[0] + scan.points[:, :2] @ np.array(ground[1:], np.float32))
+    height = scan.points[:, 2] - (
+        ground[0] + scan.points[:, :2] @ np.array(ground[1:], np.float32)
+    )
     assert scan.boxes is not None
     for profile in _profiles(
         scan.points[(height > _CLEAR) & ~scan.boxes.contain(scan.points).any(0)]
@@ -132,16 +166,30 @@ def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
     rows = []
     for number, start, stop in _groups(sector):
         # The first run of returns without a gap that has enough of them.
-        ends = np.append(np.flatnonzero(np.diff(rho[start:stop]) > _GAP) + 1, stop - start)
+        ends = np.append(
+            np.flatnonzero(np.diff(rho[start:stop]) > _GAP) + 1, stop - start
+        )
         first, last = next(
-            ((a, b) for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True) if b - a >= _LEAST),
+            (
+                (a, b)
+                for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True)
+                if b - a >= _LEAST
+            ),
             (0, 0),
         )
         if last:
             part = slice(start + first, start + last)
             near, far = np.quantile(rho[part], (0.1, 0.9))
             middle = float(np.median(rho[part]))
-            rows.append((number, middle, z[part].min() - _EDGE, z[part].max() + _EDGE, far - near))
+            rows.append(
+                (
+                    number,
+                    middle,
+                    z[part].min() - _EDGE,
+                    z[part].max() + _EDGE,
+                    far - near,
+                )
+            )
     yield from _connected(np.array(rows, np.float64).reshape(-1, 5))
 
 
@@ -149,7 +197,10 @@ def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
     """(sector, first, last + 1) of sorted sectors."""
     numbers, starts = np.unique(sector, return_index=True)
     yield from zip(
-        numbers.tolist(), starts.tolist(), np.append(starts, len(sector))[1:].tolist(), strict=True
+        numbers.tolist(),
+        starts.tolist(),
+        np.append(starts, len(sector))[1:].tolist(),
+        strict=True,
     )
 
 
@@ -160,13 +211,20 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
         return
     gap = np.abs(np.diff(rows, axis=0))
     allowed = np.maximum(_GAP, 0.15 * rows[1:, 1])
-    breaks = (gap[:, 0] > 1) | (gap[:, 1] > allowed) | (gap[:, 2] > _STEP) | (gap[:, 3] > _STEP)
+    breaks = (
+        (gap[:, 0] > 1)
+        | (gap[:, 1] > allowed)
+        | (gap[:, 2] > _STEP)
+        | (gap[:, 3] > _STEP)
+    )
     for line in np.split(rows, np.flatnonzero(breaks) + 1):
         # Half a sector on both sides, so that lines of neighbouring sectors meet.
         edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
         padded = np.r_[line[:1], line, line[-1:]]
         azimuth = (edges / SECTORS - 0.5) * 2 * np.pi
         corners = np.c_[
-            padded[:, 1] * np.cos(azimuth), -padded[:, 1] * np.sin(azimuth), padded[:, 2:]
+            padded[:, 1] * np.cos(azimuth),
+            -padded[:, 1] * np.sin(azimuth),
+            padded[:, 2:],
         ]
         yield corners.astype(np.float32)

@@ -101,7 +101,12 @@ def load_layout(path: str | Path) -> Layout:
         tuple(NAMES.get(o.kind, o.kind) for o in given.objects),
     )
     walls = [
-        Outline(w.kind, np.array(w.line, np.float32), given.ground + w.low, given.ground + w.height)
+        Outline(
+            w.kind,
+            np.array(w.line, np.float32),
+            given.ground + w.low,
+            given.ground + w.height,
+        )
         for w in given.outlines
     ]
     return Layout(boxes, (given.ground, 0.0, 0.0), walls, given.reach, path.stem)
@@ -115,4 +120,11 @@ def _box(given: _Object, ground: float, path: Path) -> tuple[float, ...]:
         )
     length, width, height = given.size or SIZES[given.kind]
     yaw = (np.radians(given.heading) + np.pi) % (2 * np.pi) - np.pi
-    return (*given.at, ground + given.above + height / 2, length, width, height, float(yaw))
+    return (
+        *given.at,
+        ground + given.above + height / 2,
+        length,
+        width,
+        height,
+        float(yaw),
+    )

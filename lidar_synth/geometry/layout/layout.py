@@ -31,7 +31,9 @@ CLASSES = (
 """Classes of boxes as KITTI spells them; it counts motorcyclists as ``Misc``, of which narrow boxes
 are theirs."""
 
-CODES = {name: code for code, name in enumerate(("unknown", "ground", *OUTLINES, *CLASSES))}
+CODES = {
+    name: code for code, name in enumerate(("unknown", "ground", *OUTLINES, *CLASSES))
+}
 """The code of each class in a layout's image."""
 
 CHANNELS = ("class", "depth_high", "depth_low", "chord", "along")
@@ -74,16 +76,25 @@ class Outline:
         line = np.asarray(self.line, np.float32)
         object.__setattr__(self, "line", line)
         if self.kind not in OUTLINES:
-            raise DataError(f"an outline of {self.kind!r}", f"one of {', '.join(OUTLINES)}")
-        if line.ndim != 2 or line.shape[1] != 2 or len(line) < 2 or not (np.abs(line) < _FAR).all():
             raise DataError(
-                f"an outline of shape {line.shape}", "two or more corners x, y in metres"
+                f"an outline of {self.kind!r}", f"one of {', '.join(OUTLINES)}"
+            )
+        if (
+            line.ndim != 2
+            or line.shape[1] != 2
+            or len(line) < 2
+            or not (np.abs(line) < _FAR).all()
+        ):
+            raise DataError(
+                f"an outline of shape {line.shape}",
+                "two or more corners x, y in metres",
             )
         for name in ("low", "high"):
             edge = np.asarray(getattr(self, name), np.float32)
             if edge.shape not in ((), (len(line),)):
                 raise DataError(
-                    f"an outline's {name} of shape {edge.shape}", f"one number, or ({len(line)},)"
+                    f"an outline's {name} of shape {edge.shape}",
+                    f"one number, or ({len(line)},)",
                 )
             object.__setattr__(self, name, np.broadcast_to(edge, len(line)))
         low = np.asarray(self.low)
@@ -131,18 +142,21 @@ class Layout:
         object.__setattr__(self, "outlines", tuple(self.outlines))
         if unknown := sorted(set(self.boxes.names) - set(CLASSES)):
             raise self._error(
-                f"boxes of {', '.join(map(repr, unknown))}", f"classes of {', '.join(CLASSES)}"
+                f"boxes of {', '.join(map(repr, unknown))}",
+                f"classes of {', '.join(CLASSES)}",
             )
         height, rise, across = map(float, self.ground)
         if not -10 < height < -0.2 or not np.hypot(rise, across) <= 0.3:
             raise self._error(
-                f"ground {tuple(self.ground)}", "-10 to -0.2 m, and a rise of at most 0.3 per metre"
+                f"ground {tuple(self.ground)}",
+                "-10 to -0.2 m, and a rise of at most 0.3 per metre",
             )
         if not 0 < self.reach < _FAR:
             raise self._error(f"ground up to {self.reach} m", "metres above 0")
         if (around := around_sensor(self.boxes)).any():
             raise self._error(
-                f"box {int(around.argmax())} around the sensor", "boxes beside the sensor"
+                f"box {int(around.argmax())} around the sensor",
+                "boxes beside the sensor",
             )
         for i, j in overlaps(self.boxes):
             names = f"{self.boxes.names[i]} and {self.boxes.names[j]}"
@@ -154,7 +168,9 @@ class Layout:
 
     def _error(self, given: str, expected: str, hint: str = "") -> DataError:
         return DataError(
-            f"layout {self.id!r}: {given}" if self.id else f"a layout with {given}", expected, hint
+            f"layout {self.id!r}: {given}" if self.id else f"a layout with {given}",
+            expected,
+            hint,
         )
 
     def codes(self) -> NDArray[np.uint8]:
@@ -169,7 +185,9 @@ class Layout:
 
 def around_sensor(boxes: Boxes) -> NDArray[np.bool_]:
     """(M,) whether the sensor is in, above or below a box."""
-    level = replace(boxes, values=boxes.values * np.array([1, 1, 0, 1, 1, 1, 1], np.float32))
+    level = replace(
+        boxes, values=boxes.values * np.array([1, 1, 0, 1, 1, 1, 1], np.float32)
+    )
     return level.contain(np.zeros((1, 3), np.float32))[:, 0]
 
 
@@ -180,14 +198,26 @@ def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
     half = np.maximum(values[:, 3:6] - margin, 1e-3) / 2
     c = np.cos(values[:, 6])
     s = np.sin(values[:, 6])
-    axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)  # (M, 2 axes, x and y)
+    axes = np.stack(
+        [np.stack([c, s], -1), np.stack([-s, c], -1)], 1
+    )  # (M, 2 axes, x and y)
     found = []
     for i in range(len(values)):
         gap = values[i + 1 :, :3] - values[i, :3]
-        near = np.hypot(*gap[:, :2].T) < np.hypot(*half[i, :2]) + np.hypot(*half[i + 1 :, :2].T)
-        for j in i + 1 + np.flatnonzero(near & (np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2])):
+        near = np.hypot(*gap[:, :2].T) < np.hypot(*half[i, :2]) + np.hypot(
+            *half[i + 1 :, :2].T
+        )
+        for j in (
+            i
+            + 1
+            + np.flatnonzero(near & (np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2]))
+        ):
             if _footprints_meet(
-                axes[i], half[i, :2], axes[j], half[j, :2], values[j, :2] - values[i, :2]
+                axes[i],
+                half[i, :2],
+                axes[j],
+                half[j, :2],
+                values[j, :2] - values[i, :2],
             ):
                 found.append((i, int(j)))
     return found
@@ -197,6 +227,9 @@ def _footprints_meet(axes_a, half_a, axes_b, half_b, gap) -> bool:  # type: igno
     """Separating axis theorem for two rectangles with unit axes (2, 2), half sides (2,) and centres
     ``gap`` apart."""
     for axis in (*axes_a, *axes_b):
-        if abs(axis @ gap) >= np.abs(axes_a @ axis) @ half_a + np.abs(axes_b @ axis) @ half_b:
+        if (
+            abs(axis @ gap)
+            >= np.abs(axes_a @ axis) @ half_a + np.abs(axes_b @ axis) @ half_b
+        ):
             return False
     return True

@@ -5,7 +5,13 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lidar_synth.geometry.layout.layout import CHANNELS, CHORD_STEP, CODES, DEPTH_STEP, Layout
+from lidar_synth.geometry.layout.layout import (
+    CHANNELS,
+    CHORD_STEP,
+    CODES,
+    DEPTH_STEP,
+    Layout,
+)
 from lidar_synth.geometry.sensor import Sensor
 
 FARTHEST = 65535 * DEPTH_STEP
@@ -82,7 +88,9 @@ def _walls(layout: Layout) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 
 @numba.njit(cache=True)
-def _cast(azimuth, slope, lift, boxes, codes, walls, kinds, ground, reach, nearest, farthest):  # type: ignore[no-untyped-def]
+def _cast(  # type: ignore[no-untyped-def]
+    azimuth, slope, lift, boxes, codes, walls, kinds, ground, reach, nearest, farthest
+):
     """Code, distance, way through the box and place along the box of the first thing on each ray
     (H, W).
 
@@ -159,7 +167,9 @@ def _cross_boxes(dx, dy, boxes, which, span):  # type: ignore[no-untyped-def]
         x, y, _, length, width, _, yaw = boxes[k]
         c = np.cos(yaw)
         s = np.sin(yaw)
-        enter, leave = _between(-x * c - y * s, dx * c + dy * s, length / 2, 0.0, np.inf)
+        enter, leave = _between(
+            -x * c - y * s, dx * c + dy * s, length / 2, 0.0, np.inf
+        )
         enter, leave = _between(x * s - y * c, dy * c - dx * s, width / 2, enter, leave)
         if enter < leave:
             which[count] = k

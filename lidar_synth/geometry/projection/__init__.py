@@ -2,7 +2,13 @@
 
 from lidar_synth.geometry.projection.batch import BatchImage, project_batch
 from lidar_synth.geometry.projection.rings import ring_numbers
-from lidar_synth.geometry.projection.spherical import Cells, carry, locate, project, unproject
+from lidar_synth.geometry.projection.spherical import (
+    Cells,
+    carry,
+    locate,
+    project,
+    unproject,
+)
 from lidar_synth.geometry.projection.unfold import laser_rows, unfold
 
 __all__ = [

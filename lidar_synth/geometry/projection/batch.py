@@ -59,7 +59,11 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
         row = torch.searchsorted(-inner, -elevation.contiguous(), right=True)
     else:
         up, down = torch.tensor([grid.up, grid.down], device=points.device).unbind()
-        row = ((1 - (elevation - down) / (up - down)) * grid.rows).clamp(0, grid.rows - 1).long()
+        row = (
+            ((1 - (elevation - down) / (up - down)) * grid.rows)
+            .clamp(0, grid.rows - 1)
+            .long()
+        )
     azimuth = -torch_atan2(y, x)
     column = ((azimuth / torch.pi + 1) * 0.5 * grid.columns).long() % grid.columns
     return torch.where(in_range, row * grid.columns + column, 0), torch.where(
@@ -67,7 +71,9 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
     )
 
 
-def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -> BatchImage:
+def project_batch(
+    points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor
+) -> BatchImage:
     """Project a batch of point clouds to range images, each bit for bit as ``project`` does.
 
     Args:
@@ -95,7 +101,11 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
             f"points {tuple(points.shape)} {points.dtype}",
             "(N, 3 + C) float32: x, y, z in metres, ...",
         )
-    if int(offsets[0]) != 0 or int(offsets[-1]) != len(points) or bool((offsets.diff() < 0).any()):
+    if (
+        int(offsets[0]) != 0
+        or int(offsets[-1]) != len(points)
+        or bool((offsets.diff() < 0).any())
+    ):
         raise DataError(
             f"offsets {offsets.tolist()} for {len(points)} points",
             "rising from 0 to the number of points",
@@ -107,13 +117,19 @@ def project_batch(points: torch.Tensor, offsets: torch.Tensor, sensor: Sensor) -
     )
     # Positive floats are ordered like their bit patterns, so one integer minimum over (range bits,
     # point index) finds the nearest point, and the first of points at equal range.
-    key = distance.view(torch.int32).long() << 32 | torch.arange(len(points), device=points.device)
+    key = distance.view(torch.int32).long() << 32 | torch.arange(
+        len(points), device=points.device
+    )
     best = torch.full((batch * height * width,), _NONE, device=points.device)
     in_range = distance < torch.inf
-    best.scatter_reduce_(0, (cloud * (height * width) + cell)[in_range], key[in_range], "amin")
+    best.scatter_reduce_(
+        0, (cloud * (height * width) + cell)[in_range], key[in_range], "amin"
+    )
     hit = best < _NONE
     point = torch.where(hit, best & 0xFFFFFFFF, -1).view(batch, height, width)
-    shown = torch.where(hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0)
+    shown = torch.where(
+        hit.view_as(point)[..., None], points[point.clamp(min=0)][..., 3:], 0.0
+    )
     distances = torch.where(hit.view_as(point), distance[point.clamp(min=0)], 0.0)
     return BatchImage(distances, shown.movedim(-1, 1), point)
 

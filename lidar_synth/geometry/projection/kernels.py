@@ -22,9 +22,20 @@ from numpy.typing import NDArray
 from lidar_synth.geometry.sensor import Sensor
 
 _f = np.float32
-ATAN = tuple(map(_f, (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1)))
+ATAN = tuple(
+    map(_f, (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1))
+)
 ASIN = tuple(
-    map(_f, (4.2163199048e-2, 2.4181311049e-2, 4.5470025998e-2, 7.4953002686e-2, 1.6666752422e-1))
+    map(
+        _f,
+        (
+            4.2163199048e-2,
+            2.4181311049e-2,
+            4.5470025998e-2,
+            7.4953002686e-2,
+            1.6666752422e-1,
+        ),
+    )
 )
 _A0, _A1, _A2, _A3 = ATAN
 _S0, _S1, _S2, _S3, _S4 = ASIN
@@ -184,13 +195,16 @@ def _locate_block(x, y, z, grid, cell, distance):  # type: ignore[no-untyped-def
             in_range = (r >= low) & (r <= high) & (r > 0)
             distance[i] = r if in_range else _INF
             cell[i] = (
-                row * columns + column_of(-atan2(y[i], x[i]), columns) if in_range else np.int32(0)
+                row * columns + column_of(-atan2(y[i], x[i]), columns)
+                if in_range
+                else np.int32(0)
             )
     elif len(grid.edges) > 0:
         for i in range(len(x)):
             if distance[i] < _INF:
                 cell[i] = (
-                    cell[i] % columns + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns
+                    cell[i] % columns
+                    + row_in_table(asin(z[i] / distance[i]), grid.edges) * columns
                 )
 
 
@@ -228,7 +242,11 @@ def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
     for start in range(0, len(points), _BLOCK):
         n = min(_BLOCK, len(points) - start)
         for i in range(n):
-            x[i], y[i], z[i] = points[start + i, 0], points[start + i, 1], points[start + i, 2]
+            x[i], y[i], z[i] = (
+                points[start + i, 0],
+                points[start + i, 1],
+                points[start + i, 2],
+            )
         _locate_block(x[:n], y[:n], z[:n], grid, cell, distance)
         _scatter(cell[:n], distance[:n], start, image, index)
     _mark_empty(image, index)

@@ -65,7 +65,9 @@ def ring_bounds(points: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.concatenate([[0], starts, [len(points)]]).astype(np.int64)
 
 
-def fault_of(points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sensor) -> str:
+def fault_of(
+    points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sensor
+) -> str:
     """Why the rings from ``ring_bounds`` cannot be those of a sensor, as a text; "" if they can.
 
     Args:
@@ -77,7 +79,9 @@ def fault_of(points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sen
         return ""
     count = len(bounds) - 1
     if count > lasers.shape[0]:
-        return f"{count} rings found for the {lasers.shape[0]} lasers of {lasers.name!r}"
+        return (
+            f"{count} rings found for the {lasers.shape[0]} lasers of {lasers.name!r}"
+        )
     everywhere = _all_around(points)
     if count > 1 and not everywhere:
         azimuth, flat = turns(points)
@@ -119,7 +123,9 @@ def fault_of(points: NDArray[np.float32], bounds: NDArray[np.int64], lasers: Sen
     return ""
 
 
-def turns(points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def turns(
+    points: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N,) radians counter-clockwise from straight ahead, in [0, 2 pi], and (N,) horizontal
     distance, metres."""
     azimuth = np.empty(len(points), np.float32)
@@ -149,14 +155,18 @@ def _start_candidates(points: NDArray[np.float32]) -> list[NDArray[np.intp]]:
     azimuth, flat = turns(points)
     places = np.empty(len(points), np.int64)
     limits = np.empty(len(points), np.float32)
-    count = decreases(azimuth, flat, np.float32(MIN_DECREASE), np.float32(MOTION), places, limits)
+    count = decreases(
+        azimuth, flat, np.float32(MIN_DECREASE), np.float32(MOTION), places, limits
+    )
     places = places[:count]
     limits = limits[:count]
     if _all_around(points):
         limits = np.maximum(limits, np.float32(MIN_DECREASE_ALL_AROUND))
     steps = np.empty(count, np.float32)
     steps_at(azimuth, places, STRAYS, steps)
-    candidates = places[(steps > limits) & (azimuth[places - 1] - azimuth[places] > limits)]
+    candidates = places[
+        (steps > limits) & (azimuth[places - 1] - azimuth[places] > limits)
+    ]
     if not len(candidates):
         return []
     return np.split(candidates, np.flatnonzero(np.diff(candidates) > STRAYS) + 1)
@@ -177,13 +187,17 @@ def _best_candidate(group: NDArray[np.intp], points: NDArray[np.float32]) -> int
     return int(min(group.tolist(), key=spread))
 
 
-def _without_fragments(starts: NDArray[np.intp], points: NDArray[np.float32]) -> NDArray[np.intp]:
+def _without_fragments(
+    starts: NDArray[np.intp], points: NDArray[np.float32]
+) -> NDArray[np.intp]:
     """The starts of rings without those that only cut a fragment off a ring."""
     length = np.diff(np.concatenate([[0], starts, [len(points)]]))
     short = np.flatnonzero(length < FRAGMENT * np.median(length))
     if not len(short):
         return starts
-    middle = np.array([np.median(part) for part in np.split(_elevations(points), starts)])
+    middle = np.array(
+        [np.median(part) for part in np.split(_elevations(points), starts)]
+    )
     gap = float(np.median(np.abs(np.diff(middle))))
     removed = set()
     for i in short.tolist():
@@ -191,7 +205,9 @@ def _without_fragments(starts: NDArray[np.intp], points: NDArray[np.float32]) ->
         nearest = min(neighbours, key=lambda j: abs(middle[j] - middle[i]))
         if abs(middle[nearest] - middle[i]) < gap / 2:
             removed.add(max(i, nearest))
-    return np.array([start for i, start in enumerate(starts, 1) if i not in removed], np.intp)
+    return np.array(
+        [start for i, start in enumerate(starts, 1) if i not in removed], np.intp
+    )
 
 
 def _height(points: NDArray[np.float32], bounds: NDArray[np.int64]) -> float:

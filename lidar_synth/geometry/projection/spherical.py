@@ -129,7 +129,9 @@ def project(
     sensor = sensor or scan.sensor
     image = np.empty(sensor.shape, np.float32)
     index = np.empty(sensor.shape, np.int32)
-    nearest_points(_checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1))
+    nearest_points(
+        _checked(scan.points), grid_of(sensor), image.reshape(-1), index.reshape(-1)
+    )
     return RangeImage(image, sensor, carry(scan, index, channels))
 
 
@@ -152,7 +154,9 @@ def carry(
     fields = scan.fields()
     names = list(fields) if channels is None else list(channels)
     if missing := [n for n in names if n not in fields]:
-        raise ConfigError(f"scan {scan.id!r} has no {missing}", f"some of {sorted(fields)}")
+        raise ConfigError(
+            f"scan {scan.id!r} has no {missing}", f"some of {sorted(fields)}"
+        )
     carried = {}
     for name in names:
         carried[name] = np.empty(index.shape, fields[name].dtype)

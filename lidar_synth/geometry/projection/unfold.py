@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
-from lidar_synth.geometry.projection.kernels import grid_of, medians, put_in_rows, sines_of
+from lidar_synth.geometry.projection.kernels import (
+    grid_of,
+    medians,
+    put_in_rows,
+    sines_of,
+)
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.projection.spherical import carry, cells_of, nearest_in
 from lidar_synth.geometry.scan import RangeImage, Scan
@@ -43,7 +48,9 @@ def _rows_by_elevation(
     return rows
 
 
-def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation") -> RangeImage:
+def unfold(
+    scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation"
+) -> RangeImage:
     """Unfold a scan to a range image with one row per laser; a cell shows its nearest return.
 
     Args:
@@ -68,14 +75,18 @@ def unfold(scan: Scan, sensor: Sensor | None = None, anchor: Anchor = "elevation
         ((64, 2048), 'hdl64e_lasers')
     """
     lasers = (sensor or scan.sensor).by_beams()
-    grid = grid_of(lasers)._replace(edges=np.empty(0, np.float32))  # the rows follow from the rings
+    grid = grid_of(lasers)._replace(
+        edges=np.empty(0, np.float32)
+    )  # the rows follow from the rings
     cell, distance = cells_of(scan.points, grid)
     put_in_rows(cell, laser_rows(scan, lasers, anchor), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)
     return RangeImage(image, lasers, carry(scan, index))
 
 
-def laser_rows(scan: Scan, lasers: Sensor, anchor: Anchor = "elevation") -> NDArray[np.int64]:
+def laser_rows(
+    scan: Scan, lasers: Sensor, anchor: Anchor = "elevation"
+) -> NDArray[np.int64]:
     """(N,) row of the laser that measured each point, 0 = highest.
 
     Args:
@@ -90,7 +101,9 @@ def laser_rows(scan: Scan, lasers: Sensor, anchor: Anchor = "elevation") -> NDAr
     if scan.ring is not None:
         if len(scan) and not 0 <= scan.ring.min() <= scan.ring.max() < height:
             rings = f"rings {scan.ring.min()} to {scan.ring.max()}"
-            raise _not_in_rings(scan, f"{rings} for the {height} lasers of {lasers.name!r}")
+            raise _not_in_rings(
+                scan, f"{rings} for the {height} lasers of {lasers.name!r}"
+            )
         return scan.ring.astype(np.int64)
     bounds = ring_bounds(scan.points)
     if fault := fault_of(scan.points, bounds, lasers):

@@ -62,7 +62,10 @@ class Hits:
 
 
 def first_hits(
-    surfaces: ScanSurfaces, points: NDArray[np.float64], rays: Rays, upright: NDArray[np.float64]
+    surfaces: ScanSurfaces,
+    points: NDArray[np.float64],
+    rays: Rays,
+    upright: NDArray[np.float64],
 ) -> Hits:
     """Cast rays at the surfaces of a scan.
 
@@ -84,7 +87,9 @@ def first_hits(
     rows_above(points, rays, rho, rows)
     vertices = Vertices(points, azimuth, rho, rows, scan.reflectance)
     triangles = (
-        surfaces.triangles if there.all() else surfaces.triangles[there[surfaces.triangles].all(1)]
+        surfaces.triangles
+        if there.all()
+        else surfaces.triangles[there[surfaces.triangles].all(1)]
     )
     size = len(rays.slope), rays.firings
     nothing = np.zeros(size, np.float32)
@@ -96,7 +101,9 @@ def first_hits(
     shape = FootprintShape(
         scan.points, surfaces.level, surfaces.step / 2, surfaces.up, surfaces.down
     )
-    hit_footprints(vertices, rim, _reach(scan, rim), shape, upright, rays, FRONT, nearest)
+    hit_footprints(
+        vertices, rim, _reach(scan, rim), shape, upright, rays, FRONT, nearest
+    )
     return Hits(nearest, scan.fields())
 
 

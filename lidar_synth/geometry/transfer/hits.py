@@ -104,7 +104,9 @@ def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untype
     """
     rows = vertices.rows
     for t in range(len(triangles)):
-        i = np.uintp(triangles[t, 0])  # unsigned: no test whether an index counts from the end
+        i = np.uintp(
+            triangles[t, 0]
+        )  # unsigned: no test whether an index counts from the end
         j = np.uintp(triangles[t, 1])
         k = np.uintp(triangles[t, 2])
         top = min(rows[i], rows[j], rows[k])
@@ -116,7 +118,9 @@ def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untype
             alone, one, other = _alone_first(rows, laser, i, j, k)
             start = _cut(vertices, rays, laser, alone, one)
             end = _cut(vertices, rays, laser, alone, other)
-            _hit_segment(vertices, (alone, one, other), start, end, normal, rays, laser, nearest)
+            _hit_segment(
+                vertices, (alone, one, other), start, end, normal, rays, laser, nearest
+            )
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -181,7 +185,9 @@ def _hit_segment(vertices, corners, start, end, normal, rays, laser, nearest):  
             nearest.value[laser, column] = (
                 of_alone * value[alone] + of_one * value[one] + of_other * value[other]
             )
-            squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+            squares = (
+                normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+            )
             length = np.sqrt(squares * (1 + rays.slope[laser] * rays.slope[laser]))
             towards = normal[0] * dx + normal[1] * dy + normal[2] * rays.slope[laser]
             nearest.facing[laser, column] = abs(towards) / length
@@ -260,7 +266,9 @@ def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest)
                 rho = over / towards if over * towards > 0 else away
                 beyond = abs(rho - away) > reach[k]
                 rho = min(max(rho, NEAREST * away), FARTHEST * away)
-                hidden = rho if found[laser, column] else rho * (1 + front[1]) + front[0]
+                hidden = (
+                    rho if found[laser, column] else rho * (1 + front[1]) + front[0]
+                )
                 if hidden < nearest.rho[laser, column] and not beyond:
                     found[laser, column] = True
                     nearest.rho[laser, column] = rho

@@ -59,7 +59,9 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
             along = np.sqrt((xi - xj) ** 2 + (yi - yj) ** 2)
             if abs(zi - zj) <= 0.12 * along + 0.02 and along > 0.05:
                 level[i] = True
-    for i in range(len(points)):  # the nearest returns of a surface have no neighbour below
+    for i in range(
+        len(points)
+    ):  # the nearest returns of a surface have no neighbour below
         j = below[i]
         if j >= 0 and level[i] and below[j] < 0:
             level[j] = True
@@ -87,7 +89,8 @@ def _joined(points, distance, key, ground, level, i, j, across):  # type: ignore
     cz = xi * yj - yi * xj
     least = OTHER_OBJECT if not same else SAME_OBJECT if across else SAME_RING
     return int(
-        np.sqrt(cx * cx + cy * cy + cz * cz) >= least * (far - (xi * xj + yi * yj + zi * zj))
+        np.sqrt(cx * cx + cy * cy + cz * cz)
+        >= least * (far - (xi * xj + yi * yj + zi * zj))
     )
 
 
@@ -102,7 +105,9 @@ def _around(azimuth, start, i, count):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def triangulate(rings, starts, azimuth, points, key, ground, level, below, step, bridge):  # type: ignore[no-untyped-def]
+def triangulate(  # type: ignore[no-untyped-def]
+    rings, starts, azimuth, points, key, ground, level, below, step, bridge
+):
     """Join neighbouring rings by triangles.
 
     Args:
@@ -176,7 +181,9 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                     at_b = to_b
                     next_b, to_b = _around(azimuth, b0, j + 1, m)
                 joined = _UNKNOWN
-                if further == 2 and (0 <= below[from_a] < b0 or (upper and 0 <= below[c] < b0)):
+                if further == 2 and (
+                    0 <= below[from_a] < b0 or (upper and 0 <= below[c] < b0)
+                ):
                     continue  # the ring between has a return
                 whole = False
                 if gap <= limit and abs(apart) <= limit and abs(at_a - at_b) <= limit:
@@ -185,9 +192,16 @@ def triangulate(rings, starts, azimuth, points, key, ground, level, below, step,
                             points, distance, key, ground, level, from_a, from_b, True
                         )
                     if between:
-                        joined = _joined(points, distance, key, ground, level, a, b, True)
+                        joined = _joined(
+                            points, distance, key, ground, level, a, b, True
+                        )
                     if between and joined:
-                        whole = _joined(points, distance, key, ground, level, before, c, False) == 1
+                        whole = (
+                            _joined(
+                                points, distance, key, ground, level, before, c, False
+                            )
+                            == 1
+                        )
                 if whole:
                     triangles[found, 0] = from_a
                     triangles[found, 1] = from_b

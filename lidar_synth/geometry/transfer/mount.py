@@ -44,7 +44,9 @@ class Mount:
         """(4, 4) from the target's frame to the frame of the recording sensor."""
         c = np.cos(np.radians(self.pitch))
         s = np.sin(np.radians(self.pitch))
-        return np.array([(c, 0, s, 0), (0, 1, 0, 0), (-s, 0, c, self.z), (0, 0, 0, 1)], np.float64)
+        return np.array(
+            [(c, 0, s, 0), (0, 1, 0, 0), (-s, 0, c, self.z), (0, 0, 0, 1)], np.float64
+        )
 
     def points(self, points: NDArray[np.floating]) -> Matrix:
         """(N, 3) points of the recording sensor's frame in the target's frame, metres."""
@@ -65,7 +67,9 @@ class Mount:
             return boxes
         values = boxes.values.astype(np.float64)
         heading = (
-            np.stack([np.cos(values[:, 6]), np.sin(values[:, 6]), np.zeros(len(boxes))], 1)
+            np.stack(
+                [np.cos(values[:, 6]), np.sin(values[:, 6]), np.zeros(len(boxes))], 1
+            )
             @ self.matrix[:3, :3]
         )
         values[:, :3] = self.points(values[:, :3])

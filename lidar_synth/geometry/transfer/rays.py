@@ -40,7 +40,12 @@ def rays_from(
     step = 2 * np.pi / firings
     turned = first[:, None] + np.arange(firings) * step
     return Rays(
-        slope, height, first, step, firings, np.stack([np.cos(turned), -np.sin(turned)], -1)
+        slope,
+        height,
+        first,
+        step,
+        firings,
+        np.stack([np.cos(turned), -np.sin(turned)], -1),
     )
 
 

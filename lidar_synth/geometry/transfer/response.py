@@ -61,7 +61,11 @@ class Response:
         Raises:
             DataError: on scans without returns between 4 and 40 m.
         """
-        return cls(*_matched(_reflectances(recorded, "recorded"), _reflectances(target, "target")))
+        return cls(
+            *_matched(
+                _reflectances(recorded, "recorded"), _reflectances(target, "target")
+            )
+        )
 
 
 def _matched(
@@ -72,7 +76,9 @@ def _matched(
     values, first = np.unique(given, return_index=True)
     if len(values) < 2:
         return (0.0, 1.0), (float(gives.mean()),) * 2
-    means = [part.mean() for part in np.split(gives, first[1:])]  # a value that many returns have
+    means = [
+        part.mean() for part in np.split(gives, first[1:])
+    ]  # a value that many returns have
     return tuple(map(float, values)), tuple(map(float, means))
 
 

@@ -91,7 +91,9 @@ class Measurement:
             reflectance = self.response(reflectance)
         levels = target.reflectance_levels
         if levels is not None:
-            reflectance = np.minimum(np.round(reflectance * levels), levels - 1) / levels
+            reflectance = (
+                np.minimum(np.round(reflectance * levels), levels - 1) / levels
+            )
         return np.asarray(np.clip(reflectance, 0, 1), np.float32)
 
 

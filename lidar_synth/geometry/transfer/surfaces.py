@@ -14,7 +14,11 @@ from lidar_synth.geometry.projection.kernels import medians, sines_of
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds, turns
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.geometry.transfer.kernels import find_level, neighbours_below, triangulate
+from lidar_synth.geometry.transfer.kernels import (
+    find_level,
+    neighbours_below,
+    triangulate,
+)
 
 ORDERED = np.radians(2.0)
 """Half of the steps of azimuth between successive points of a file that may be in ring order are
@@ -97,7 +101,16 @@ def estimate(scan: Scan) -> ScanSurfaces:
         else GROUND[scan.label] | (scan.label == IGNORE)
     )
     triangles, rim = triangulate(
-        present, starts, azimuth, scan.points, _objects(scan), ground, level, below, step, on_grid
+        present,
+        starts,
+        azimuth,
+        scan.points,
+        _objects(scan),
+        ground,
+        level,
+        below,
+        step,
+        on_grid,
     )
     half = np.maximum(-np.diff(middle), 0) / np.diff(present) / 2
     up = np.concatenate([half[:1], half])
@@ -128,7 +141,8 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int64], bool]:
     elevation = _elevations(scan)
     some = elevation[:: 1 + len(elevation) // SAMPLES]
     off = [
-        np.median(np.abs(some - s.row_elevations()[_row(some, s)])) for s in (scan.sensor, lasers)
+        np.median(np.abs(some - s.row_elevations()[_row(some, s)]))
+        for s in (scan.sensor, lasers)
     ]
     on_grid = bool(off[0] <= off[1])
     return _row(elevation, scan.sensor if on_grid else lasers), on_grid
@@ -156,7 +170,8 @@ def _rows_of(scan: Scan) -> NDArray[np.int64]:
 def _check(scan: Scan) -> None:
     if not len(scan):
         raise DataError(
-            f"scan {scan.id!r} without a return", "a scan with returns, to find surfaces"
+            f"scan {scan.id!r} without a return",
+            "a scan with returns, to find surfaces",
         )
     if not np.isfinite(scan.points).all():
         raise DataError(

@@ -52,7 +52,9 @@ def moved(sweep: Scan, scan: Scan) -> NDArray[np.float64]:
         return out
     inside = _widened(sweep.boxes).contain(sweep.points)
     there = {} if scan.boxes is None else {int(n): box for n, box in _numbered(scan)}
-    for held, instance, box in zip(inside, sweep.boxes.instance, sweep.boxes.values, strict=True):
+    for held, instance, box in zip(
+        inside, sweep.boxes.instance, sweep.boxes.values, strict=True
+    ):
         out[held] = (
             np.nan
             if int(instance) not in there
@@ -84,4 +86,6 @@ def _carried(
     c = np.cos(turn)
     s = np.sin(turn)
     offset = points - box[:3].astype(np.float64)
-    return np.asarray(offset @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) + to[:3], np.float64)
+    return np.asarray(
+        offset @ np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) + to[:3], np.float64
+    )

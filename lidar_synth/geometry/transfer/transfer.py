@@ -16,7 +16,11 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.mount import Mount
 from lidar_synth.geometry.transfer.rays import Rays, rays_of
-from lidar_synth.geometry.transfer.returns import Measurement, gather_hits, place_returns
+from lidar_synth.geometry.transfer.returns import (
+    Measurement,
+    gather_hits,
+    place_returns,
+)
 from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate
 from lidar_synth.geometry.transfer.sweeps import moved
 from lidar_synth.noise import keyed_rng
@@ -81,7 +85,10 @@ class Transfer:
         return self._seen_by_target(scan, rng or keyed_rng(0), ())[0]
 
     def cast(
-        self, scan: Scan, rng: np.random.Generator | None = None, sweeps: Sequence[Scan] = ()
+        self,
+        scan: Scan,
+        rng: np.random.Generator | None = None,
+        sweeps: Sequence[Scan] = (),
     ) -> Transferred:
         """The scan as the target sensor would have recorded it, and the share of its field of view
         that was seen.
@@ -110,21 +117,30 @@ class Transfer:
         rays = rays_of(self.target)
         surfaces = estimate(self._without_vehicle(scan))
         _warn_of_differences(
-            scan.sensor, self.target, self.mount.pitch, self.measurement.response is None
+            scan.sensor,
+            self.target,
+            self.mount.pitch,
+            self.measurement.response is None,
         )
         upright = self.mount.matrix[2, :3]
-        hits = first_hits(surfaces, self.mount.points(surfaces.scan.points), rays, upright)
+        hits = first_hits(
+            surfaces, self.mount.points(surfaces.scan.points), rays, upright
+        )
         further: Hits | None = None
         for sweep in sweeps:
             other = estimate(self._without_vehicle(sweep))
-            found = first_hits(other, self.mount.points(moved(other.scan, scan)), rays, upright)
+            found = first_hits(
+                other, self.mount.points(moved(other.scan, scan)), rays, upright
+            )
             if further is None:
                 further = found
             else:
                 further.add(found, found.nearest.rho < further.nearest.rho)
         if further is not None:
             hits.fields.pop("time", None)  # sweeps count from moments of their own
-            hits.add(further, np.isinf(hits.nearest.rho) & np.isfinite(further.nearest.rho))
+            hits.add(
+                further, np.isinf(hits.nearest.rho) & np.isfinite(further.nearest.rho)
+            )
         returns = self._returns(hits, rays, rng)
         if not len(returns):
             seen = _seen(surfaces, self.target, self.mount)
@@ -137,7 +153,10 @@ class Transfer:
             )
         boxes = None if scan.boxes is None else self.mount.boxes(scan.boxes)
         pose = None if scan.pose is None else scan.pose @ self.mount.matrix
-        kept = {name: getattr(scan, name) for name in ("image_path", "id", "domain", "provenance")}
+        kept = {
+            name: getattr(scan, name)
+            for name in ("image_path", "id", "domain", "provenance")
+        }
         return replace(returns, boxes=boxes, pose=pose, **kept), surfaces
 
     def _without_vehicle(self, scan: Scan) -> Scan:
@@ -165,7 +184,9 @@ class Transfer:
         count = gather_hits(nearest.rho, rays.slope, at, distance)
         at = at[:count]
         distance = distance[:count]
-        kept = self.measurement.returned(distance, nearest.value, nearest.facing, at, rng)
+        kept = self.measurement.returned(
+            distance, nearest.value, nearest.facing, at, rng
+        )
         if not kept.all():
             at = at[kept]
             distance = distance[kept]
@@ -176,7 +197,9 @@ class Transfer:
         at = at[:count]
         reflectance = self.measurement.reflectances(nearest.value.take(at), self.target)
         ring = (at // rays.firings).astype(np.int16)
-        return Scan(points[:count], reflectance, self.target, ring=ring, **hits.carried(at))
+        return Scan(
+            points[:count], reflectance, self.target, ring=ring, **hits.carried(at)
+        )
 
     @property
     def identity(self) -> str:
@@ -222,11 +245,15 @@ class SeenAs:
         return len(self.source)
 
     def __getitem__(self, index: int) -> Scan:
-        return self.transfer(self.source[index], keyed_rng(self.seed, index % len(self)))
+        return self.transfer(
+            self.source[index], keyed_rng(self.seed, index % len(self))
+        )
 
 
 @lru_cache(maxsize=256)
-def _warn_of_differences(given: Sensor, target: Sensor, pitch: float, unmatched: bool) -> None:
+def _warn_of_differences(
+    given: Sensor, target: Sensor, pitch: float, unmatched: bool
+) -> None:
     """Say once what scans of the target will lack: lasers outside the field of view, and its own
     reflectance."""
     if given.name == target.name:
@@ -252,13 +279,18 @@ def _seen(surfaces: ScanSurfaces, target: Sensor, mount: Mount) -> float:
     """The share of the target's rays that lie in the field of view of the sensor that recorded the
     surfaces."""
     elevation, sector = _views(target, mount)
-    looked = np.bincount(_sector(-surfaces.azimuth.astype(np.float32)), minlength=SECTORS) > 0
+    looked = (
+        np.bincount(_sector(-surfaces.azimuth.astype(np.float32)), minlength=SECTORS)
+        > 0
+    )
     inside = (elevation >= surfaces.bounds[0]) & (elevation <= surfaces.bounds[1])
     return float((inside & looked.take(sector)).mean())
 
 
 @lru_cache(maxsize=16)
-def _views(target: Sensor, mount: Mount) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _views(
+    target: Sensor, mount: Mount
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """(H, F) elevation, radians, and sector of each ray in the frame of the recording sensor."""
     rays = rays_of(target)
     slope = np.broadcast_to(rays.slope[:, None, None], (*rays.directions.shape[:2], 1))

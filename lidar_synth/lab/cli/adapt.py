@@ -8,15 +8,20 @@ import typer
 
 def adapt(
     model: Annotated[
-        str, typer.Argument(metavar="MODEL", help="a shipped model such as town, or a file")
+        str,
+        typer.Argument(metavar="MODEL", help="a shipped model such as town, or a file"),
     ],
     scans: Annotated[
         Path,
-        typer.Option(metavar="ROOT", help="20 to 200 scans of one sensor, with labels or without"),
+        typer.Option(
+            metavar="ROOT", help="20 to 200 scans of one sensor, with labels or without"
+        ),
     ],
     out: Annotated[
         Path,
-        typer.Option(metavar="FILE", help="checkpoint to write; its name ends in .safetensors"),
+        typer.Option(
+            metavar="FILE", help="checkpoint to write; its name ends in .safetensors"
+        ),
     ],
     minutes: Annotated[
         float, typer.Option(min=0.01, help="limit of the time of all trainings")
@@ -28,7 +33,10 @@ def adapt(
         str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
     town: Annotated[
-        int, typer.Option(min=0, help="scans of the town, as your sensor sees it, to learn too")
+        int,
+        typer.Option(
+            min=0, help="scans of the town, as your sensor sees it, to learn too"
+        ),
     ] = 400,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
@@ -50,5 +58,7 @@ def adapt(
     if dry_run:
         typer.echo(plan_adaptation(model, scans, out, minutes, sensor, town))
         return
-    path = run(model, scans, out, minutes=minutes, licence=licence, sensor=sensor, town=town)
+    path = run(
+        model, scans, out, minutes=minutes, licence=licence, sensor=sensor, town=town
+    )
     typer.echo(f"{path}\nIts card is {path.with_suffix('.md')}")

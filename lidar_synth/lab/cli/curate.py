@@ -20,24 +20,34 @@ def curate(
     bank: BankFolder,
     drop: Annotated[
         list[str] | None,
-        typer.Option(help="rule that selects scans to drop; repeatable, any match drops"),
+        typer.Option(
+            help="rule that selects scans to drop; repeatable, any match drops"
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="folder of the curated bank; without it nothing is written")
+        Path | None,
+        typer.Option(help="folder of the curated bank; without it nothing is written"),
     ] = None,
     reference: Annotated[
         str | None,
-        typer.Option(help="scans whose mean histograms to compare with [the bank's own]"),
+        typer.Option(
+            help="scans whose mean histograms to compare with [the bank's own]"
+        ),
     ] = None,
     split: Annotated[
-        str | None, typer.Option(help="split of the reference, for instance r2flow/test")
+        str | None,
+        typer.Option(help="split of the reference, for instance r2flow/test"),
     ] = None,
     sort: Annotated[
-        str, typer.Option(help="sort the list by this score, highest first; -SCORE: lowest first")
+        str,
+        typer.Option(
+            help="sort the list by this score, highest first; -SCORE: lowest first"
+        ),
     ] = "range",
     limit: Annotated[int, typer.Option(min=0, help="number of scans to list")] = 10,
     plot: Annotated[
-        Path | None, typer.Option(help="PNG file to write with the distribution of every score")
+        Path | None,
+        typer.Option(help="PNG file to write with the distribution of every score"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="number of worker processes")] = 1,
@@ -88,7 +98,8 @@ def curate(
         ]
         typer.echo(
             json.dumps(
-                {"scans": len(opened), "dropped": int(dropped.sum()), "listed": rows}, indent=1
+                {"scans": len(opened), "dropped": int(dropped.sum()), "listed": rows},
+                indent=1,
             )
         )
     else:
@@ -102,7 +113,9 @@ def curate(
         f"{dropped.sum()} of {len(opened)} scans left out by "
         f"{' or '.join(map(repr, rules))}{compared}"
     )
-    index = write(opened, np.flatnonzero(dropped).tolist(), why, out, progress=not as_json)
+    index = write(
+        opened, np.flatnonzero(dropped).tolist(), why, out, progress=not as_json
+    )
     if not as_json:
         typer.echo(f"{out}: {index.scans} scans in {len(index.shards)} shards; {why}")
 
@@ -117,14 +130,25 @@ def _check(plot: Path | None, out: Path | None, rules: list[str]) -> None:
 
 
 def _scores(
-    opened: "Bank", bank: Path, reference: str | None, split: str | None, jobs: int, progress: bool
+    opened: "Bank",
+    bank: Path,
+    reference: str | None,
+    split: str | None,
+    jobs: int,
+    progress: bool,
 ) -> "Scores":
     """Read the saved scores of this bank and reference, or compute and save them."""
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
     from lidar_synth.geometry.scan import scan_hash
-    from lidar_synth.lab.curate import FILE, keep_features_in, read_scores, score, write_scores
+    from lidar_synth.lab.curate import (
+        FILE,
+        keep_features_in,
+        read_scores,
+        score,
+        write_scores,
+    )
 
     if split is not None and reference is None:
         raise ConfigError(f"--split {split} without a reference", "--reference as well")
@@ -141,7 +165,9 @@ def _scores(
         if (saved.bank, saved.reference) == (opened.identity, name):
             return saved
     with keep_features_in(bank) as folder:
-        scores = score(opened, source, name=name, jobs=jobs, progress=progress, folder=folder)
+        scores = score(
+            opened, source, name=name, jobs=jobs, progress=progress, folder=folder
+        )
         write_scores(path, scores)
     return scores
 
@@ -158,12 +184,22 @@ def _sorted(scores: "Scores", by: str) -> "NDArray[np.int64]":
 
 def _row(bank: "Bank", scores: "Scores", number: int) -> dict[str, Any]:
     twin = int(scores.twin[number])
-    values = {name: round(float(values[number]), 4) for name, values in scores.values.items()}
-    return {"number": number, "id": bank.ids[number], **values, "twin": twin if twin >= 0 else None}
+    values = {
+        name: round(float(values[number]), 4) for name, values in scores.values.items()
+    }
+    return {
+        "number": number,
+        "id": bank.ids[number],
+        **values,
+        "twin": twin if twin >= 0 else None,
+    }
 
 
 def _table(
-    bank: "Bank", scores: "Scores", shown: "NDArray[np.int64]", dropped: "NDArray[np.bool_]"
+    bank: "Bank",
+    scores: "Scores",
+    shown: "NDArray[np.int64]",
+    dropped: "NDArray[np.bool_]",
 ) -> None:
     """Print percentiles of the scores, and the listed scans."""
     import numpy as np
@@ -183,12 +219,16 @@ def _table(
     for number in shown.tolist():
         twin = int(scores.twin[number])
         mark = "  dropped" if dropped[number] else ""
-        figures = "".join(f"{values[number]:>12.4f}" for values in scores.values.values())
+        figures = "".join(
+            f"{values[number]:>12.4f}" for values in scores.values.values()
+        )
         typer.echo(f"{number:>8}  {bank.ids[number]:<24}{figures}{twin:>8}{mark}")
     typer.echo(f"\n{dropped.sum()} of {len(bank)} scans match the rules")
 
 
-def _plot(path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: Path) -> None:
+def _plot(
+    path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: Path
+) -> None:
     from lidar_synth.files.disk import write_file
     from lidar_synth.lab.curate import MEANINGS
     from lidar_synth.viz import histograms

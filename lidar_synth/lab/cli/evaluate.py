@@ -14,11 +14,16 @@ if TYPE_CHECKING:
 
 def evaluate(
     real: Annotated[
-        Path, typer.Argument(metavar="REAL", help="reference scans: root of a dataset, or a folder")
+        Path,
+        typer.Argument(
+            metavar="REAL", help="reference scans: root of a dataset, or a folder"
+        ),
     ],
     fake: Annotated[
         Path,
-        typer.Argument(metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder"),
+        typer.Argument(
+            metavar="FAKE", help="scans to evaluate: root of a dataset, or a folder"
+        ),
     ],
     protocol: Annotated[
         str | None,
@@ -28,7 +33,9 @@ def evaluate(
     ] = None,
     judge: Annotated[
         Path | None,
-        typer.Option(help="archive of lidar-bonnetal: how well its network recognises both sets"),
+        typer.Option(
+            help="archive of lidar-bonnetal: how well its network recognises both sets"
+        ),
     ] = None,
     columns: Annotated[
         int | None, typer.Option(help="width of the judge's grid; its own by default")
@@ -44,11 +51,15 @@ def evaluate(
     ] = False,
     weights: Annotated[
         Path | None,
-        typer.Option(help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD"),
+        typer.Option(
+            help="folder with published weights, for FRD, FRID, FPD, FSVD, FPVD, FLD"
+        ),
     ] = None,
     extended: Annotated[
         bool,
-        typer.Option(help="of features, add unbiased forms, precision, recall, density, coverage"),
+        typer.Option(
+            help="of features, add unbiased forms, precision, recall, density, coverage"
+        ),
     ] = False,
     intervals: Annotated[
         int, typer.Option(help="resamples for 95 % intervals, for instance 200")
@@ -56,7 +67,9 @@ def evaluate(
     beside: Annotated[
         bool, typer.Option(help="print the published figures of the protocol, too")
     ] = False,
-    cache: Annotated[Path | None, typer.Option(help="folder in which features are kept")] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="folder in which features are kept")
+    ] = None,
     processes: Annotated[
         int, typer.Option(help="processes that extract features; needs --cache", min=1)
     ] = 1,
@@ -64,7 +77,8 @@ def evaluate(
         bool, typer.Option(help="permit a reference that the model was trained on")
     ] = False,
     anyway: Annotated[
-        bool, typer.Option(help="compare fewer scans than the paper's, and other sensors")
+        bool,
+        typer.Option(help="compare fewer scans than the paper's, and other sensors"),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
@@ -98,14 +112,20 @@ def evaluate(
 
     if beside and (as_json or judge is not None):
         raise typer.BadParameter(
-            "goes with --protocol and prints tables: leave out --json", param_hint="--beside"
+            "goes with --protocol and prints tables: leave out --json",
+            param_hint="--beside",
         )
     if (protocol is None) == (judge is None):
-        raise typer.BadParameter("give --protocol or --judge, one of them", param_hint="--protocol")
+        raise typer.BadParameter(
+            "give --protocol or --judge, one of them", param_hint="--protocol"
+        )
     if judge is None and protocol not in PROTOCOLS:
         known = f"{protocol!r} is none of {', '.join(PROTOCOLS)}. {suggest(protocol, PROTOCOLS)}"
         raise typer.BadParameter(known, param_hint="--protocol")
-    sources = open_scans(real, sensor=sensor, split=split), open_scans(fake, sensor=sensor)
+    sources = (
+        open_scans(real, sensor=sensor, split=split),
+        open_scans(fake, sensor=sensor),
+    )
     if not training_data and (seen := seen_by_model_of(fake, sources[1])) is not None:
         _refuse_training_data(
             seen, measured(sources[0], layout_of(real), real, split, seen), real, fake

@@ -10,9 +10,15 @@ from lidar_synth.errors import ConfigError
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="released weights: .pth or .ckpt")],
-    out: Annotated[Path, typer.Argument(metavar="OUT.safetensors", help="checkpoint to write")],
-    peer: Annotated[str, typer.Option(help="project of the weights: r2flow | lidm")] = "r2flow",
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="released weights: .pth or .ckpt")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT.safetensors", help="checkpoint to write")
+    ],
+    peer: Annotated[
+        str, typer.Option(help="project of the weights: r2flow | lidm")
+    ] = "r2flow",
 ) -> None:
     """Converts the released weights of another project to a checkpoint.
 
@@ -39,7 +45,9 @@ def import_(
         for n, net in networks.items()
     ]
     rows, columns = header.sensor.shape
-    print(f"{out}: {', '.join(counts)}, {rows} x {columns}, {', '.join(header.channels)}")
+    print(
+        f"{out}: {', '.join(counts)}, {rows} x {columns}, {', '.join(header.channels)}"
+    )
     print(
         f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
         f"{header.provenance['data_licence']}"

@@ -13,19 +13,33 @@ if TYPE_CHECKING:
 def label(
     dataset: Annotated[str, typer.Argument(metavar="DATASET", help="kitti360")],
     root: Annotated[
-        Path, typer.Argument(metavar="ROOT", help="root of the dataset, with data_3d_semantics")
+        Path,
+        typer.Argument(
+            metavar="ROOT", help="root of the dataset, with data_3d_semantics"
+        ),
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to; may be ROOT")],
-    split: Annotated[str, typer.Option(help="drives to label, for instance r2flow/train")] = "all",
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="folder to write to; may be ROOT")
+    ],
+    split: Annotated[
+        str, typer.Option(help="drives to label, for instance r2flow/train")
+    ] = "all",
     against: Annotated[
         Path | None,
-        typer.Option(help="folder with known labels per scan, to compare the new ones with"),
+        typer.Option(
+            help="folder with known labels per scan, to compare the new ones with"
+        ),
     ] = None,
-    jobs: Annotated[int, typer.Option(help="number of worker processes; each needs 1 to 3 GB")] = 1,
+    jobs: Annotated[
+        int, typer.Option(help="number of worker processes; each needs 1 to 3 GB")
+    ] = 1,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="only count the frames that would get labels")
+        bool,
+        typer.Option("--dry-run", help="only count the frames that would get labels"),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="print the report as JSON")
+    ] = False,
 ) -> None:
     """Labels KITTI-360's scans from its accumulated clouds, with a confidence per point and a
     report by class.
@@ -50,7 +64,9 @@ def label(
         print(f"{plan.frames} scans in {len(plan.jobs)} windows would get labels")
         _print_frames(plan.without_pose, plan.outside, plan.without_clouds)
         return
-    report = label_scans(root, out, split=split, against=against, jobs=jobs, progress=not as_json)
+    report = label_scans(
+        root, out, split=split, against=against, jobs=jobs, progress=not as_json
+    )
     if as_json:
         print(json.dumps(report.to_dict(), indent=1))
     else:
@@ -76,25 +92,44 @@ def _print(report: "LabelReport", out: Path) -> None:
                 "poses"
             )
             print(f"  {drive}: {len(metres)} scans {far}", file=sys.stderr)
-    print("\n" + "  ".join(f"{name} {share:.1%}" for name, share in report.totals().items()) + "\n")
+    print(
+        "\n"
+        + "  ".join(f"{name} {share:.1%}" for name, share in report.totals().items())
+        + "\n"
+    )
     names = ("points", "confidence", "covered", "right")
     rows = report.classes()
     shown = [n for n in names if any(row[n] is not None for row in rows.values())]
     print(f"{'class':<15}" + "".join(f"{name:>12}" for name in shown))
     for name, row in rows.items():
         cells = [
-            "" if row[n] is None else f"{row[n]:,}" if n == "points" else f"{row[n]:.3f}"
+            ""
+            if row[n] is None
+            else f"{row[n]:,}"
+            if n == "points"
+            else f"{row[n]:.3f}"
             for n in shown
         ]
         print(f"{name:<15}" + "".join(f"{cell:>12}" for cell in cells))
 
 
 def _print_frames(
-    without_pose: dict[str, int], outside: dict[str, int], without_clouds: tuple[str, ...]
+    without_pose: dict[str, int],
+    outside: dict[str, int],
+    without_clouds: tuple[str, ...],
 ) -> None:
-    for counts, reason in ((without_pose, "have no pose"), (outside, "lie outside all windows")):
+    for counts, reason in (
+        (without_pose, "have no pose"),
+        (outside, "lie outside all windows"),
+    ):
         for drive, count in counts.items():
             if count:
-                print(f"  {drive}: {count} frames {reason} and get no labels", file=sys.stderr)
+                print(
+                    f"  {drive}: {count} frames {reason} and get no labels",
+                    file=sys.stderr,
+                )
     if without_clouds:
-        print(f"  without accumulated clouds: {', '.join(without_clouds)}", file=sys.stderr)
+        print(
+            f"  without accumulated clouds: {', '.join(without_clouds)}",
+            file=sys.stderr,
+        )

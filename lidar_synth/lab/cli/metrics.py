@@ -9,7 +9,9 @@ if TYPE_CHECKING:
     from lidar_synth.lab.evaluate.extractors import ExtractorSpec
 
 metrics = typer.Typer(
-    name="metrics", help="Weights that the field's measures need: setup.", no_args_is_help=True
+    name="metrics",
+    help="Weights that the field's measures need: setup.",
+    no_args_is_help=True,
 )
 
 
@@ -23,7 +25,8 @@ def setup(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[FOLDER]", help="folder of the weights; default: $LIDAR_SYNTH_METRICS"
+            metavar="[FOLDER]",
+            help="folder of the weights; default: $LIDAR_SYNTH_METRICS",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,

@@ -10,18 +10,26 @@ _ARMS = "a training to compare, repeatable [exchange, pretrain, pretrain-generat
 
 def prove(
     root: Annotated[
-        Path, typer.Argument(metavar="ROOT", help="labelled scans, in any layout that is read")
+        Path,
+        typer.Argument(
+            metavar="ROOT", help="labelled scans, in any layout that is read"
+        ),
     ],
     out: Annotated[
-        Path, typer.Option(help="folder of the page and of all that is needed to resume")
+        Path,
+        typer.Option(help="folder of the page and of all that is needed to resume"),
     ] = Path("proof"),
-    minutes: Annotated[float | None, typer.Option(min=1, help="limit of the time [none]")] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=1, help="limit of the time [none]")
+    ] = None,
     labelled: Annotated[
-        int | None, typer.Option(min=1, help="labelled scans of a training [all, at most 200]")
+        int | None,
+        typer.Option(min=1, help="labelled scans of a training [all, at most 200]"),
     ] = None,
     arm: Annotated[list[str] | None, typer.Option(help=_ARMS)] = None,
     ratio: Annotated[
-        list[float] | None, typer.Option(help="share of synthetic scans, repeatable [0.5]")
+        list[float] | None,
+        typer.Option(help="share of synthetic scans, repeatable [0.5]"),
     ] = None,
     iterations: Annotated[
         int, typer.Option(min=10, help="of each training; fewer if --minutes is short")
@@ -29,21 +37,30 @@ def prove(
     batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[
-        str, typer.Option(help="how places are told apart: auto | drive | pose | stretch")
+        str,
+        typer.Option(help="how places are told apart: auto | drive | pose | stretch"),
     ] = "auto",
     model: Annotated[
         str, typer.Option(help="of the arms with a generator: a name or a file")
     ] = "town",
-    synthetic: Annotated[int, typer.Option(min=1, help="synthetic scans of each kind")] = 150,
+    synthetic: Annotated[
+        int, typer.Option(min=1, help="synthetic scans of each kind")
+    ] = 150,
     classes: Annotated[
         str,
-        typer.Option(help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes"),
+        typer.Option(
+            help="pooled classes: auto | semantic_kitti | pandaset | kitti360 | nuscenes"
+        ),
     ] = "auto",
     only: Annotated[
-        list[str] | None, typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable")
+        list[str] | None,
+        typer.Option(metavar="CLASS", help="mean IoU over this class, repeatable"),
     ] = None,
     trainer: Annotated[
-        str | None, typer.Option(help="your own trainer: a command with {job}, the mixture as YAML")
+        str | None,
+        typer.Option(
+            help="your own trainer: a command with {job}, the mixture as YAML"
+        ),
     ] = None,
     sensor: Annotated[
         str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
@@ -52,9 +69,12 @@ def prove(
         str | None, typer.Option(help="split of ROOT, if its layout has splits")
     ] = None,
     pools: Annotated[
-        Path | None, typer.Option(help="folder of the synthetic scans, to share between runs")
+        Path | None,
+        typer.Option(help="folder of the synthetic scans, to share between runs"),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="processes [one for each core]")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="processes [one for each core]")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
     ] = False,
@@ -94,8 +114,14 @@ def prove(
     )
     source = open_scans(root, sensor=sensor, split=split)
     if dry_run:
-        typer.echo(describe(make_plan(source, settings, minutes, jobs or os.cpu_count() or 1)[0]))
+        typer.echo(
+            describe(
+                make_plan(source, settings, minutes, jobs or os.cpu_count() or 1)[0]
+            )
+        )
         return
     chosen = CommandTrainer(trainer) if trainer else reference
-    proof = run(source, out, settings, minutes=minutes, jobs=jobs, trainer=chosen, pools=pools)
+    proof = run(
+        source, out, settings, minutes=minutes, jobs=jobs, trainer=chosen, pools=pools
+    )
     typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")

@@ -9,7 +9,8 @@ import typer
 
 def recipes(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="print the file of this recipe")
+        str | None,
+        typer.Argument(metavar="[NAME]", help="print the file of this recipe"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
@@ -32,7 +33,8 @@ def recipes(
 
     if name is not None:
         typer.echo(
-            (find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"), nl=False
+            (find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"),
+            nl=False,
         )
         return
     listed = [*published_models(), *published()]
@@ -44,5 +46,7 @@ def recipes(
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         typer.echo(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            "  ".join(
+                cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+            ).rstrip()
         )

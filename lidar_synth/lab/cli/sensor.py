@@ -14,9 +14,14 @@ if TYPE_CHECKING:
 @options_from(Reading, after="scans")
 def fit_from_scans(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="file, folder or root of a dataset with scans")
+        Path,
+        typer.Argument(
+            metavar="PATH", help="file, folder or root of a dataset with scans"
+        ),
     ],
-    out: Annotated[Path, typer.Option(help="YAML file to write, for --sensor of any command")],
+    out: Annotated[
+        Path, typer.Option(help="YAML file to write, for --sensor of any command")
+    ],
     scans: Annotated[
         int, typer.Option(min=1, max=20, help="number of scans to use, evenly spaced")
     ] = 8,
@@ -58,8 +63,12 @@ def fit_from_scans(
         raise ConfigError(f"--picture {picture}", "a file that ends in .png")
     source = open_scans(path, **drop_missing(reading))
     source.skip_sensor_check()
-    chosen = np.unique(np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int))
-    found = fit_sensor([source[int(index)] for index in chosen], name=out.stem, columns=columns)
+    chosen = np.unique(
+        np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int)
+    )
+    found = fit_sensor(
+        [source[int(index)] for index in chosen], name=out.stem, columns=columns
+    )
     write_file(out, sensor_yaml(found.sensor).encode())
     if picture is not None:
         from lidar_synth.lab.fitting.picture import fit_figure
@@ -67,7 +76,9 @@ def fit_from_scans(
         figure = fit_figure(found)
         write_file(picture, lambda file: figure.savefig(file, format="png"))
     if as_json:
-        typer.echo(json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1))
+        typer.echo(
+            json.dumps({**_values(found), "sensor": found.sensor.to_dict()}, indent=1)
+        )
         return
     for name, value in _values(found).items():
         typer.echo(f"{name:<22}{value}")
@@ -93,7 +104,11 @@ def _values(found: "SensorFit") -> dict[str, object]:
         if found.azimuths.known
         else "not known",
         "ranges": f"{found.nearest:.2f} to {found.farthest:.2f} m"
-        + (f", in steps of {1000 * sensor.range_step:.0f} mm" if sensor.range_step else ""),
+        + (
+            f", in steps of {1000 * sensor.range_step:.0f} mm"
+            if sensor.range_step
+            else ""
+        ),
         "reflectance": f"{sensor.reflectance_levels} levels"
         if sensor.reflectance_levels
         else "not in equal steps",
@@ -101,5 +116,7 @@ def _values(found: "SensorFit") -> dict[str, object]:
     }
 
 
-sensor = typer.Typer(name="sensor", help="Fits a sensor to scans.", no_args_is_help=True)
+sensor = typer.Typer(
+    name="sensor", help="Fits a sensor to scans.", no_args_is_help=True
+)
 sensor.command("fit")(fit_from_scans)

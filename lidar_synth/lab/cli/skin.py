@@ -23,7 +23,9 @@ def fit_from_scans(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="file to write; its name ends in .skin")
     ],
-    licence: Annotated[str, typer.Option(help="licence of the scans, which the file states")],
+    licence: Annotated[
+        str, typer.Option(help="licence of the scans, which the file states")
+    ],
     sensor: Annotated[
         str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
@@ -56,7 +58,12 @@ def fit_from_scans(
     count = min(most, len(source))
     picked = [source[i * len(source) // count] for i in range(count)]
     learnt = fit_skin(
-        picked, licence=licence, source=scans.name, seed=seed, streets=streets, lasers=lasers
+        picked,
+        licence=licence,
+        source=scans.name,
+        seed=seed,
+        streets=streets,
+        lasers=lasers,
     )
     learnt.save(out)
     print(f"{out}: learnt from {count} scans of {learnt.sensor.name}")
@@ -64,7 +71,9 @@ def fit_from_scans(
 
 @skin.command("show")
 def show(
-    file: Annotated[str, typer.Argument(metavar="SKIN", help="a shipped skin by name, or a file")],
+    file: Annotated[
+        str, typer.Argument(metavar="SKIN", help="a shipped skin by name, or a file")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Describes a skin: sensor, scans, licence, and what it changes.

@@ -9,7 +9,9 @@ import typer
 def town(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")],
     scans: Annotated[int, typer.Option(help="number of scans")] = 200,
-    seed: Annotated[int, typer.Option(help="seed of the town: another seed is another town")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="seed of the town: another seed is another town")
+    ] = 0,
     layout: Annotated[
         str, typer.Option(help="folder layout: kitti360 | semantic_kitti | kitti")
     ] = "kitti360",
@@ -19,7 +21,9 @@ def town(
     camera: Annotated[
         bool, typer.Option(help="render a camera image of each scan (about 1 s each)")
     ] = True,
-    interval: Annotated[float, typer.Option(help="seconds between consecutive scans")] = 0.4,
+    interval: Annotated[
+        float, typer.Option(help="seconds between consecutive scans")
+    ] = 0.4,
     sequence: Annotated[
         int | None,
         typer.Option(
@@ -29,7 +33,8 @@ def town(
     accumulate: Annotated[
         bool,
         typer.Option(
-            "--accumulate", help="also write KITTI-360's accumulated clouds, for lidar-synth label"
+            "--accumulate",
+            help="also write KITTI-360's accumulated clouds, for lidar-synth label",
         ),
     ] = False,
     jobs: Annotated[int, typer.Option(help="number of worker processes")] = 1,
@@ -57,6 +62,12 @@ def town(
 
     source = Town(seed, sensor, scans, interval, skin=skin)
     written, kept = export_town(
-        source, out, layout, sequence=sequence, camera=camera, accumulate=accumulate, jobs=jobs
+        source,
+        out,
+        layout,
+        sequence=sequence,
+        camera=camera,
+        accumulate=accumulate,
+        jobs=jobs,
     )
     print(f"{out}: {written} scans written, {kept} were there already")

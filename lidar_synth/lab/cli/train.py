@@ -9,16 +9,20 @@ import typer
 RecipeName = Annotated[
     str,
     typer.Argument(
-        metavar="RECIPE", help="name of a recipe (see `lidar-synth recipes`), or a YAML file"
+        metavar="RECIPE",
+        help="name of a recipe (see `lidar-synth recipes`), or a YAML file",
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="[KEY=VALUE]...", help="values of the recipe to override"),
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="resume the run in the output folder")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="resume the run in the output folder")
+]
 Minutes = Annotated[
-    float | None, typer.Option(help="save and stop after this many minutes; --resume continues")
+    float | None,
+    typer.Option(help="save and stop after this many minutes; --resume continues"),
 ]
 
 
@@ -45,7 +49,8 @@ def train(
         ),
     ] = None,
     until: Annotated[
-        str | None, typer.Option(metavar="STAGE", help="of a model: the last stage to run")
+        str | None,
+        typer.Option(metavar="STAGE", help="of a model: the last stage to run"),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="of a model: print the time of each stage")
@@ -74,7 +79,13 @@ def train(
       torchrun --nproc-per-node 8 -m lidar_synth train kitti360_teacher precision=bf16
     """
     from lidar_synth.errors import ConfigError
-    from lidar_synth.lab.train import TrainConfig, load_config, plan_model, run, train_model
+    from lidar_synth.lab.train import (
+        TrainConfig,
+        load_config,
+        plan_model,
+        run,
+        train_model,
+    )
     from lidar_synth.lab.train.config import find_model_file
 
     if find_model_file(recipe) is not None:
@@ -87,13 +98,17 @@ def train(
     if until is not None or dry_run:
         given = "--dry-run" if dry_run else f"--until {until}"
         raise ConfigError(
-            f"{given} for the recipe {recipe}", "a model of several stages, such as town"
+            f"{given} for the recipe {recipe}",
+            "a model of several stages, such as town",
         )
     _print_once(run(load_config(TrainConfig, recipe, overrides or ()), resume, minutes))
 
 
 def distill(
-    recipe: RecipeName, overrides: Overrides = None, resume: Resume = False, minutes: Minutes = None
+    recipe: RecipeName,
+    overrides: Overrides = None,
+    resume: Resume = False,
+    minutes: Minutes = None,
 ) -> None:
     """Distils a student that needs few steps from a teacher.
 
@@ -109,7 +124,9 @@ def distill(
     """
     from lidar_synth.lab.train import DistillConfig, load_config, run
 
-    _print_once(run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes))
+    _print_once(
+        run(load_config(DistillConfig, recipe, overrides or ()), resume, minutes)
+    )
 
 
 def _print_once(path: Path) -> None:

@@ -10,7 +10,14 @@ bank, add a line to ``scores``.
 """
 
 from lidar_synth.lab.curate.rules import matching
-from lidar_synth.lab.curate.scores import FILE, MEANINGS, Scores, read_scores, score, write_scores
+from lidar_synth.lab.curate.scores import (
+    FILE,
+    MEANINGS,
+    Scores,
+    read_scores,
+    score,
+    write_scores,
+)
 from lidar_synth.lab.curate.store import keep_features_in
 
 __all__ = [

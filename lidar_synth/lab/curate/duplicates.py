@@ -30,7 +30,9 @@ def most_similar(
         (N,) similarity in [0, 1], 0 for the first scan; (N,) number of the most similar scan, -1
         for the first.
     """
-    return (compare_all if len(signatures) <= ALL_PAIRS else find_similar)(signatures, progress)
+    return (compare_all if len(signatures) <= ALL_PAIRS else find_similar)(
+        signatures, progress
+    )
 
 
 def compare_all(
@@ -43,13 +45,21 @@ def compare_all(
     twin = np.full(count, -1)
     starts = range(0, count, BLOCK)
     pairs = [(a, b) for a in starts for b in starts if b <= a]
-    for a, b in tqdm(pairs, desc="duplicates", unit="block", disable=not progress, delay=2):
-        later, earlier = (signatures[first : first + BLOCK].astype(np.float32) for first in (a, b))
+    for a, b in tqdm(
+        pairs, desc="duplicates", unit="block", disable=not progress, delay=2
+    ):
+        later, earlier = (
+            signatures[first : first + BLOCK].astype(np.float32) for first in (a, b)
+        )
         products = later @ earlier.T
-        products[np.arange(a, a + len(later))[:, None] <= np.arange(b, b + len(earlier))] = -1
+        products[
+            np.arange(a, a + len(later))[:, None] <= np.arange(b, b + len(earlier))
+        ] = -1
         found = products.argmax(1)
         similarity = products[np.arange(len(later)), found].clip(max=1)
-        better = similarity > np.where(twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK])
+        better = similarity > np.where(
+            twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK]
+        )
         best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = (
             similarity[better],
             found[better] + b,

@@ -22,7 +22,9 @@ along a side."""
 SIGNATURE = CELLS * CELLS
 """Entries of a signature."""
 
-_SAME_SURFACE = 0.02  # relative range difference of two neighbouring cells on the same surface
+_SAME_SURFACE = (
+    0.02  # relative range difference of two neighbouring cells on the same surface
+)
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,17 @@ def _speckle(image: RangeImage, scan: Scan) -> float:
     right = np.roll(label, -1, 1)
     beyond = np.roll(metres, -1, 1)
     known = image.mask & (beyond > 0) & (label != IGNORE) & (right != IGNORE)
-    return _share((label != right)[known & (np.abs(metres - beyond) < _SAME_SURFACE * metres)])
+    return _share(
+        (label != right)[known & (np.abs(metres - beyond) < _SAME_SURFACE * metres)]
+    )
 
 
 def _confidence(image: RangeImage, scan: Scan) -> float:
-    return float(image.channels["confidence"][image.mask].mean()) if image.mask.any() else 0.0
+    return (
+        float(image.channels["confidence"][image.mask].mean())
+        if image.mask.any()
+        else 0.0
+    )
 
 
 MEASURES: dict[str, ScanMeasure] = {
@@ -76,9 +84,13 @@ MEASURES: dict[str, ScanMeasure] = {
         "share of ground returns (road to terrain) above the sensor", "label", _floating
     ),
     "speckle": ScanMeasure(
-        "share of neighbours in a row, 2 % apart in range, with two labels", "label", _speckle
+        "share of neighbours in a row, 2 % apart in range, with two labels",
+        "label",
+        _speckle,
     ),
-    "confidence": ScanMeasure("mean confidence of the returns", "confidence", _confidence),
+    "confidence": ScanMeasure(
+        "mean confidence of the returns", "confidence", _confidence
+    ),
 }
 """Measures by the name of their score; a share of an empty set is 0."""
 
@@ -114,8 +126,13 @@ def supported_measures(fields: Collection[str]) -> tuple[str, ...]:
 def features(image: RangeImage) -> ScanFeatures:
     """The features of a range image; measures of missing channels are left out."""
     scan = unproject(image)
-    numbers = {name: MEASURES[name].of(image, scan) for name in supported_measures(image.channels)}
-    ranges, _ = np.histogram(image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max))
+    numbers = {
+        name: MEASURES[name].of(image, scan)
+        for name in supported_measures(image.channels)
+    }
+    ranges, _ = np.histogram(
+        image.range[image.mask], RANGE_BINS, (0, image.sensor.range_max)
+    )
     labels = np.zeros(0, np.uint8) if scan.label is None else scan.label
     classes = np.bincount(labels[labels != IGNORE], minlength=len(NAMES))
     return ScanFeatures(numbers, ranges, classes, _signature(scan.points))

@@ -48,9 +48,13 @@ PAIRS = 1 << 19
 
 # quantisation steps of a signature's entries in [0, 1]: sums of 1024 entries are exact in float32
 _STEPS = 4095
-_SAMPLE = 65_536  # signatures from which the centre and scale of the sketches are estimated
+_SAMPLE = (
+    65_536  # signatures from which the centre and scale of the sketches are estimated
+)
 _SPREAD = 4  # standard deviations that the range of a byte covers
-_NUMBERS = 2.0**30  # larger than any scan number; its product with a distance is exact in float64
+_NUMBERS = (
+    2.0**30
+)  # larger than any scan number; its product with a distance is exact in float64
 _NONE = 2.0**53 - 1  # larger than any key
 
 
@@ -81,13 +85,17 @@ def find_similar(
     ) as steps:
         first = _first_copies(signatures)
         steps.update()
-        own = np.flatnonzero(first == np.arange(count))  # the first of each group of copies
+        own = np.flatnonzero(
+            first == np.arange(count)
+        )  # the first of each group of copies
         sketches = _sketches(signatures, own)
         steps.update()
         nearest = _nearest(sketches, steps)
         for part in _parts(count):
             candidates = nearest[np.searchsorted(own, first[part])]
-            found = np.where(candidates < 0, -1, own[candidates])  # to numbers among all signatures
+            found = np.where(
+                candidates < 0, -1, own[candidates]
+            )  # to numbers among all signatures
             copies = first[part] < np.arange(part.start, part.stop)
             found[copies] = first[part][copies, None]
             similarity[part], twin[part] = _best(signatures, part, found)
@@ -106,7 +114,9 @@ def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
     for part in _parts(len(signatures)):
         rows = np.ascontiguousarray(signatures[part])
         hashes[part] = [
-            int.from_bytes(hashlib.blake2b(row.tobytes(), digest_size=8).digest(), "big")
+            int.from_bytes(
+                hashlib.blake2b(row.tobytes(), digest_size=8).digest(), "big"
+            )
             for row in rows
         ]
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
@@ -116,10 +126,14 @@ def _first_copies(signatures: Signatures) -> NDArray[np.int64]:
 def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8]:
     """(len(own), DIMENSIONS) the sketches of some signatures."""
     width = signatures[:1].shape[1]
-    signs = keyed_rng(width, DIMENSIONS).choice(np.array([-1, 1], np.float32), (width, DIMENSIONS))
+    signs = keyed_rng(width, DIMENSIONS).choice(
+        np.array([-1, 1], np.float32), (width, DIMENSIONS)
+    )
 
     def project(rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        values: NDArray[np.float32] = np.rint(signatures[rows].astype(np.float32) * _STEPS) @ signs
+        values: NDArray[np.float32] = (
+            np.rint(signatures[rows].astype(np.float32) * _STEPS) @ signs
+        )
         return values
 
     some = own[np.linspace(0, len(own) - 1, min(len(own), _SAMPLE)).astype(np.int64)]
@@ -130,7 +144,9 @@ def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8
         squares += float((values**2).sum())
     centre = np.rint(total / len(some)).astype(np.float32)
     variance = squares / len(some) - float((total / len(some)) @ (total / len(some)))
-    scale = np.float32(127 / _SPREAD / max(np.sqrt(max(variance, 0.0) / DIMENSIONS), 1.0))
+    scale = np.float32(
+        127 / _SPREAD / max(np.sqrt(max(variance, 0.0) / DIMENSIONS), 1.0)
+    )
     sketches = np.empty((len(own), DIMENSIONS), np.int8)
     for part in _parts(len(own)):
         sketches[part] = np.rint((project(own[part]) - centre) * scale).clip(-127, 127)
@@ -141,12 +157,15 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     """(N, CANDIDATES) numbers of the nearest earlier sketches, -1 where there are fewer."""
     count = len(sketches)
     cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
-    centres = sketches[np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))]
+    centres = sketches[
+        np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))
+    ]
     probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
     for part in _parts(count, PAIRS // cells + 1):
         keys = _keys(sketches[part], centres, np.arange(cells))
         probes[part] = (
-            np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]]) % _NUMBERS
+            np.sort(np.partition(keys, probes.shape[1] - 1)[:, : probes.shape[1]])
+            % _NUMBERS
         )
     order, bounds = _by_cell(probes[:, 0], cells)
     members = [order[a:b][:CROWD] for a, b in pairwise(bounds)]
@@ -180,9 +199,9 @@ def _compare(
     """Update the best candidates of each query with the earlier members of a cell."""
     keys = _keys(sketches[queries], sketches[members], members)
     keys[members >= queries[:, None]] = _NONE
-    best[queries] = np.partition(np.concatenate([best[queries], keys], 1), CANDIDATES - 1)[
-        :, :CANDIDATES
-    ]
+    best[queries] = np.partition(
+        np.concatenate([best[queries], keys], 1), CANDIDATES - 1
+    )[:, :CANDIDATES]
 
 
 def _keys(
@@ -192,7 +211,9 @@ def _keys(
     sketch."""
     a = some.astype(np.float32)
     b = others.astype(np.float32)
-    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)  # whole numbers below 2^22
+    distances = (
+        (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
+    )  # whole numbers below 2^22
     keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
     return keys
 

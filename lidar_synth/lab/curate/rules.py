@@ -21,7 +21,9 @@ OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     ">=": operator.ge,
 }
 
-_CONDITION = re.compile(r"\s*(\w+)\s*([<>]=?)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*")
+_CONDITION = re.compile(
+    r"\s*(\w+)\s*([<>]=?)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
+)
 
 
 def matching(rule: str, scores: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
@@ -42,10 +44,13 @@ def matching(rule: str, scores: Mapping[str, NDArray[np.float64]]) -> NDArray[np
         match = _CONDITION.fullmatch(condition)
         if match is None:
             raise ConfigError(
-                f"rule {rule!r}", "a score, < <= > or >=, and a number: 'confidence < 0.5'"
+                f"rule {rule!r}",
+                "a score, < <= > or >=, and a number: 'confidence < 0.5'",
             )
         name, sign, number = match.groups()
         if name not in scores:
-            raise ConfigError(f"score {name!r} in rule {rule!r}", f"one of {', '.join(scores)}")
+            raise ConfigError(
+                f"score {name!r} in rule {rule!r}", f"one of {', '.join(scores)}"
+            )
         selected &= OPERATORS[sign](scores[name], float(number))
     return selected

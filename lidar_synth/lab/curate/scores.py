@@ -95,12 +95,16 @@ def score(
         DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
     if jobs < 1 or (reference is not None and len(reference) == 0):
-        raise ConfigError(f"{jobs} jobs, a reference of {name!r}", "at least one job, and one scan")
+        raise ConfigError(
+            f"{jobs} jobs, a reference of {name!r}", "at least one job, and one scan"
+        )
     with TemporaryDirectory() as temporary:
         store = measure(bank, folder or Path(temporary), jobs, progress)
         if reference is None:
             ranges, classes = _means(
-                (row["ranges"], row["classes"]) for rows in store.blocks() for row in rows
+                (row["ranges"], row["classes"])
+                for rows in store.blocks()
+                for row in rows
             )
         else:
             ranges, classes = _means_of(reference, bank.sensor, jobs, progress)
@@ -110,7 +114,9 @@ def score(
         numbers = np.concatenate([rows["numbers"] for rows in store.blocks()])
         values |= dict(zip(store.names, numbers.T.copy(), strict=True))
         values["duplicate"], twin = most_similar(store, progress)
-    return Scores(bank.identity, name, {n: values[n] for n in MEANINGS if n in values}, twin)
+    return Scores(
+        bank.identity, name, {n: values[n] for n in MEANINGS if n in values}, twin
+    )
 
 
 def write_scores(path: Path, scores: Scores) -> None:
@@ -136,10 +142,16 @@ def read_scores(path: Path) -> Scores:
     """
     arrays = read_arrays(path, most=1 << 32)
     values = {name: arrays[name] for name in MEANINGS if name in arrays}
-    shapes = {array.shape for name, array in arrays.items() if name in MEANINGS or name == "twin"}
+    shapes = {
+        array.shape
+        for name, array in arrays.items()
+        if name in MEANINGS or name == "twin"
+    }
     if not {"bank", "reference", "twin", "range"} <= set(arrays) or len(shapes) != 1:
         raise DataError(
-            f"{path} holds {sorted(arrays)}", "the scores of a bank", "Remove it and curate again."
+            f"{path} holds {sorted(arrays)}",
+            "the scores of a bank",
+            "Remove it and curate again.",
         )
     return Scores(str(arrays["bank"]), str(arrays["reference"]), values, arrays["twin"])
 
@@ -176,7 +188,13 @@ def _means_of(source: Source, sensor: Sensor, jobs: int, progress: bool) -> Hist
     count = len(source)
     with map_in_processes(work, range(count), jobs, _CHUNK) as results:
         return _means(
-            tqdm(results, desc="reference", total=count, unit="scan", disable=not progress)
+            tqdm(
+                results,
+                desc="reference",
+                total=count,
+                unit="scan",
+                disable=not progress,
+            )
         )
 
 
@@ -185,7 +203,9 @@ def _of_source(source: Source, sensor: Sensor, number: int) -> Histograms:
     return found.ranges, found.classes
 
 
-def _distances(store: Store, key: str, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+def _distances(
+    store: Store, key: str, mean: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(N,) Jensen-Shannon distance of each scan's histogram to a mean histogram."""
     known = mean.any()
     found = (

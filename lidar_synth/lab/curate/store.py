@@ -22,7 +22,12 @@ from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import write_file
 from lidar_synth.files.lock import lock_shared, try_lock
 from lidar_synth.files.processes import map_in_processes
-from lidar_synth.lab.curate.features import RANGE_BINS, SIGNATURE, features, supported_measures
+from lidar_synth.lab.curate.features import (
+    RANGE_BINS,
+    SIGNATURE,
+    features,
+    supported_measures,
+)
 
 BLOCK = 4096
 """Scans per file."""
@@ -83,12 +88,19 @@ class Store:
             rows: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
         except OSError as error:
             raise FileError(
-                f"{path} cannot be read ({error.strerror or error})", "what was measured"
+                f"{path} cannot be read ({error.strerror or error})",
+                "what was measured",
             ) from error
         except ValueError as error:
-            raise DataError(f"{path} is damaged ({error})", "what was measured") from error
-        if rows.dtype != self.dtype or rows.shape != (min(BLOCK, self.count - block * BLOCK),):
-            raise DataError(f"{path} holds {rows.shape} of {rows.dtype}", "what was measured")
+            raise DataError(
+                f"{path} is damaged ({error})", "what was measured"
+            ) from error
+        if rows.dtype != self.dtype or rows.shape != (
+            min(BLOCK, self.count - block * BLOCK),
+        ):
+            raise DataError(
+                f"{path} holds {rows.shape} of {rows.dtype}", "what was measured"
+            )
         return rows
 
     def blocks(self) -> Iterator[NDArray[Any]]:
@@ -102,7 +114,9 @@ class Store:
             FileError: if it cannot be written.
         """
         write_file(
-            self._path(block), lambda file: np.save(file, rows, allow_pickle=False), durable=True
+            self._path(block),
+            lambda file: np.save(file, rows, allow_pickle=False),
+            durable=True,
         )
 
     def stored(self) -> int:
@@ -124,15 +138,23 @@ def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
     Raises:
         DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
-    own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"  # not reused by others
+    own = (
+        folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"
+    )  # not reused by others
     store = Store(own, len(bank), supported_measures(bank.fields))
     start = store.stored()
-    spans = [range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)]
+    spans = [
+        range(a, min(a + _UNIT, len(bank))) for a in range(start, len(bank), _UNIT)
+    ]
     waiting: list[NDArray[Any]] = []
     with (
         map_in_processes(partial(_rows, bank, store), spans, jobs) as results,
         tqdm(
-            total=len(bank), initial=start, desc="scores", unit="scan", disable=not progress
+            total=len(bank),
+            initial=start,
+            desc="scores",
+            unit="scan",
+            disable=not progress,
         ) as bar,
     ):
         for rows in results:

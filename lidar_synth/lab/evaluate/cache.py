@@ -37,7 +37,8 @@ def checked(
     features = np.asarray(extract(scans, *more))
     if features.ndim != 2 or len(features) != len(scans):
         raise DataError(
-            f"features of shape {features.shape} of {len(scans)} scans", f"({len(scans)}, D)"
+            f"features of shape {features.shape} of {len(scans)} scans",
+            f"({len(scans)}, D)",
         )
     finite = np.isfinite(features).all(1)
     if not finite.all():
@@ -96,7 +97,9 @@ class Cached:
         return np.stack([features for features in found if features is not None])
 
     def _path(self, scan: Scan, more: tuple[bool, ...]) -> Path:
-        name = hashlib.sha256(f"{VERSION} {self.key} {more} {scan_hash(scan)}".encode()).hexdigest()
+        name = hashlib.sha256(
+            f"{VERSION} {self.key} {more} {scan_hash(scan)}".encode()
+        ).hexdigest()
         return self.folder / name[:2] / f"{name}.npz"
 
 
@@ -133,7 +136,9 @@ def extract_all(
     Raises:
         DataError: on an empty source, and as the extractor.
     """
-    parts = [range(i, min(i + batch, len(source))) for i in range(0, len(source), batch)]
+    parts = [
+        range(i, min(i + batch, len(source))) for i in range(0, len(source), batch)
+    ]
     if not parts:
         raise DataError("no scans", "at least one")
     if processes == 1:
@@ -149,7 +154,9 @@ def extract_all(
         return np.concatenate(list(pool.map(_extract, parts)))
 
 
-_state: dict[str, Any] = {}  # of a process: its extractor, the source and the further arguments
+_state: dict[
+    str, Any
+] = {}  # of a process: its extractor, the source and the further arguments
 
 
 def _start(

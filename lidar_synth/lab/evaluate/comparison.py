@@ -65,7 +65,9 @@ def evaluate(
     rules = find_protocol(protocol)
     if processes > 1:
         _fill(rules, (real, generated), weights, cache, processes, batch)
-    metric = Metric(rules, extractors, weights, replicates, extended, any_sensor, batch, cache)
+    metric = Metric(
+        rules, extractors, weights, replicates, extended, any_sensor, batch, cache
+    )
     indices: Sequence[int] = range(len(real))
     if (
         not extractors
@@ -75,7 +77,9 @@ def evaluate(
     ):
         indices = choice(len(real), rules.limit)
     metric.update(_read(real, indices, "real", progress), real=True)
-    metric.update(_read(generated, range(len(generated)), "generated", progress), real=False)
+    metric.update(
+        _read(generated, range(len(generated)), "generated", progress), real=False
+    )
     scores = metric.scores()
     if left_out is not None:
         left_out |= metric.left_out
@@ -128,6 +132,8 @@ def _fill(
                 )
 
 
-def _read(source: Source, indices: Sequence[int], name: str, progress: bool) -> Iterator[Scan]:
+def _read(
+    source: Source, indices: Sequence[int], name: str, progress: bool
+) -> Iterator[Scan]:
     for i in tqdm(indices, desc=f"{name} scans", disable=not progress):
         yield source[i]

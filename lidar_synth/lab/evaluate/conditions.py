@@ -28,14 +28,18 @@ ABOVE = 0.5
 metres."""
 
 
-def map_agreement(generated: Sequence[Scan], real: Sequence[Scan], judge: Judge) -> float:
+def map_agreement(
+    generated: Sequence[Scan], real: Sequence[Scan], judge: Judge
+) -> float:
     """mIoU in [0, 1] between the real scans' labels, cell by cell, and a segmenter's prediction on
     the generated ones.
 
     Raises:
         DataError: on sets of different lengths, or real scans without labels.
     """
-    return mean_iou(judge.agreement([relabel(a, b) for a, b in _pairs(generated, real)]))
+    return mean_iou(
+        judge.agreement([relabel(a, b) for a, b in _pairs(generated, real)])
+    )
 
 
 def sight_agreement(generated: Sequence[Scan], real: Sequence[Scan]) -> Statistic:
@@ -47,7 +51,9 @@ def sight_agreement(generated: Sequence[Scan], real: Sequence[Scan]) -> Statisti
     """
     overlaps = [(obstacles(a), obstacles(b)) for a, b in _pairs(generated, real)]
     return share(
-        np.array([(a & b).sum() / max((a | b).sum(), 1) for a, b in overlaps]), False, len(real)
+        np.array([(a & b).sum() / max((a | b).sum(), 1) for a, b in overlaps]),
+        False,
+        len(real),
     )
 
 
@@ -63,7 +69,9 @@ def obstacles(scan: Scan) -> NDArray[np.bool_]:
     """(REACH, 2 REACH) square metres ahead that have a return above the ground."""
     x, y, z = scan.points.T
     seen = (
-        (np.abs(np.arctan2(y, x)) < FIELD) & (np.hypot(x, y) < REACH) & (z > ABOVE - SENSOR_HEIGHT)
+        (np.abs(np.arctan2(y, x)) < FIELD)
+        & (np.hypot(x, y) < REACH)
+        & (z > ABOVE - SENSOR_HEIGHT)
     )
     cells = np.zeros((REACH, 2 * REACH), bool)
     cells[np.floor(x[seen]).astype(int), np.floor(y[seen]).astype(int) + REACH] = True
@@ -79,7 +87,9 @@ def _pairs(generated: Sequence[Scan], real: Sequence[Scan]) -> list[tuple[Scan, 
     return list(zip(generated, real, strict=True))
 
 
-AGREEMENTS: dict[str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge], float]]] = {
+AGREEMENTS: dict[
+    str, tuple[str, Callable[[Sequence[Scan], Sequence[Scan], Judge], float]]
+] = {
     "semantic": ("mIoU of map and segmenter", map_agreement),
     "camera": (
         "bird's-eye IoU in the camera's sight",

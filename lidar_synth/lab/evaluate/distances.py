@@ -19,7 +19,9 @@ def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> flo
     Raises:
         DataError: on weights that are not a distribution, or of two shapes.
     """
-    if p.shape != q.shape or not all((w >= 0).all() and 0 < w.sum() < np.inf for w in (p, q)):
+    if p.shape != q.shape or not all(
+        (w >= 0).all() and 0 < w.sum() < np.inf for w in (p, q)
+    ):
         raise DataError(
             f"weights of shape {p.shape} and {q.shape} with sums {p.sum()} and {q.sum()}",
             "two non-negative histograms of one shape, neither of them empty",
@@ -27,7 +29,10 @@ def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> flo
     p = p.ravel() / p.sum()
     q = q.ravel() / q.sum()
     mean = (p + q) / 2
-    divergence = sum(float((w[w > 0] * np.log(w[w > 0] / mean[w > 0])).sum()) for w in (p, q)) / 2
+    divergence = (
+        sum(float((w[w > 0] * np.log(w[w > 0] / mean[w > 0])).sum()) for w in (p, q))
+        / 2
+    )
     return float(np.sqrt(max(divergence, 0.0)))
 
 
@@ -47,7 +52,9 @@ def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
         DataError: on other shapes, fewer than two samples, or features that are not finite.
     """
     a, b = checked_features(a, b)
-    cov_a, cov_b = (np.atleast_2d(np.cov(features, rowvar=False)) for features in (a, b))
+    cov_a, cov_b = (
+        np.atleast_2d(np.cov(features, rowvar=False)) for features in (a, b)
+    )
     return frechet_of_moments(a.mean(0), cov_a, b.mean(0), cov_b)
 
 
@@ -61,7 +68,9 @@ def frechet_of_moments(
     values, vectors = np.linalg.eigh(cov_a)
     root = (vectors * np.sqrt(values.clip(0))) @ vectors.T
     cross = np.sqrt(np.linalg.eigvalsh(root @ cov_b @ root).clip(0)).sum()
-    squared = np.square(mean_a - mean_b).sum() + np.trace(cov_a) + np.trace(cov_b) - 2 * cross
+    squared = (
+        np.square(mean_a - mean_b).sum() + np.trace(cov_a) + np.trace(cov_b) - 2 * cross
+    )
     return float(max(squared, 0.0))  # rounding leaves equal sets a little below 0
 
 
@@ -99,7 +108,9 @@ def squared_mmd(
     for _ in range(subsets):
         x = generated[rng.choice(len(generated), size, replace=False)]
         y = real[rng.choice(len(real), size, replace=False)]
-        xx, yy, xy = ((p @ q.T / real.shape[1] + 1) ** 3 for p, q in ((x, x), (y, y), (x, y)))
+        xx, yy, xy = (
+            (p @ q.T / real.shape[1] + 1) ** 3 for p, q in ((x, x), (y, y), (x, y))
+        )
         within = xx.sum() - np.trace(xx) + yy.sum() - np.trace(yy)
         total += within / (size - 1) - 2 * xy.sum() / size
     return float(total / subsets / size)
@@ -116,7 +127,9 @@ def checked_features(
     sets = a, b
     a, b = (np.asarray(features).astype(np.float64) for features in sets)
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
-        raise DataError(f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D)")
+        raise DataError(
+            f"features of shape {a.shape} and {b.shape}", "(N, D) and (M, D)"
+        )
     if min(len(a), len(b)) < 2:
         raise DataError(
             f"features of {len(a)} and {len(b)} scans",

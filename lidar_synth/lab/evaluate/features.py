@@ -31,7 +31,9 @@ SAMPLES_PER_FEATURE = 4
 """Samples for each feature from which a Fréchet distance gets an interval; with fewer it does not
 cover the truth."""
 
-JOINED: dict[str, Callable[[Scan], NDArray[np.float64]]] = {"class_shares": class_shares}
+JOINED: dict[str, Callable[[Scan], NDArray[np.float64]]] = {
+    "class_shares": class_shares
+}
 """Descriptions that a measure joins to features, by the name of its option ``join``."""
 
 
@@ -109,7 +111,9 @@ def find_weights(extractor: str, folder: Path | None) -> Path | None:
     if package is None:
         return None
     if extractor not in package.EXTRACTORS:
-        raise ConfigError(f"extractor {extractor!r}", f"one of {', '.join(package.EXTRACTORS)}")
+        raise ConfigError(
+            f"extractor {extractor!r}", f"one of {', '.join(package.EXTRACTORS)}"
+        )
     found: Path | None = package.EXTRACTORS[extractor].found(folder)
     return found
 
@@ -122,13 +126,17 @@ def _package() -> Any:
         return None
 
 
-def statistic_of(real: NDArray[np.floating], fake: NDArray[np.floating]) -> Statistic | None:
+def statistic_of(
+    real: NDArray[np.floating], fake: NDArray[np.floating]
+) -> Statistic | None:
     """The Fréchet distance to resample; None with too few samples for an interval."""
     enough = min(len(real), len(fake)) >= SAMPLES_PER_FEATURE * real.shape[1]
     return frechet(real, fake) if enough else None
 
 
-Figure = tuple[str, Callable[[], float], Callable[[], Statistic | None], tuple[float, float]]
+Figure = tuple[
+    str, Callable[[], float], Callable[[], Statistic | None], tuple[float, float]
+]
 """Title, value, statistic to resample (None = no interval), and the smallest and the largest
 possible value."""
 
@@ -164,13 +172,17 @@ def figures_of(
     return figures + more_figures(name, real, fake) if extended else figures
 
 
-def more_figures(name: str, real: NDArray[np.floating], fake: NDArray[np.floating]) -> list[Figure]:
+def more_figures(
+    name: str, real: NDArray[np.floating], fake: NDArray[np.floating]
+) -> list[Figure]:
     """Unbiased forms, precision, recall, density and coverage; those for which there are enough
     samples."""
     figures: list[Figure] = []
 
     def add(title: str, statistic: Statistic, limits: tuple[float, float]) -> None:
-        figures.append((f"{title} of {name}", lambda: statistic.value, lambda: statistic, limits))
+        figures.append(
+            (f"{title} of {name}", lambda: statistic.value, lambda: statistic, limits)
+        )
 
     add("unbiased squared maximum mean discrepancy", polynomial_mmd(real, fake), ANY)
     try:
@@ -197,5 +209,6 @@ def describe_missing(missing: Mapping[str, str], protocol: Protocol) -> str:
     """One line per measure that could not be measured, with the reason."""
     measures = protocol.measures
     return "\n".join(
-        f"{measures[n].table or measures[n].title}: {reason}" for n, reason in missing.items()
+        f"{measures[n].table or measures[n].title}: {reason}"
+        for n, reason in missing.items()
     )

@@ -71,7 +71,9 @@ def bootstrap(
     for first in range(0, replicates, _BATCH):
         count = min(_BATCH, replicates - first)
         values.append(
-            statistic.at(*(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes))
+            statistic.at(
+                *(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)
+            )
         )
     if not np.isfinite(together := np.concatenate(values)).all():
         return None
@@ -115,7 +117,10 @@ def extrapolated_frechet(
     shares = 1 / np.linspace(1, 1 / smallest, sizes)
     values = [
         frechet_distance(
-            *(s[rng.choice(len(s), round(share * len(s)), replace=False)] for s in (real, fake))
+            *(
+                s[rng.choice(len(s), round(share * len(s)), replace=False)]
+                for s in (real, fake)
+            )
         )
         for share in shares
     ]

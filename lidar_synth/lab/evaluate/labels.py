@@ -20,7 +20,11 @@ CLASSES = len(NAMES)
 
 
 def class_histogram(
-    scan: Scan, field: float = FIELD, bins: int = BINS, near: float = NEAR, far: float = FAR
+    scan: Scan,
+    field: float = FIELD,
+    bins: int = BINS,
+    near: float = NEAR,
+    far: float = FAR,
 ) -> Sparse:
     """The bins that are not empty of (19, bins, bins): class, then x, then y. Ignored points do not
     count.
@@ -49,7 +53,9 @@ def class_histogram(
             f"scan {scan.id!r} with no labelled return from {near:g} m to {far:g} m",
             "labelled returns",
         )
-    index = (scan.label[kept].astype(np.int64) * bins + cell[kept, 0]) * bins + cell[kept, 1]
+    index = (scan.label[kept].astype(np.int64) * bins + cell[kept, 0]) * bins + cell[
+        kept, 1
+    ]
     where, amounts = np.unique(index, return_counts=True)
     return Sparse(where.astype(np.int32), amounts.astype(np.uint16))
 
@@ -63,11 +69,13 @@ def class_shares(scan: Scan, bands: int = 16) -> NDArray[np.float64]:
     """
     if scan.label is None:
         raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
-    ring = np.minimum(np.linalg.norm(scan.points[:, :2], axis=1) * bands / 56, bands - 1).astype(
-        np.int64
-    )
+    ring = np.minimum(
+        np.linalg.norm(scan.points[:, :2], axis=1) * bands / 56, bands - 1
+    ).astype(np.int64)
     known = scan.label != IGNORE
-    counts = np.bincount(ring[known] * CLASSES + scan.label[known], minlength=bands * CLASSES)
+    counts = np.bincount(
+        ring[known] * CLASSES + scan.label[known], minlength=bands * CLASSES
+    )
     table = counts.reshape(bands, CLASSES).astype(np.float64)
     shares: NDArray[np.float64] = table / np.maximum(table.sum(1, keepdims=True), 1)
     return shares.ravel()

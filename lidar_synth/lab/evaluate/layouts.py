@@ -98,7 +98,9 @@ def _inside(
     """(N,) points in a box, with the tolerance; (N,) points of boxed classes; (M,) number of points
     in each box, without those of the ground."""
     if scan.label is None:
-        raise DataError(f"scan {scan.id!r} has no labels", "labels, to compare it with its layout")
+        raise DataError(
+            f"scan {scan.id!r} has no labels", "labels, to compare it with its layout"
+        )
     inside = layout.boxes.enlarged(TOLERANCE).contain(scan.points)
     points: NDArray[np.int64] = (inside & ~GROUND[scan.label]).sum(1)
     return np.asarray(inside.any(0)), np.isin(scan.label, BOXED), points

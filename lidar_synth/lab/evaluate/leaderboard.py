@@ -38,10 +38,14 @@ class PublishedTable(BaseModel):
 def leaderboard() -> tuple[tuple[PublishedTable, ...], Mapping[str, str]]:
     """All tables, and {source: what it is}."""
     text = (
-        files("lidar_synth.lab.evaluate").joinpath("leaderboard.yaml").read_text(encoding="utf-8")
+        files("lidar_synth.lab.evaluate")
+        .joinpath("leaderboard.yaml")
+        .read_text(encoding="utf-8")
     )
     values = yaml.safe_load(text)
-    return tuple(PublishedTable(**table) for table in values["tables"]), values["sources"]
+    return tuple(PublishedTable(**table) for table in values["tables"]), values[
+        "sources"
+    ]
 
 
 def compare_published(scores: Sequence[Score]) -> str:
@@ -57,7 +61,10 @@ def compare_published(scores: Sequence[Score]) -> str:
         longest_first = sorted(table.rows, key=len, reverse=True)
         columns = list(
             dict.fromkeys(
-                key for row in longest_first for key in row if key not in ("method", "steps")
+                key
+                for row in longest_first
+                for key in row
+                if key not in ("method", "steps")
             )
         )
         head = [
@@ -70,9 +77,19 @@ def compare_published(scores: Sequence[Score]) -> str:
             for row in table.rows
         ]
         own = " | ".join(_shown(named[c]) if c in named else "" for c in columns)
-        where = f"{table.dataset}, {table.task}. {sources[table.source]}. {table.note}".rstrip(". ")
+        where = f"{table.dataset}, {table.task}. {sources[table.source]}. {table.note}".rstrip(
+            ". "
+        )
         parts.append(
-            "\n".join([f"{where}.", "", *head, *rows, f"| **these scans** ({counts}) | | {own} |"])
+            "\n".join(
+                [
+                    f"{where}.",
+                    "",
+                    *head,
+                    *rows,
+                    f"| **these scans** ({counts}) | | {own} |",
+                ]
+            )
         )
     return "\n\n".join(parts) or "No published figures of this protocol are known."
 

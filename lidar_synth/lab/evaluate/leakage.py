@@ -49,7 +49,9 @@ def seen_by_model_of(path: Path, source: ScanFiles | None = None) -> Recordings 
     """
     if models := models_of(path):
         return _of_models(models)
-    by_model = source is not None and next(iter(source)).provenance.get("made_by") == "model"
+    by_model = (
+        source is not None and next(iter(source)).provenance.get("made_by") == "model"
+    )
     return Recordings() if by_model else None
 
 
@@ -72,11 +74,19 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
         return town(made.get("seed", 0))
     if isinstance(source, BankScans):  # includes the training data of its model
         return all_frames(FILES, [str(path)]) | _of_bank(source.bank)
-    return frames_of(layout, source.ids) if layout in PLACES else all_frames(FILES, [str(path)])
+    return (
+        frames_of(layout, source.ids)
+        if layout in PLACES
+        else all_frames(FILES, [str(path)])
+    )
 
 
 def measured(
-    source: ScanFiles, layout: str, path: Path, split: str | None, seen: Recordings | None = None
+    source: ScanFiles,
+    layout: str,
+    path: Path,
+    split: str | None,
+    seen: Recordings | None = None,
 ) -> Recordings:
     """The recordings of a reference, and its path: data on which an evaluated model must not have
     been trained.
@@ -113,8 +123,12 @@ def overlap(seen: Recordings, reference: Recordings) -> Recordings:
 def undecided(seen: Recordings, reference: Recordings) -> bool:
     """Whether one is from KITTI's object set and the other from the raw drives from which that was
     sampled."""
-    some, others = ({dataset for dataset, _ in part.drives} for part in (seen, reference))
-    return (KITTI in some and KITTI_OBJECT in others) or (KITTI_OBJECT in some and KITTI in others)
+    some, others = (
+        {dataset for dataset, _ in part.drives} for part in (seen, reference)
+    )
+    return (KITTI in some and KITTI_OBJECT in others) or (
+        KITTI_OBJECT in some and KITTI in others
+    )
 
 
 def town(seed: int) -> Recordings:

@@ -33,7 +33,9 @@ SENSOR = Sensor(
 """The grid of LiDM's range images."""
 
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
-_MOST_CELLS = 1 << 16  # cells of a grid up to which the maps of a block are held and multiplied
+_MOST_CELLS = (
+    1 << 16
+)  # cells of a grid up to which the maps of a block are held and multiplied
 
 
 def find_occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:
@@ -51,7 +53,8 @@ def find_occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]
     inside = xy[((xy > -HALF) & (xy < HALF)).all(1)]
     if len(inside) == 0:
         raise DataError(
-            f"a cloud of {len(points)} points with none within +-{HALF} m", "a scan with returns"
+            f"a cloud of {len(points)} points with none within +-{HALF} m",
+            "a scan with returns",
         )
     side = round(2 * HALF / size)
     cell = np.floor(inside / np.float32(size)).astype(np.int32) + side // 2
@@ -66,7 +69,9 @@ def cells_along(size: float) -> int:
 
 
 def matching_distances(
-    real: Sequence[NDArray[np.int32]], generated: Sequence[NDArray[np.int32]], size: float
+    real: Sequence[NDArray[np.int32]],
+    generated: Sequence[NDArray[np.int32]],
+    size: float,
 ) -> NDArray[np.float32]:
     """(N, M) Chamfer distance of every real cloud and every generated one.
 
@@ -80,7 +85,9 @@ def matching_distances(
         size: of a cell, metres.
     """
     side = cells_along(size)
-    both = (_by_product if side**2 <= _MOST_CELLS else _by_lookup)(real, generated, side)
+    both = (_by_product if side**2 <= _MOST_CELLS else _by_lookup)(
+        real, generated, side
+    )
     return np.asarray(both / np.float32(2 * side**2), np.float32)
 
 
@@ -89,7 +96,10 @@ def _by_product(
 ) -> NDArray[np.float32]:
     total = np.empty((len(real), len(generated)), np.float32)
     maps = np.concatenate(
-        [_distance_maps(real[i : i + _BLOCK], side) for i in range(0, len(real), _BLOCK)]
+        [
+            _distance_maps(real[i : i + _BLOCK], side)
+            for i in range(0, len(real), _BLOCK)
+        ]
     )
     for j in range(0, len(generated), _BLOCK):
         block = generated[j : j + _BLOCK]
@@ -139,7 +149,9 @@ def _weights(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float
     return weights
 
 
-def _distance_maps(clouds: Sequence[NDArray[np.int32]], side: int) -> NDArray[np.float32]:
+def _distance_maps(
+    clouds: Sequence[NDArray[np.int32]], side: int
+) -> NDArray[np.float32]:
     """(n, side * side) squared distance, in cells, from every cell to the nearest that a cloud
     occupies."""
     return np.stack([_distance_map(cells, side).ravel() for cells in clouds])

@@ -54,7 +54,9 @@ def normalised_rows(histograms: Sequence[NDArray[Any]]) -> Rows:
     """Histograms as rows that sum to 1 each."""
 
     def rows(first: int, last: int) -> Tensor:
-        counts = torch.from_numpy(np.stack(histograms[first:last]).astype(np.float32)).flatten(1)
+        counts = torch.from_numpy(
+            np.stack(histograms[first:last]).astype(np.float32)
+        ).flatten(1)
         return counts / counts.sum(1, keepdim=True)
 
     return rows
@@ -100,7 +102,10 @@ def _jsd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statisti
 
 def _mmd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
     return gaussian_mmd(
-        normalised_rows(real), normalised_rows(fake), (len(real), len(fake)), real[0].size
+        normalised_rows(real),
+        normalised_rows(fake),
+        (len(real), len(fake)),
+        real[0].size,
     )
 
 
@@ -109,7 +114,9 @@ def _occupancy(
 ) -> Callable[[Sequence[Any], Sequence[Any], Options], Statistic]:
     """How often each cell is occupied."""
 
-    def compare(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
+    def compare(
+        real: Sequence[Any], fake: Sequence[Any], options: Options
+    ) -> Statistic:
         once = [
             [Sparse(cells, np.ones(len(cells), np.uint8)) for cells in side]
             for side in (real, fake)
@@ -141,7 +148,9 @@ KINDS = {
     "bev_jsd": Kind(_bev, _jsd),
     "bev_mmd": Kind(_bev, _mmd),
     "occupancy_jsd": Kind(_occupied, _occupancy(sparse_histogram_distance)),
-    "occupancy_tv": Kind(_occupied, _occupancy(sparse_histogram_distance, total_variation)),
+    "occupancy_tv": Kind(
+        _occupied, _occupancy(sparse_histogram_distance, total_variation)
+    ),
     "minimum_matching": Kind(_occupied, _matching),
     "class_jsd": Kind(_classes, _class_jsd, labels=True),
     "class_mmd": Kind(_classes, _class_mmd, labels=True),

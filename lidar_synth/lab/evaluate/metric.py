@@ -31,7 +31,13 @@ from lidar_synth.lab.evaluate.features import (
 )
 from lidar_synth.lab.evaluate.intervals import LEVEL, bootstrap
 from lidar_synth.lab.evaluate.measures import KINDS
-from lidar_synth.lab.evaluate.protocols import FEATURES, Measure, Protocol, alike, find_protocol
+from lidar_synth.lab.evaluate.protocols import (
+    FEATURES,
+    Measure,
+    Protocol,
+    alike,
+    find_protocol,
+)
 
 SIDES = ("real", "generated")
 
@@ -63,9 +69,13 @@ class Score:
 
     def __str__(self) -> str:
         interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
-        setting = f"{self.protocol} protocol, {self.real} real, {self.generated} generated"
+        setting = (
+            f"{self.protocol} protocol, {self.real} real, {self.generated} generated"
+        )
         table = (
-            f", in its tables {self.table} = {self.value * self.times:.4g}" if self.table else ""
+            f", in its tables {self.table} = {self.value * self.times:.4g}"
+            if self.table
+            else ""
         )
         return f"{self.metric} = {self.value:.6g}{interval} ({setting}){table}"
 
@@ -157,7 +167,10 @@ class Metric:
 
     def reset(self, real: bool = True) -> None:
         """Forget the generated scans, and the real ones unless ``real`` is False."""
-        self._kept = {"real": _Kept() if real else self._kept["real"], "generated": _Kept()}
+        self._kept = {
+            "real": _Kept() if real else self._kept["real"],
+            "generated": _Kept(),
+        }
         self.left_out = dict(self._missing)
 
     def update(self, scans: Iterable[Scan], real: bool) -> None:
@@ -181,7 +194,9 @@ class Metric:
         measured = [m for m in self.protocol.measures.values() if m.kind != FEATURES]
         for scan in scans:
             self._check_sensor(scan, side)
-            for key, description in self._describe(scan, generated, measured, side).items():
+            for key, description in self._describe(
+                scan, generated, measured, side
+            ).items():
                 part.descriptions.setdefault(key, []).append(description)
         for name, extract in self._extractors.items():
             part.features[name] = [checked(extract, scans)]
@@ -253,10 +268,14 @@ class Metric:
         ]
         for name in self._extractors:
             real, fake = (np.concatenate(kept[side].features[name]) for side in SIDES)
-            scores += self._of_figures(figures_of(name, real, fake, self._extended), kept)
+            scores += self._of_figures(
+                figures_of(name, real, fake, self._extended), kept
+            )
         if self._extended:
             for name in self._published:
-                real, fake = (np.concatenate(kept[side].features[_own(name)]) for side in SIDES)
+                real, fake = (
+                    np.concatenate(kept[side].features[_own(name)]) for side in SIDES
+                )
                 table = self.protocol.measures[name].table or name
                 scores += self._of_figures(more_figures(table, real, fake), kept)
         if not scores:
@@ -271,7 +290,9 @@ class Metric:
         if measure.kind == FEATURES:
             if name not in self._published:
                 return None
-            real, fake = (np.concatenate(kept[side].features[_own(name)]) for side in SIDES)
+            real, fake = (
+                np.concatenate(kept[side].features[_own(name)]) for side in SIDES
+            )
             statistic = statistic_of(real, fake) if self._replicates else None
             return self._made(
                 measure, frechet_distance(real, fake), statistic, len(real), len(fake)
@@ -281,7 +302,8 @@ class Metric:
         if KINDS[measure.kind].labels and [len(b) for b in both] != counts:
             if any(0 < len(b) < n for b, n in zip(both, counts, strict=True)):
                 raise DataError(
-                    "a set in which only some scans have labels", "labels in all scans or in none"
+                    "a set in which only some scans have labels",
+                    "labels in all scans or in none",
                 )
             self.left_out[name] = "scans without labels"
             return None
@@ -290,7 +312,9 @@ class Metric:
         compared = KINDS[measure.kind].compare(real_scans, fake_scans, measure.options)
         return self._made(measure, compared.value, compared, *compared.sizes)
 
-    def _made(self, measure: Measure, value: float, statistic: Any, real: int, fake: int) -> Score:
+    def _made(
+        self, measure: Measure, value: float, statistic: Any, real: int, fake: int
+    ) -> Score:
         low, high = self._interval(
             statistic, (-np.inf if measure.least is None else measure.least, np.inf)
         )
@@ -306,12 +330,20 @@ class Metric:
             high,
         )
 
-    def _of_figures(self, figures: Iterable[Figure], kept: Mapping[str, _Kept]) -> list[Score]:
+    def _of_figures(
+        self, figures: Iterable[Figure], kept: Mapping[str, _Kept]
+    ) -> list[Score]:
         real, fake = (kept[side].count for side in SIDES)
         scores = []
         for title, value, statistic, limits in figures:
-            low, high = self._interval(statistic() if self._replicates else None, limits)
-            scores.append(Score(title, value(), self.protocol.name, real, fake, low=low, high=high))
+            low, high = self._interval(
+                statistic() if self._replicates else None, limits
+            )
+            scores.append(
+                Score(
+                    title, value(), self.protocol.name, real, fake, low=low, high=high
+                )
+            )
         return scores
 
     def _interval(
@@ -325,7 +357,9 @@ class Metric:
 
     def _gathered(self) -> dict[str, _Kept]:
         """Both sets of all processes, in the order of their ranks."""
-        together = torch.distributed.is_available() and torch.distributed.is_initialized()
+        together = (
+            torch.distributed.is_available() and torch.distributed.is_initialized()
+        )
         if not together or torch.distributed.get_world_size() == 1:
             return self._kept
         parts: list[Any] = [None] * torch.distributed.get_world_size()

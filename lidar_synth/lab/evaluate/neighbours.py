@@ -58,9 +58,12 @@ def manifold(
         raise ConfigError(f"neighbour k = {k}", "at least 1")
     if min(len(x), len(y)) <= k:
         raise DataError(
-            f"{len(x)} real and {len(y)} generated samples", f"more than k = {k} of each"
+            f"{len(x)} real and {len(y)} generated samples",
+            f"more than k = {k} of each",
         )
-    real_radii, fake_radii = (_by_rows(s, s, lambda d: d.kthvalue(k + 1).values) for s in (x, y))
+    real_radii, fake_radii = (
+        _by_rows(s, s, lambda d: d.kthvalue(k + 1).values) for s in (x, y)
+    )
     # Real balls around each generated sample.
     balls = _by_rows(y, x, lambda d: (d <= real_radii).double().sum(1))
     recalled = _by_rows(x, y, lambda d: (d <= fake_radii).any(1).double())
@@ -91,7 +94,9 @@ class Novelty(NamedTuple):
 
 
 def nearest_training(
-    training: NDArray[np.floating], fake: NDArray[np.floating], held_out: NDArray[np.floating]
+    training: NDArray[np.floating],
+    fake: NDArray[np.floating],
+    held_out: NDArray[np.floating],
 ) -> Novelty:
     """How close generated samples are to the training data, beside held-out real samples.
 
@@ -106,11 +111,15 @@ def nearest_training(
     known = torch.from_numpy(checked_features(training, fake)[0])
     generated, others = (
         _by_rows(
-            torch.from_numpy(checked_features(training, s)[1]), known, lambda d: d.min(1).values
+            torch.from_numpy(checked_features(training, s)[1]),
+            known,
+            lambda d: d.min(1).values,
         ).numpy()
         for s in (fake, held_out)
     )
-    return Novelty(generated, others, float((generated < np.quantile(others, 0.05)).mean()))
+    return Novelty(
+        generated, others, float((generated < np.quantile(others, 0.05)).mean())
+    )
 
 
 def _by_rows(a: Tensor, b: Tensor, reduce: Callable[[Tensor], Tensor]) -> Tensor:

@@ -48,5 +48,7 @@ def step_histogram(scan: Scan) -> NDArray[np.uint32]:
             both[0] = False
         sides.append(np.histogram(step[both], STEPS)[0])
     if not np.sum(sides):
-        raise DataError(f"scan {scan.id!r} without neighbouring returns", "a scan with returns")
+        raise DataError(
+            f"scan {scan.id!r} without neighbouring returns", "a scan with returns"
+        )
     return np.array(sides, np.uint32)

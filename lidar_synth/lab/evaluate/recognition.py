@@ -42,12 +42,18 @@ class Recognition:
     def iou(self) -> dict[str, float]:
         """IoU in [0, 1] of the classes that occur in the labels."""
         ious = class_ious(self.table)
-        return {name: float(ious[i]) for i, name in enumerate(NAMES) if self.table[i].sum()}
+        return {
+            name: float(ious[i]) for i, name in enumerate(NAMES) if self.table[i].sum()
+        }
 
-    def confusions(self, name: str, most: int = 2, least: float = 0.05) -> list[tuple[str, float]]:
+    def confusions(
+        self, name: str, most: int = 2, least: float = 0.05
+    ) -> list[tuple[str, float]]:
         """The classes most often predicted instead of a class, with their share of its cells,
         largest first."""
-        row = self.table[NAMES.index(name)] / max(1, self.table[NAMES.index(name)].sum())
+        row = self.table[NAMES.index(name)] / max(
+            1, self.table[NAMES.index(name)].sum()
+        )
         order = [i for i in np.argsort(-row) if NAMES[i] != name and row[i] >= least]
         return [(NAMES[i], float(row[i])) for i in order[:most]]
 
@@ -110,12 +116,18 @@ def as_text(figures: Mapping[str, Any]) -> str:
         f"| mean IoU | {100 * real['mean_iou']:.1f} | {100 * fake['mean_iou']:.1f} | |",
     ]
     for name in (n for n in NAMES if n in real["iou"] or n in fake["iou"]):
-        values = (f"{100 * r['iou'][name]:.1f}" if name in r["iou"] else "" for r in (real, fake))
+        values = (
+            f"{100 * r['iou'][name]:.1f}" if name in r["iou"] else ""
+            for r in (real, fake)
+        )
         instead = ", ".join(
             f"{k} {100 * v:.0f}" for k, v in fake["confusions"].get(name, {}).items()
         )
         lines.append(f"| {name} | {' | '.join(values)} | {instead} |")
-    for key, label in (("frechet_distance", "Frechet distance"), ("squared_mmd", "squared MMD")):
+    for key, label in (
+        ("frechet_distance", "Frechet distance"),
+        ("squared_mmd", "squared MMD"),
+    ):
         if key in figures:
             lines.append(f"| {label} of features | | {figures[key]:.4g} | |")
     return "\n".join(lines)

@@ -35,7 +35,9 @@ Images = Mapping[str, Tensor]
 "reflectance" float32 in [0, 1]; "label" uint8 train ids, 255 = ignore."""
 
 
-def confusion(network: nn.Module, batches: Iterable[Images], height: Tensor) -> NDArray[np.int64]:
+def confusion(
+    network: nn.Module, batches: Iterable[Images], height: Tensor
+) -> NDArray[np.int64]:
     """(19, 19) number of cells by label (row) and prediction (column), without ignored cells."""
     count = len(NAMES)
     table = torch.zeros(count * count, dtype=torch.int64)
@@ -70,7 +72,9 @@ def mean_iou(table: NDArray[np.int64]) -> float:
     """
     labelled = table.sum(1) > 0
     if not labelled.any():
-        raise DataError("no labelled cell", "at least one label that is not 255 = ignore")
+        raise DataError(
+            "no labelled cell", "at least one label that is not 255 = ignore"
+        )
     return float(class_ious(table)[labelled].mean())
 
 
@@ -111,7 +115,9 @@ class Judge:
         def labelled() -> Iterator[Images]:
             for scan in scans:
                 if scan.label is None:
-                    raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+                    raise DataError(
+                        f"scan {scan.id!r} without labels", "labelled scans"
+                    )
                 yield self._images([scan])
 
         return confusion(self.network, labelled(), self.height)
@@ -123,10 +129,15 @@ class Judge:
             else ("reflectance",)
         )
         images = [project(scan, self.sensor, names) for scan in scans]
-        stacked = {name: np.stack([image.channels[name] for image in images]) for name in names}
+        stacked = {
+            name: np.stack([image.channels[name] for image in images]) for name in names
+        }
         return {
             k: torch.from_numpy(v)
-            for k, v in {"range": np.stack([i.range for i in images]), **stacked}.items()
+            for k, v in {
+                "range": np.stack([i.range for i in images]),
+                **stacked,
+            }.items()
         }
 
     def save(self, path: Path) -> None:
@@ -140,9 +151,14 @@ class Judge:
             "sensor": self.sensor.to_dict(),
             "provenance": dict(self.provenance),
         }
-        state = {k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}
+        state = {
+            k: v.detach().cpu().contiguous()
+            for k, v in self.network.state_dict().items()
+        }
         write_file(
-            path, save(state, {"lidar_synth": json.dumps(header, sort_keys=True)}), durable=True
+            path,
+            save(state, {"lidar_synth": json.dumps(header, sort_keys=True)}),
+            durable=True,
         )
 
 
@@ -159,7 +175,9 @@ def load_judge(path: Path | None = None) -> Judge:
         >>> load_judge().features([Town(seed=1, scans=1)[0]]).shape
         (1, 64)
     """
-    path = path or Path(str(files("lidar_synth.lab.evaluate"))) / "segmenter.safetensors"
+    path = (
+        path or Path(str(files("lidar_synth.lab.evaluate"))) / "segmenter.safetensors"
+    )
     content = read_file(path)
     try:
         start = int.from_bytes(content[:8], "little") + 8
@@ -168,8 +186,11 @@ def load_judge(path: Path | None = None) -> Judge:
             raise ConfigError(f"format {header['format']!r}", repr(FORMAT))
         network = RangeSegmenter()
         network.load_state_dict(load(content))
-        return Judge(network.eval(), Sensor.from_dict(header["sensor"]), header["provenance"])
+        return Judge(
+            network.eval(), Sensor.from_dict(header["sensor"]), header["provenance"]
+        )
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise DataError(
-            f"{path} is not a segmenter of this version ({error})", f"a file of {FORMAT}"
+            f"{path} is not a segmenter of this version ({error})",
+            f"a file of {FORMAT}",
         ) from error

@@ -41,7 +41,9 @@ class CircularConv(nn.Module):
     """3 x 3 convolution, norm and ReLU, with circular padding of columns and zero padding of
     rows."""
 
-    def __init__(self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)
+    ) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, stride, padding=(1, 0), bias=False)
         self.norm = nn.BatchNorm2d(outputs)
@@ -114,5 +116,11 @@ def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Te
     """
     returned = (distance > 0).to(distance.dtype)
     return torch.stack(
-        [torch.log2(1 + distance) / 6, distance * height / 2, reflectance * returned, returned], 1
+        [
+            torch.log2(1 + distance) / 6,
+            distance * height / 2,
+            reflectance * returned,
+            returned,
+        ],
+        1,
     )

@@ -95,7 +95,10 @@ def _sparse(histogram: NDArray[Any]) -> Sparse:
 
 
 def _sum(
-    histograms: Sequence[Sparse], counts: NDArray[Any], place: NDArray[np.int32], size: int
+    histograms: Sequence[Sparse],
+    counts: NDArray[Any],
+    place: NDArray[np.int32],
+    size: int,
 ) -> NDArray[np.int64]:
     """(size,) weighted sum of histograms; ``place`` says where each of their bins lies in it."""
     total = np.zeros(size, np.int64)
@@ -142,7 +145,12 @@ def gaussian_mmd(
 
 
 def _mean_kernel(
-    kernel: Callable[[Tensor, Tensor], Tensor], p: Rows, a: Counts, q: Rows, b: Counts, size: int
+    kernel: Callable[[Tensor, Tensor], Tensor],
+    p: Rows,
+    a: Counts,
+    q: Rows,
+    b: Counts,
+    size: int,
 ) -> NDArray[np.float64]:
     """(R,) mean of the kernel over all pairs, by the counts (R, N) and (R, M); ``size`` samples at
     a time."""
@@ -155,7 +163,10 @@ def _mean_kernel(
             y = x if same and j == i else q(j, min(j + size, right.shape[1]))
             block = kernel(x, y)
             part = (
-                ((left[:, i : i + size].to(block) @ block) * right[:, j : j + size].to(block))
+                (
+                    (left[:, i : i + size].to(block) @ block)
+                    * right[:, j : j + size].to(block)
+                )
                 .double()
                 .sum(1)
             )
@@ -224,7 +235,9 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
         return (
-            within(0, a) + within(1, b) - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)
+            within(0, a)
+            + within(1, b)
+            - 2 * _mean_kernel(kernel, rows[0], a, rows[1], b, _BLOCK)
         )
 
     return Statistic(at, (len(x), len(y)))

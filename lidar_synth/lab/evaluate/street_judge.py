@@ -64,7 +64,9 @@ class StreetJudge:
         """Train ids (H, W) of an ``image`` (5, H, W); "unlabelled" is never predicted."""
         known = np.flatnonzero(self.train_id != IGNORE)
         with torch.inference_mode():
-            best: NDArray[np.intp] = self.segmenter.network(image[None])[0, known].argmax(0).numpy()
+            best: NDArray[np.intp] = (
+                self.segmenter.network(image[None])[0, known].argmax(0).numpy()
+            )
         return self.train_id[known[best]]
 
     def features(self, scans: Sequence[Scan]) -> NDArray[np.floating]:
@@ -72,7 +74,10 @@ class StreetJudge:
         ``Extractor``."""
         inputs = [self.image(scan)[0] for scan in scans]
         with torch.inference_mode():
-            rows = [mean_over_returns(self.segmenter.decode(image), image) for image in inputs]
+            rows = [
+                mean_over_returns(self.segmenter.decode(image), image)
+                for image in inputs
+            ]
         return torch.stack(rows).double().numpy()
 
     def image(self, scan: Scan) -> tuple[Tensor, NDArray[np.uint8]]:
@@ -80,7 +85,9 @@ class StreetJudge:
         without labels."""
         image, shown = nearest_points(scan, self.segmenter.sensor)
         fields = ["label"] if scan.label is not None else []
-        label = carry(scan, shown, fields).get("label", np.full(shown.shape, IGNORE, np.uint8))
+        label = carry(scan, shown, fields).get(
+            "label", np.full(shown.shape, IGNORE, np.uint8)
+        )
         return self.segmenter.normalise(image), label
 
 
@@ -101,7 +108,10 @@ def load_archive(folder: Path, columns: int | None = None) -> StreetJudge:
     classes = archive.yaml("data_cfg.yaml")
     segmenter = read_segmenter(archive, columns)
     try:
-        ids = [classes["learning_map_inv"][i] for i in range(len(classes["learning_map_inv"]))]
+        ids = [
+            classes["learning_map_inv"][i]
+            for i in range(len(classes["learning_map_inv"]))
+        ]
         if not all(type(i) is int and 0 <= i < 1 << 32 for i in ids):
             raise ValueError(f"ids {ids}")
     except (KeyError, TypeError, ValueError) as error:
@@ -111,10 +121,12 @@ def load_archive(folder: Path, columns: int | None = None) -> StreetJudge:
         ) from error
     if len(segmenter.channels) != len(CHANNELS):
         raise ConfigError(
-            f"{folder} without remission as an input", "a network of range, xyz and remission"
+            f"{folder} without remission as an input",
+            "a network of range, xyz and remission",
         )
     if len(ids) != segmenter.network.get_submodule("segmentation_head.1").out_channels:
         raise ConfigError(
-            f"{folder} with {len(ids)} names of classes", "one for each output of its head"
+            f"{folder} with {len(ids)} names of classes",
+            "one for each output of its head",
         )
     return StreetJudge(segmenter, SEMANTIC_KITTI.decode(np.array(ids), str(folder)))

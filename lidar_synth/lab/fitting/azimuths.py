@@ -123,9 +123,14 @@ def fit_azimuths(turns: list[Turn], beams: int) -> Azimuths:
     phases = [_phases(turn, beams, lattice, sides) for turn in clear]
     if locked:
         by_scan = np.stack([(_wrap(phase - 0.5)) * 360 / lattice for phase in phases])
-        return Azimuths(count, size, *_combined(by_scan, beams, "one firing", 360 / lattice), sides)
+        return Azimuths(
+            count, size, *_combined(by_scan, beams, "one firing", 360 / lattice), sides
+        )
     by_scan = np.stack(
-        [_by_pattern(t, beams, lattice, sides, p) for t, p in zip(clear, phases, strict=True)]
+        [
+            _by_pattern(t, beams, lattice, sides, p)
+            for t, p in zip(clear, phases, strict=True)
+        ]
     )
     return Azimuths(count, size, *_combined(by_scan, beams, "encoder"), sides)
 
@@ -167,7 +172,9 @@ def _firings(turn: Turn, beams: int) -> float:
     positive = [step[step > 2e-5] for step in steps]
     typical = float(np.median(np.concatenate(positive)))
     # Longer steps are missing returns. An encoder makes single steps up to half as long.
-    single = [step[(step > 0.3 * typical) & (step < 1.4 * typical)] for step in positive]
+    single = [
+        step[(step > 0.3 * typical) & (step < 1.4 * typical)] for step in positive
+    ]
     single = [step for step in single if len(step)]
     if np.median([step.std() / step.mean() for step in single]) > UNEVEN:
         return 0.0
@@ -210,7 +217,9 @@ def _sides(turn: Turn, beams: int, lattice: int) -> Floats:
         phase = 2j * np.pi * lattice * (azimuth + SIDES[:, None] * near)
         value = np.abs(np.exp(phase).mean(1))
         best = int(np.argmax(value))
-        sides[beam] = SIDES[best] if value[best] > value[len(SIDES) // 2] + 0.02 else 0.0
+        sides[beam] = (
+            SIDES[best] if value[best] > value[len(SIDES) // 2] + 0.02 else 0.0
+        )
     return sides
 
 
@@ -219,15 +228,22 @@ def _phases(turn: Turn, beams: int, lattice: int, sides: Floats) -> Floats:
     [-0.5, 0.5)."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)
     wave = np.exp(2j * np.pi * lattice * seen)
-    real, imaginary = (np.bincount(turn.ring, part, beams) for part in (wave.real, wave.imag))
+    real, imaginary = (
+        np.bincount(turn.ring, part, beams) for part in (wave.real, wave.imag)
+    )
     phase = np.arctan2(imaginary, real) / (2 * np.pi)
     return np.where(np.bincount(turn.ring, minlength=beams) >= FEW, phase, np.nan)
 
 
-def _by_pattern(turn: Turn, beams: int, lattice: int, sides: Floats, phases: Floats) -> Floats:
+def _by_pattern(
+    turn: Turn, beams: int, lattice: int, sides: Floats, phases: Floats
+) -> Floats:
     """(B,) degrees: offsets that align the patterns of skipped encoder steps; their median is 0."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)
-    step = np.round(lattice * seen - np.nan_to_num(phases)[turn.ring]).astype(np.int64) % lattice
+    step = (
+        np.round(lattice * seen - np.nan_to_num(phases)[turn.ring]).astype(np.int64)
+        % lattice
+    )
     hit = np.zeros((beams, lattice), bool)
     hit[turn.ring, step] = True
     following = np.roll(hit, -1, 1)
@@ -267,7 +283,9 @@ def _offsets_by_time(turn: Turn, beams: int) -> Floats:
     for _ in range(4):
         head = azimuth - offsets[ring] / 360
         wave = np.exp(2j * np.pi * head)
-        mean = np.bincount(part, wave.real, PARTS) + 1j * np.bincount(part, wave.imag, PARTS)
+        mean = np.bincount(part, wave.real, PARTS) + 1j * np.bincount(
+            part, wave.imag, PARTS
+        )
         path = np.unwrap(np.angle(mean)) / (2 * np.pi)
         slope = np.gradient(path, centre)
         beyond = _wrap(azimuth - path[part] - slope[part] * (time - centre[part])) * 360

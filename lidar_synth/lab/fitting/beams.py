@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, refine, residuals
+from lidar_synth.geometry.lines import (
+    CAP,
+    Cloud,
+    Model,
+    nearest_beams,
+    refine,
+    residuals,
+)
 from lidar_synth.geometry.projection.rings import fault_of, ring_bounds
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -137,9 +144,14 @@ def _unwrapped(points: NDArray[np.float32]) -> Floats:
 def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]:
     """(N,) rings that the scans have, or that follow from their order; None if there are none."""
     if all(scan.ring is not None for scan in scans):
-        return "ring field", np.concatenate([np.asarray(scan.ring, np.int64) for scan in scans])
+        return "ring field", np.concatenate(
+            [np.asarray(scan.ring, np.int64) for scan in scans]
+        )
     found = [rings_in_order(scan.points) for scan in scans]
-    most = max((int(ring.max()) + 1 for ring in found if ring is not None and len(ring)), default=0)
+    most = max(
+        (int(ring.max()) + 1 for ring in found if ring is not None and len(ring)),
+        default=0,
+    )
     # A scan with fewer rings is a crop; its rings have other numbers.
     complete = [
         ring if ring is not None and len(ring) and ring.max() + 1 == most else None
@@ -161,9 +173,13 @@ def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
     if not 4 <= count <= 512:
         return None
     elevation = np.degrees(
-        np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(np.float64)
+        np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])).astype(
+            np.float64
+        )
     )
-    middle = np.sort([np.median(part) for part in np.split(elevation, bounds[1:-1])])[::-1]
+    middle = np.sort([np.median(part) for part in np.split(elevation, bounds[1:-1])])[
+        ::-1
+    ]
     try:
         lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
     except ConfigError:  # two rings with the same elevation
@@ -189,9 +205,13 @@ def fit_beams(scans: Sequence[Scan], seed: int = 0) -> tuple[Beams | None, Cloud
     """
     cloud = gather(scans)
     source, ring = rings_of_file(scans)
-    cloud = replace(cloud, ring=cloud.ring if ring is None else ring, kept=ring is not None)
+    cloud = replace(
+        cloud, ring=cloud.ring if ring is None else ring, kept=ring is not None
+    )
     part = _without_gaps(_some_points(cloud, POINTS, seed))
-    still = Model(np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6)))
+    still = Model(
+        np.zeros(1), np.zeros(1), np.zeros(3), np.eye(3), np.zeros((len(scans), 6))
+    )
     best, quality = _attempt(part, still, seed)
     if quality < GOOD:
         offset, turn = find_mount(
@@ -218,7 +238,10 @@ def _with_another_seam(
 ) -> tuple[Model, frozenset[str]]:
     """The best fit with turns that start behind the sensor, as before, or on another side of it."""
     still = replace(
-        best[0], motion=np.zeros_like(best[0].motion), tangents=np.zeros(1), heights=np.zeros(1)
+        best[0],
+        motion=np.zeros_like(best[0].motion),
+        tangents=np.zeros(1),
+        heights=np.zeros(1),
     )
     for seam in (0.25, 0.5, 0.75):
         turned = replace(cloud, time=(cloud.time + seam + 0.5) % 1.0 - 0.5)
@@ -235,14 +258,18 @@ def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
         use = use[cloud.ring[use] >= 0]
     if len(use) > count:
         use = np.sort(np.random.default_rng(seed).choice(use, count, replace=False))
-    return Cloud(cloud.points[use], cloud.scan[use], cloud.time[use], cloud.ring[use], cloud.kept)
+    return Cloud(
+        cloud.points[use], cloud.scan[use], cloud.time[use], cloud.ring[use], cloud.kept
+    )
 
 
 def _without_gaps(cloud: Cloud) -> Cloud:
     """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may
     be dead."""
     return (
-        replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1]) if cloud.kept else cloud
+        replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1])
+        if cloud.kept
+        else cloud
     )
 
 
@@ -282,7 +309,11 @@ def _without_doubles(model: Model, cloud: Cloud) -> Model:
     order = np.argsort(-model.tangents)
     kept: list[int] = []
     for beam in order.tolist():
-        if kept and np.arctan(model.tangents[kept[-1]]) - np.arctan(model.tangents[beam]) < DOUBLE:
+        if (
+            kept
+            and np.arctan(model.tangents[kept[-1]]) - np.arctan(model.tangents[beam])
+            < DOUBLE
+        ):
             kept[-1] = max(kept[-1], beam, key=lambda one: int(points[one]))
         else:
             kept.append(beam)
@@ -292,7 +323,9 @@ def _without_doubles(model: Model, cloud: Cloud) -> Model:
 def quality_of(model: Model, cloud: Cloud) -> float:
     """Share of points in the middle half between the borders of their beams; 0.5 for points
     anywhere."""
-    residual = residuals(model.aligned(cloud), cloud.ring, model.tangents, model.heights)
+    residual = residuals(
+        model.aligned(cloud), cloud.ring, model.tangents, model.heights
+    )
     return float((np.abs(residual) < room_of(model.tangents)[cloud.ring] / 4).mean())
 
 
@@ -314,7 +347,10 @@ def _choose_parts(
     while others := [part for part in GAIN if part not in parts]:
         trials = {
             part: refine(
-                cloud, _with_motion(cloud, model) if part == "motion" else model, parts | {part}, 8
+                cloud,
+                _with_motion(cloud, model) if part == "motion" else model,
+                parts | {part},
+                8,
             )
             for part in others
         }
@@ -336,7 +372,9 @@ def _with_motion(cloud: Cloud, model: Model) -> Model:
     motion = model.motion.copy()
     for scan in np.unique(cloud.scan):
         use = cloud.scan == scan
-        part = Cloud(cloud.points[use], cloud.scan[use], cloud.time[use], ring[use], cloud.kept)
+        part = Cloud(
+            cloud.points[use], cloud.scan[use], cloud.time[use], ring[use], cloud.kept
+        )
         if quality_of(model, part) < GOOD:
             motion[scan] = find_motion(part, model, scan)
     return replace(model, motion=motion)
@@ -344,7 +382,9 @@ def _with_motion(cloud: Cloud, model: Model) -> Model:
 
 def _score(model: Model, cloud: Cloud) -> float:
     """The mean residual, capped, radians."""
-    residual = residuals(model.aligned(cloud), cloud.ring, model.tangents, model.heights)
+    residual = residuals(
+        model.aligned(cloud), cloud.ring, model.tangents, model.heights
+    )
     return float(np.minimum(np.abs(residual), CAP).mean())
 
 
@@ -367,7 +407,9 @@ def add_peaks(cloud: Cloud, model: Model) -> Model | None:
     """The model with its beams found anew, as peaks of the elevations; None without two beams."""
     points = model.aligned(cloud)
     ring = nearest_beams(points, model.tangents, model.heights)
-    elevation = np.arctan2(points[:, 2] - model.heights[ring], np.hypot(points[:, 0], points[:, 1]))
+    elevation = np.arctan2(
+        points[:, 2] - model.heights[ring], np.hypot(points[:, 0], points[:, 1])
+    )
     found = [beam_peaks(elevation, width) for width in WIDTHS]
     best = max(found, key=lambda beams: concentration(elevation, beams))
     if len(best) < 2:

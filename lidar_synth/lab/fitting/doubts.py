@@ -31,7 +31,11 @@ MOST_MISSING = 0.5
 
 
 def doubts(
-    elevations: Floats, points: NDArray[np.int64], within: Floats, near: float, known: Azimuths
+    elevations: Floats,
+    points: NDArray[np.int64],
+    within: Floats,
+    near: float,
+    known: Azimuths,
 ) -> list[str]:
     """One sentence for each part of a fit that is not certain.
 
@@ -52,9 +56,13 @@ def doubts(
         )
     strays = 1 - float((points * within).sum() / max(points.sum(), 1))
     if strays >= STRAYS:
-        found.append(f"{strays:.1%} of the points lie farther than 0.05 degrees from every beam.")
+        found.append(
+            f"{strays:.1%} of the points lie farther than 0.05 degrees from every beam."
+        )
     if near >= STRAYS:
-        found.append(f"{near:.1%} of the points are nearer than 0.5 m and were not fitted.")
+        found.append(
+            f"{near:.1%} of the points are nearer than 0.5 m and were not fitted."
+        )
     return found + _of_azimuths(elevations, known)
 
 
@@ -75,7 +83,11 @@ def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
             "raster.",
         ]
     if missing := _listed(elevations[np.isnan(known.offsets)]):
-        needed = f"{FEWEST} points beyond {FAR:.0f} m" if known.known == "time" else f"{FEW} points"
+        needed = (
+            f"{FEWEST} points beyond {FAR:.0f} m"
+            if known.known == "time"
+            else f"{FEW} points"
+        )
         found.append(
             f"The azimuth offsets of the beams at {missing} degrees are not known: no scan has "
             f"{needed} there."
@@ -85,14 +97,20 @@ def _of_azimuths(elevations: Floats, known: Azimuths) -> list[str]:
             "The azimuth offsets are known up to a multiple of the angle between two firings."
         )
     elif known.spread > 0.05:
-        found.append(f"The azimuth offsets differ between scans by {known.spread:.2f} degrees.")
+        found.append(
+            f"The azimuth offsets differ between scans by {known.spread:.2f} degrees."
+        )
     return found
 
 
 @lru_cache(maxsize=1)
 def vendors() -> dict[str, Floats]:
     """{name: (B,) elevations in degrees, highest first} of the sensors in ``vendors.yaml``."""
-    text = files("lidar_synth.geometry").joinpath("vendors.yaml").read_text(encoding="utf-8")
+    text = (
+        files("lidar_synth.geometry")
+        .joinpath("vendors.yaml")
+        .read_text(encoding="utf-8")
+    )
     tables = parse_yaml(text, "vendors.yaml")
     return {name: _elevations(table) for name, table in tables.items()}
 
@@ -101,7 +119,9 @@ def _elevations(table: Any) -> Floats:
     """An entry of ``vendors.yaml`` as a table."""
     if isinstance(table, dict):
         return np.linspace(*table["evenly"])
-    return np.asarray(presets()[table].elevations if isinstance(table, str) else table, np.float64)
+    return np.asarray(
+        presets()[table].elevations if isinstance(table, str) else table, np.float64
+    )
 
 
 def name_vendor(elevations: Floats, points: NDArray[np.int64]) -> str:
@@ -118,9 +138,9 @@ def name_vendor(elevations: Floats, points: NDArray[np.int64]) -> str:
         spacing = np.abs(np.gradient(table))
         nearest = np.abs(elevations[:, None] - table).argmin(1)
         off = np.abs(elevations - table[nearest])
-        if (off > np.minimum(SAME * spacing[nearest], 0.1)).any() or len(np.unique(nearest)) < len(
-            elevations
-        ):
+        if (off > np.minimum(SAME * spacing[nearest], 0.1)).any() or len(
+            np.unique(nearest)
+        ) < len(elevations):
             continue
         few = len(table) - int((points >= FEW_POINTS).sum())
         if few < missing and few <= MOST_MISSING * len(table):

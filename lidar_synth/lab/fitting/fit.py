@@ -139,7 +139,8 @@ def fit_sensor(
     ]
     returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
     scans = [
-        scan if there.all() else scan[there] for scan, there in zip(given, returned, strict=True)
+        scan if there.all() else scan[there]
+        for scan, there in zip(given, returned, strict=True)
     ]
     count = sum(len(scan) for scan in scans)
     if count < LEAST_POINTS:
@@ -153,9 +154,12 @@ def fit_sensor(
         raise DataError(given_points, "two beams or more", FRAME_HINT)
     found = _described(beams, cloud, scans, name, columns)
     rings = tuple(
-        _spread(there, part, -1) for there, part in zip(returned, found.rings, strict=True)
+        _spread(there, part, -1)
+        for there, part in zip(returned, found.rings, strict=True)
     )
-    off = tuple(_spread(there, part, 0) for there, part in zip(returned, found.off, strict=True))
+    off = tuple(
+        _spread(there, part, 0) for there, part in zip(returned, found.off, strict=True)
+    )
     return replace(found, rings=rings, off=off)
 
 
@@ -182,10 +186,14 @@ def _described(
     number = np.bincount(ring[usable], minlength=rows)
     order = np.split(np.argsort(ring[usable], kind="stable"), np.cumsum(number)[:-1])
     degrees = np.abs(np.degrees(off))[usable]
-    within = np.array([np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order])
+    within = np.array(
+        [np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order]
+    )
     azimuths = _azimuths(scans, cloud, points, ring, rows)
     distance = np.sqrt(
-        points[:, 0] ** 2 + points[:, 1] ** 2 + (points[:, 2] - model.heights[ring]) ** 2
+        points[:, 0] ** 2
+        + points[:, 1] ** 2
+        + (points[:, 2] - model.heights[ring]) ** 2
     )
     nearest, farthest = range_limits(np.linalg.norm(points[usable], axis=1))
     elevations = tuple(np.degrees(np.arctan(model.tangents)).round(4).tolist())
@@ -199,8 +207,12 @@ def _described(
         heights=tuple(model.heights.round(4).tolist()) if model.heights.any() else None,
         firings=azimuths.firings,
         azimuths=_offsets(azimuths),
-        range_step=None if model.motion.any() else range_step(distance[usable], ring[usable], rows),
-        reflectance_levels=reflectance_levels(np.concatenate([scan.reflectance for scan in scans])),
+        range_step=None
+        if model.motion.any()
+        else range_step(distance[usable], ring[usable], rows),
+        reflectance_levels=reflectance_levels(
+            np.concatenate([scan.reflectance for scan in scans])
+        ),
         description=f"fitted to {len(scans)} scans",
     )
     mount = np.eye(4)
@@ -209,7 +221,9 @@ def _described(
     return SensorFit(
         sensor,
         number,
-        spread=np.array([np.median(degrees[part]) if len(part) else 0.0 for part in order]),
+        spread=np.array(
+            [np.median(degrees[part]) if len(part) else 0.0 for part in order]
+        ),
         within=within,
         mount=mount,
         motion=model.motion,
@@ -220,7 +234,9 @@ def _described(
         rings=tuple(np.split(ring.astype(np.int16), splits)),
         off=tuple(np.split(np.degrees(off).astype(np.float32), splits)),
         uncertain=tuple(
-            doubts(np.array(elevations), number, within, 1 - float(usable.mean()), azimuths)
+            doubts(
+                np.array(elevations), number, within, 1 - float(usable.mean()), azimuths
+            )
         ),
         vendor=name_vendor(np.array(elevations), number),
     )
@@ -235,8 +251,12 @@ def _highest_first(model: Model) -> Model:
     offset = model.offset
     if heights.any():
         # A common height and a vertical offset are the same; a small one belongs to the lasers.
-        inside = np.abs(offset).max() < 0.5 and model.turn[2, 2] > np.cos(np.radians(0.5))
-        common = -float(offset @ model.turn[:, 2]) if inside else float(np.median(heights))
+        inside = np.abs(offset).max() < 0.5 and model.turn[2, 2] > np.cos(
+            np.radians(0.5)
+        )
+        common = (
+            -float(offset @ model.turn[:, 2]) if inside else float(np.median(heights))
+        )
         heights = heights - common
         offset = offset + model.turn[:, 2] * common
     return Model(tangents, heights, offset, model.turn, model.motion)
@@ -264,7 +284,11 @@ def _check(model: Model, ring: NDArray[np.int64], off: Floats) -> None:
 
 
 def _azimuths(
-    scans: Sequence[Scan], cloud: Cloud, points: Floats, ring: NDArray[np.int64], rows: int
+    scans: Sequence[Scan],
+    cloud: Cloud,
+    points: Floats,
+    ring: NDArray[np.int64],
+    rows: int,
 ) -> Azimuths:
     turns = []
     for number in range(min(TURNS, len(scans))):

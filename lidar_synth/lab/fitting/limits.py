@@ -17,7 +17,9 @@ COHERENT = 0.6
 
 def range_limits(distance: Floats) -> tuple[float, float]:
     """The nearest and the farthest range, metres, rounded outward to centimetres."""
-    return float(np.floor(distance.min() * 100) / 100), float(np.ceil(distance.max() * 100) / 100)
+    return float(np.floor(distance.min() * 100) / 100), float(
+        np.ceil(distance.max() * 100) / 100
+    )
 
 
 def range_step(distance: Floats, ring: NDArray[np.int64], beams: int) -> float | None:
@@ -36,7 +38,8 @@ def range_step(distance: Floats, ring: NDArray[np.int64], beams: int) -> float |
     for step in STEPS:
         wave = np.exp(2j * np.pi * distance / step)
         total = np.abs(
-            np.bincount(ring, wave.real, beams) + 1j * np.bincount(ring, wave.imag, beams)
+            np.bincount(ring, wave.real, beams)
+            + 1j * np.bincount(ring, wave.imag, beams)
         )
         if np.median(total[use] / count[use]) > COHERENT:
             return step

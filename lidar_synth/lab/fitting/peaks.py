@@ -27,7 +27,9 @@ def density(elevations: Floats, width: float) -> tuple[Floats, Floats]:
         width: standard deviation of the smoothing, radians.
     """
     count = round(np.pi / BIN)
-    histogram = np.histogram(elevations, count, (-np.pi / 2, np.pi / 2))[0].astype(np.float64)
+    histogram = np.histogram(elevations, count, (-np.pi / 2, np.pi / 2))[0].astype(
+        np.float64
+    )
     reach = int(np.ceil(3 * width / BIN))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * BIN / width) ** 2)
     centres = (np.arange(count) + 0.5) * np.pi / count - np.pi / 2

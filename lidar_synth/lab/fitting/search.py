@@ -70,7 +70,8 @@ def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
         seed: of the choice of points.
     """
     chosen = [
-        scans[i] for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
+        scans[i]
+        for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
     ]
     chosen = [scan for scan in chosen if len(scan)]
     best = FLAT
@@ -112,12 +113,18 @@ def find_motion(cloud: Cloud, model: Model, scan: int) -> Floats:
     def mean_residual(motion: Floats) -> float:
         moved = replace(model, motion=motion[None])
         points = moved.aligned(part)
-        ring = part.ring if cloud.kept else nearest_beams(points, model.tangents, model.heights)
+        ring = (
+            part.ring
+            if cloud.kept
+            else nearest_beams(points, model.tangents, model.heights)
+        )
         residual = residuals(points, ring, model.tangents, model.heights)
         return float(np.minimum(np.abs(residual), CAP).mean())
 
     step = np.array([0.1, 0.1, 0.05, 0.004, 0.004, 0]) / duration
-    return climb(lambda motion: -mean_residual(motion), min(tried, key=mean_residual), step, 4)
+    return climb(
+        lambda motion: -mean_residual(motion), min(tried, key=mean_residual), step, 4
+    )
 
 
 def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
@@ -125,14 +132,20 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
     the grid."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
     part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-    dense = points[(part * _NARROW / 2).astype(np.int64) % max(len(points) // GRID_POINTS, 1) == 0]
+    dense = points[
+        (part * _NARROW / 2).astype(np.int64) % max(len(points) // GRID_POINTS, 1) == 0
+    ]
     if len(points) > POINTS:
-        points = points[np.random.default_rng(seed).choice(len(points), POINTS, replace=False)]
+        points = points[
+            np.random.default_rng(seed).choice(len(points), POINTS, replace=False)
+        ]
     best = FLAT
     found = np.zeros(5)
     for place in _best_on_grid(dense, starts):
         for sectors in _SECTORS:
-            value = partial(_sharpness_within, dense if sectors > 32 else points, sectors)
+            value = partial(
+                _sharpness_within, dense if sectors > 32 else points, sectors
+            )
             step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
             step = step * (1 if sectors < 32 else 4)
             place = climb(value, place, step)
@@ -149,7 +162,9 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
 
 def tilt_of(angles: Floats) -> Floats:
     """(3, 3) rotation by small angles about x and y, radians."""
-    return rotate(np.eye(3), np.broadcast_to(np.array([angles[0], angles[1], 0.0]), (3, 3))).T
+    return rotate(
+        np.eye(3), np.broadcast_to(np.array([angles[0], angles[1], 0.0]), (3, 3))
+    ).T
 
 
 def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
@@ -184,7 +199,11 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
 
 def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
     limit = np.array([*REACH, TILT, TILT])
-    return sector_sharpness(points, place, sectors) if (np.abs(place) <= limit).all() else 0.0
+    return (
+        sector_sharpness(points, place, sectors)
+        if (np.abs(place) <= limit).all()
+        else 0.0
+    )
 
 
 def _best_on_grid(points: Floats, count: int) -> list[Floats]:
@@ -193,8 +212,13 @@ def _best_on_grid(points: Floats, count: int) -> list[Floats]:
     sides = (-1.2, 0.0, 1.2)
     heights = (-0.2, 0.6, 1.4, 2.2)
     tilts = np.radians([-5.0, -2.5, 0.0, 2.5, 5.0])
-    places = [np.array(place) for place in itertools.product(sides, sides, heights, tilts, tilts)]
-    return sorted(places, key=lambda place: -sector_sharpness(points, place, _NARROW))[:count]
+    places = [
+        np.array(place)
+        for place in itertools.product(sides, sides, heights, tilts, tilts)
+    ]
+    return sorted(places, key=lambda place: -sector_sharpness(points, place, _NARROW))[
+        :count
+    ]
 
 
 def climb(

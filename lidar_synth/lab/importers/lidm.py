@@ -38,7 +38,13 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
-from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, Header, NetworkSpec
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    VELOCITY,
+    Header,
+    NetworkSpec,
+)
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.lidm.diffusion import schedule_times
@@ -83,12 +89,16 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             "LiDM's dictionary with state_dict among its keys, or a state dictionary",
         )
     weights = {
-        k: v for k, v in state_of(content, "state_dict", path).items() if not k.startswith("loss.")
+        k: v
+        for k, v in state_of(content, "state_dict", path).items()
+        if not k.startswith("loss.")
     }
     try:
         model = config["model"]["params"]
         data = config["data"]["params"]
-        parts, conditioning = _parts(model, data["dataset"], data.get("aug") or {}, path)
+        parts, conditioning = _parts(
+            model, data["dataset"], data.get("aug") or {}, path
+        )
         header = Header(
             networks=parts,
             sensor=_sensor(data),
@@ -103,7 +113,8 @@ def read_lidm(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         raise
     except MISFITS as error:
         raise DataError(
-            f"{path}: a configuration that does not fit ({error!r})", "LiDM's own config.yaml"
+            f"{path}: a configuration that does not fit ({error!r})",
+            "LiDM's own config.yaml",
         ) from error
 
 
@@ -123,7 +134,10 @@ def _config(path: Path) -> dict[str, Any]:
 
 
 def _parts(
-    model: Mapping[str, Any], dataset: Mapping[str, Any], augment: Mapping[str, Any], path: Path
+    model: Mapping[str, Any],
+    dataset: Mapping[str, Any],
+    augment: Mapping[str, Any],
+    path: Path,
 ) -> tuple[dict[str, NetworkSpec], dict[str, Any]]:
     """The networks of a configuration, and the options of its condition."""
     if "ddconfig" in model:
@@ -145,19 +159,27 @@ def _parts(
         unet.arguments.update(
             channels=unet.arguments["channels"] - channels, condition_channels=channels
         )
-        sizes = {"resolution": list(dataset["size"]), "target": unet.arguments["resolution"]}
-        return parts | {ENCODER: NetworkSpec("semantic_map", sizes | {"channels": channels})}, {
-            "semantic": {"dropout": 0.0}
+        sizes = {
+            "resolution": list(dataset["size"]),
+            "target": unet.arguments["resolution"],
         }
+        return parts | {
+            ENCODER: NetworkSpec("semantic_map", sizes | {"channels": channels})
+        }, {"semantic": {"dropout": 0.0}}
     if kind == "FrozenClipMultiImageEmbedder":
         given = condition["params"]
-        arguments = {"views": given["split_per_view"], "channels": given.get("out_dim", 512)}
+        arguments = {
+            "views": given["split_per_view"],
+            "channels": given.get("out_dim", 512),
+        }
         options = {
             "dropout": 0.0,
             "view_dropout": augment.get("camera_drop", 0.0),
             "image": list(CAMERA_SIZE),
         }
-        return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {"camera": options}
+        return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {
+            "camera": options
+        }
     if kind:
         raise DataError(
             f"{path}: a condition encoded by {kind}",
@@ -167,7 +189,9 @@ def _parts(
     return parts, {}
 
 
-def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> NetworkSpec:
+def codec_part(
+    params: Mapping[str, Any], size: list[int], path: Path | str
+) -> NetworkSpec:
     """The autoencoder of LiDM's configuration, for images of ``size`` rows and columns."""
     inner = params["ddconfig"]
     mask = bool(params.get("use_mask"))
@@ -176,7 +200,9 @@ def codec_part(params: Mapping[str, Any], size: list[int], path: Path | str) -> 
         "z_channels": params["embed_dim"],
         "out_ch": inner["in_channels"] + mask,
     }
-    unsupported = {key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value}
+    unsupported = {
+        key: inner.get(key) for key, value in wanted.items() if inner.get(key) != value
+    }
     if unsupported or params.get("lib_name") != "lidm":
         raise DataError(
             f"{path}: an autoencoder with {unsupported or dict(params)}",
@@ -207,9 +233,12 @@ def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
     """The U-Net of LiDM's configuration; ``channels`` includes those of a condition that is
     concatenated with the state."""
     levels = [1 << i for i in range(len(params["channel_mult"]))]
-    if params.get("lib_name") != "lidm" or not set(params["attention_resolutions"]) <= set(levels):
+    if params.get("lib_name") != "lidm" or not set(
+        params["attention_resolutions"]
+    ) <= set(levels):
         raise DataError(
-            f"{path}: a U-Net with {dict(params)}", "one of LiDM's published configurations"
+            f"{path}: a U-Net with {dict(params)}",
+            "one of LiDM's published configurations",
         )
     return NetworkSpec(
         "diffusion_unet",
@@ -220,7 +249,9 @@ def unet_part(params: Mapping[str, Any], path: Path | str) -> NetworkSpec:
             "width": params["model_channels"],
             "multipliers": list(params["channel_mult"]),
             "blocks": params["num_res_blocks"],
-            "attention": [i for i, d in enumerate(levels) if d in params["attention_resolutions"]],
+            "attention": [
+                i for i, d in enumerate(levels) if d in params["attention_resolutions"]
+            ],
             "head_channels": params["num_head_channels"],
             "position": False,
         },
@@ -246,7 +277,13 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     if (rows, columns, up, down) == (*sensor.shape, sensor.up, sensor.down):
         return sensor
     return Sensor(
-        "lidm", columns, float(low), float(high), rows=rows, fov_up=float(up), fov_down=float(down)
+        "lidm",
+        columns,
+        float(low),
+        float(high),
+        rows=rows,
+        fov_up=float(up),
+        fov_down=float(down),
     )
 
 
@@ -278,7 +315,9 @@ def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "data": name,
         "data_licence": "CC BY-NC-SA 3.0",
         "split": "lidm/train",
-        "seen": seen(name, generates="ddconfig" not in config["model"]["params"]).to_list(),
+        "seen": seen(
+            name, generates="ddconfig" not in config["model"]["params"]
+        ).to_list(),
         "licence": "as LiDM's repository: MIT",
         "source": SOURCE,
         "file": path.name,
@@ -288,7 +327,9 @@ def _provenance(config: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def convert(
-    weights: Mapping[str, Tensor], parts: Mapping[str, NetworkSpec], what: str = "LiDM's weights"
+    weights: Mapping[str, Tensor],
+    parts: Mapping[str, NetworkSpec],
+    what: str = "LiDM's weights",
 ) -> dict[str, nn.Module]:
     """Convert LiDM's state dict to our networks.
 
@@ -307,7 +348,12 @@ def convert(
         _check_schedule(weights, parts[VELOCITY].arguments, what)
         weights = _averaged(weights)
     sources = {name: peer_names(name, part, nested) for name, part in parts.items()}
-    known = {theirs for names in sources.values() for some in names.values() for theirs in some}
+    known = {
+        theirs
+        for names in sources.values()
+        for some in names.values()
+        for theirs in some
+    }
     missing = sorted(known - set(weights))
     unexpected = sorted(k for k in set(weights) - known if not _frozen(k))
     if missing or unexpected:
@@ -320,7 +366,9 @@ def convert(
         state = _statistics(part) if name == CODEC else {}
         for ours, theirs in sources[name].items():
             tensor = (
-                torch.cat([weights[t] for t in theirs]) if len(theirs) > 1 else weights[theirs[0]]
+                torch.cat([weights[t] for t in theirs])
+                if len(theirs) > 1
+                else weights[theirs[0]]
             )
             state[ours] = _arranged(ours, tensor, part)
         networks[name] = assemble(*part, state, f"{what}: {name}")
@@ -344,12 +392,22 @@ def _frozen(key: str) -> bool:
 
 def _averaged(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """The weights without the schedule, and with the averaged U-Net instead of the last one."""
-    plain = {k: v for k, v in weights.items() if k not in _SCHEDULE and not k.startswith(UNET_EMA)}
-    average = {k: v for k, v in weights.items() if k.startswith(UNET_EMA) and k not in _COUNTERS}
+    plain = {
+        k: v
+        for k, v in weights.items()
+        if k not in _SCHEDULE and not k.startswith(UNET_EMA)
+    }
+    average = {
+        k: v
+        for k, v in weights.items()
+        if k.startswith(UNET_EMA) and k not in _COUNTERS
+    }
     if not average:
         return plain
     names = {
-        k: UNET_EMA + k.removeprefix("model.").replace(".", "") for k in plain if k.startswith(UNET)
+        k: UNET_EMA + k.removeprefix("model.").replace(".", "")
+        for k in plain
+        if k.startswith(UNET)
     }
     averaged = {k: average.pop(name) for k, name in names.items() if name in average}
     return {k: v for k, v in plain.items() if k not in names} | averaged | average
@@ -364,7 +422,9 @@ _SCHEDULE = (
 ).split()
 
 
-def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any], what: str) -> None:
+def _check_schedule(
+    weights: Mapping[str, Tensor], arguments: Mapping[str, Any], what: str
+) -> None:
     if "scale_factor" in weights and float(weights["scale_factor"]) != 1:
         raise DataError(
             f"{what}: latents scaled by {float(weights['scale_factor'])}",
@@ -372,10 +432,13 @@ def _check_schedule(weights: Mapping[str, Tensor], arguments: Mapping[str, Any],
         )
     if (signal := weights.get("alphas_cumprod")) is None:
         return
-    times = schedule_times(arguments["beta_start"], arguments["beta_end"], arguments["steps"])
+    times = schedule_times(
+        arguments["beta_start"], arguments["beta_end"], arguments["steps"]
+    )
     if signal.shape != times.shape:
         raise DataError(
-            f"{what}: a noise schedule of shape {tuple(signal.shape)}", f"{tuple(times.shape)}"
+            f"{what}: a noise schedule of shape {tuple(signal.shape)}",
+            f"{tuple(times.shape)}",
         )
     signal = signal.double()
     stored = (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
@@ -402,7 +465,13 @@ def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
         # In LiDM, heads are outermost: query, key and value of the first head, then of the next.
         width = part.arguments["head_channels"]
         tensor = (
-            tensor.reshape(-1, 3, width, *tensor.shape[1:]).transpose(0, 1).reshape(tensor.shape)
+            tensor.reshape(-1, 3, width, *tensor.shape[1:])
+            .transpose(0, 1)
+            .reshape(tensor.shape)
         )
     linear = (".qkv.", ".out.", ".enter.", ".leave.")
-    return tensor.flatten(1) if tensor.ndim > 2 and any(name in ours for name in linear) else tensor
+    return (
+        tensor.flatten(1)
+        if tensor.ndim > 2 and any(name in ours for name in linear)
+        else tensor
+    )

@@ -43,7 +43,11 @@ CONTEXT: Sources = {
 """Names inside the U-Net's blocks: residual, self-attention, cross-attention to a context."""
 
 CODEC_RESIDUAL = {"shortcut": "nin_shortcut"}
-CODEC_ATTENTION: Sources = {"norm": ("norm",), "qkv": ("q", "k", "v"), "out": ("proj_out",)}
+CODEC_ATTENTION: Sources = {
+    "norm": ("norm",),
+    "qkv": ("q", "k", "v"),
+    "out": ("proj_out",),
+}
 """Names inside the autoencoder's blocks; all other names are the same in both."""
 MIDDLE = ("mid.block_1", "mid.attn_1", "mid.block_2")
 MOST_MODULES = 4_000
@@ -64,24 +68,39 @@ def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
     with torch.device("meta"), limit_modules(MOST_MODULES):
         keys = list(build_network(*part).state_dict())
     if name == VELOCITY:
-        attending = {key.partition(".attention.")[0] for key in keys if ".attention." in key}
+        attending = {
+            key.partition(".attention.")[0] for key in keys if ".attention." in key
+        }
         attention = CONTEXT if part.arguments["context_channels"] else ATTENTION
         names = {key: _unet(key, attending, attention) for key in keys}
     elif name == CODEC:
         levels = len(part.arguments["multipliers"])
         attending = part.arguments.get("attention_levels", ())
-        names = {key: _codec(key, levels, attending) for key in keys if key not in STATISTICS}
+        names = {
+            key: _codec(key, levels, attending) for key in keys if key not in STATISTICS
+        }
     else:
         renamed = {"mix": "channel_mapper", "project": "linear"}
         names = {key: (_renamed(key, renamed),) for key in keys}
-    prefix = {VELOCITY: UNET, CODEC: FIRST_STAGE, ENCODER: COND_STAGE}[name] if nested else ""
-    return {ours: tuple(prefix + one for one in theirs) for ours, theirs in names.items()}
+    prefix = (
+        {VELOCITY: UNET, CODEC: FIRST_STAGE, ENCODER: COND_STAGE}[name]
+        if nested
+        else ""
+    )
+    return {
+        ours: tuple(prefix + one for one in theirs) for ours, theirs in names.items()
+    }
 
 
 def _unet(key: str, attending: set[str], attention: Sources) -> tuple[str, ...]:
     """LiDM's names of a U-Net key, given the blocks that have attention and the names inside
     attention."""
-    top = {"time": "time_embed", "stem": "input_blocks.0.0", "norm": "out.0", "head": "out.2"}
+    top = {
+        "time": "time_embed",
+        "stem": "input_blocks.0.0",
+        "norm": "out.0",
+        "head": "out.2",
+    }
     where, number, *rest = key.split(".")
     if where in top:
         return (_renamed(key, top),)
@@ -91,7 +110,11 @@ def _unet(key: str, attending: set[str], attention: Sources) -> tuple[str, ...]:
         place = f"middle_block.{1 if kind == 'attention' else 2 * int(number)}"
     else:
         after = 1 + (f"{where}.{number}" in attending)
-        block = f"input_blocks.{int(number) + 1}" if where == "down" else f"output_blocks.{number}"
+        block = (
+            f"input_blocks.{int(number) + 1}"
+            if where == "down"
+            else f"output_blocks.{number}"
+        )
         place = f"{block}.{ {'residual': 0, 'attention': 1, 'resample': after, 'conv': 0}[kind] }"
     if kind == "conv":
         return (f"{place}.op.{inside}",)
@@ -130,10 +153,14 @@ def _codec(key: str, levels: int, attending: Collection[int]) -> tuple[str, ...]
     level = int(number) if side == "down" else levels - 1 - int(number)
     if kind == "levels":
         first, _, inside = inside.partition(".")
-        block, is_attention = divmod(int(first), 2) if level in attending else (int(first), 0)
+        block, is_attention = (
+            divmod(int(first), 2) if level in attending else (int(first), 0)
+        )
         if is_attention:
             return _attention(f"{where}.{side}.{level}.attn.{block}", inside)
-        return (f"{where}.{side}.{level}.block.{block}.{_renamed(inside, CODEC_RESIDUAL)}",)
+        return (
+            f"{where}.{side}.{level}.block.{block}.{_renamed(inside, CODEC_RESIDUAL)}",
+        )
     return (f"{where}.{side}.{level}.{side}sample.conv.{inside.removeprefix('conv.')}",)
 
 

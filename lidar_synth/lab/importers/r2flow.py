@@ -41,7 +41,10 @@ NORMALISATIONS: dict[str, Literal["log", "linear", "inverse"]] = {
     "inverse": "inverse",
     "metric": "linear",
 }
-DATA = {"kitti_360": ("KITTI-360", "hdl64e_kitti360"), "kitti_raw": ("KITTI raw", "hdl64e_kitti")}
+DATA = {
+    "kitti_360": ("KITTI-360", "hdl64e_kitti360"),
+    "kitti_raw": ("KITTI raw", "hdl64e_kitti"),
+}
 """R2Flow's names of datasets: (name of the dataset, name of the sensor)."""
 
 BLOCK = {
@@ -79,7 +82,9 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
             networks={VELOCITY: part},
             sensor=_sensor(data),
             normalisation=normalisation,
-            channels=("range", "reflectance") if data["train_reflectance"] else ("range",),
+            channels=("range", "reflectance")
+            if data["train_reflectance"]
+            else ("range",),
             time_grid=_time_grid(content["cfg"]),
             provenance=_provenance(content, path),
         )
@@ -88,7 +93,8 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         raise
     except MISFITS as error:
         raise DataError(
-            f"{path}: a configuration that does not fit ({error!r})", "R2Flow's groups and keys"
+            f"{path}: a configuration that does not fit ({error!r})",
+            "R2Flow's groups and keys",
         ) from error
 
 
@@ -97,17 +103,24 @@ def _load(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     content = load_pickle(path, "R2Flow")
     if not isinstance(content, dict) or not {"cfg", "weights"} <= set(content):
         given = (
-            sorted(map(str, content))[:8] if isinstance(content, dict) else type(content).__name__
+            sorted(map(str, content))[:8]
+            if isinstance(content, dict)
+            else type(content).__name__
         )
         raise DataError(
-            f"{path} holds {given}", "R2Flow's dictionary with cfg and weights among its keys"
+            f"{path} holds {given}",
+            "R2Flow's dictionary with cfg and weights among its keys",
         )
     return content, state_of(content, "weights", path)
 
 
-def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> NetworkSpec:
+def _network(
+    data: Mapping[str, Any], model: Mapping[str, Any], path: Path
+) -> NetworkSpec:
     if model["architecture"] != "nat_hdit":
-        raise DataError(f"{path}: architecture {model['architecture']!r}", "nat_hdit, R2Flow's own")
+        raise DataError(
+            f"{path}: architecture {model['architecture']!r}", "nat_hdit, R2Flow's own"
+        )
     if model["coords_encoding"] not in POSITIONS:
         raise DataError(
             f"{path}: coords_encoding {model['coords_encoding']!r}",
@@ -129,9 +142,12 @@ def _network(data: Mapping[str, Any], model: Mapping[str, Any], path: Path) -> N
 def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
     if data["data_format"] not in NORMALISATIONS:
         raise DataError(
-            f"{path}: data_format {data['data_format']!r}", f"one of {', '.join(NORMALISATIONS)}"
+            f"{path}: data_format {data['data_format']!r}",
+            f"one of {', '.join(NORMALISATIONS)}",
         )
-    return Normalisation(NORMALISATIONS[data["data_format"]], data["min_depth"], data["max_depth"])
+    return Normalisation(
+        NORMALISATIONS[data["data_format"]], data["min_depth"], data["max_depth"]
+    )
 
 
 def _sensor(data: Mapping[str, Any]) -> Sensor:
@@ -141,16 +157,26 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
         sensor = sensor.by_beams()
     rows, columns = data["resolution"]
     sensor = replace(
-        sensor, columns=columns, range_min=data["min_depth"], range_max=data["max_depth"]
+        sensor,
+        columns=columns,
+        range_min=data["min_depth"],
+        range_max=data["max_depth"],
     )
     if rows != sensor.shape[0]:
-        linear = {"rows": rows, "fov_up": sensor.up, "fov_down": sensor.down, "elevations": None}
+        linear = {
+            "rows": rows,
+            "fov_up": sensor.up,
+            "fov_down": sensor.down,
+            "elevations": None,
+        }
         sensor = replace(sensor, **linear, beams=None, heights=None, azimuths=None)
     return sensor
 
 
 def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
-    return uniform_grid(cfg["finetuning"]["k_distil"] or cfg["flow"]["num_sampling_steps"])
+    return uniform_grid(
+        cfg["finetuning"]["k_distil"] or cfg["flow"]["num_sampling_steps"]
+    )
 
 
 def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
@@ -168,7 +194,10 @@ def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "file": path.name,
         "file_sha256": sha256(path),
         "images": content.get("num_images"),
-        "recipe": {group: cfg.get(group) for group in ("data", "flow", "training", "finetuning")},
+        "recipe": {
+            group: cfg.get(group)
+            for group in ("data", "flow", "training", "finetuning")
+        },
     }
 
 
@@ -196,7 +225,11 @@ def convert(
     names = peer_names(depths, position)
     known = {
         *names.values(),
-        *(f"{block}.{name}" for block in block_names(depths).values() for name in HARMONICS),
+        *(
+            f"{block}.{name}"
+            for block in block_names(depths).values()
+            for name in HARMONICS
+        ),
     }
     known |= set(FOURIER) if position == "fourier_features" else set()
     missing = sorted(known - set(weights))
@@ -252,7 +285,9 @@ def block_names(depths: Sequence[int]) -> dict[str, str]:
     names = {f"middle.{j}": f"mid_levels.{j}" for j in range(middle)}
     for side in ("down", "up"):
         for i, depth in enumerate(upper):
-            names |= {f"{side}.{i}.{j}": f"{side}_levels.level_{i}.{j}" for j in range(depth)}
+            names |= {
+                f"{side}.{i}.{j}": f"{side}_levels.level_{i}.{j}" for j in range(depth)
+            }
     return names
 
 
@@ -271,7 +306,10 @@ def _reverse_time(weight: Tensor, frequencies: Tensor) -> Tensor:
     t."""
     turn = 2 * math.pi * frequencies.double()
     cosine, sine = weight.double().chunk(2, 1)
-    reverse = (cosine * turn.cos() + sine * turn.sin(), cosine * turn.sin() - sine * turn.cos())
+    reverse = (
+        cosine * turn.cos() + sine * turn.sin(),
+        cosine * turn.sin() - sine * turn.cos(),
+    )
     return torch.cat(reverse, 1).to(weight.dtype)
 
 
@@ -283,7 +321,9 @@ def _harmonics(
     for ours, theirs in block_names(depths).items():
         level = len(depths) - 1 if ours.startswith("middle") else ours.split(".")[1]
         stored = torch.stack([weights[f"{theirs}.{name}"] for name in HARMONICS])
-        if not torch.equal(state.setdefault(f"rotary.{level}.harmonics", stored), stored):
+        if not torch.equal(
+            state.setdefault(f"rotary.{level}.harmonics", stored), stored
+        ):
             raise DataError(
                 f"{what}: {theirs} has other rotary harmonics than its level",
                 "the same harmonics in all blocks of a level",

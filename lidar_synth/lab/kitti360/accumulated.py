@@ -91,7 +91,9 @@ def find_windows(root: Path, drive: str) -> list[Window]:
             )
         moving = path.parents[1] / "dynamic" / path.name
         windows.append(
-            Window(int(match[1]), int(match[2]), path, moving if moving.is_file() else None)
+            Window(
+                int(match[1]), int(match[2]), path, moving if moving.is_file() else None
+            )
         )
     return sorted(windows, key=lambda w: (w.first, w.last))
 
@@ -115,7 +117,9 @@ def read_cloud(path: Path) -> NDArray[np.void]:
     return points
 
 
-def cloud_values(points: NDArray[np.void], where: str = "the cloud") -> NDArray[np.uint32]:
+def cloud_values(
+    points: NDArray[np.void], where: str = "the cloud"
+) -> NDArray[np.uint32]:
     """(N,) the values of a label file for points of a cloud: the class, and above it the instance,
     0 = none.
 
@@ -125,10 +129,13 @@ def cloud_values(points: NDArray[np.void], where: str = "the cloud") -> NDArray[
     """
     semantic = points["semantic"]
     instance = points["instance"]
-    CLASSES.decode(np.flatnonzero(np.bincount(np.clip(semantic, -1, 1 << 15) + 1)) - 1, where)
+    CLASSES.decode(
+        np.flatnonzero(np.bincount(np.clip(semantic, -1, 1 << 15) + 1)) - 1, where
+    )
     if len(instance) and not 0 <= instance.min() <= instance.max() <= 0xFFFF:
         raise DataError(
-            f"{where} has instances from {instance.min()} to {instance.max()}", "0..65535"
+            f"{where} has instances from {instance.min()} to {instance.max()}",
+            "0..65535",
         )
     numbered = np.where(instance % MAX_INSTANCES > 0, instance, 0)
     return semantic.astype(np.uint32) | numbered.astype(np.uint32) << np.uint32(16)
@@ -145,7 +152,9 @@ def write_cloud(path: Path, values: Mapping[str, NDArray[Any]]) -> None:
     Raises:
         FileError: if it cannot be written.
     """
-    kept = [(n, kind) for n, kind in PROPERTIES.items() if n != "timestamp" or n in values]
+    kept = [
+        (n, kind) for n, kind in PROPERTIES.items() if n != "timestamp" or n in values
+    ]
     records = np.zeros(len(values["x"]), kept)
     for name, array in values.items():
         records[name] = array

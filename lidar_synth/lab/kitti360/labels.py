@@ -49,7 +49,9 @@ from lidar_synth.lab.kitti360.report import LabelCounts, LabelReport
 VERSION = 2
 """Raised when the rules change, so that a rerun replaces labels of older versions."""
 
-_SAMPLES = 8  # scans of a window on which it is tested whether they are motion-compensated
+_SAMPLES = (
+    8  # scans of a window on which it is tested whether they are motion-compensated
+)
 _OBJECTS = np.isin(np.arange(256), range(8))  # train ids of what can move
 
 
@@ -117,7 +119,9 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
             without_clouds.append(drive)
             continue
         frames = [
-            int(p.stem) for p in list_files(scans_folder(root, drive), ".bin") if p.stem.isdecimal()
+            int(p.stem)
+            for p in list_files(scans_folder(root, drive), ".bin")
+            if p.stem.isdecimal()
         ]
         poses = _poses(root, drive)
         if not poses:
@@ -132,7 +136,9 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
         for i, window in enumerate(windows):
             own = tuple(f for f in placed if owner[f] == i)
             if own:
-                jobs.append(WindowJob(drive, tuple(windows[max(i - 1, 0) : i + 2]), window, own))
+                jobs.append(
+                    WindowJob(drive, tuple(windows[max(i - 1, 0) : i + 2]), window, own)
+                )
     if not jobs:
         raise DataError(
             f"{root} has no frame inside an accumulated cloud ({len(without_clouds)} drives "
@@ -148,7 +154,9 @@ def plan_labels(root: str | Path, split: str = "all") -> Plan:
 def _owner(windows: Sequence[Window], frame: int) -> int | None:
     covering = [i for i, w in enumerate(windows) if w.first <= frame <= w.last]
     return max(
-        covering, key=lambda i: min(frame - windows[i].first, windows[i].last - frame), default=None
+        covering,
+        key=lambda i: min(frame - windows[i].first, windows[i].last - frame),
+        default=None,
     )
 
 
@@ -210,16 +218,21 @@ def _claim(labels: Path) -> None:
     can be resumed."""
     records = labels.parent / "windows"
     if labels.is_dir() and not records.is_dir():
-        raise ConfigError(f"{labels} holds labels from elsewhere", "a folder without labels")
+        raise ConfigError(
+            f"{labels} holds labels from elsewhere", "a folder without labels"
+        )
     try:
         records.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(
-            f"{records} cannot be made ({error.strerror})", "a folder to write labels to"
+            f"{records} cannot be made ({error.strerror})",
+            "a folder to write labels to",
         ) from error
 
 
-def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
+def _label_window(
+    root: Path, out: Path, against: Path | None, job: WindowJob
+) -> dict[str, Any]:
     """Label the frames of a window, unless its record shows that this is done; return the
     record."""
     folder = labels_folder(out, job.drive)
@@ -230,7 +243,9 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
         (folder / f"{int(f):010d}.label").is_file() for f in record["fitting"]
     ):
         return record | {"kept": True}
-    poses = fill_poses(_poses(root, job.drive), range(min(job.frames) - 1, max(job.frames) + 2))
+    poses = fill_poses(
+        _poses(root, job.drive), range(min(job.frames) - 1, max(job.frames) + 2)
+    )
     recovery = Recovery(job.windows, _boxes(root, job.drive), poses, job.frames)
     points = partial(_points, root, job.drive)
     recovery.choose_motion(
@@ -261,10 +276,19 @@ def _label_window(root: Path, out: Path, against: Path | None, job: WindowJob) -
         reasons = {"far": found.far, "disputed": found.disputed, "moving": found.moving}
         counts.count(train, found.confidence, fit=found.fit, **reasons)
         if against is not None:
-            truth = read_scan_labels(against, job.drive, name, folder, len(scan)).get("label")
+            truth = read_scan_labels(against, job.drive, name, folder, len(scan)).get(
+                "label"
+            )
             if truth is not None:
-                counts.compare(frame, train, truth, _moving(recovery, scan, frame, truth))
-    record = {"inputs": made_of, "turns": recovery.turns, "fitting": fitting, "misfits": misfits}
+                counts.compare(
+                    frame, train, truth, _moving(recovery, scan, frame, truth)
+                )
+    record = {
+        "inputs": made_of,
+        "turns": recovery.turns,
+        "fitting": fitting,
+        "misfits": misfits,
+    }
     record |= {"moved": moved, "counts": counts.to_dict()}
     write_file(path, json.dumps(record).encode())
     return record
@@ -293,7 +317,9 @@ def _inputs(root: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
             for p in (*files, *([boxes] if boxes else []))
         ],
         "poses": _hash(root / "data_poses" / job.drive / "poses.txt"),
-        "calibration": {p.name: _hash(p) for p in sorted((root / "calibration").glob("*.txt"))},
+        "calibration": {
+            p.name: _hash(p) for p in sorted((root / "calibration").glob("*.txt"))
+        },
         "against": None if against is None else str(against.resolve()),
     }
 
@@ -302,7 +328,11 @@ def _read_record(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     record = parse_json(read_text(path), str(path), "the record of a window")
-    return record if isinstance(record, dict) and isinstance(record.get("fitting"), list) else {}
+    return (
+        record
+        if isinstance(record, dict) and isinstance(record.get("fitting"), list)
+        else {}
+    )
 
 
 def _points(root: Path, drive: str, frame: int) -> NDArray[np.float32]:

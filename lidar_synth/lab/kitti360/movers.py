@@ -72,14 +72,19 @@ class Movers:
     """
 
     def __init__(
-        self, clouds: Iterable[NDArray[np.void]], boxes: WorldBoxes | None, frames: range
+        self,
+        clouds: Iterable[NDArray[np.void]],
+        boxes: WorldBoxes | None,
+        frames: range,
     ) -> None:
         found = [
             (_points(cloud), cloud_values(cloud), cloud["timestamp"].astype(np.int64))
             for cloud in clouds
         ]
         empty = np.zeros((0, 3)), np.zeros(0, np.uint32), np.zeros(0, np.int64)
-        points, values, frame = (np.concatenate(parts) for parts in zip(empty, *found, strict=True))
+        points, values, frame = (
+            np.concatenate(parts) for parts in zip(empty, *found, strict=True)
+        )
         tracks = [] if boxes is None else _tracks(boxes, frames)
         free = np.ones(len(points), bool)
         for track in tracks:
@@ -104,7 +109,10 @@ class Movers:
 
 
 def find_inside(
-    box: NDArray[np.float64], points: NDArray[np.float64], margin: float = 0.0, floor: float = 0.0
+    box: NDArray[np.float64],
+    points: NDArray[np.float64],
+    margin: float = 0.0,
+    floor: float = 0.0,
 ) -> NDArray[np.intp]:
     """The indices of the points in a box.
 
@@ -116,7 +124,9 @@ def find_inside(
     """
     size = np.linalg.norm(box[:3, :3], axis=0)
     near = np.flatnonzero(
-        (np.abs(points[:, :2] - box[:2, 3]) < np.linalg.norm(size) / 2 + margin).all(axis=1)
+        (np.abs(points[:, :2] - box[:2, 3]) < np.linalg.norm(size) / 2 + margin).all(
+            axis=1
+        )
     )
     local = (points[near] - box[:3, 3]) @ (box[:3, :3] / size)
     kept = (np.abs(local) <= size / 2 + margin).all(axis=1)
@@ -139,7 +149,9 @@ def _rigid(box: NDArray[np.float64]) -> NDArray[np.float64]:
 def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
     """The objects with one box per frame; an instance number that is used again is another
     object."""
-    stamped = (boxes.windows[:, 0] == boxes.windows[:, 1]) & np.isin(boxes.windows[:, 0], frames)
+    stamped = (boxes.windows[:, 0] == boxes.windows[:, 1]) & np.isin(
+        boxes.windows[:, 0], frames
+    )
     order = np.flatnonzero(stamped)
     order = order[np.lexsort((boxes.windows[order, 0], boxes.instances[order]))]
     instance = boxes.instances[order]
@@ -147,7 +159,9 @@ def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
     place = boxes.transforms[order, :3, 3]
     gap = np.diff(frame)
     jump = np.linalg.norm(np.diff(place, axis=0), axis=1) > _JUMP * np.maximum(gap, 1)
-    parts = np.split(order, np.flatnonzero((np.diff(instance) != 0) | (gap > _GAP) | jump) + 1)
+    parts = np.split(
+        order, np.flatnonzero((np.diff(instance) != 0) | (gap > _GAP) | jump) + 1
+    )
     return [
         MovingTrack(
             int(boxes.instances[part[0]]),
@@ -176,6 +190,8 @@ def _gather(
         local.append((points[taken] - box[:3, 3]) @ _rigid(box)[:3, :3])
         own.append(values[taken])
     gathered = np.concatenate(local)
-    _, first = np.unique(np.floor(gathered / _SPACING).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(
+        np.floor(gathered / _SPACING).astype(np.int64), axis=0, return_index=True
+    )
     track.points = gathered[first]
     track.values = np.concatenate(own)[first]

@@ -63,7 +63,10 @@ _PROBES, _PROBED = (
 )
 # Height in the sensor's frame, metres, above which a point does not lie on the road.
 _UPRIGHT = -1.0
-_CLOSE, _ABOUT = 0.2, 1.0  # metres: a probe on the clouds, and a probe that the clouds reach at all
+_CLOSE, _ABOUT = (
+    0.2,
+    1.0,
+)  # metres: a probe on the clouds, and a probe that the clouds reach at all
 _FEW = 50  # probes that the clouds reach, below which a frame has too little structure to be judged
 _COVERED = 0.2  # minimum share of the points within reach that have neighbours, in such a frame
 
@@ -146,7 +149,8 @@ class Recovery:
                 self._lay(points, frame)
             fits.append(
                 sum(
-                    self._on_clouds(self.place(points, f), points)[0] for f, points in scans.items()
+                    self._on_clouds(self.place(points, f), points)[0]
+                    for f, points in scans.items()
                 )
             )
         self.turns = fits[0] >= fits[1]
@@ -154,7 +158,11 @@ class Recovery:
     def place(self, points: NDArray[np.float32], frame: int) -> NDArray[np.float64]:
         """(N, 3) the points of a scan in the world."""
         pose = self._poses[frame]
-        local = undo_ego_motion(points, ego_motion(self._poses, frame)) if self.turns else points
+        local = (
+            undo_ego_motion(points, ego_motion(self._poses, frame))
+            if self.turns
+            else points
+        )
         placed = np.asarray(local @ pose[:3, :3].T + pose[:3, 3])
         return apply(self._moves[frame], placed) if frame in self._moves else placed
 
@@ -183,14 +191,16 @@ class Recovery:
         moving = self._vote_of_movers(placed, frame, *vote)
         far = ~np.isfinite(distance)
         disputed = share < AGREEMENT
-        confidence = (share * trust * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))).astype(
-            np.float32
-        )
+        confidence = (
+            share * trust * (1 - np.minimum(distance, RADIUS) / (2 * RADIUS))
+        ).astype(np.float32)
         values[far | disputed] = 0
         confidence[values == 0] = 0
         boxed = self._label_boxed(placed, frame, values, confidence, distance)
         close, about = self._on_clouds(placed, points)
-        fits = close >= FIT * about if about >= _FEW else bool((~far).mean() >= _COVERED)
+        fits = (
+            close >= FIT * about if about >= _FEW else bool((~far).mean() >= _COVERED)
+        )
         return Recovered(
             values,
             confidence,
@@ -218,7 +228,9 @@ class Recovery:
             low = cloud.min(axis=0) - RADIUS
             high = cloud.max(axis=0) + RADIUS
             near = np.flatnonzero(((placed > low) & (placed < high)).all(axis=1))
-            index = index_cloud([(cloud, labels, np.ones(len(cloud), np.float32))], low, high)
+            index = index_cloud(
+                [(cloud, labels, np.ones(len(cloud), np.float32))], low, high
+            )
             vote = index.vote(placed[near], RADIUS)
             closer = vote.distance < distance[near]
             chosen = near[closer]
@@ -258,7 +270,9 @@ class Recovery:
         reach."""
         distance = np.linalg.norm(points, axis=1)
         upright = np.flatnonzero(
-            (points[:, 2] > _UPRIGHT) & (distance > _PROBED[0]) & (distance < _PROBED[1])
+            (points[:, 2] > _UPRIGHT)
+            & (distance > _PROBED[0])
+            & (distance < _PROBED[1])
         )
         probes = placed[upright[:: max(1, len(upright) // _PROBES)]]
         nearest = self._static.vote(probes, _ABOUT).distance

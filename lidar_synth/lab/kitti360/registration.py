@@ -33,7 +33,9 @@ _STEPS, _STILL = (
     3,
     2e-3,
 )
-_PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2  # of errors of a pose: metres and radians
+_PRIOR = (
+    np.array([1.0] * 3 + [0.05] * 3) ** -2
+)  # of errors of a pose: metres and radians
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction
 _GAIN = 1.03  # factor of the score by which a transform has to be better than none
 _THINNED = 3  # of how many points one is used before the last steps
@@ -66,7 +68,9 @@ class SurfaceMap:
         hit = np.flatnonzero(found >= 0)
         number = self.index.values[found[hit]]
         axes = self.axes[number]
-        off = np.einsum("nij,nj->ni", axes, points[hit] - self.origin - self.means[number])
+        off = np.einsum(
+            "nij,nj->ni", axes, points[hit] - self.origin - self.means[number]
+        )
         return hit, np.concatenate([axes, off[:, :, None]], axis=2)
 
 
@@ -81,12 +85,16 @@ def find_surfaces(cloud: NearestLabels) -> SurfaceMap:
     corner = cells[order[starts]] * _SIDE
     local = (points - cells * np.float32(_SIDE)).astype(np.float32)[order]
     mean = _sums(local, starts) / counts[:, None]
-    products = [_sums(local * local[:, [i]], starts) / counts[:, None] for i in range(3)]
+    products = [
+        _sums(local * local[:, [i]], starts) / counts[:, None] for i in range(3)
+    ]
     spread = np.stack(products, axis=1) - mean[:, :, None] * mean[:, None, :]
     variance, axes = np.linalg.eigh(spread)
     deviation = np.sqrt(np.maximum(variance, 0))
     weights = np.where(
-        (deviation <= _THIN) & (counts >= _FEWEST)[:, None], 1 / np.hypot(deviation, _NOISE), 0
+        (deviation <= _THIN) & (counts >= _FEWEST)[:, None],
+        1 / np.hypot(deviation, _NOISE),
+        0,
     )
     kept = weights.any(axis=1)
     means = (corner + mean)[kept]
@@ -94,7 +102,9 @@ def find_surfaces(cloud: NearestLabels) -> SurfaceMap:
     numbers = np.arange(len(means), dtype=np.uint32)
     trust = np.ones(len(means), np.float32)
     high = means.max(axis=0, initial=0) + _SIDE
-    index = index_cloud([(means + cloud.low, numbers, trust)], cloud.low, cloud.low + high)
+    index = index_cloud(
+        [(means + cloud.low, numbers, trust)], cloud.low, cloud.low + high
+    )
     return SurfaceMap(index, means, scaled, cloud.low)
 
 
@@ -152,7 +162,8 @@ def _score(
 ) -> float:
     return float(
         _robust(
-            surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3], 5 * _CLOSE[0]
+            surfaces.residuals(apply(transform, points), _CLOSE[0])[1][:, :, 3],
+            5 * _CLOSE[0],
         ).sum()
     )
 
@@ -163,16 +174,22 @@ def _robust(off: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     return weights
 
 
-def apply(transform: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def apply(
+    transform: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Points (N, 3) moved by a (4, 4) transform."""
     moved: NDArray[np.float64] = points @ transform[:3, :3].T + transform[:3, 3]
     return moved
 
 
-def _small(step: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def _small(
+    step: NDArray[np.float64], centre: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(4, 4) a translation and a small rotation vector about a point, made orthogonal."""
     x, y, z = step[3:]
-    turned, _, back = np.linalg.svd(np.eye(3) + np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)]))
+    turned, _, back = np.linalg.svd(
+        np.eye(3) + np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    )
     transform = np.eye(4)
     transform[:3, :3] = turned @ back
     transform[:3, 3] = step[:3] + centre - transform[:3, :3] @ centre

@@ -78,9 +78,20 @@ class LabelCounts:
         covered = (truth != IGNORE) & (train != IGNORE)
         right = truth == train
         cars = moving & (truth == TRAIN_ID["car"])
-        for name, mask in (("known", known), ("covered", covered), ("right", covered & right)):
+        for name, mask in (
+            ("known", known),
+            ("covered", covered),
+            ("right", covered & right),
+        ):
             self.classes[name] += _by_class(truth[mask])
-        masks = (known, covered, covered & right, cars, cars & covered, cars & covered & right)
+        masks = (
+            known,
+            covered,
+            covered & right,
+            cars,
+            cars & covered,
+            cars & covered & right,
+        )
         self.compared[frame] = [int(mask.sum()) for mask in masks]
 
     def __iadd__(self, other: "LabelCounts") -> "LabelCounts":
@@ -104,9 +115,13 @@ class LabelCounts:
             DataError: on other values.
         """
         try:
-            classes = {name: np.array(values["classes"][name], np.float64) for name in CLASS_COUNTS}
+            classes = {
+                name: np.array(values["classes"][name], np.float64)
+                for name in CLASS_COUNTS
+            }
             compared = {
-                int(frame): [int(n) for n in counts] for frame, counts in values["compared"].items()
+                int(frame): [int(n) for n in counts]
+                for frame, counts in values["compared"].items()
             }
             return cls(**values | {"classes": classes, "compared": compared})
         except (TypeError, KeyError, ValueError, AttributeError) as error:
@@ -144,7 +159,9 @@ class LabelReport:
         """Add the record of a window."""
         own = LabelCounts.from_dict(record["counts"])
         self.counts += own
-        self.compared |= {f"{drive}/{frame:010d}": counts for frame, counts in own.compared.items()}
+        self.compared |= {
+            f"{drive}/{frame:010d}": counts for frame, counts in own.compared.items()
+        }
         self.labelled[drive] = self.labelled.get(drive, 0) + len(record["fitting"])
         self.misfits.setdefault(drive, []).extend(record["misfits"])
         self.moved.setdefault(drive, []).extend(record["moved"].values())
@@ -173,10 +190,18 @@ class LabelReport:
             for name in ("far", "disputed", "void", "moving")
         }
         labelled = float(counts.classes["points"].sum()) / max(counts.points, 1)
-        shares = {"on_clouds": counts.fit / max(counts.scans, 1), "labelled": labelled} | shares
+        shares = {
+            "on_clouds": counts.fit / max(counts.scans, 1),
+            "labelled": labelled,
+        } | shares
         if self.compared:
-            known, covered, right, *cars = np.sum(list(self.compared.values()), axis=0).tolist()
-            shares |= {"covered": covered / max(known, 1), "right": right / max(covered, 1)}
+            known, covered, right, *cars = np.sum(
+                list(self.compared.values()), axis=0
+            ).tolist()
+            shares |= {
+                "covered": covered / max(known, 1),
+                "right": right / max(covered, 1),
+            }
             shares |= {
                 "cars_covered": cars[1] / max(cars[0], 1),
                 "cars_right": cars[2] / max(cars[1], 1),

@@ -66,7 +66,9 @@ class Arm:
         """Names of the pools whose scans or objects it needs."""
         found = {stage.pool for stage in self.stages(0.5)} - {"", REAL}
         return found | (
-            {"skin"} if any("objects" in stage.options for stage in self.stages(0.5)) else set()
+            {"skin"}
+            if any("objects" in stage.options for stage in self.stages(0.5))
+            else set()
         )
 
 
@@ -85,13 +87,18 @@ PRETRAINING = 0.75
 
 def _then_real(pool: str) -> tuple[ArmStage, ArmStage]:
     """Synthetic scans first, then half real ones, at a lower learning rate."""
-    return ArmStage(PRETRAINING, 1, pool), ArmStage(1 - PRETRAINING, 0.5, pool, rate=0.25)
+    return ArmStage(PRETRAINING, 1, pool), ArmStage(
+        1 - PRETRAINING, 0.5, pool, rate=0.25
+    )
 
 
 ARMS: dict[str, Arm] = {
     "real": Arm("real scans only", lambda ratio: (ArmStage(),), synthetic=False),
     "longer": Arm(
-        "real scans only, twice as long", lambda ratio: (ArmStage(),), iterations=2, synthetic=False
+        "real scans only, twice as long",
+        lambda ratio: (ArmStage(),),
+        iterations=2,
+        synthetic=False,
     ),
     "exchange": Arm(
         "real scans, PolarMix and LaserMix",
@@ -117,7 +124,9 @@ ARMS: dict[str, Arm] = {
         budget=GENERATOR_BUDGET,
     ),
     "pretrain": Arm(
-        "the town first, then half your scans", lambda ratio: _then_real("town"), budget=_TOWN
+        "the town first, then half your scans",
+        lambda ratio: _then_real("town"),
+        budget=_TOWN,
     ),
     "pretrain-skin": Arm(
         "the town in your skin first, then half your scans",
@@ -166,7 +175,11 @@ class Row:
     @property
     def title(self) -> str:
         """The row in tables."""
-        return self.arm.title if self.ratio is None else f"{self.arm.title}, {100 * self.ratio:g} %"
+        return (
+            self.arm.title
+            if self.ratio is None
+            else f"{self.arm.title}, {100 * self.ratio:g} %"
+        )
 
     def stages(self) -> tuple[ArmStage, ...]:
         """The stages of the training."""
@@ -188,10 +201,13 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
     """
     if unknown := [name for name in names if name not in ARMS]:
         given = f"arm {', '.join(map(repr, unknown))}"
-        raise ConfigError(given, f"some of {', '.join(ARMS)}", suggest(unknown[0], ARMS))
+        raise ConfigError(
+            given, f"some of {', '.join(ARMS)}", suggest(unknown[0], ARMS)
+        )
     if wrong := [ratio for ratio in ratios if not 0 < ratio < 1]:
         raise ConfigError(
-            f"ratio {wrong[0]}", "shares of synthetic scans between 0 and 1, such as 0.5"
+            f"ratio {wrong[0]}",
+            "shares of synthetic scans between 0 and 1, such as 0.5",
         )
     ordered = [name for name in ARMS if name in {BASE, *names}]
     return [
@@ -212,16 +228,22 @@ def policy_of(
         objects: those to paste.
         fields: the fields of the synthetic scans.
     """
-    return make_policy(stage.labels, real=real, fields=fields, **options_of(stage, real, objects))
+    return make_policy(
+        stage.labels, real=real, fields=fields, **options_of(stage, real, objects)
+    )
 
 
-def options_of(stage: ArmStage, real: Any, objects: ObjectBank | None) -> dict[str, Any]:
+def options_of(
+    stage: ArmStage, real: Any, objects: ObjectBank | None
+) -> dict[str, Any]:
     """The options of the label policy of a stage; arguments as for ``policy_of``."""
     options = dict(stage.options)
     if options.pop("objects", False):
         assert objects is not None
         there = {
-            n for n, points in zip(objects.boxes.names, objects.counts, strict=True) if points >= 5
+            n
+            for n, points in zip(objects.boxes.names, objects.counts, strict=True)
+            if points >= 5
         }
         options |= {
             "objects": objects,

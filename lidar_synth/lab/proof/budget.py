@@ -32,7 +32,9 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     seconds = sum(map(plan.seconds, plan.rows)) * len(pairs)
     for row in plan.rows:
         if (stage := row.pretraining) is not None:
-            starts = len(pairs) if stage.pool == "skin" else len({seed for _, seed in pairs})
+            starts = (
+                len(pairs) if stage.pool == "skin" else len({seed for _, seed in pairs})
+            )
             seconds += starts * stage.share * settings.iterations * plan.step
     seconds *= OVERHEAD
     town = settings.synthetic * TOWN_SECONDS
@@ -67,7 +69,9 @@ def within(plan: ProofPlan, minutes: float | None, resumed: bool = False) -> Pro
         count = max(count, least)
     pairs = plan.pairs[:count]
     labelled = {pair: plan.labelled[pair] for pair in pairs}
-    return replace(plan, pairs=pairs, labelled=labelled, minutes=estimate_minutes(plan, pairs))
+    return replace(
+        plan, pairs=pairs, labelled=labelled, minutes=estimate_minutes(plan, pairs)
+    )
 
 
 def _with_fewer_iterations(plan: ProofPlan, least: int, minutes: float) -> ProofPlan:

@@ -63,14 +63,19 @@ class CommandTrainer:
         """
         write_scans(job.real, job.folder / "real")
         write_scans(
-            [replace(s, label=None, raw_label=None, instance=None) for s in job.held_out],
+            [
+                replace(s, label=None, raw_label=None, instance=None)
+                for s in job.held_out
+            ],
             job.folder / "held_out",
         )
         path = job.folder / "job.yaml"
         write_file(path, yaml.safe_dump(describe(job), sort_keys=False).encode())
         words = [word.replace(FIELD, str(path)) for word in shlex.split(self.command)]
         try:
-            done = subprocess.run(words, capture_output=True, text=True, errors="replace")
+            done = subprocess.run(
+                words, capture_output=True, text=True, errors="replace"
+            )
         except OSError as error:
             raise ProcessError(
                 f"trainer {words[0]!r} does not start ({error.strerror})", "a command"
@@ -88,7 +93,11 @@ def describe(job: Job) -> dict[str, Any]:
     """The plain values of a job, for its YAML file."""
     stages = []
     for stage, iterations in job.stages():
-        folder = job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
+        folder = (
+            job.folder / "real"
+            if stage.pool == REAL
+            else job.pool_folders.get(stage.pool)
+        )
         options = options_of(stage, list(job.real), job.objects)
         if isinstance(options.get("objects"), ObjectBank):
             options["objects"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
@@ -96,7 +105,9 @@ def describe(job: Job) -> dict[str, Any]:
             {
                 "iterations": iterations,
                 "ratio": float(stage.ratio),
-                "synthetic": None if not stage.ratio or folder is None else str(folder.resolve()),
+                "synthetic": None
+                if not stage.ratio or folder is None
+                else str(folder.resolve()),
                 "labels": stage.labels,
                 "label_options": options,
                 "rate": stage.rate,
@@ -104,7 +115,12 @@ def describe(job: Job) -> dict[str, Any]:
         )
     home = job.folder.resolve()
     folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}
-    plain = {"arm": job.row.key, "place": job.place, "seed": job.seed, "batch": job.batch}
+    plain = {
+        "arm": job.row.key,
+        "place": job.place,
+        "seed": job.seed,
+        "batch": job.batch,
+    }
     return {**plain, "iterations": job.iterations, **folders, "stages": stages}
 
 
@@ -125,13 +141,16 @@ def _table(scans: Sequence[Scan], folder: Path) -> NDArray[np.int64]:
         assert scan.label is not None
         if len(raw) != len(scan):
             raise DataError(
-                f"{path} with {len(raw)} predictions", f"{len(scan)}, one for each point"
+                f"{path} with {len(raw)} predictions",
+                f"{len(scan)}, one for each point",
             )
         predicted = SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
         valid = scan.label != IGNORE
         # A return without a prediction is an error: it counts as a class with which its own is
         # never pooled.
-        wrong = np.where(scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"])
+        wrong = np.where(
+            scan.label == TRAIN_ID["road"], TRAIN_ID["car"], TRAIN_ID["road"]
+        )
         given = np.where(predicted == IGNORE, wrong, predicted)
         pairs = scan.label[valid].astype(np.int64) * count + given[valid]
         table += np.bincount(pairs, minlength=count * count).reshape(count, count)

@@ -122,7 +122,9 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
             f'<line x1="{left + width + 24}" x2="{left + width + 50}" y1="{y}" y2="{y}" stroke="{colour}" '
             f'stroke-width="2"{dash}/>'
         )
-        words = html.escape(row["title"] if len(row["title"]) < 48 else row["title"][:46] + " …")
+        words = html.escape(
+            row["title"] if len(row["title"]) < 48 else row["title"][:46] + " …"
+        )
         parts.append(f'<text x="{left + width + 58}" y="{y + 4}">{words}</text>')
     return "".join([*parts, "</svg>"])
 
@@ -132,4 +134,6 @@ def ticks(low: float, high: float) -> list[float]:
     step = 10.0 ** np.floor(np.log10((high - low) / 5))
     step *= next(k for k in (1, 2, 5, 10) if (high - low) / (k * step) <= 7)
     first = int(np.ceil(low / step))
-    return [round(float(k * step), 6) for k in range(first, int(np.floor(high / step)) + 1)]
+    return [
+        round(float(k * step), 6) for k in range(first, int(np.floor(high / step)) + 1)
+    ]

@@ -22,7 +22,9 @@ def write_page(path: Path, proof: Proof) -> None:
     Raises:
         FileError: if it cannot be written.
     """
-    template = files("lidar_synth.lab.proof").joinpath("page.html").read_text(encoding="utf-8")
+    template = (
+        files("lidar_synth.lab.proof").joinpath("page.html").read_text(encoding="utf-8")
+    )
     write_file(path, template.replace("@body@", body(proof.values)).encode())
 
 
@@ -34,10 +36,16 @@ def body(values: Values) -> str:
         f'<p class="more">{_text(rest)}</p>' if rest else "",
         f"<p>{_text(what_was_done(values))}</p>",
         _section(
-            "Change of the mIoU against real scans only", differences(values["arms"]), _DIFFERENCE
+            "Change of the mIoU against real scans only",
+            differences(values["arms"]),
+            _DIFFERENCE,
         ),
         _section("Table", _table(values)),
-        _section("During the training", curves(values["arms"]), "Mean mIoU on the places left out.")
+        _section(
+            "During the training",
+            curves(values["arms"]),
+            "Mean mIoU on the places left out.",
+        )
         if any(len(row["curve"]) > 1 for row in values["arms"])
         else "",
         _section(
@@ -87,7 +95,11 @@ def protocol(values: Values) -> list[str]:
         f"scans, grid of {settings['columns']} columns, {values['precision']}; turned and mirrored "
         "at random in all arms.",
         f"Classes: {', '.join(values['classes'])}."
-        + (f" Not in your labels: {', '.join(values['absent'])}." if values["absent"] else ""),
+        + (
+            f" Not in your labels: {', '.join(values['absent'])}."
+            if values["absent"]
+            else ""
+        ),
         f"Sensor: {values['sensor']}. Machine: {values['machine']}. Date: {values['date']}.",
         f"Command: {values['command']}",
     ]
@@ -97,7 +109,9 @@ def _sentences(text: str) -> tuple[str, str, str]:
     """The first sentence of a text, and the rest."""
     match = re.search(r"\. (?=[A-Z])", text)
     return (
-        (text, "", "") if match is None else (text[: match.start() + 1], " ", text[match.end() :])
+        (text, "", "")
+        if match is None
+        else (text[: match.start() + 1], " ", text[match.end() :])
     )
 
 
@@ -139,7 +153,8 @@ def _classes(values: Values) -> str:
     rows = []
     for name in arms[0]["iou"]:
         cells = [_cell(name)] + [
-            _cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}") for row in arms
+            _cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}")
+            for row in arms
         ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     return _grid(["class", *(row["title"] for row in arms)], rows)
@@ -154,11 +169,15 @@ def _places(values: Values) -> str:
         cells = [_cell(place), _cell("–" if miou is None else f"{miou:.1f}")]
         cells += [_cell(format_signed(row["by_place"][place])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    return _grid(["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows)
+    return _grid(
+        ["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows
+    )
 
 
 def _grid(head: Sequence[str], rows: Sequence[str]) -> str:
-    names = "".join(f"<th{' class=text' * (name == _USES)}>{_text(name)}</th>" for name in head)
+    names = "".join(
+        f"<th{' class=text' * (name == _USES)}>{_text(name)}</th>" for name in head
+    )
     return f'<div class="scroll"><table><thead><tr>{names}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
@@ -168,7 +187,9 @@ def _section(title: str, content: str, note: str = "") -> str:
 
 
 def _list(sentences: Sequence[str]) -> str:
-    return f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in sentences)}</ul>"
+    return (
+        f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in sentences)}</ul>"
+    )
 
 
 def _cell(text: str, kind: str = "") -> str:
@@ -177,7 +198,11 @@ def _cell(text: str, kind: str = "") -> str:
 
 def _sign(row: Values) -> str:
     ends = row["interval"]
-    return "" if ends is None or ends[0] <= 0 <= ends[1] else ("plus" if ends[0] > 0 else "minus")
+    return (
+        ""
+        if ends is None or ends[0] <= 0 <= ends[1]
+        else ("plus" if ends[0] > 0 else "minus")
+    )
 
 
 def _text(text: str) -> str:

@@ -49,7 +49,9 @@ def by_pose(source: Source, names: Sequence[str]) -> Places:
         cluster = clusters(positions, APART)
         for number in range(cluster.max() + 1):
             name = f"{drive}, place {number + 1}"
-            places[name] = [i for i, c in zip(indices, cluster, strict=True) if c == number]
+            places[name] = [
+                i for i, c in zip(indices, cluster, strict=True) if c == number
+            ]
     return places
 
 
@@ -91,12 +93,19 @@ def find_places(source: Source, by: str = "auto") -> Places:
     counted = by == "stretch" and count.isdigit() and int(count) > 1
     if (by != "auto" and by not in SPLITS) or (count and not counted):
         raise ConfigError(
-            f"places by {by + mark + count!r}", f"one of auto, {', '.join(SPLITS)}, or stretch:2"
+            f"places by {by + mark + count!r}",
+            f"one of auto, {', '.join(SPLITS)}, or stretch:2",
         )
     names = names_of(source)
     if by == "auto":
-        by = "drive" if len(by_drive(source, names)) > 1 or not _has_pose(source) else "pose"
-    places = by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
+        by = (
+            "drive"
+            if len(by_drive(source, names)) > 1 or not _has_pose(source)
+            else "pose"
+        )
+    places = (
+        by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
+    )
     if len(places) < 2:
         raise DataError(
             f"{len(source)} scans of one place ({next(iter(places))})",
@@ -133,7 +142,9 @@ def clusters(positions: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
             here = waiting.pop()
             cluster[here] = count - 1
             x, y = squares[here].tolist()
-            near = (numbers.get((x + dx, y + dy)) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
+            near = (
+                numbers.get((x + dx, y + dy)) for dx in (-1, 0, 1) for dy in (-1, 0, 1)
+            )
             waiting += [n for n in near if n is not None and cluster[n] < 0]
     return cluster[square.reshape(-1)]
 
@@ -153,7 +164,9 @@ def _position(source: Source, index: int) -> NDArray[np.float64]:
     return scan.pose[:3, 3]
 
 
-def choose(places: Places, without: str, count: int | None, rng: np.random.Generator) -> list[int]:
+def choose(
+    places: Places, without: str, count: int | None, rng: np.random.Generator
+) -> list[int]:
     """The labelled scans to train on: at random, from as many places as possible, none from the
     place left out.
 
@@ -167,7 +180,9 @@ def choose(places: Places, without: str, count: int | None, rng: np.random.Gener
         ConfigError: on more scans than there are.
     """
     piles = [
-        rng.permutation(indices).tolist() for name, indices in places.items() if name != without
+        rng.permutation(indices).tolist()
+        for name, indices in places.items()
+        if name != without
     ]
     there = sum(map(len, piles))
     if count is None:
@@ -178,7 +193,9 @@ def choose(places: Places, without: str, count: int | None, rng: np.random.Gener
             f"1 to {there}, the scans of the places other than {without!r}",
         )
     order = [piles[i] for i in rng.permutation(len(piles))]
-    dealt = [pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)]
+    dealt = [
+        pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)
+    ]
     return sorted(dealt[:count])
 
 

@@ -72,7 +72,9 @@ class ProofPlan:
     def skin_scans(self, place: str) -> list[int]:
         """Indices of the scans, of other places than this, that a skin is learnt from; their labels
         are not used."""
-        indices = [i for name, members in self.places.items() if name != place for i in members]
+        indices = [
+            i for name, members in self.places.items() if name != place for i in members
+        ]
         return spread(indices, MOST_SKIN_SCANS)
 
     def seconds(self, row: Row) -> float:
@@ -108,7 +110,9 @@ def describe(plan: ProofPlan) -> str:
     tested = sorted({place for place, _ in plan.pairs})
     lines = [
         f"{len(plan.names)} scans of {plan.sensor.name} in {len(plan.places)} places: "
-        + ", ".join(f"{name} ({len(members)})" for name, members in plan.places.items()),
+        + ", ".join(
+            f"{name} ({len(members)})" for name, members in plan.places.items()
+        ),
         f"each training gets {plan.budget} labelled scans and is tested on a place that was left "
         "out",
         f"tested places: {', '.join(tested)}; seeds: {len({seed for _, seed in plan.pairs})}; "

@@ -55,19 +55,27 @@ def make_plan(
     groups = groups_of(_classes(source, settings.classes), settings.only)
     places = find_places(source, settings.places)
     sensor = sensor_of(source)
-    grid = None if settings.columns is None else replace(sensor, columns=settings.columns)
+    grid = (
+        None if settings.columns is None else replace(sensor, columns=settings.columns)
+    )
     rng = np.random.default_rng(settings.seed)
     order = [list(places)[i] for i in rng.permutation(len(places))]
     pairs = [(place, seed) for seed in range(settings.seeds) for place in order]
     labelled = {pair: _labelled(places, pair, settings) for pair in pairs}
-    tested = {place: spread(indices, settings.tested) for place, indices in places.items()}
-    needed = sorted({i for part in (*labelled.values(), *tested.values()) for i in part})
+    tested = {
+        place: spread(indices, settings.tested) for place, indices in places.items()
+    }
+    needed = sorted(
+        {i for part in (*labelled.values(), *tested.values()) for i in part}
+    )
     scans = {i: _read(source, i, grid) for i in needed}
     absent = require_labels(_counts(scans), groups, settings.only)
     batch = [scans[i] for i in needed[: settings.batch]]
     half, step = measure_step(batch, settings, earlier.get("half") if earlier else None)
     if earlier and minutes is not None:
-        settings = replace(settings, iterations=min(settings.iterations, earlier["iterations"]))
+        settings = replace(
+            settings, iterations=min(settings.iterations, earlier["iterations"])
+        )
     names = tuple(names_of(source))
     plan = ProofPlan(
         settings,
@@ -82,7 +90,9 @@ def make_plan(
         len(pairs),
         labelled,
         tested,
-        recordings_of_scans(source, [names[i] for part in tested.values() for i in part]),
+        recordings_of_scans(
+            source, [names[i] for part in tested.values() for i in part]
+        ),
         half,
         step,
         0.0,
@@ -104,7 +114,9 @@ def recordings_of_scans(source: Source, names: Sequence[str]) -> Recordings:
 def _labelled(places: Places, pair: Pair, settings: ProofSettings) -> list[int]:
     place, seed = pair
     there = sum(len(members) for name, members in places.items() if name != place)
-    count = min(there, MOST_LABELLED) if settings.labelled is None else settings.labelled
+    count = (
+        min(there, MOST_LABELLED) if settings.labelled is None else settings.labelled
+    )
     if count < settings.batch:
         raise ConfigError(
             f"{count} labelled scans for batches of {settings.batch}, where {place!r} is left out",
@@ -112,7 +124,9 @@ def _labelled(places: Places, pair: Pair, settings: ProofSettings) -> list[int]:
             f"Use --batch {count} (batch={count}), or label more scans.",
         )
     number = sorted(places).index(place)
-    return choose(places, place, count, np.random.default_rng((settings.seed, seed, number)))
+    return choose(
+        places, place, count, np.random.default_rng((settings.seed, seed, number))
+    )
 
 
 def _read(source: Source, index: int, grid: Sensor | None) -> Scan:

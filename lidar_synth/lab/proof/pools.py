@@ -161,7 +161,9 @@ def read_objects(folder: Path) -> ObjectBank | None:
     return ObjectBank.load(folder / OBJECTS) if (folder / OBJECTS).is_file() else None
 
 
-def refuse_leaks(model: str, tested: Recordings, scans: Iterable[Scan] = ()) -> Generator:
+def refuse_leaks(
+    model: str, tested: Recordings, scans: Iterable[Scan] = ()
+) -> Generator:
     """Load a generator, and refuse one that was trained on the places that are tested.
 
     Args:
@@ -202,7 +204,12 @@ def town_seed(recordings: Recordings) -> int:
 
 def _settings(task: PoolTask) -> dict[str, Any]:
     grid = None if task.grid is None else task.grid.to_dict()
-    plain = {"kind": task.kind, "sensor": task.sensor.to_dict(), "grid": grid, "count": task.count}
+    plain = {
+        "kind": task.kind,
+        "sensor": task.sensor.to_dict(),
+        "grid": grid,
+        "count": task.count,
+    }
     streets = {"seed": task.town_seed}
     if task.kind == "generator":
         header, checkpoint = read_header(find_model(task.model))
@@ -218,7 +225,9 @@ def _settings(task: PoolTask) -> dict[str, Any]:
 def _streets(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:
     streets = -(-task.count // len(FRAMES))
     made = Town(task.town_seed, task.sensor, streets * STRETCH_FRAMES, skin=skin)
-    places = [STRETCH_FRAMES * street + frame for street in range(streets) for frame in FRAMES]
+    places = [
+        STRETCH_FRAMES * street + frame for street in range(streets) for frame in FRAMES
+    ]
     for place in places[: task.count]:
         yield made[place]
 

@@ -74,12 +74,17 @@ def groups_of(classes: str, only: Sequence[str] = ()) -> Groups:
     groups = GROUPS[classes]
     if unknown := [name for name in only if name not in groups]:
         raise ConfigError(
-            f"class {', '.join(map(repr, unknown))} of {classes}", f"some of {', '.join(groups)}"
+            f"class {', '.join(map(repr, unknown))} of {classes}",
+            f"some of {', '.join(groups)}",
         )
-    return {name: members for name, members in groups.items() if not only or name in only}
+    return {
+        name: members for name, members in groups.items() if not only or name in only
+    }
 
 
-def require_labels(table: NDArray[np.int64], groups: Groups, only: Sequence[str]) -> list[str]:
+def require_labels(
+    table: NDArray[np.int64], groups: Groups, only: Sequence[str]
+) -> list[str]:
     """The names of the groups that no label has.
 
     Args:
@@ -91,7 +96,9 @@ def require_labels(table: NDArray[np.int64], groups: Groups, only: Sequence[str]
         DataError: if none of the groups, or one that was asked for, is labelled.
     """
     absent = [
-        name for name, members in groups.items() if not sum(table[TRAIN_ID[m]] for m in members)
+        name
+        for name, members in groups.items()
+        if not sum(table[TRAIN_ID[m]] for m in members)
     ]
     if missing := [name for name in absent if name in only]:
         raise DataError(
@@ -117,7 +124,9 @@ def group_ious(table: NDArray[np.int64], groups: Groups) -> NDArray[np.float64]:
         group[[TRAIN_ID[name] for name in members]] = i
     small = np.zeros((count + 1, count + 1), np.int64)
     np.add.at(small, (group[:, None], group[None]), table)
-    small = small[:count]  # labels of no group do not count; predictions of no group do, as errors
+    small = small[
+        :count
+    ]  # labels of no group do not count; predictions of no group do, as errors
     hits = np.diagonal(small)
     union = small.sum(1) + small[:, :count].sum(0) - hits
     return np.where(small.sum(1) > 0, hits / np.maximum(union, 1), np.nan)
@@ -130,7 +139,10 @@ def mean_group_iou(table: NDArray[np.int64], groups: Groups) -> float:
 
 
 def interval(
-    differences: NDArray[np.float64], level: float = 0.95, seed: int = 0, draws: int = DRAWS
+    differences: NDArray[np.float64],
+    level: float = 0.95,
+    seed: int = 0,
+    draws: int = DRAWS,
 ) -> tuple[float, float] | None:
     """Interval of the mean of paired differences, by a bootstrap over places and, within each, over
     seeds.
@@ -157,12 +169,16 @@ def interval(
     means = np.empty((draws, count))
     for place, values in enumerate(there):
         # The means of drawn seeds of this place, which are used whenever the place is drawn.
-        means[:, place] = values[rng.integers(0, len(values), (draws, len(values)))].mean(1)
+        means[:, place] = values[
+            rng.integers(0, len(values), (draws, len(values)))
+        ].mean(1)
     drawn = rng.integers(0, count, (draws, count))
     totals = np.zeros(draws)
     for column in range(count):
         totals += means[rng.permutation(draws), drawn[:, column]]
-    tail = NormalDist().cdf(-sqrt(count / (count - 1)) * t_quantile((1 + level) / 2, count - 1))
+    tail = NormalDist().cdf(
+        -sqrt(count / (count - 1)) * t_quantile((1 + level) / 2, count - 1)
+    )
     low, high = np.quantile(totals / count, (tail, 1 - tail))
     return float(low), float(high)
 

@@ -84,14 +84,19 @@ class Trainings:
         """The file of an outcome."""
         place, seed = pair
         return (
-            self.out / RUNS / row.key / f"{seed}-{sorted(self.plan.places).index(place):03d}.json"
+            self.out
+            / RUNS
+            / row.key
+            / f"{seed}-{sorted(self.plan.places).index(place):03d}.json"
         )
 
     def pool_folder(self, kind: str, place: str) -> Path:
         """The folder of a pool: one for all places, but for skins, which must not know the place
         that is tested on."""
         return self.pools / (
-            kind if kind != "skin" else f"skin-{sorted(self.plan.places).index(place):03d}"
+            kind
+            if kind != "skin"
+            else f"skin-{sorted(self.plan.places).index(place):03d}"
         )
 
     def start(self, row: Row, pair: Pair) -> Path | None:
@@ -135,7 +140,9 @@ class Trainings:
             seed,
             real=[self.scans[i] for i in plan.labelled[pair]],
             held_out=[self.scans[i] for i in plan.tested[place]],
-            pools={kind: _pool(folder) for kind, folder in folders.items() if kind in used},
+            pools={
+                kind: _pool(folder) for kind, folder in folders.items() if kind in used
+            },
             objects=_objects(folders["skin"]) if row.name == "paste" else None,
             iterations=round(plan.settings.iterations * row.arm.iterations),
             batch=plan.settings.batch,
@@ -224,13 +231,25 @@ def prove(
     out = Path(out)
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
     jobs = jobs or os.cpu_count() or 1
-    plan, loaded = make_plan(source, settings or ProofSettings(), minutes, jobs, _earlier(out))
+    plan, loaded = make_plan(
+        source, settings or ProofSettings(), minutes, jobs, _earlier(out)
+    )
     seen = ""
     if any("generator" in row.arm.pools() for row in plan.rows):
-        generator = refuse_leaks(plan.settings.model, plan.recordings, _nameless(source, plan))
-        claim(out / GENERATOR, {"model": plan.settings.model, "checkpoint": generator.hash})
-        seen = str(seen_by(generator.header.provenance)) or "scans that its file does not name"
-    named = getattr(trainer, "command", getattr(trainer, "__name__", type(trainer).__name__))
+        generator = refuse_leaks(
+            plan.settings.model, plan.recordings, _nameless(source, plan)
+        )
+        claim(
+            out / GENERATOR,
+            {"model": plan.settings.model, "checkpoint": generator.hash},
+        )
+        seen = (
+            str(seen_by(generator.header.provenance))
+            or "scans that its file does not name"
+        )
+    named = getattr(
+        trainer, "command", getattr(trainer, "__name__", type(trainer).__name__)
+    )
     claim(out / STUDY, plan.identity() | {"trainer": named})
     deadline = None if minutes is None else start + 60 * minutes
     work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
@@ -267,7 +286,9 @@ def report(work: Trainings, trainer: str, seen: str = "") -> Proof:
             found[pair] = {row: read_outcome(path) for row, path in paths.items()}
     if not found:
         raise DataError(
-            "no place with trainings of all arms", "at least one", "Give more --minutes."
+            "no place with trainings of all arms",
+            "at least one",
+            "Give more --minutes.",
         )
     costs = {row.key: _preparation(work, row) for row in plan.rows}
     proof = summarise(plan, found, costs, trainer, seen)
@@ -297,7 +318,9 @@ def read_outcome(path: Path) -> TrialOutcome:
     values = read_sealed(path, "the outcome of a training")
     try:
         table = np.array(values["table"], np.int64)
-        curve = [(int(step), np.array(part, np.int64)) for step, part in values["curve"]]
+        curve = [
+            (int(step), np.array(part, np.int64)) for step, part in values["curve"]
+        ]
         return TrialOutcome(
             table, curve, [float(v) for v in values["losses"]], float(values["seconds"])
         )
@@ -355,22 +378,31 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
         make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))
     ) as done:
         for _ in tqdm(
-            done, total=len(tasks), desc="synthetic scans", unit="pool", disable=not progress
+            done,
+            total=len(tasks),
+            desc="synthetic scans",
+            unit="pool",
+            disable=not progress,
         ):
             pass
 
 
-def _pretrain(work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool) -> None:
+def _pretrain(
+    work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool
+) -> None:
     """Make the pretrained networks that the trainings begin with."""
     needed = {
         path: task
         for task in tasks
-        if (path := work.start(*task)) is not None and not _is_there(path, pretraining_seconds)
+        if (path := work.start(*task)) is not None
+        and not _is_there(path, pretraining_seconds)
     }
     with map_in_processes(
         work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))
     ) as done:
-        for _ in tqdm(done, total=len(needed), desc="pretraining", disable=not progress):
+        for _ in tqdm(
+            done, total=len(needed), desc="pretraining", disable=not progress
+        ):
             pass
 
 
@@ -398,5 +430,7 @@ def _preparation(work: Trainings, row: Row) -> float:
         if (path := work.start(row, pair)) is not None and path.is_file()
     }
     return total + (
-        float(np.mean([pretraining_seconds(path) for path in starts])) if starts else 0.0
+        float(np.mean([pretraining_seconds(path) for path in starts]))
+        if starts
+        else 0.0
     )

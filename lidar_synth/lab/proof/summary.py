@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from lidar_synth.lab.proof.arms import BASE, GENERATOR_BUDGET, Row
 from lidar_synth.lab.proof.machine import command_line, machine
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
-from lidar_synth.lab.proof.scores import FEWEST_PLACES, group_ious, interval, mean_group_iou
+from lidar_synth.lab.proof.scores import (
+    FEWEST_PLACES,
+    group_ious,
+    interval,
+    mean_group_iou,
+)
 from lidar_synth.lab.proof.trial import LOOKS, TrialOutcome
 
 Results = dict[Pair, dict[Row, TrialOutcome]]
@@ -72,7 +77,11 @@ def span(ends: Sequence[float] | None) -> str:
 
 
 def summarise(
-    plan: ProofPlan, found: Results, preparation: Mapping[str, float], trainer: str, seen: str = ""
+    plan: ProofPlan,
+    found: Results,
+    preparation: Mapping[str, float],
+    trainer: str,
+    seen: str = "",
 ) -> Proof:
     """The result of some complete pairs.
 
@@ -92,7 +101,9 @@ def summarise(
         for row in plan.rows
     ]
     for row in arms:
-        row["budget"] = row["budget"].replace(GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}")
+        row["budget"] = row["budget"].replace(
+            GENERATOR_BUDGET, f"{GENERATOR_BUDGET}: {seen}"
+        )
     sizes = {
         name: {"scans": len(part), "tested": len(plan.tested[name])}
         for name, part in plan.places.items()
@@ -129,7 +140,11 @@ def summarise(
 
 
 def _scores(
-    plan: ProofPlan, found: Results, row: Row, places: Sequence[str], seeds: Sequence[int]
+    plan: ProofPlan,
+    found: Results,
+    row: Row,
+    places: Sequence[str],
+    seeds: Sequence[int],
 ) -> NDArray[np.float64]:
     """(P, S) mIoU in per cent; NaN where there is no training."""
     scores = np.full((len(places), len(seeds)), np.nan)
@@ -170,7 +185,9 @@ def _arm(
         "miou": _mean(scores[row]),
         "difference": None if first else _mean(difference),
         "interval": None if first else interval(difference),
-        "better_in": "" if first else f"{int((judged > 0).sum())} of {len(judged)} places",
+        "better_in": ""
+        if first
+        else f"{int((judged > 0).sum())} of {len(judged)} places",
         "by_place": dict(zip(places, map(_known, by_place), strict=True)),
         "miou_by_place": dict(zip(places, map(_known, scored), strict=True)),
         "iou": _class_ious(plan, outcomes),
@@ -201,22 +218,29 @@ def _budget(plan: ProofPlan, row: Row) -> str:
     return f"{text}; {extra}"
 
 
-def _class_ious(plan: ProofPlan, outcomes: Sequence[TrialOutcome]) -> dict[str, float | None]:
+def _class_ious(
+    plan: ProofPlan, outcomes: Sequence[TrialOutcome]
+) -> dict[str, float | None]:
     """IoU of every class in per cent, over the returns of all tested scans together."""
     total = np.sum([outcome.table for outcome in outcomes], 0)
     ious = 100 * group_ious(total, plan.groups)
     return {
-        name: None if np.isnan(v) else float(v) for name, v in zip(plan.groups, ious, strict=True)
+        name: None if np.isnan(v) else float(v)
+        for name, v in zip(plan.groups, ious, strict=True)
     }
 
 
-def _curve(plan: ProofPlan, outcomes: Sequence[TrialOutcome]) -> list[tuple[int, float]]:
+def _curve(
+    plan: ProofPlan, outcomes: Sequence[TrialOutcome]
+) -> list[tuple[int, float]]:
     """(iterations, mean mIoU in per cent) during the training."""
     points: dict[int, list[float]] = {}
     for outcome in outcomes:
         for step, table in outcome.curve:
             points.setdefault(step, []).append(100 * mean_group_iou(table, plan.groups))
-    return [(step, float(np.nanmean(values))) for step, values in sorted(points.items())][:LOOKS]
+    return [
+        (step, float(np.nanmean(values))) for step, values in sorted(points.items())
+    ][:LOOKS]
 
 
 def _chosen_elsewhere(
@@ -230,7 +254,8 @@ def _chosen_elsewhere(
     gains = np.stack([scores[row] - base for row in rows])
     means = np.nanmean(gains, 2)
     picked = [
-        int(np.argmax(np.nanmean(np.delete(means, place, 1), 1))) for place in range(len(base))
+        int(np.argmax(np.nanmean(np.delete(means, place, 1), 1)))
+        for place in range(len(base))
     ]
     chosen = np.stack([gains[arm, place] for place, arm in enumerate(picked)])
     return {
@@ -245,11 +270,15 @@ def _over_best_real(
 ) -> dict[str, Any] | None:
     """The best arm with synthetic scans against the best arm with real scans only and as many
     iterations."""
-    real = [row for row in plan.rows if not row.arm.synthetic and row.arm.iterations == 1]
+    real = [
+        row for row in plan.rows if not row.arm.synthetic and row.arm.iterations == 1
+    ]
     synthetic = [row for row in plan.rows if row.arm.synthetic]
     if not synthetic:
         return None
-    best, other = (max(rows, key=lambda row: _mean(scores[row])) for rows in (synthetic, real))
+    best, other = (
+        max(rows, key=lambda row: _mean(scores[row])) for rows in (synthetic, real)
+    )
     difference = scores[best] - scores[other]
     return {
         "arm": best.key,
@@ -298,7 +327,9 @@ def headline(values: Mapping[str, Any]) -> str:
         gain = format_signed(longer["difference"])
         text += f" More iterations alone: {gain} {span(longer['interval'])}."
     swept = [
-        row for row in values["arms"] if row["arm"] == best["arm"] and row["ratio"] is not None
+        row
+        for row in values["arms"]
+        if row["arm"] == best["arm"] and row["ratio"] is not None
     ]
     if len(swept) > 1:
         text += f" Best share of synthetic scans: {100 * best['ratio']:g} %."

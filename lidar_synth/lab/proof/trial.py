@@ -86,7 +86,9 @@ class Job:
         done = 0
         for number, stage in enumerate(stages):
             last = number + 1 == len(stages)
-            count = self.iterations - done if last else round(stage.share * self.iterations)
+            count = (
+                self.iterations - done if last else round(stage.share * self.iterations)
+            )
             done += count
             yield stage, count
 
@@ -101,9 +103,14 @@ class Job:
             synthetic = None
             labels = None
             if stage.ratio:
-                synthetic = list(self.real) if stage.pool == REAL else self.pools[stage.pool]
+                synthetic = (
+                    list(self.real) if stage.pool == REAL else self.pools[stage.pool]
+                )
                 labels = policy_of(
-                    stage, list(self.real), self.objects, frozenset(synthetic[0].fields())
+                    stage,
+                    list(self.real),
+                    self.objects,
+                    frozenset(synthetic[0].fields()),
                 )
             yield (
                 MixedScans(
@@ -167,12 +174,15 @@ def run_trainer(trainer: Trainer, job: Job) -> TrialOutcome:
     start = time.monotonic()
     result = trainer(job)
     outcome = (
-        result if isinstance(result, TrialOutcome) else TrialOutcome(np.asarray(result, np.int64))
+        result
+        if isinstance(result, TrialOutcome)
+        else TrialOutcome(np.asarray(result, np.int64))
     )
     expected = (len(NAMES), len(NAMES))
     if outcome.table.shape != expected:
         raise DataError(
-            f"a trainer that returns a table of shape {outcome.table.shape}", f"{expected}"
+            f"a trainer that returns a table of shape {outcome.table.shape}",
+            f"{expected}",
         )
     return replace(outcome, seconds=time.monotonic() - start)
 
@@ -182,19 +192,25 @@ def reference(job: Job) -> TrialOutcome:
     held-out scans."""
     network, height = _fresh(job)
     held_out = images(job.held_out, job.held_out[0].sensor)
-    looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {job.iterations}
+    looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {
+        job.iterations
+    }
     curve: list[tuple[int, NDArray[np.int64]]] = []
     losses: list[float] = []
 
     def test(batches: int) -> NDArray[np.int64]:
-        return _test(_settled(network, job, height, batches), held_out, height, job.half)
+        return _test(
+            _settled(network, job, height, batches), held_out, height, job.half
+        )
 
     def watch(step: int) -> None:
         if done + step in looks:
             curve.append((done + step, test(SETTLING_LOOK)))
 
     done = 0
-    for (stage, count), (mixed, _) in zip(job.stages(), job.mixtures(collate="range"), strict=True):
+    for (stage, count), (mixed, _) in zip(
+        job.stages(), job.mixtures(collate="range"), strict=True
+    ):
         if job.start is not None and not done:
             network.load_state_dict(load_file(job.start))
             curve.append((count, test(SETTLING_LOOK)))
@@ -235,8 +251,12 @@ def pretraining_seconds(path: Path) -> float:
         if facts["weights"] == weights_hash(load_file(path)):
             return float(facts[SECONDS])
     except (SafetensorError, LookupError, TypeError, ValueError) as error:
-        raise DataError(f"{path} is damaged ({error})", "a pretrained network") from error
-    raise DataError(f"{path} is damaged (the sum of its weights differs)", "a pretrained network")
+        raise DataError(
+            f"{path} is damaged ({error})", "a pretrained network"
+        ) from error
+    raise DataError(
+        f"{path} is damaged (the sum of its weights differs)", "a pretrained network"
+    )
 
 
 def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
@@ -260,7 +280,14 @@ def _learn(
     batches = endless_batches(mixed, job.batch)
     rate = RATE * stage.rate
     return train_segmenter(
-        network, batches, height, count, rate, progress=False, half=job.half, watch=watch
+        network,
+        batches,
+        height,
+        count,
+        rate,
+        progress=False,
+        half=job.half,
+        watch=watch,
     )
 
 
@@ -273,7 +300,9 @@ def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:
             "range": image.range,
             **{name: image.channels[name] for name in ("reflectance", "label")},
         }
-        made.append({name: torch.from_numpy(values[None]) for name, values in arrays.items()})
+        made.append(
+            {name: torch.from_numpy(values[None]) for name, values in arrays.items()}
+        )
     return made
 
 
@@ -285,7 +314,9 @@ def _test(
         return confusion(network, held_out, height)
 
 
-def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) -> RangeSegmenter:
+def _settled(
+    network: RangeSegmenter, job: Job, height: Tensor, batches: int
+) -> RangeSegmenter:
     """A copy whose statistics of the normalisation are those of the labelled real scans; the same
     in every arm.
 
@@ -304,7 +335,10 @@ def _settled(network: RangeSegmenter, job: Job, height: Tensor, batches: int) ->
     network = deepcopy(network)
     with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
         update_bn(
-            (segmenter_input(batch["range"], batch["reflectance"], height) for batch in some),
+            (
+                segmenter_input(batch["range"], batch["reflectance"], height)
+                for batch in some
+            ),
             network,
         )
     return network.eval()

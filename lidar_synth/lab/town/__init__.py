@@ -7,4 +7,12 @@ from lidar_synth.lab.town.skin.fit import fit_skin
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES
 
-__all__ = ["LAYOUTS", "STRETCH_FRAMES", "Skin", "Town", "export_town", "fit_skin", "load_skin"]
+__all__ = [
+    "LAYOUTS",
+    "STRETCH_FRAMES",
+    "Skin",
+    "Town",
+    "export_town",
+    "fit_skin",
+    "load_skin",
+]

@@ -66,7 +66,9 @@ def windows_of(town: Town) -> list[tuple[int, int]]:
     for begin in range(0, len(town), STRETCH_FRAMES):
         end = min(begin + STRETCH_FRAMES, len(town)) - 1
         starts = [
-            s for s in range(begin, end + 1, STRIDE) if s == begin or s + LENGTH - STRIDE <= end
+            s
+            for s in range(begin, end + 1, STRIDE)
+            if s == begin or s + LENGTH - STRIDE <= end
         ]
         windows += [(s, min(s + LENGTH - 1, end)) for s in starts]
     return windows
@@ -90,11 +92,17 @@ def write_window(town: Town, root: Path, drive: str, window: tuple[int, int]) ->
         FileError: if they cannot be written.
     """
     frames = range(window[0] + -window[0] % STEP, window[1] + 1, STEP)
-    clouds = [_measured(town[i], i, keyed_rng(town.seed, _POSE_ERRORS, i)) for i in frames]
+    clouds = [
+        _measured(town[i], i, keyed_rng(town.seed, _POSE_ERRORS, i)) for i in frames
+    ]
     moving = _join([_thin({n: v[c["moving"]] for n, v in c.items()}) for c in clouds])
     static = _thin(_join([{n: v[~c["moving"]] for n, v in c.items()} for c in clouds]))
-    for path, cloud in zip(window_paths(root, drive, window)[::-1], (moving, static), strict=True):
-        left_out = ("range", "moving") if cloud is moving else ("range", "moving", "timestamp")
+    for path, cloud in zip(
+        window_paths(root, drive, window)[::-1], (moving, static), strict=True
+    ):
+        left_out = (
+            ("range", "moving") if cloud is moving else ("range", "moving", "timestamp")
+        )
         write_cloud(path, {n: v for n, v in cloud.items() if n not in left_out})
 
 
@@ -125,12 +133,16 @@ def _measured(scan: Scan, frame: int, rng: np.random.Generator) -> Cloud:
 
 
 def _join(clouds: list[Cloud]) -> Cloud:
-    return {name: np.concatenate([cloud[name] for cloud in clouds]) for name in clouds[0]}
+    return {
+        name: np.concatenate([cloud[name] for cloud in clouds]) for name in clouds[0]
+    }
 
 
 def _thin(cloud: Cloud) -> Cloud:
     """The point of each cube of ``SPACING`` that was measured from nearest, as in the dataset."""
-    cubes = np.floor(np.column_stack([cloud[axis] for axis in "xyz"]) / SPACING).astype(np.int64)
+    cubes = np.floor(np.column_stack([cloud[axis] for axis in "xyz"]) / SPACING).astype(
+        np.int64
+    )
     cubes -= cubes.min(axis=0, initial=0)
     order = np.argsort(cloud["range"], kind="stable")
     sides = cubes.max(axis=0, initial=0) + 1

@@ -27,11 +27,15 @@ def close_ends(street: Street, scene: Scene, rng: Rng) -> None:
         t = -40.0
         while t < 40:
             width = rng.uniform(9, 16)
-            plan = sample_house(str(rng.choice(["house", "house", "block"])), width, 9.0, rng)
+            plan = sample_house(
+                str(rng.choice(["house", "house", "block"])), width, 9.0, rng
+            )
             house = StaticObject(make_building(plan, rng), finishes(rng), HOUSE)
             # The front faces back along the street; in a building's own frame it faces -y.
             at = t if direction < 0 else t + width
-            scene.put(house, end + direction * rng.uniform(3, 6), at, -direction * np.pi / 2)
+            scene.put(
+                house, end + direction * rng.uniform(3, 6), at, -direction * np.pi / 2
+            )
             scene.put(fences.clipped_hedge(width, rng), end, t, np.pi / 2)
             t += width + rng.uniform(1, 4)
 
@@ -56,15 +60,24 @@ def line_side_streets(street: Street, scene: Scene, rng: Rng) -> None:
                     style = str(rng.choice(["house", "house", "row", "block"]))
                     depth = rng.uniform(8, 10)
                     plan = sample_house(style, width, depth, rng)
-                    mesh = make_building(plan, rng) if near else _plain_house(int(rng.integers(12)))
+                    mesh = (
+                        make_building(plan, rng)
+                        if near
+                        else _plain_house(int(rng.integers(12)))
+                    )
                     low = t if side == LEFT else -t - width
                     at = low if direction < 0 else low + width
                     house = StaticObject(mesh, finishes(rng), HOUSE)
                     scene.put(
-                        house, edge + direction * rng.uniform(2.5, 6), at, -direction * np.pi / 2
+                        house,
+                        edge + direction * rng.uniform(2.5, 6),
+                        at,
+                        -direction * np.pi / 2,
                     )
                     for _ in range(rng.poisson(3)):
-                        species = str(rng.choice(["bush", "bush", "thuja", "fruit", "round"]))
+                        species = str(
+                            rng.choice(["bush", "bush", "thuja", "fruit", "round"])
+                        )
                         place = (2 * side - 1) * rng.uniform(t, t + width + 3)
                         scene.put(
                             furniture.random_plant(species, rng, near=near),
@@ -78,7 +91,9 @@ def _line(
     scene: Scene, ends: tuple[float, float], at: float, side: int, kind: str, rng: Rng
 ) -> None:
     """Put a boundary along t on one side of the street; ``ends`` are |t|, ``at`` is s, metres."""
-    put_boundary(scene, kind, ends if side == LEFT else (-ends[1], -ends[0]), at, False, rng)
+    put_boundary(
+        scene, kind, ends if side == LEFT else (-ends[1], -ends[0]), at, False, rng
+    )
 
 
 @cache
@@ -88,7 +103,11 @@ def _plain_house(variant: int) -> Mesh:
     roof = ("gable", "cross", "hip")[variant % 3]
     return make_building(
         BuildingPlan(
-            rng.uniform(9, 16), rng.uniform(8, 11), 1 + variant % 4, roof=roof, detail=False
+            rng.uniform(9, 16),
+            rng.uniform(8, 11),
+            1 + variant % 4,
+            roof=roof,
+            detail=False,
         ),
         rng,
     )
@@ -104,17 +123,27 @@ def second_row(street: Street, scene: Scene, rng: Rng) -> None:
         for depth in (36.0, 62.0, 105.0):
             for s in np.arange(low, high, 9.0 + depth / 8):
                 far = not -REACH <= s <= street.length + REACH
-                t = street.front(side) + (12 if far and depth < 40 else depth) + rng.uniform(-4, 4)
+                t = (
+                    street.front(side)
+                    + (12 if far and depth < 40 else depth)
+                    + rng.uniform(-4, 4)
+                )
                 crossed = any(
                     side in c.sides and abs(s + 5 - c.s) < c.half + c.pavement + 20
                     for c in street.crossings
                 )
-                if crossed or (street.plaza == side and t < street.front(side) + PLAZA_DEPTH + 20):
+                if crossed or (
+                    street.plaza == side and t < street.front(side) + PLAZA_DEPTH + 20
+                ):
                     continue
                 if not open_land and rng.random() < 0.55:
                     turn = float(rng.choice([0.0, np.pi / 2])) if depth > 40 else 0.0
-                    house = StaticObject(_plain_house(int(rng.integers(12))), finishes(rng), HOUSE)
-                    scene.put(house, s, sign * t, turn + (np.pi if side == RIGHT else 0))
+                    house = StaticObject(
+                        _plain_house(int(rng.integers(12))), finishes(rng), HOUSE
+                    )
+                    scene.put(
+                        house, s, sign * t, turn + (np.pi if side == RIGHT else 0)
+                    )
                 elif rng.random() < (0.5 if open_land else 0.8):
                     scene.put(
                         furniture.random_plant(

@@ -74,7 +74,9 @@ class Station(NamedTuple):
     above: int = PAINT
 
 
-def shell(stations: list[Station], length: float, width: float, lit: bool = False) -> Mesh:
+def shell(
+    stations: list[Station], length: float, width: float, lit: bool = False
+) -> Mesh:
     """The closed surface of a body through its cross-sections.
 
     Args:
@@ -97,7 +99,10 @@ def shell(stations: list[Station], length: float, width: float, lit: bool = Fals
         outline = [(-y, z) for y, z in right] + [(0.0, s.top)] + right[::-1]
         sections.append([(x, y, z) for y, z in outline])
     panels = np.array(
-        [[PAINT, PAINT, s.side, s.above, s.above, s.side, PAINT, PAINT] for s in stations[:-1]]
+        [
+            [PAINT, PAINT, s.side, s.above, s.above, s.side, PAINT, PAINT]
+            for s in stations[:-1]
+        ]
     )
     if lit:
         panels[0, [1, 6]] = HEAD
@@ -126,9 +131,16 @@ def wheels(axles: list[float], radius: float, width: float, arch: bool = True) -
         for side in (-1, 1):
             y = side * width / 2
             parts.append(
-                tube([(x, y - side * 0.2, radius), (x, y + side * 0.008, radius)], radius, 12, TYRE)
+                tube(
+                    [(x, y - side * 0.2, radius), (x, y + side * 0.008, radius)],
+                    radius,
+                    12,
+                    TYRE,
+                )
             )
-            parts.append(disc((x, y + side * 0.012, radius), (0, 1, 0), 0.62 * radius, 10, RIM))
+            parts.append(
+                disc((x, y + side * 0.012, radius), (0, 1, 0), 0.62 * radius, 10, RIM)
+            )
             if arch:
                 angle = np.linspace(0, np.pi, 8)
                 rim = np.c_[
@@ -142,7 +154,12 @@ def wheels(axles: list[float], radius: float, width: float, arch: bool = True) -
 
 
 def face(
-    x: float, low: float, high: float, width: float, slots: tuple[int, int], plate: float
+    x: float,
+    low: float,
+    high: float,
+    width: float,
+    slots: tuple[int, int],
+    plate: float,
 ) -> Mesh:
     """Two lights and a number plate on the flat front or rear of a body.
 
@@ -163,6 +180,11 @@ def face(
         for s in (-1, 1)
     ]
     plates = [
-        [(x, -0.26, plate), (x, 0.26, plate), (x, 0.26, plate + 0.11), (x, -0.26, plate + 0.11)]
+        [
+            (x, -0.26, plate),
+            (x, 0.26, plate),
+            (x, 0.26, plate + 0.11),
+            (x, -0.26, plate + 0.11),
+        ]
     ]
     return quads([*lights, *plates], np.array([slots[0], slots[0], slots[1]]))

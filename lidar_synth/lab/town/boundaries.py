@@ -4,7 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidar_synth.lab.town.fences import bar_fence, clipped_hedge, low_wall, thicket, wire_fence
+from lidar_synth.lab.town.fences import (
+    bar_fence,
+    clipped_hedge,
+    low_wall,
+    thicket,
+    wire_fence,
+)
 from lidar_synth.lab.town.furniture import StaticObject
 from lidar_synth.lab.town.materials import Finish
 from lidar_synth.lab.town.scene import Scene
@@ -66,7 +72,12 @@ def put_boundary(
 
 
 def _piece(
-    kind: str, length: float, height: float, stone: Finish, shade: float, rng: np.random.Generator
+    kind: str,
+    length: float,
+    height: float,
+    stone: Finish,
+    shade: float,
+    rng: np.random.Generator,
 ) -> list[tuple[StaticObject, float, float]]:
     """The objects that make up one piece: (object, metres to its left, metres above the ground)."""
     iron = (shade, shade, 1.1 * shade)
@@ -80,7 +91,9 @@ def _piece(
         case "bars":
             return [(bar_fence(length, height, 0.13, iron, False), 0.0, 0.0)]
         case "boards":
-            return [(bar_fence(length, height, 0.12, (0.5, 0.38, 0.25), True), 0.0, 0.0)]
+            return [
+                (bar_fence(length, height, 0.12, (0.5, 0.38, 0.25), True), 0.0, 0.0)
+            ]
         case "wire":
             return [(wire_fence(length, height), 0.0, 0.0)]
         case "wallhedge":

@@ -31,7 +31,9 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
         snapshot: the stretch at the time of the scan.
     """
     count = len(objects)
-    in_sensor = np.linalg.inv(pose) @ np.array([o.pose for o in objects]).reshape(-1, 4, 4)
+    in_sensor = np.linalg.inv(pose) @ np.array([o.pose for o in objects]).reshape(
+        -1, 4, 4
+    )
     values = np.array(
         [_box_values(o, p) for o, p in zip(objects, in_sensor, strict=True)], np.float32
     ).reshape(-1, 7)
@@ -50,7 +52,8 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
         snapshot,
     )
     occlusion[truncation >= 0] = [
-        next((level for threshold, level in _LEVELS if v >= threshold), 3) for v in visible
+        next((level for threshold, level in _LEVELS if v >= threshold), 3)
+        for v in visible
     ]
     names = tuple(o.prototype.name for o in objects)
     instance = np.array([o.instance for o in objects], np.int32)
@@ -62,7 +65,11 @@ def _box_values(placed: PlacedObject, in_sensor: Pose) -> NDArray[np.float64]:
     low, high = placed.prototype.mesh.bounds
     centre = in_sensor[:3, :3] @ (placed.scale * (low + high) / 2) + in_sensor[:3, 3]
     return np.array(
-        [*centre, *(placed.scale * (high - low)), np.arctan2(in_sensor[1, 0], in_sensor[0, 0])]
+        [
+            *centre,
+            *(placed.scale * (high - low)),
+            np.arctan2(in_sensor[1, 0], in_sensor[0, 0]),
+        ]
     )
 
 
@@ -87,7 +94,10 @@ def _image_box_of(
 
 
 def _visible_shares(
-    objects: list[PlacedObject], image_boxes: NDArray[np.float32], pose: Pose, snapshot: Snapshot
+    objects: list[PlacedObject],
+    image_boxes: NDArray[np.float32],
+    pose: Pose,
+    snapshot: Snapshot,
 ) -> list[float]:
     """For each object, the share of the camera rays towards it that nothing in front of it
     blocks."""
@@ -105,7 +115,11 @@ def _visible_shares(
         return []
     directions = np.concatenate(rays)
     distance = np.concatenate(own_distances)
-    first = snapshot.cast(np.broadcast_to(eye, directions.shape), directions, eye).distance
+    first = snapshot.cast(
+        np.broadcast_to(eye, directions.shape), directions, eye
+    ).distance
     unblocked = first > distance - 0.05
     ends = np.cumsum([len(r) for r in rays])[:-1]
-    return [float(part.mean()) if len(part) else 0.0 for part in np.split(unblocked, ends)]
+    return [
+        float(part.mean()) if len(part) else 0.0 for part in np.split(unblocked, ends)
+    ]

@@ -35,7 +35,11 @@ def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
                 parts.append(
                     boxes(
                         low,
-                        [(x + 2.8, -1.25, z + 1), (x + 0.05, 0, z + 1), (x + 2.8, 0, z + 1)],
+                        [
+                            (x + 2.8, -1.25, z + 1),
+                            (x + 0.05, 0, z + 1),
+                            (x + 2.8, 0, z + 1),
+                        ],
                         SLAB,
                     )
                 )
@@ -43,9 +47,14 @@ def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
                 bars = np.arange(x, x + 2.8, 0.14)
                 grid = np.c_[bars, bars + 0.025, 0 * bars + z, 0 * bars + z + 1]
                 parts.append(
-                    quads(panels(grid, -1.28, (np.zeros(3), np.eye(3)[0], np.eye(3)[1])), RAIL)
+                    quads(
+                        panels(grid, -1.28, (np.zeros(3), np.eye(3)[0], np.eye(3)[1])),
+                        RAIL,
+                    )
                 )
-                parts.append(boxes([(x, -1.31, z + 0.98)], [(x + 2.8, -1.26, z + 1.03)], RAIL))
+                parts.append(
+                    boxes([(x, -1.31, z + 0.98)], [(x + 2.8, -1.26, z + 1.03)], RAIL)
+                )
         x += rng.uniform(4.5, 6.5)
     return merge(parts)
 
@@ -59,7 +68,14 @@ def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     if plan.roof == "flat":
         edge = boxes([(-0.1, -0.1, z - 0.2)], [(w + 0.1, d + 0.1, z + 0.25)], SLAB)
         return merge(
-            [edge, boxes([(0.3 * w, 0.3 * d, z)], [(0.3 * w + 1.6, 0.3 * d + 1.6, z + 1.4)], SLAB)]
+            [
+                edge,
+                boxes(
+                    [(0.3 * w, 0.3 * d, z)],
+                    [(0.3 * w + 1.6, 0.3 * d + 1.6, z + 1.4)],
+                    SLAB,
+                ),
+            ]
         )
     cross = plan.roof == "cross"
     # Built with the ridge along x; a cross gable is the same roof with x and y swapped.
@@ -78,7 +94,10 @@ def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
         [(x0, y1, low), a, b, (x1, y1, low)],
     ]
     ends = [[(x0, y0, low), a, a, (x0, y1, low)], [(x1, y0, low), (x1, y1, low), b, b]]
-    gables = [[(x, 0, z), (x, deep, z), (x, deep / 2, top), (x, deep / 2, top)] for x in (0, along)]
+    gables = [
+        [(x, 0, z), (x, deep, z), (x, deep / 2, top), (x, deep / 2, top)]
+        for x in (0, along)
+    ]
     sheets = quads(
         [*slopes, *(ends if inset else gables)],
         np.array([ROOF, ROOF] + [ROOF if inset else WALL] * 2),
@@ -86,7 +105,9 @@ def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
     turned = Mesh(sheets.triangles[..., [1, 0, 2]], sheets.slot) if cross else sheets
     chimney = np.array([rng.uniform(0.2, 0.8) * w, 0.5 * d, top])
     stack = boxes(
-        [chimney - np.array((0.3, 0.3, 1.0))], [chimney + np.array((0.3, 0.3, 0.9))], PLINTH
+        [chimney - np.array((0.3, 0.3, 1.0))],
+        [chimney + np.array((0.3, 0.3, 0.9))],
+        PLINTH,
     )
     lights = (
         [_skylights(slopes[0], int(rng.integers(0, 4)), rng)]
@@ -107,9 +128,17 @@ def _skylights(
     height = 1.2 / float(np.linalg.norm(d - a))
     corners = []
     for u in map(float, rng.uniform(0.1, 0.85, count)):
-        edges = [(u, 0.4), (u + width, 0.4), (u + width, 0.4 + height), (u, 0.4 + height)]
+        edges = [
+            (u, 0.4),
+            (u + width, 0.4),
+            (u + width, 0.4 + height),
+            (u, 0.4 + height),
+        ]
         corners.append(
-            [(1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up for s, v in edges]
+            [
+                (1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up
+                for s, v in edges
+            ]
         )
     return quads(np.array(corners).reshape(-1, 4, 3), GLASS)
 
@@ -125,16 +154,25 @@ def make_building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
         (d, (w * axes[0], axes[1], -axes[0])),
         (w, (d * axes[1], axes[0], -axes[1])),
     ]
-    parts = [facade(plan, length, frame, i, rng) for i, (length, frame) in enumerate(sides)]
+    parts = [
+        facade(plan, length, frame, i, rng) for i, (length, frame) in enumerate(sides)
+    ]
     parts.append(_roof(plan, rng))
     if plan.detail:
         inset = min(3.2, 0.35 * d, 0.35 * w)
-        parts.append(boxes([(inset, inset, 0)], [(w - inset, d - inset, plan.eaves - 0.1)], ROOM))
+        parts.append(
+            boxes([(inset, inset, 0)], [(w - inset, d - inset, plan.eaves - 0.1)], ROOM)
+        )
         floors = plan.plinth + plan.storey * np.arange(plan.floors)
         parts.append(
             quads(
                 [
-                    [(0.1, 0.3, z), (w - 0.1, 0.3, z), (w - 0.1, d - 0.3, z), (0.1, d - 0.3, z)]
+                    [
+                        (0.1, 0.3, z),
+                        (w - 0.1, 0.3, z),
+                        (w - 0.1, d - 0.3, z),
+                        (0.1, d - 0.3, z),
+                    ]
                     for z in floors
                 ],
                 ROOM,
@@ -153,7 +191,9 @@ def garage(width: float, depth: float) -> Mesh:
     door = np.array([[0.3, width - 0.3, 0.0, 2.1]])
     shell = boxes([(0, 0.12, -0.5)], [(width, depth, 2.6)], WALL)
     slats = np.linspace(0, 2.1, 6)
-    leaves = np.stack([np.full(5, 0.3), np.full(5, width - 0.3), slats[:-1] + 0.02, slats[1:]], 1)
+    leaves = np.stack(
+        [np.full(5, 0.3), np.full(5, width - 0.3), slats[:-1] + 0.02, slats[1:]], 1
+    )
     return merge(
         [
             shell,

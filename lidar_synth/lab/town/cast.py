@@ -57,7 +57,10 @@ def _shape(mesh: Mesh) -> _CastShape:
         low, high = mesh.bounds
         radius = float(np.linalg.norm(high - low)) / 2
         shape = _SHAPES[id(mesh)] = _CastShape(
-            mesh, Solid(mesh.triangles), np.asarray((low + high) / 2, np.float32), radius
+            mesh,
+            Solid(mesh.triangles),
+            np.asarray((low + high) / 2, np.float32),
+            radius,
         )
     return shape
 
@@ -81,10 +84,13 @@ class Snapshot:
         ]
         self._middles = np.array(middles, np.float32).reshape(-1, 3)
         self._radii = np.array(
-            [m.scale * s.radius for m, s in zip(movers, shapes, strict=True)], np.float32
+            [m.scale * s.radius for m, s in zip(movers, shapes, strict=True)],
+            np.float32,
         )
 
-    def cast(self, origins: Floats, directions: Floats, eye: Floats | None = None) -> SceneHits:
+    def cast(
+        self, origins: Floats, directions: Floats, eye: Floats | None = None
+    ) -> SceneHits:
         """Find the first hit of each ray.
 
         Args:
@@ -119,14 +125,22 @@ class Snapshot:
         normal /= np.maximum(length, 1e-12)[:, None]
         return SceneHits(distance, surface, normal)
 
-    def _candidates(self, directions: Floats, eye: Floats, margin: float) -> NDArray[np.bool_]:
+    def _candidates(
+        self, directions: Floats, eye: Floats, margin: float
+    ) -> NDArray[np.bool_]:
         """(M, N) which rays that start within ``margin`` metres of ``eye`` can hit each mover's
         bounding sphere; may include a few more."""
         offset = self._middles - eye
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
-        sine = np.minimum((self._radii[:, None] + margin) / np.maximum(distance, 1e-3), 1)
-        smallest_cosine = np.where(sine < 0.95, np.sqrt(1 - sine * sine), -2).astype(np.float32)
-        return np.asarray((offset / np.maximum(distance, 1e-3)) @ directions.T > smallest_cosine)
+        sine = np.minimum(
+            (self._radii[:, None] + margin) / np.maximum(distance, 1e-3), 1
+        )
+        smallest_cosine = np.where(sine < 0.95, np.sqrt(1 - sine * sine), -2).astype(
+            np.float32
+        )
+        return np.asarray(
+            (offset / np.maximum(distance, 1e-3)) @ directions.T > smallest_cosine
+        )
 
     def _candidates_of_any_rays(
         self, origins: Floats, directions: Floats
@@ -136,9 +150,9 @@ class Snapshot:
         for middle, radius in zip(self._middles, self._radii, strict=True):
             offset = middle - origins
             along = np.einsum("ij,ij->i", offset, directions)
-            yield (np.einsum("ij,ij->i", offset, offset) - along * along < radius**2) & (
-                along > -radius
-            )
+            yield (
+                np.einsum("ij,ij->i", offset, offset) - along * along < radius**2
+            ) & (along > -radius)
 
 
 def trace(

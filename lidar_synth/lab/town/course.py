@@ -18,10 +18,13 @@ class Course:
         rng: samples the curvature.
     """
 
-    def __init__(self, start: float, end: float, bend: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, start: float, end: float, bend: float, rng: np.random.Generator
+    ) -> None:
         self._s = np.arange(start, end + 1.0)
         waves = sum(
-            rng.normal() * np.sin(2 * np.pi * self._s / rng.uniform(90, 260) + rng.uniform(0, 6.3))
+            rng.normal()
+            * np.sin(2 * np.pi * self._s / rng.uniform(90, 260) + rng.uniform(0, 6.3))
             for _ in range(3)
         )
         curvature = bend * np.tanh(waves)
@@ -63,10 +66,15 @@ class Relief:
         """Height at street coordinates, metres."""
         s = np.asarray(s, float)
         t = np.asarray(t, float)
-        along = (s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)) / self._length
+        along = (
+            s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)
+        ) / self._length
         hills = (self._height * np.sin(2 * np.pi * along + self._phase)).sum(-1)
-        bank = np.where(t > 0, self._banks[0], self._banks[1]) * np.clip(np.abs(t) - 9, 0, 40)
+        bank = np.where(t > 0, self._banks[0], self._banks[1]) * np.clip(
+            np.abs(t) - 9, 0, 40
+        )
         far = (
-            np.where(t > 0, self._far[0], self._far[1]) * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
+            np.where(t > 0, self._far[0], self._far[1])
+            * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
         )
         return np.asarray(hills + self._slope * s + bank + far)

@@ -5,13 +5,24 @@ from functools import cache
 import numpy as np
 
 from lidar_synth.lab.town.bodywork import HEAD, PAINT, PLATE, RIM, TRIM, TYRE
-from lidar_synth.lab.town.meshes import Mesh, boxes, disc, loft, merge, quads, tube, tubes
+from lidar_synth.lab.town.meshes import (
+    Mesh,
+    boxes,
+    disc,
+    loft,
+    merge,
+    quads,
+    tube,
+    tubes,
+)
 
 
 def _ring(x: float, radius: float, thick: float, slot: int) -> Mesh:
     """The tyre of an upright wheel that touches the ground at x."""
     angle = np.linspace(0, 2 * np.pi, 15)[:-1]
-    hub = np.stack([x + radius * np.cos(angle), 0 * angle, radius + radius * np.sin(angle)], -1)
+    hub = np.stack(
+        [x + radius * np.cos(angle), 0 * angle, radius + radius * np.sin(angle)], -1
+    )
     out = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
     across = np.array([0.0, 1.0, 0.0])
     sections = np.stack(
@@ -50,7 +61,10 @@ def bicycle_mesh() -> Mesh:
     )
     guard = loft(
         [
-            [(-0.53 + 0.37 * np.cos(a), y, 0.34 + 0.37 * np.sin(a)) for y in (-0.03, 0.03)]
+            [
+                (-0.53 + 0.37 * np.cos(a), y, 0.34 + 0.37 * np.sin(a))
+                for y in (-0.03, 0.03)
+            ]
             for a in np.linspace(0.3, 2.6, 6)
         ],
         PAINT,
@@ -62,8 +76,12 @@ def bicycle_mesh() -> Mesh:
 @cache
 def motorcycle_mesh() -> Mesh:
     """A motorcycle with a fairing."""
-    wheels = [tube([(x, -0.07, 0.31), (x, 0.07, 0.31)], 0.31, 12, TYRE) for x in (-0.72, 0.72)]
-    rims = [tube([(x, -0.08, 0.31), (x, 0.08, 0.31)], 0.19, 10, RIM) for x in (-0.72, 0.72)]
+    wheels = [
+        tube([(x, -0.07, 0.31), (x, 0.07, 0.31)], 0.31, 12, TYRE) for x in (-0.72, 0.72)
+    ]
+    rims = [
+        tube([(x, -0.08, 0.31), (x, 0.08, 0.31)], 0.19, 10, RIM) for x in (-0.72, 0.72)
+    ]
     bars: list[tuple[list[tuple[float, float, float]], float]] = [
         ([(0.72, 0, 0.31), (0.45, 0, 0.95)], 0.05),
         ([(0.42, -0.36, 1.0), (0.47, 0, 1.02), (0.42, 0.36, 1.0)], 0.02),
@@ -82,7 +100,12 @@ def motorcycle_mesh() -> Mesh:
         [(x, y * w, z) for y, z in ((-1, low), (-0.9, high), (0.9, high), (1, low))]
         for x, w, low, high in stations
     ]
-    plate = [(-0.97, -0.1, 0.55), (-0.97, 0.1, 0.55), (-0.96, 0.1, 0.70), (-0.96, -0.1, 0.70)]
+    plate = [
+        (-0.97, -0.1, 0.55),
+        (-0.97, 0.1, 0.55),
+        (-0.96, 0.1, 0.70),
+        (-0.96, -0.1, 0.70),
+    ]
     return merge(
         [
             *wheels,

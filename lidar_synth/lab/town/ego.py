@@ -25,7 +25,9 @@ def body() -> Mesh:
     """The parts of the vehicle around the LiDAR, in the sensor frame, metres."""
     angle = np.linspace(-0.64, 0.64, 11)
     reach = 0.80 - 0.18 * (angle / 0.64) ** 2
-    front = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.full(11, -0.21)], -1)
+    front = np.stack(
+        [reach * np.cos(angle), reach * np.sin(angle), np.full(11, -0.21)], -1
+    )
     rear = [
         (-1.60, -0.15),
         (-1.15, -0.32),
@@ -34,7 +36,9 @@ def body() -> Mesh:
         (-1.15, 0.32),
         (-1.60, 0.15),
     ]
-    rack = [(x, y) for x, y in ((-0.58, -0.57), (-0.58, 0.57), (0.78, -0.37), (0.78, 0.37))]
+    rack = [
+        (x, y) for x, y in ((-0.58, -0.57), (-0.58, 0.57), (0.78, -0.37), (0.78, 0.37))
+    ]
     return merge(
         [
             fan([(0.3, 0.0, -0.21), *front]),
@@ -44,7 +48,11 @@ def body() -> Mesh:
                 [(x + 0.04, y + 0.06, -0.22) for x, y in rack],
             ),
             *(
-                tube([(-0.015, y, z) for z in (-0.4, 0.0, 0.6)], (0.019, 0.0145, 0.007), 8)
+                tube(
+                    [(-0.015, y, z) for z in (-0.4, 0.0, 0.6)],
+                    (0.019, 0.0145, 0.007),
+                    8,
+                )
                 for y in (-0.285, 0.285)
             ),
         ]
@@ -58,9 +66,12 @@ def free_rays(sensor: Sensor) -> NDArray[np.bool_]:
     a = sensor.firing_azimuths()
     e = np.broadcast_to(elevation[:, None], a.shape)
     rays = np.stack([np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)], -1)
-    side = np.where(np.arange(len(elevation)) % 2, _LASER_OFFSET, -_LASER_OFFSET)[:, None]
+    side = np.where(np.arange(len(elevation)) % 2, _LASER_OFFSET, -_LASER_OFFSET)[
+        :, None
+    ]
     start = np.stack(
-        [side * np.sin(a), side * np.cos(a), np.broadcast_to(height[:, None], a.shape)], -1
+        [side * np.sin(a), side * np.cos(a), np.broadcast_to(height[:, None], a.shape)],
+        -1,
     )
     distance, _, _ = Solid(body().triangles).first(
         start.reshape(-1, 3).astype(np.float32), rays.reshape(-1, 3).astype(np.float32)

@@ -87,7 +87,9 @@ def export_town(
     if layout not in LAYOUTS or jobs < 1:
         expected = f"one of {', '.join(LAYOUTS)}, and at least 1 job"
         raise ConfigError(
-            f"layout {layout!r}, {jobs} jobs", expected, suggest(layout, set(LAYOUTS) - {layout})
+            f"layout {layout!r}, {jobs} jobs",
+            expected,
+            suggest(layout, set(LAYOUTS) - {layout}),
         )
     number = SEQUENCES.get(layout, 0) if sequence is None else sequence
     if not 0 <= number < 100:
@@ -97,7 +99,10 @@ def export_town(
     _claim_folder(Path(out), town, layout, number, camera)
     with hold_writing(Path(out) / SETTINGS):
         writer = LAYOUTS[layout](out, calibration=town.calibration)
-        names = [f"{number:02d}/{i:06d}" if layout in SEQUENCES else None for i in range(len(town))]
+        names = [
+            f"{number:02d}/{i:06d}" if layout in SEQUENCES else None
+            for i in range(len(town))
+        ]
         missing = [i for i, name in enumerate(names) if not writer.complete(i, name)]
         work = partial(_write_group, town, writer, names, camera)
         with (
@@ -110,7 +115,9 @@ def export_town(
         if layout == "semantic_kitti" and len(town):
             _write_times(Path(out) / "sequences" / f"{number:02d}" / "times.txt", town)
         if accumulate:
-            _write_windows(town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress)
+            _write_windows(
+                town, Path(out), f"2013_05_28_drive_{number:04d}_sync", jobs, progress
+            )
     return len(missing), len(town) - len(missing)
 
 
@@ -118,16 +125,25 @@ def _write_times(path: Path, town: Town) -> None:
     """Write the times of the scans; an earlier call may have written more of them, which stay."""
     there = len(read_text(path).splitlines()) if path.is_file() else 0
     if there < len(town):
-        write_file(path, "".join(f"{town.interval * i:e}\n" for i in range(len(town))).encode())
+        write_file(
+            path, "".join(f"{town.interval * i:e}\n" for i in range(len(town))).encode()
+        )
 
 
-def _claim_folder(out: Path, town: Town, layout: str, sequence: int, camera: bool) -> None:
+def _claim_folder(
+    out: Path, town: Town, layout: str, sequence: int, camera: bool
+) -> None:
     """Write the settings and a README into the folder.
 
     Raises:
         ConfigError: if the folder was written with other settings.
     """
-    settings = {"layout": layout, "sequence": sequence, "camera": camera, **town.settings}
+    settings = {
+        "layout": layout,
+        "sequence": sequence,
+        "camera": camera,
+        **town.settings,
+    }
     claim(out / SETTINGS, settings)
     if not (out / "README.md").exists():
         names = {
@@ -157,15 +173,23 @@ def _groups(indices: list[int], jobs: int) -> list[list[int]]:
 
 
 def _write_group(
-    town: Town, writer: Writer, names: list[str | None], camera: bool, indices: list[int]
+    town: Town,
+    writer: Writer,
+    names: list[str | None],
+    camera: bool,
+    indices: list[int],
 ) -> int:
     for i in indices:
         writer.write(town[i], i, name=names[i], image=town.image(i) if camera else None)
     return len(indices)
 
 
-def _write_windows(town: Town, out: Path, drive: str, jobs: int, progress: bool) -> None:
-    missing = [w for w in windows_of(town) if not window_paths(out, drive, w)[0].is_file()]
+def _write_windows(
+    town: Town, out: Path, drive: str, jobs: int, progress: bool
+) -> None:
+    missing = [
+        w for w in windows_of(town) if not window_paths(out, drive, w)[0].is_file()
+    ]
     work = partial(write_window, town, out, drive)
     with map_in_processes(work, missing, jobs) as done:
         for _ in tqdm(done, total=len(missing), unit="window", disable=not progress):

@@ -123,14 +123,16 @@ def reveals(rect: Array, deep: float, frame: Frame) -> Array:
     return np.concatenate(sides)
 
 
-def wall_around(width: float, low: float, high: float, holes: Array, frame: Frame) -> Mesh:
+def wall_around(
+    width: float, low: float, high: float, holes: Array, frame: Frame
+) -> Mesh:
     """A wall with rectangular holes (n, 4: u0, u1, z0, z1), as a grid of rectangles between the
     holes' edges."""
     u = np.unique(np.r_[0.0, width, holes[:, :2].ravel()])
     z = np.unique(np.r_[low, high, holes[:, 2:].ravel()])
-    cells = np.stack([*np.meshgrid(u[:-1], z[:-1]), *np.meshgrid(u[1:], z[1:])], -1).reshape(-1, 4)[
-        :, [0, 2, 1, 3]
-    ]
+    cells = np.stack(
+        [*np.meshgrid(u[:-1], z[:-1]), *np.meshgrid(u[1:], z[1:])], -1
+    ).reshape(-1, 4)[:, [0, 2, 1, 3]]
     middle = (cells[:, [0, 2]] + cells[:, [1, 3]]) / 2
     inside = (middle[:, :1] > holes[:, 0]) & (middle[:, :1] < holes[:, 1])
     inside &= (middle[:, 1:] > holes[:, 2]) & (middle[:, 1:] < holes[:, 3])
@@ -158,7 +160,10 @@ def _window(rect: Array, frame: Frame, rng: np.random.Generator) -> Mesh:
         [
             quads(panels(rect, recess, frame), GLASS),
             quads(reveals(rect, recess, frame), WALL),
-            *(quads(panels(np.stack(bar, 1), recess - 0.02, frame), FRAME) for bar in bars),
+            *(
+                quads(panels(np.stack(bar, 1), recess - 0.02, frame), FRAME)
+                for bar in bars
+            ),
             quads(panels(blind, recess - 0.05, frame), BLIND),
             quads(panels(sill, -0.06, frame), SLAB),
             quads(panels(curtain, recess + 0.22, frame), ROOM),
@@ -173,25 +178,41 @@ def _openings(
     count = max(1, int(width / rng.uniform(2.3, 3.3)))
     pitch = width / count
     half = min(rng.uniform(0.5, 0.85), 0.36 * pitch)
-    column, level = (g.ravel() for g in np.meshgrid(np.arange(count), np.arange(plan.floors)))
+    column, level = (
+        g.ravel() for g in np.meshgrid(np.arange(count), np.arange(plan.floors))
+    )
     middle = (column + 0.5) * pitch
     floor = plan.plinth + level * plan.storey
     rect = np.stack(
-        [middle - half, middle + half, floor + 0.9, floor + 0.9 + rng.uniform(1.15, 1.45)], 1
+        [
+            middle - half,
+            middle + half,
+            floor + 0.9,
+            floor + 0.9 + rng.uniform(1.15, 1.45),
+        ],
+        1,
     )
     keep = rng.random(len(rect)) > (0.06 if front else 0.35)
     doors = np.zeros((0, 4))
     if plan.shop and front:
         ground = level == 0
         rect[ground] = np.stack(
-            [middle - 0.45 * pitch, middle + 0.45 * pitch, floor + 0.35, floor + 2.35], 1
+            [middle - 0.45 * pitch, middle + 0.45 * pitch, floor + 0.35, floor + 2.35],
+            1,
         )[ground]
         keep |= ground
     if front:
         at = int(rng.integers(count))
         keep &= ~((column == at) & (level == 0))
         doors = np.array(
-            [[(at + 0.5) * pitch - 0.55, (at + 0.5) * pitch + 0.55, plan.plinth, plan.plinth + 2.1]]
+            [
+                [
+                    (at + 0.5) * pitch - 0.55,
+                    (at + 0.5) * pitch + 0.55,
+                    plan.plinth,
+                    plan.plinth + 2.1,
+                ]
+            ]
         )
         if plan.balconies:
             french = (level > 0) & (column % 2 == 1)
@@ -205,11 +226,17 @@ def facade(
     """The mesh of one wall with its windows and doors; side 0 is the front, 3 the back."""
     windows, doors = _openings(plan, width, side == 0, rng)
     if not plan.detail or side == 3:
-        wall = quads(panels(np.array([[0.0, width, -1.0, plan.eaves]]), 0.0, frame), WALL)
+        wall = quads(
+            panels(np.array([[0.0, width, -1.0, plan.eaves]]), 0.0, frame), WALL
+        )
         return merge([wall, quads(panels(windows, -0.01, frame), GLASS)])
     parts = [
-        wall_around(width, plan.plinth, plan.eaves, np.concatenate([windows, doors]), frame),
-        quads(panels(np.array([[0.0, width, -1.0, plan.plinth]]), -0.02, frame), PLINTH),
+        wall_around(
+            width, plan.plinth, plan.eaves, np.concatenate([windows, doors]), frame
+        ),
+        quads(
+            panels(np.array([[0.0, width, -1.0, plan.plinth]]), -0.02, frame), PLINTH
+        ),
         _window(windows, frame, rng),
     ]
     if len(doors):

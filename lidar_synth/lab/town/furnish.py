@@ -55,7 +55,9 @@ def furnish(street: Street, lots: list[Lot], scene: Scene, rng: Rng) -> None:
         square(street, street.plaza, scene, rng)
 
 
-def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: Rng) -> None:
+def _park_along(
+    street: Street, lots: list[Lot], side: int, scene: Scene, rng: Rng
+) -> None:
     """Park vehicles along one side of the street."""
     how = street.parking[side]
     if how == "none":
@@ -73,7 +75,9 @@ def _park_along(street: Street, lots: list[Lot], side: int, scene: Scene, rng: R
             ends = kinds[kind].mesh.bounds
             length = float(ends[1][0] - ends[0][0])
             s += length / 2
-            blocked = any(a - length / 2 - 0.3 < s < b + length / 2 + 0.3 for a, b in drives)
+            blocked = any(
+                a - length / 2 - 0.3 < s < b + length / 2 + 0.3 for a, b in drives
+            )
             if rng.random() < density and not blocked and s + length / 2 < high:
                 yaw = (
                     (0.0 if side == RIGHT else np.pi)
@@ -138,7 +142,9 @@ def _put_trees(street: Street, side: int, scene: Scene, rng: Rng) -> None:
             for s in np.arange(low, high - 8, 8.0):
                 if rng.random() < 0.4:
                     scene.put(
-                        furniture.weeds(8.0, verge[1] - verge[0] - 0.3, rng.uniform(0.1, 0.3), rng),
+                        furniture.weeds(
+                            8.0, verge[1] - verge[0] - 0.3, rng.uniform(0.1, 0.3), rng
+                        ),
                         s,
                         sign * (verge[0] + verge[1]) / 2,
                     )
@@ -162,7 +168,9 @@ def _put_lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     at = (
         street.front(side) - 0.35
         if rng.random() < 0.5
-        else street.edge[side] + 0.4 + (2.2 if street.parking[side] in ("bay", "kerb") else 0.0)
+        else street.edge[side]
+        + 0.4
+        + (2.2 if street.parking[side] in ("bay", "kerb") else 0.0)
     )
     for low, high in street.gaps(side, 0.5):
         for s in np.arange(low + rng.uniform(0, step), high, step):
@@ -188,11 +196,17 @@ def _put_lamps(street: Street, side: int, scene: Scene, rng: Rng) -> None:
 def _put_signs(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     """Put road signs along one side."""
     sign = 2 * side - 1
-    at = street.edge[side] + 0.45 + (2.1 if street.parking[side] in ("bay", "kerb") else 0.0)
+    at = (
+        street.edge[side]
+        + 0.45
+        + (2.1 if street.parking[side] in ("bay", "kerb") else 0.0)
+    )
     facing = np.pi if side == RIGHT else 0.0
     for low, high in street.gaps(side, 0.3):
         for s in np.arange(low + rng.uniform(0, 30), high, rng.uniform(28, 55)):
-            kind = str(rng.choice(list(BOARDS)[:6], p=[0.2, 0.3, 0.12, 0.23, 0.12, 0.03]))
+            kind = str(
+                rng.choice(list(BOARDS)[:6], p=[0.2, 0.3, 0.12, 0.23, 0.12, 0.03])
+            )
             scene.put(
                 road_sign(kind, rng.uniform(1.9, 2.4)),
                 s,
@@ -214,7 +228,13 @@ def _put_corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> 
                 if direction == -sign or rng.random() < 0.5:
                     towards = np.pi if direction < 0 else 0.0
                     reach = 3.5 if direction == sign and rng.random() < 0.6 else 0.0
-                    scene.put(traffic_light(5.2 if reach else 3.2, reach), s, t, towards, solid=0.3)
+                    scene.put(
+                        traffic_light(5.2 if reach else 3.2, reach),
+                        s,
+                        t,
+                        towards,
+                        solid=0.3,
+                    )
                 scene.put(
                     traffic_light(3.2, 0.0),
                     s - direction * 0.5,
@@ -223,7 +243,13 @@ def _put_corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> 
                     solid=0.3,
                 )
             elif rng.random() < 0.35:
-                scene.put(road_sign("street", 2.5), s, t, rng.choice([0.0, np.pi / 2]), solid=0.3)
+                scene.put(
+                    road_sign("street", 2.5),
+                    s,
+                    t,
+                    rng.choice([0.0, np.pi / 2]),
+                    solid=0.3,
+                )
             elif rng.random() < 0.3:
                 scene.put(
                     road_sign(str(rng.choice(["warning", "priority"])), 2.1),
@@ -234,7 +260,9 @@ def _put_corner_posts(street: Street, c: SideStreet, scene: Scene, rng: Rng) -> 
                 )
             if rng.random() < 0.25:
                 for k in range(3):
-                    scene.put(furniture.bollard(), s + direction * 1.5 * k, t, solid=0.2)
+                    scene.put(
+                        furniture.bollard(), s + direction * 1.5 * k, t, solid=0.2
+                    )
 
 
 def _put_street_furniture(street: Street, side: int, scene: Scene, rng: Rng) -> None:
@@ -281,6 +309,10 @@ def _put_street_furniture(street: Street, side: int, scene: Scene, rng: Rng) -> 
             elif draw < 0.27:
                 scene.put(furniture.planter(rng), s, sign * (front - 0.6), solid=0.6)
             elif draw < 0.285 and street.kind != "residential":
-                scene.put(furniture.shelter(), s, sign * (front - 0.75), away, solid=1.2)
+                scene.put(
+                    furniture.shelter(), s, sign * (front - 0.75), away, solid=1.2
+                )
             elif draw < 0.295 and street.kind != "residential":
-                scene.put(furniture.advertising_column(), s, sign * (front - 0.8), solid=0.8)
+                scene.put(
+                    furniture.advertising_column(), s, sign * (front - 0.8), solid=0.8
+                )

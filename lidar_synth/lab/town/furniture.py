@@ -10,7 +10,14 @@ import numpy as np
 
 from lidar_synth.lab.town.materials import RGB, Finish
 from lidar_synth.lab.town.meshes import Mesh, boxes, merge, prism, quads, tube, tubes
-from lidar_synth.lab.town.plants import SPECIES, TREE_CLASSES, VARIANTS, coarse_plant, plant, tufts
+from lidar_synth.lab.town.plants import (
+    SPECIES,
+    TREE_CLASSES,
+    VARIANTS,
+    coarse_plant,
+    plant,
+    tufts,
+)
 
 BUILDING = 50
 FENCE = 51
@@ -44,7 +51,9 @@ def random_plant(
     """A tree or bush of a species with a random shape, size and tint; with fewer leaves unless it
     is ``near``."""
     mesh = (plant if near else coarse_plant)(species, int(rng.integers(VARIANTS)))
-    mesh = mesh.moved(yaw=rng.uniform(0, 2 * np.pi), scale=size * rng.uniform(0.85, 1.15, 3))
+    mesh = mesh.moved(
+        yaw=rng.uniform(0, 2 * np.pi), scale=size * rng.uniform(0.85, 1.15, 3)
+    )
     leaf, *rest = SPECIES[species]
     assert leaf.colour is not None
     tint = rng.uniform(0.8, 1.25) * rng.uniform(0.9, 1.1, 3)
@@ -54,24 +63,36 @@ def random_plant(
     return StaticObject(mesh, (Finish("leaf", (r, g, b)), *rest), TREE_CLASSES)
 
 
-def weeds(length: float, depth: float, height: float, rng: np.random.Generator) -> StaticObject:
+def weeds(
+    length: float, depth: float, height: float, rng: np.random.Generator
+) -> StaticObject:
     """A strip of high grass along +x."""
     return StaticObject(
-        tufts(length, depth, height, 26, rng), (Finish("leaf", (0.36, 0.45, 0.18)),), (TERRAIN,)
+        tufts(length, depth, height, 26, rng),
+        (Finish("leaf", (0.36, 0.45, 0.18)),),
+        (TERRAIN,),
     )
 
 
 def lamp_post(height: float, reach: float) -> StaticObject:
     """A street lamp with its arm towards +x."""
     pole = tube(
-        [(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)], (0.085, 0.085, 0.06, 0.045), 8
+        [(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)],
+        (0.085, 0.085, 0.06, 0.045),
+        8,
     )
     arm = tube(
-        [(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)], 0.035, 6
+        [(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)],
+        0.035,
+        6,
     )
-    head = boxes([(reach - 0.1, -0.14, height + 0.22)], [(reach + 0.6, 0.14, height + 0.36)], 1)
+    head = boxes(
+        [(reach - 0.1, -0.14, height + 0.22)], [(reach + 0.6, 0.14, height + 0.36)], 1
+    )
     return StaticObject(
-        merge([pole, arm, head]), (GALVANISED, Finish("lamp", (0.6, 0.6, 0.6))), (POLE, POLE)
+        merge([pole, arm, head]),
+        (GALVANISED, Finish("lamp", (0.6, 0.6, 0.6))),
+        (POLE, POLE),
     )
 
 
@@ -86,13 +107,19 @@ def mast(height: float, radius: float, wood: bool) -> StaticObject:
 
 def bench() -> StaticObject:
     """A park bench facing +x, its seat 0.45 m high."""
-    slats = [(-0.22 + 0.11 * i, 0.43) for i in range(4)] + [(-0.27, 0.60), (-0.30, 0.76)]
+    slats = [(-0.22 + 0.11 * i, 0.43) for i in range(4)] + [
+        (-0.27, 0.60),
+        (-0.30, 0.76),
+    ]
     low = [(x, -0.85, z) for x, z in slats]
     high = [
-        (x + (0.09 if z < 0.5 else 0.03), 0.85, z + (0.04 if z < 0.5 else 0.11)) for x, z in slats
+        (x + (0.09 if z < 0.5 else 0.03), 0.85, z + (0.04 if z < 0.5 else 0.11))
+        for x, z in slats
     ]
     legs = boxes(
-        [(-0.25, y, -0.05) for y in (-0.7, 0.64)], [(0.2, y + 0.06, 0.43) for y in (-0.7, 0.64)], 1
+        [(-0.25, y, -0.05) for y in (-0.7, 0.64)],
+        [(0.2, y + 0.06, 0.43) for y in (-0.7, 0.64)],
+        1,
     )
     return StaticObject(
         merge([boxes(low, high), legs]),
@@ -154,11 +181,16 @@ def shelter() -> StaticObject:
                 [(x - 0.04, y - 0.04, -0.1) for x, y in posts],
                 [(x + 0.04, y + 0.04, 2.3) for x, y in posts],
             ),
-            boxes([(-0.9, -2.2, 2.3), (-0.65, -1.2, 0.42)], [(0.8, 2.2, 2.42), (-0.3, 1.2, 0.47)]),
+            boxes(
+                [(-0.9, -2.2, 2.3), (-0.65, -1.2, 0.42)],
+                [(0.8, 2.2, 2.42), (-0.3, 1.2, 0.47)],
+            ),
         ]
     )
     return StaticObject(
-        mesh, (Finish("metal", (0.25, 0.27, 0.28)), Finish("glass")), (STRUCTURE, STRUCTURE)
+        mesh,
+        (Finish("metal", (0.25, 0.27, 0.28)), Finish("glass")),
+        (STRUCTURE, STRUCTURE),
     )
 
 
@@ -191,7 +223,9 @@ def fountain() -> StaticObject:
         ]
     )
     return StaticObject(
-        mesh, (Finish("stone"), Finish("plastic", (0.2, 0.3, 0.34))), (STRUCTURE, STRUCTURE)
+        mesh,
+        (Finish("stone"), Finish("plastic", (0.2, 0.3, 0.34))),
+        (STRUCTURE, STRUCTURE),
     )
 
 

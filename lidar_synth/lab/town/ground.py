@@ -99,17 +99,22 @@ class TownGround:
         self.corners = corners
         ends = np.array(rects, float).reshape(-1, 5)
         squares = np.array(
-            [(c.s, c.s + c.along * c.radius, c.t, c.t + c.across * c.radius) for c in corners]
+            [
+                (c.s, c.s + c.along * c.radius, c.t, c.t + c.across * c.radius)
+                for c in corners
+            ]
         ).reshape(-1, 4)
         edges = np.concatenate([ends[:, :4], squares])
         self._s = _lines(edges[:, :2].ravel(), (reach[0], reach[1]), fine)
         self._t = _lines(edges[:, 2:].ravel(), (reach[2], reach[3]), (-15.0, 15.0))
         self._kinds = np.zeros((len(self._s) - 1, len(self._t) - 1), np.int32)
         first = [
-            np.searchsorted(line, ends[:, i] - 0.011) for line, i in ((self._s, 0), (self._t, 2))
+            np.searchsorted(line, ends[:, i] - 0.011)
+            for line, i in ((self._s, 0), (self._t, 2))
         ]
         last = [
-            np.searchsorted(line, ends[:, i] - 0.011) for line, i in ((self._s, 1), (self._t, 3))
+            np.searchsorted(line, ends[:, i] - 0.011)
+            for line, i in ((self._s, 1), (self._t, 3))
         ]
         for s0, s1, t0, t1, kind in zip(
             first[0], last[0], first[1], last[1], ends[:, 4], strict=True
@@ -123,19 +128,27 @@ class TownGround:
         j = np.clip(np.searchsorted(self._t, t, "right") - 1, 0, len(self._t) - 2)
         return np.asarray(self._kinds[i, j])
 
-    def height(self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None) -> Array:
+    def height(
+        self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
+    ) -> Array:
         """Height at street coordinates, metres: of the ground there, or of the given kind of ground
         instead."""
         lift = _LIFT[self.kind(s, t) if kind is None else np.asarray(kind)]
         s = np.asarray(s, float)
         t = np.asarray(t, float)
         half = np.where(t > 0, self.edge[1], self.edge[0])
-        return np.asarray(self.relief(s, t) - 0.018 * np.minimum(np.abs(t), half) + lift)
+        return np.asarray(
+            self.relief(s, t) - 0.018 * np.minimum(np.abs(t), half) + lift
+        )
 
-    def points(self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None) -> Array:
+    def points(
+        self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
+    ) -> Array:
         """(..., 3) world coordinates of the ground's surface at street coordinates, metres."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
-        return np.concatenate([self.course.points(s, t), self.height(s, t, kind)[..., None]], -1)
+        return np.concatenate(
+            [self.course.points(s, t), self.height(s, t, kind)[..., None]], -1
+        )
 
     def mesh(self, rng: np.random.Generator) -> Mesh:
         """All ground as triangles, with indices in ``NAMES`` as slots; ``rng`` roughens unpaved
@@ -154,7 +167,9 @@ class TownGround:
         cells = np.stack([bare[pick] for pick in picks], 2)
         cells[..., 2] += _LIFT[self._kinds][..., None]
         middle = np.meshgrid(
-            (self._s[:-1] + self._s[1:]) / 2, (self._t[:-1] + self._t[1:]) / 2, indexing="ij"
+            (self._s[:-1] + self._s[1:]) / 2,
+            (self._t[:-1] + self._t[1:]) / 2,
+            indexing="ij",
         )
         hole = np.zeros(self._kinds.shape, bool)
         for c in self.corners:
@@ -179,8 +194,14 @@ class TownGround:
         road, kerb, pavement = (NAMES.index(k) for k in ("road", "kerb", "sidewalk"))
 
         def sheet(a: Array, b: Array, low: int, slot: int) -> Mesh:
-            ends = self.points(a[:, 0], a[:, 1], low), self.points(b[:, 0], b[:, 1], slot)
-            return quads(np.stack([ends[0][:-1], ends[0][1:], ends[1][1:], ends[1][:-1]], 1), slot)
+            ends = (
+                self.points(a[:, 0], a[:, 1], low),
+                self.points(b[:, 0], b[:, 1], slot),
+            )
+            return quads(
+                np.stack([ends[0][:-1], ends[0][1:], ends[1][1:], ends[1][:-1]], 1),
+                slot,
+            )
 
         return merge(
             [
@@ -192,27 +213,43 @@ class TownGround:
         )
 
 
-def _lines(edges: Array, reach: tuple[float, float], fine: tuple[float, float]) -> Array:
+def _lines(
+    edges: Array, reach: tuple[float, float], fine: tuple[float, float]
+) -> Array:
     """Grid lines along one axis: all edges, and lines between them at most 3 m apart, wider outside
     ``fine``."""
-    edges = np.unique(np.round(np.r_[edges[(edges > reach[0]) & (edges < reach[1])], reach], 3))
+    edges = np.unique(
+        np.round(np.r_[edges[(edges > reach[0]) & (edges < reach[1])], reach], 3)
+    )
     edges = edges[np.r_[True, np.diff(edges) > 0.02]]
     lines = [edges[:1]]
     for a, b in pairwise(edges):
         outside = max(0.0, fine[0] - (a + b) / 2, (a + b) / 2 - fine[1])
-        lines.append(np.linspace(a, b, max(1, int(np.ceil((b - a) / (3 + 0.3 * outside)))) + 1)[1:])
+        lines.append(
+            np.linspace(a, b, max(1, int(np.ceil((b - a) / (3 + 0.3 * outside)))) + 1)[
+                1:
+            ]
+        )
     return np.concatenate(lines)
 
 
-def _steps(cells: Array, kinds: NDArray[np.int32], hole: NDArray[np.bool_], axis: int) -> Mesh:
+def _steps(
+    cells: Array, kinds: NDArray[np.int32], hole: NDArray[np.bool_], axis: int
+) -> Mesh:
     """Vertical faces between neighbouring cells of different height along an axis."""
-    before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+    before, after = (
+        (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+    )
     a, b = (
         (cells[before][:, :, [1, 2]], cells[after][:, :, [0, 3]])
         if axis == 0
         else (cells[before][:, :, [3, 2]], cells[after][:, :, [0, 1]])
     )
-    apart = (np.abs(a[..., 2] - b[..., 2]).max(-1) > 0.004) & ~(hole[before] & hole[after])
+    apart = (np.abs(a[..., 2] - b[..., 2]).max(-1) > 0.004) & ~(
+        hole[before] & hole[after]
+    )
     faces = np.stack([a[:, :, 0], a[:, :, 1], b[:, :, 1], b[:, :, 0]], 2)[apart]
-    upper = np.where(a[..., 2].mean(-1) > b[..., 2].mean(-1), kinds[before], kinds[after])[apart]
+    upper = np.where(
+        a[..., 2].mean(-1) > b[..., 2].mean(-1), kinds[before], kinds[after]
+    )[apart]
     return quads(faces, upper)

@@ -67,7 +67,11 @@ def sample_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPl
             )
         case "row":
             return BuildingPlan(
-                width, depth, int(rng.integers(2, 4)), rng.uniform(2.7, 3.0), rng.uniform(0.2, 0.8)
+                width,
+                depth,
+                int(rng.integers(2, 4)),
+                rng.uniform(2.7, 3.0),
+                rng.uniform(0.2, 0.8),
             )
         case "block":
             roof = str(rng.choice(["gable", "hip", "flat"]))
@@ -113,7 +117,9 @@ def _style(street: Street, side: int, rng: Rng) -> str:
     if street.plaza == side:
         return "shop"
     return str(
-        rng.choice(["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08])
+        rng.choice(
+            ["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]
+        )
     )
 
 
@@ -131,7 +137,9 @@ def sample_lots(street: Street, rng: Rng) -> list[Lot]:
         for low, high in street.gaps(side, 1.0):
             s = low
             while high - s > 7:
-                on_plaza = street.plaza == side and s + 9 > -12 and s < street.length + 12
+                on_plaza = (
+                    street.plaza == side and s + 9 > -12 and s < street.length + 12
+                )
                 lot = _sample_lot(
                     street,
                     side,
@@ -174,7 +182,11 @@ def _sample_lot(
             rng.uniform(0.4, 1.0),
         )
     width = min(rng.uniform(low, top), high - s - 1.5)
-    between = 0.0 if style in ("row", "shop") and rng.random() < 0.8 else rng.uniform(3.2, 9.0)
+    between = (
+        0.0
+        if style in ("row", "shop") and rng.random() < 0.8
+        else rng.uniform(3.2, 9.0)
+    )
     end = min(high, s + width + between)
     back = 0.3 if style == "shop" else max(0.3, setback + rng.uniform(-1.5, 1.5))
     first = bool(rng.random() < 0.5)

@@ -48,15 +48,29 @@ class Material(NamedTuple):
 
 
 MATERIALS: dict[str, Material] = {
-    "asphalt": Material(0.296, 0.028, roughness=0.0005, colour=(0.27, 0.27, 0.28), grain=0.18),
+    "asphalt": Material(
+        0.296, 0.028, roughness=0.0005, colour=(0.27, 0.27, 0.28), grain=0.18
+    ),
     "marking": Material(0.5, 0.06, roughness=0.0005, colour=(0.82, 0.82, 0.8)),
     "paving": Material(
-        0.325, 0.03, roughness=0.0006, grazing=0.02, colour=(0.5, 0.48, 0.46), grain=0.14
+        0.325,
+        0.03,
+        roughness=0.0006,
+        grazing=0.02,
+        colour=(0.5, 0.48, 0.46),
+        grain=0.14,
     ),
     "cobble": Material(
-        0.305, 0.035, roughness=0.002, grazing=0.03, colour=(0.42, 0.4, 0.39), grain=0.25
+        0.305,
+        0.035,
+        roughness=0.002,
+        grazing=0.03,
+        colour=(0.42, 0.4, 0.39),
+        grain=0.25,
     ),
-    "kerbstone": Material(0.315, 0.035, roughness=0.0008, grazing=0.02, colour=(0.56, 0.55, 0.53)),
+    "kerbstone": Material(
+        0.315, 0.035, roughness=0.0008, grazing=0.02, colour=(0.56, 0.55, 0.53)
+    ),
     "grass": Material(
         0.365,
         0.052,
@@ -93,14 +107,23 @@ MATERIALS: dict[str, Material] = {
         grain=0.06,
         colour_dependent=True,
     ),
-    "brick": Material(0.36, 0.04, roughness=0.0015, colour=(0.55, 0.28, 0.2), grain=0.15),
-    "concrete": Material(0.35, 0.03, roughness=0.001, colour=(0.58, 0.57, 0.55), grain=0.12),
+    "brick": Material(
+        0.36, 0.04, roughness=0.0015, colour=(0.55, 0.28, 0.2), grain=0.15
+    ),
+    "concrete": Material(
+        0.35, 0.03, roughness=0.001, colour=(0.58, 0.57, 0.55), grain=0.12
+    ),
     "stone": Material(0.37, 0.05, roughness=0.003, colour=(0.5, 0.45, 0.4), grain=0.3),
     "tile": Material(
         0.34, 0.05, roughness=0.002, grazing=0.05, colour=(0.45, 0.21, 0.15), grain=0.15
     ),
     "wood": Material(
-        0.38, 0.05, roughness=0.002, colour=(0.45, 0.31, 0.19), grain=0.18, colour_dependent=True
+        0.38,
+        0.05,
+        roughness=0.002,
+        colour=(0.45, 0.31, 0.19),
+        grain=0.18,
+        colour_dependent=True,
     ),
     "plastic": Material(
         0.31,
@@ -120,7 +143,9 @@ MATERIALS: dict[str, Material] = {
         grain=0.05,
         colour_dependent=True,
     ),
-    "wire": Material(0.3, 0.08, transmission=0.8, roughness=0.003, colour=(0.35, 0.42, 0.36)),
+    "wire": Material(
+        0.3, 0.08, transmission=0.8, roughness=0.003, colour=(0.35, 0.42, 0.36)
+    ),
     "paint": Material(
         0.52,
         0.05,
@@ -131,17 +156,31 @@ MATERIALS: dict[str, Material] = {
         colour_dependent=True,
     ),
     "glass": Material(
-        0.22, 0.05, gloss=0.6, transmission=0.45, dropout=0.5, colour=(0.1, 0.12, 0.14), grain=0.0
+        0.22,
+        0.05,
+        gloss=0.6,
+        transmission=0.45,
+        dropout=0.5,
+        colour=(0.1, 0.12, 0.14),
+        grain=0.0,
     ),
     "carglass": Material(
-        0.15, 0.03, gloss=0.9, transmission=0.1, dropout=0.9, colour=(0.06, 0.07, 0.08), grain=0.0
+        0.15,
+        0.03,
+        gloss=0.9,
+        transmission=0.1,
+        dropout=0.9,
+        colour=(0.06, 0.07, 0.08),
+        grain=0.0,
     ),
     "tyre": Material(0.21, 0.03, gloss=0.1, dropout=0.08, colour=(0.06, 0.06, 0.065)),
     "interior": Material(0.25, 0.04, gloss=0.1, dropout=0.2, colour=(0.11, 0.1, 0.1)),
     "curtain": Material(0.4, 0.05, roughness=0.002, colour=(0.78, 0.76, 0.72)),
     "plate": Material(0.9, 0.1, colour=(0.85, 0.85, 0.82), grain=0.0),
     "sign": Material(0.8, 0.15, colour=(0.8, 0.8, 0.8), grain=0.0),
-    "lamp": Material(0.38, 0.15, gloss=0.3, dropout=0.1, colour=(0.85, 0.85, 0.8), grain=0.0),
+    "lamp": Material(
+        0.38, 0.15, gloss=0.3, dropout=0.1, colour=(0.85, 0.85, 0.8), grain=0.0
+    ),
     "leaf": Material(
         0.365,
         0.085,
@@ -154,11 +193,24 @@ MATERIALS: dict[str, Material] = {
         grain=0.5,
     ),
     "foliage": Material(
-        0.355, 0.085, roughness=0.08, relief=0.4, grazing=1.0, colour=(0.12, 0.21, 0.07), grain=0.6
+        0.355,
+        0.085,
+        roughness=0.08,
+        relief=0.4,
+        grazing=1.0,
+        colour=(0.12, 0.21, 0.07),
+        grain=0.6,
     ),
-    "bark": Material(0.39, 0.08, roughness=0.003, colour=(0.33, 0.27, 0.21), grain=0.45),
+    "bark": Material(
+        0.39, 0.08, roughness=0.003, colour=(0.33, 0.27, 0.21), grain=0.45
+    ),
     "cloth": Material(
-        0.4, 0.06, dropout=0.01, colour=(0.3, 0.3, 0.4), grain=0.12, colour_dependent=True
+        0.4,
+        0.06,
+        dropout=0.01,
+        colour=(0.3, 0.3, 0.4),
+        grain=0.12,
+        colour_dependent=True,
     ),
     "skin": Material(0.4, 0.05, colour=(0.78, 0.58, 0.47), grain=0.05),
 }
@@ -209,7 +261,9 @@ class Finishes:
             instance: instance number of its object, 0 = none.
         """
         colour = finish.colour or MATERIALS[finish.material].colour
-        self.rows.append((INDEX[finish.material], raw, instance, _reflectance(finish), colour))
+        self.rows.append(
+            (INDEX[finish.material], raw, instance, _reflectance(finish), colour)
+        )
         return len(self.rows) - 1
 
     def freeze(self) -> "SurfaceTable":

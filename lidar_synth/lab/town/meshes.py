@@ -41,14 +41,16 @@ class Mesh:
         s = np.sin(yaw)
         turn = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)], np.float32)
         shape = np.asarray(scale, np.float32)
-        points = (self.triangles * shape).reshape(-1, 3) @ turn + np.asarray(offset, np.float32)
+        points = (self.triangles * shape).reshape(-1, 3) @ turn + np.asarray(
+            offset, np.float32
+        )
         return Mesh(points.reshape(-1, 3, 3).astype(np.float32), self.slot)
 
     def posed(self, pose: NDArray[np.float64]) -> "Mesh":
         """The mesh transformed by a rigid motion (4, 4)."""
-        points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32) + pose[
-            :3, 3
-        ].astype(np.float32)
+        points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(
+            np.float32
+        ) + pose[:3, 3].astype(np.float32)
         return Mesh(points.reshape(-1, 3, 3), self.slot)
 
     @cached_property
@@ -76,7 +78,8 @@ def merge(parts: Iterable[Mesh]) -> Mesh:
     if not parts:
         return Mesh(np.zeros((0, 3, 3), np.float32), np.zeros(0, np.int32))
     return Mesh(
-        np.concatenate([p.triangles for p in parts]), np.concatenate([p.slot for p in parts])
+        np.concatenate([p.triangles for p in parts]),
+        np.concatenate([p.slot for p in parts]),
     )
 
 
@@ -106,7 +109,10 @@ _BOX_FACES = np.array(
 def boxes(low: ArrayLike, high: ArrayLike, slot: Slots = 0) -> Mesh:
     """Axis-aligned boxes, given by their lowest and highest corners, each (B, 3) metres."""
     ends = np.stack(
-        [np.asarray(low, np.float32).reshape(-1, 3), np.asarray(high, np.float32).reshape(-1, 3)]
+        [
+            np.asarray(low, np.float32).reshape(-1, 3),
+            np.asarray(high, np.float32).reshape(-1, 3),
+        ]
     )
     pick = np.array([(i >> 2, i >> 1 & 1, i & 1) for i in range(8)])
     corners = np.stack([ends[pick[:, axis], :, axis] for axis in range(3)], -1)
@@ -125,7 +131,9 @@ def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
     points = np.asarray(sections, np.float32)
     if closed:
         points = np.concatenate([points, points[:, :1]], 1)
-    corners = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], 2)
+    corners = np.stack(
+        [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], 2
+    )
     return quads(corners, _slots(slot, corners.shape[:2]))
 
 
@@ -146,7 +154,9 @@ def prism(
     plan = np.asarray(outline, np.float32)
     low = np.c_[plan, np.full(len(plan), bottom)]
     high = np.c_[plan, np.full(len(plan), top)]
-    return merge([loft([low, high], slot, closed=True), fan(high, slot if cap is None else cap)])
+    return merge(
+        [loft([low, high], slot, closed=True), fan(high, slot if cap is None else cap)]
+    )
 
 
 def disc(
@@ -154,7 +164,8 @@ def disc(
 ) -> Mesh:
     """A flat regular polygon around ``centre``."""
     return fan(
-        np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0], slot
+        np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0],
+        slot,
     )
 
 
@@ -164,13 +175,16 @@ def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
     steep = np.abs(ahead[:, 2]) >= 0.9
     x, y, z = ahead.T
     nought = np.zeros(len(x))
-    across = np.where(steep[:, None], np.stack([nought, z, -y], 1), np.stack([y, -x, nought], 1))
+    across = np.where(
+        steep[:, None], np.stack([nought, z, -y], 1), np.stack([y, -x, nought], 1)
+    )
     across /= np.sqrt((across * across).sum(1, keepdims=True))
     u, v, w = across.T
     other = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
     angle = 2 * np.pi * np.arange(sides) / sides
     ring: NDArray[np.float64] = (
-        np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None]
+        np.cos(angle)[:, None] * across[:, None]
+        + np.sin(angle)[:, None] * other[:, None]
     )
     return ring
 
@@ -197,12 +211,16 @@ def tube(
     return merge([loft(rings, slot, closed=True), *ends])
 
 
-def tubes(pieces: Sequence[tuple[ArrayLike, ArrayLike]], sides: int = 5, slot: int = 0) -> Mesh:
+def tubes(
+    pieces: Sequence[tuple[ArrayLike, ArrayLike]], sides: int = 5, slot: int = 0
+) -> Mesh:
     """Several tubes, each given as (path, radius)."""
     return merge(tube(path, radius, sides, slot) for path, radius in pieces)
 
 
-def leaves(centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: Slots = 0) -> Mesh:
+def leaves(
+    centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: Slots = 0
+) -> Mesh:
     """Small triangles of random orientation, each representing a cluster of leaves.
 
     Args:
@@ -220,7 +238,9 @@ def leaves(centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: 
     second /= np.linalg.norm(second, axis=-1, keepdims=True) + 1e-6
     reach = np.broadcast_to(np.asarray(size, np.float32), (len(middle),))[:, None]
     corners = [first, -0.5 * first + 0.87 * second, -0.5 * first - 0.87 * second]
-    return Mesh(np.stack([middle + reach * c for c in corners], 1), _slots(slot, (len(middle),)))
+    return Mesh(
+        np.stack([middle + reach * c for c in corners], 1), _slots(slot, (len(middle),))
+    )
 
 
 def ball(

@@ -43,7 +43,9 @@ class Mover:
         """Its s and t (metres) and its yaw relative to the street (radians) at a time in
         seconds."""
         moving = self.start + self.direction * self.speed * time
-        yaw = (0.0 if self.along else np.pi / 2) + (np.pi if self.direction < 0 else 0.0)
+        yaw = (0.0 if self.along else np.pi / 2) + (
+            np.pi if self.direction < 0 else 0.0
+        )
         return (moving, self.at, yaw) if self.along else (self.at, moving, yaw)
 
     def shape(self, time: float) -> Prototype:
@@ -55,12 +57,18 @@ class Mover:
 
 
 def place_movers(
-    movers: list[Mover], scene: Scene, time: float, about: tuple[float, float], reach: float
+    movers: list[Mover],
+    scene: Scene,
+    time: float,
+    about: tuple[float, float],
+    reach: float,
 ) -> list[PlacedObject]:
     """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a
     time in seconds."""
     places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
-    near = np.flatnonzero(np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach)
+    near = np.flatnonzero(
+        np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach
+    )
     lengths = [2.0 if len(movers[i].shapes) == 1 else 0.5 for i in near]
     s, t, yaw = places[near].T
     poses = scene.poses(s, t, yaw, lengths)
@@ -88,7 +96,11 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
     angle = float(np.clip((travelled - (target - radius)) / radius, 0, np.pi / 2))
     beyond = max(0.0, travelled - (target - radius) - radius * np.pi / 2)
     s = min(travelled, target - radius) + radius * np.sin(angle)
-    return float(s), float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)), sign * angle
+    return (
+        float(s),
+        float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)),
+        sign * angle,
+    )
 
 
 def ego_pose(
@@ -108,7 +120,11 @@ def ego_pose(
         [(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))]
     )
     pitched = np.array(
-        [(np.cos(pitch), 0, np.sin(pitch)), (0, 1, 0), (-np.sin(pitch), 0, np.cos(pitch))]
+        [
+            (np.cos(pitch), 0, np.sin(pitch)),
+            (0, 1, 0),
+            (-np.sin(pitch), 0, np.cos(pitch)),
+        ]
     )
     pose[:3, :3] = pose[:3, :3] @ pitched @ rolled
     pose[:3, 3] += height * pose[:3, 2]

@@ -28,7 +28,9 @@ class Paint:
     rects: list[Rect] = field(default_factory=list)
     corners: list[Corner] = field(default_factory=list)
 
-    def __call__(self, s: tuple[float, float], t: tuple[float, float], kind: str) -> None:
+    def __call__(
+        self, s: tuple[float, float], t: tuple[float, float], kind: str
+    ) -> None:
         """Paint a rectangle with a kind of ground; ``s`` and ``t`` are its intervals in metres, in
         either order."""
         self.rects.append((min(s), max(s), min(t), max(t), NAMES.index(kind)))
@@ -42,9 +44,17 @@ def pave(street: Street, rng: np.random.Generator) -> Paint:
     for side, sign in ((RIGHT, -1), (LEFT, 1)):
         front = street.front(side)
         if street.kind == "edge" and rng.random() < 0.6:
-            paint(full_length, (sign * (front + rng.uniform(2, 8)), sign * BEYOND), "field")
+            paint(
+                full_length,
+                (sign * (front + rng.uniform(2, 8)), sign * BEYOND),
+                "field",
+            )
         if street.plaza == side:
-            paint((-12, street.length + 12), (sign * front, sign * (front + PLAZA_DEPTH)), "plaza")
+            paint(
+                (-12, street.length + 12),
+                (sign * front, sign * (front + PLAZA_DEPTH)),
+                "plaza",
+            )
         at = front
         for band in reversed(street.bands[side]):
             at -= band.width
@@ -82,9 +92,19 @@ def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
                 (sign * edge, sign * BEYOND),
                 "kerb",
             )
-            paint((c.s, c.s + direction * out), (sign * edge, sign * (edge + 0.13)), "kerb")
+            paint(
+                (c.s, c.s + direction * out),
+                (sign * edge, sign * (edge + 0.13)),
+                "kerb",
+            )
             paint.corners.append(
-                Corner(c.s + direction * c.half, sign * edge, direction, sign, min(c.pavement, 3.0))
+                Corner(
+                    c.s + direction * c.half,
+                    sign * edge,
+                    direction,
+                    sign,
+                    min(c.pavement, 3.0),
+                )
             )
 
 
@@ -98,13 +118,21 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
     paint((c.s - c.half, c.s + c.half), (low, high), asphalt)
     if street.kind == "junction" and street.median:
         # The median ends before the zebra crossings.
-        paint((c.s - c.half - 6.5, c.s + c.half + 6.5), (-street.median, street.median), asphalt)
+        paint(
+            (c.s - c.half - 6.5, c.s + c.half + 6.5),
+            (-street.median, street.median),
+            asphalt,
+        )
     if not street.marked or street.kind not in ("junction", "main", "square"):
         return
     for side in c.sides:
         sign = 2 * side - 1
         edge = street.edge[side]
-        paint((c.s, c.s - sign * c.half), (sign * (edge + 1.0), sign * (edge + 1.4)), "marking")
+        paint(
+            (c.s, c.s - sign * c.half),
+            (sign * (edge + 1.0), sign * (edge + 1.4)),
+            "marking",
+        )
         for t in np.arange(edge + 3, 60, 6.0):
             paint((c.s - 0.06, c.s + 0.06), (sign * t, sign * (t + 3)), "marking")
     if street.kind == "junction":
@@ -112,7 +140,11 @@ def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> N
             s = c.s + direction * (c.half + 1.8)
             for t in np.arange(-street.edge[RIGHT] + 0.4, street.edge[LEFT] - 0.5, 1.0):
                 paint((s, s + direction * 3.0), (t, t + 0.5), "marking")
-            lanes = (-street.edge[RIGHT], -0.1) if direction < 0 else (0.1, street.edge[LEFT])
+            lanes = (
+                (-street.edge[RIGHT], -0.1)
+                if direction < 0
+                else (0.1, street.edge[LEFT])
+            )
             paint((s + direction * 4.2, s + direction * 4.6), lanes, "marking")
 
 
@@ -132,7 +164,11 @@ def _markings(street: Street, paint: Paint) -> None:
             paint((s, s + 3.0), (t - 0.06, t + 0.06), "marking")
     if street.median:
         for sign in (-1, 1):
-            paint(full_length, (sign * street.median, sign * (street.median + 0.12)), "marking")
+            paint(
+                full_length,
+                (sign * street.median, sign * (street.median + 0.12)),
+                "marking",
+            )
     if street.kind == "edge":
         for t in (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32):
             paint(full_length, (t, t + 0.12), "marking")

@@ -41,7 +41,10 @@ _BODY = (
 
 
 def _torso(
-    hip: tuple[float, float, float], neck: tuple[float, float, float], top: int, head: int
+    hip: tuple[float, float, float],
+    neck: tuple[float, float, float],
+    top: int,
+    head: int,
 ) -> Mesh:
     """The torso and the head of a person, between the hip and the neck."""
     h = np.array(hip)
@@ -81,7 +84,10 @@ def _walker(phase: float, stride: float, bag: bool) -> Mesh:
         legs.append(([(0, y, hip[2] + 0.02), knee, ankle], (0.085, 0.06, 0.045)))
         shoes.append(
             (
-                [(ankle[0] - 0.06, y, ankle[2] - 0.03), (ankle[0] + 0.17, y, ankle[2] - 0.04)],
+                [
+                    (ankle[0] - 0.06, y, ankle[2] - 0.03),
+                    (ankle[0] + 0.17, y, ankle[2] - 0.04),
+                ],
                 (0.04, 0.03),
             )
         )
@@ -123,7 +129,10 @@ def sitter() -> Prototype:
         )
         for s in (-1, 1)
     ]
-    shoes = [([(0.35, s * 0.11, 0.045), (0.58, s * 0.12, 0.035)], (0.04, 0.03)) for s in (-1, 1)]
+    shoes = [
+        ([(0.35, s * 0.11, 0.045), (0.58, s * 0.12, 0.035)], (0.04, 0.03))
+        for s in (-1, 1)
+    ]
     arms = [
         (
             [(0.0, s * 0.19, 0.98), (0.08, s * 0.24, 0.74), (0.32, s * 0.12, 0.66)],
@@ -132,7 +141,9 @@ def sitter() -> Prototype:
         for s in (-1, 1)
     ]
     body = _torso((-0.06, 0, 0.52), (-0.02, 0, 1.02), TOP, HAIR)
-    mesh = merge([body, tubes(legs, 6, TROUSERS), tubes(shoes, 5, SHOE), tubes(arms, 5, TOP)])
+    mesh = merge(
+        [body, tubes(legs, 6, TROUSERS), tubes(shoes, 5, SHOE), tubes(arms, 5, TOP)]
+    )
     return Prototype(mesh, _BODY, "Person_sitting", (30, 254))
 
 
@@ -159,7 +170,10 @@ def _rider(
             tubes(
                 [
                     (
-                        [foot - np.array((0.05, 0, 0.03)), foot + np.array((0.16, 0, -0.03))],
+                        [
+                            foot - np.array((0.05, 0, 0.03)),
+                            foot + np.array((0.16, 0, -0.03)),
+                        ],
                         (0.04, 0.03),
                     )
                 ],
@@ -175,8 +189,13 @@ def _rider(
 def cyclist(phase: int) -> Prototype:
     """A cyclist in position number ``phase`` of the ``PHASES`` positions of the pedals."""
     turn = 2 * np.pi * phase / PHASES
-    feet = [(-0.08 + 0.17 * np.cos(a), 0.30 + 0.17 * np.sin(a)) for a in (turn, turn + np.pi)]
-    person = _rider((-0.22, 0, 1.0), (0.05, 0, 1.50), (0.30, 0.26, 1.05), (feet[0], feet[1]), HAIR)
+    feet = [
+        (-0.08 + 0.17 * np.cos(a), 0.30 + 0.17 * np.sin(a))
+        for a in (turn, turn + np.pi)
+    ]
+    person = _rider(
+        (-0.22, 0, 1.0), (0.05, 0, 1.50), (0.30, 0.26, 1.05), (feet[0], feet[1]), HAIR
+    )
     return _mounted(person, bicycle_mesh(), "Cyclist", (31, 253))
 
 
@@ -184,7 +203,11 @@ def cyclist(phase: int) -> Prototype:
 def motorcyclist() -> Prototype:
     """A motorcyclist with a helmet."""
     person = _rider(
-        (-0.30, 0, 0.90), (-0.02, 0, 1.42), (0.42, 0.32, 1.02), ((0.0, 0.35), (0.0, 0.35)), HAIR
+        (-0.30, 0, 0.90),
+        (-0.02, 0, 1.42),
+        (0.42, 0.32, 1.02),
+        ((0.0, 0.35), (0.0, 0.35)),
+        HAIR,
     )
     return _mounted(person, motorcycle_mesh(), "Misc", (32, 255))
 

@@ -62,10 +62,18 @@ def square(street: Street, side: int, scene: Scene, rng: Rng) -> None:
     for row in (4.0, PLAZA_DEPTH - 5):
         species = str(rng.choice(["round", "poplar"]))
         for s in np.arange(low, high, rng.uniform(8, 12)):
-            scene.put(furniture.random_plant(species, rng), s, sign * (front + row), solid=0.5)
-            if rng.random() < 0.6 and scene.is_free(s + 2.5, sign * (front + row), (1.2, 1.2)):
+            scene.put(
+                furniture.random_plant(species, rng), s, sign * (front + row), solid=0.5
+            )
+            if rng.random() < 0.6 and scene.is_free(
+                s + 2.5, sign * (front + row), (1.2, 1.2)
+            ):
                 scene.put(
-                    furniture.bench(), s + 2.5, sign * (front + row), -sign * np.pi / 2, solid=0.9
+                    furniture.bench(),
+                    s + 2.5,
+                    sign * (front + row),
+                    -sign * np.pi / 2,
+                    solid=0.9,
                 )
                 if rng.random() < 0.6:
                     scene.park(

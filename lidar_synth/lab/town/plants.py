@@ -54,7 +54,12 @@ SPECIES: dict[str, tuple[Finish, ...]] = {
         Finish("bark"),
         Finish("foliage"),
     ),
-    "bush": (Finish("leaf", (0.22, 0.35, 0.11)), Finish("bark"), Finish("bark"), Finish("foliage")),
+    "bush": (
+        Finish("leaf", (0.22, 0.35, 0.11)),
+        Finish("bark"),
+        Finish("bark"),
+        Finish("foliage"),
+    ),
     "thuja": (
         Finish("leaf", (0.16, 0.29, 0.12)),
         Finish("bark"),
@@ -68,7 +73,9 @@ SPECIES: dict[str, tuple[Finish, ...]] = {
 def _rng(name: str, variant: int) -> np.random.Generator:
     """The random generator of a prototype; keyed by its species and variant, so that plants never
     change."""
-    return np.random.Generator(np.random.Philox(key=(sorted(SPECIES).index(name), variant)))
+    return np.random.Generator(
+        np.random.Philox(key=(sorted(SPECIES).index(name), variant))
+    )
 
 
 def _stem(
@@ -81,7 +88,9 @@ def _stem(
     return tube(path, radius * np.array([1.7, 1.25, 1.0, 0.9, 0.75]), 8, BARK), path
 
 
-def _branches(foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float) -> Mesh:
+def _branches(
+    foot: NDArray[np.float64], ends: NDArray[np.float64], radius: float
+) -> Mesh:
     """Branches from ``foot`` (3,) to each of ``ends`` (K, 3)."""
     return merge(
         tube(
@@ -104,7 +113,8 @@ def _leaf_clusters(
 ) -> Mesh:
     """Clusters of leaves, ``count`` triangles around each centre."""
     middle = (
-        np.repeat(centres, count, axis=0) + rng.normal(0, 1, (count * len(centres), 3)) * spread
+        np.repeat(centres, count, axis=0)
+        + rng.normal(0, 1, (count * len(centres), 3)) * spread
     )
     return leaves(middle, size * rng.uniform(0.6, 1.3, len(middle)), rng, LEAF)
 
@@ -114,25 +124,41 @@ def _blob(centre: NDArray[np.float64], radius: float, rng: np.random.Generator) 
     polar = np.linspace(0, np.pi, 5)[:, None]
     angle = 2 * np.pi * np.arange(6) / 6
     unit = np.stack(
-        [np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar) + 0 * angle],
+        [
+            np.sin(polar) * np.cos(angle),
+            np.sin(polar) * np.sin(angle),
+            np.cos(polar) + 0 * angle,
+        ],
         -1,
     )
-    return loft(centre + radius * unit * rng.normal(1, 0.2, (5, 6, 1)), CORE, closed=True)
+    return loft(
+        centre + radius * unit * rng.normal(1, 0.2, (5, 6, 1)), CORE, closed=True
+    )
 
 
 def _ellipsoid_points(
-    count: int, radii: tuple[float, float, float], middle: float, rng: np.random.Generator
+    count: int,
+    radii: tuple[float, float, float],
+    middle: float,
+    rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """(count, 3) points near the surface of an ellipsoid whose centre is ``middle`` metres above
     the origin."""
     out = rng.standard_normal((count, 3))
-    out *= rng.uniform(0.55, 1.0, (count, 1)) ** 0.6 / np.linalg.norm(out, axis=1, keepdims=True)
+    out *= rng.uniform(0.55, 1.0, (count, 1)) ** 0.6 / np.linalg.norm(
+        out, axis=1, keepdims=True
+    )
     points: NDArray[np.float64] = out * radii + (0, 0, middle)
     return points
 
 
 def _broadleaf(
-    rng: np.random.Generator, height: float, clear: float, width: float, size: float, droop: float
+    rng: np.random.Generator,
+    height: float,
+    clear: float,
+    width: float,
+    size: float,
+    droop: float,
 ) -> Mesh:
     """A broadleaf tree; sizes in metres, ``clear`` is the height of the trunk below the crown."""
     trunk, path = _stem(clear, rng.uniform(0.13, 0.24), rng)
@@ -142,14 +168,22 @@ def _broadleaf(
     branches = _branches(path[-1], crown[rng.permutation(len(crown))[:6]], 0.08)
     spread = np.array([0.42, 0.42, 0.34 + droop])
     core = [
-        _blob(0.82 * (c - (0, 0, middle)) + (0, 0, middle), 0.17 * width, rng) for c in crown[::3]
+        _blob(0.82 * (c - (0, 0, middle)) + (0, 0, middle), 0.17 * width, rng)
+        for c in crown[::3]
     ]
     return merge(
-        [trunk, branches, *core, _leaf_clusters(crown - (0, 0, droop), spread, 10, size, rng)]
+        [
+            trunk,
+            branches,
+            *core,
+            _leaf_clusters(crown - (0, 0, droop), spread, 10, size, rng),
+        ]
     )
 
 
-def _conifer(rng: np.random.Generator, height: float, clear: float, width: float) -> Mesh:
+def _conifer(
+    rng: np.random.Generator, height: float, clear: float, width: float
+) -> Mesh:
     """A conifer; sizes in metres, ``clear`` is the height at which its leaves begin."""
     trunk, _ = _stem(0.8 * height, 0.02 + 0.012 * height, rng)
     level = 1 - rng.uniform(0, 1, 420) ** 0.6
@@ -173,7 +207,11 @@ def _inner_cone(height: float, clear: float, width: float) -> Mesh:
     """The opaque cone inside a conifer."""
     angle = np.linspace(0, 2 * np.pi, 9)[:-1]
     rings = [
-        np.c_[0.33 * width * f * np.cos(angle), 0.33 * width * f * np.sin(angle), np.full(8, z)]
+        np.c_[
+            0.33 * width * f * np.cos(angle),
+            0.33 * width * f * np.sin(angle),
+            np.full(8, z),
+        ]
         for f, z in ((1.0, clear + 0.05 * height), (0.01, 0.95 * height))
     ]
     return loft(rings, LEAF, closed=True)
@@ -181,7 +219,9 @@ def _inner_cone(height: float, clear: float, width: float) -> Mesh:
 
 def _bush(rng: np.random.Generator, height: float, width: float) -> Mesh:
     """A bush; sizes in metres."""
-    crown = _ellipsoid_points(14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng)
+    crown = _ellipsoid_points(
+        14, (0.42 * width, 0.42 * width, 0.42 * height), 0.52 * height, rng
+    )
     twigs = _branches(np.zeros(3), crown[:3], 0.025)
     core = [_blob(c, 0.2 * width, rng) for c in 0.72 * crown[::2]]
     return merge([twigs, *core, _leaf_clusters(crown, 0.18, 11, 0.16, rng)])
@@ -213,19 +253,39 @@ def plant(species: str, variant: int) -> Mesh:
     match species:
         case "round":
             return _broadleaf(
-                rng, rng.uniform(7, 11), rng.uniform(2.0, 2.8), rng.uniform(5, 7.5), 0.38, 0.0
+                rng,
+                rng.uniform(7, 11),
+                rng.uniform(2.0, 2.8),
+                rng.uniform(5, 7.5),
+                0.38,
+                0.0,
             )
         case "birch":
             return _broadleaf(
-                rng, rng.uniform(9, 13), rng.uniform(1.8, 2.6), rng.uniform(4, 5.5), 0.28, 0.35
+                rng,
+                rng.uniform(9, 13),
+                rng.uniform(1.8, 2.6),
+                rng.uniform(4, 5.5),
+                0.28,
+                0.35,
             )
         case "poplar":
             return _broadleaf(
-                rng, rng.uniform(10, 14), rng.uniform(1.6, 2.2), rng.uniform(3.2, 4.2), 0.32, 0.0
+                rng,
+                rng.uniform(10, 14),
+                rng.uniform(1.6, 2.2),
+                rng.uniform(3.2, 4.2),
+                0.32,
+                0.0,
             )
         case "fruit":
             return _broadleaf(
-                rng, rng.uniform(3.6, 5.0), rng.uniform(1.1, 1.6), rng.uniform(2.8, 4.0), 0.22, 0.0
+                rng,
+                rng.uniform(3.6, 5.0),
+                rng.uniform(1.1, 1.6),
+                rng.uniform(2.8, 4.0),
+                0.22,
+                0.0,
             )
         case "spruce":
             return _conifer(rng, rng.uniform(8, 14), 0.5, rng.uniform(3.6, 5.5))
@@ -271,10 +331,16 @@ def hedge(
     growth = 0.05 if clipped else 0.16
     steps = max(3, int(length / 0.6) + 1)
     size = (
-        1 + growth * np.convolve(rng.normal(0, 1.6, steps + 2), np.full(3, 1 / 3), "valid")[:, None]
+        1
+        + growth
+        * np.convolve(rng.normal(0, 1.6, steps + 2), np.full(3, 1 / 3), "valid")[
+            :, None
+        ]
     )
     bumps = rng.normal(0, growth, (2, steps, len(profile)))
-    x = np.linspace(0, length, steps)[:, None] + rng.normal(0, 0.04, (steps, len(profile)))
+    x = np.linspace(0, length, steps)[:, None] + rng.normal(
+        0, 0.04, (steps, len(profile))
+    )
     y = depth * (profile[:, 0] + 0.5 * bumps[0]) * np.sqrt(size)
     z = height * (profile[:, 1] + 0.5 * bumps[1] * (profile[:, 1] > 0)) * size
     core = np.stack([x, y, z], -1)
@@ -286,21 +352,38 @@ def hedge(
     near = core[row, column] * (1 - way[0]) + core[row, column + 1] * way[0]
     far = core[row + 1, column] * (1 - way[0]) + core[row + 1, column + 1] * way[0]
     centres = (
-        near * (1 - way[1]) + far * way[1] + rng.normal(0, 0.04 if clipped else 0.1, (count, 3))
+        near * (1 - way[1])
+        + far * way[1]
+        + rng.normal(0, 0.04 if clipped else 0.1, (count, 3))
     )
-    return merge([loft(core, 1), *ends, leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)])
+    return merge(
+        [
+            loft(core, 1),
+            *ends,
+            leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF),
+        ]
+    )
 
 
 def tufts(
-    length: float, depth: float, height: float, per_metre: float, rng: np.random.Generator
+    length: float,
+    depth: float,
+    height: float,
+    per_metre: float,
+    rng: np.random.Generator,
 ) -> Mesh:
     """High grass and weeds along +x: thin upright triangles."""
     count = int(length * per_metre)
     foot = np.c_[
-        rng.uniform(0, length, count), rng.uniform(-depth / 2, depth / 2, count), np.zeros(count)
+        rng.uniform(0, length, count),
+        rng.uniform(-depth / 2, depth / 2, count),
+        np.zeros(count),
     ]
     angle = rng.uniform(0, 2 * np.pi, count)
     half = 0.06 * np.c_[np.cos(angle), np.sin(angle), np.zeros(count)]
-    tip = foot + np.c_[rng.normal(0, 0.08, (count, 2)), height * rng.uniform(0.4, 1.2, count)]
+    tip = (
+        foot
+        + np.c_[rng.normal(0, 0.08, (count, 2)), height * rng.uniform(0.4, 1.2, count)]
+    )
     triangles = np.stack([foot - half, foot + half, tip], 1).astype(np.float32)
     return Mesh(triangles, np.full(count, LEAF, np.int32))

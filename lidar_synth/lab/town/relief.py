@@ -16,7 +16,9 @@ _SCALE = 1 / np.sqrt(sum(w * w for w in WEIGHTS) / 12 * 0.41)
 @njit(cache=True)
 def _corner(x: int, y: int, z: int, octave: int) -> float:
     """A pseudo-random value in [0, 1) of a lattice point."""
-    h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(y) * np.uint64(
+        0xC2B2AE3D27D4EB4F
+    )
     h ^= np.uint64(z) * np.uint64(0x165667B19E3779F9) + np.uint64(octave)
     h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(32))) * np.uint64(0x94D049BB133111EB)
@@ -25,7 +27,10 @@ def _corner(x: int, y: int, z: int, octave: int) -> float:
 
 @njit(cache=True)
 def _noise(
-    points: Floats, sizes: NDArray[np.float64], weights: NDArray[np.float64], out: Floats
+    points: Floats,
+    sizes: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    out: Floats,
 ) -> None:
     for i in range(len(points)):
         total = 0.0
@@ -46,7 +51,11 @@ def _noise(
             for a in range(2):
                 for b in range(2):
                     for c in range(2):
-                        weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
+                        weight = (
+                            (u if a else 1 - u)
+                            * (v if b else 1 - v)
+                            * (w if c else 1 - w)
+                        )
                         value += weight * _corner(x + a, y + b, z + c, k)
             total += weights[k] * (value - 0.5)
         out[i] = total

@@ -165,8 +165,12 @@ def measure(
     distance = hits.distance[hit]
     material = surfaces.material[surface]
     facing = np.abs(np.einsum("ij,ij->i", hits.normal[hit], directions[hit]))
-    power = surfaces.reflectance[surface] * (1 - _GLOSS[material] * (1 - facing * facing))
-    probability = (1 - _DROPOUT[material]) * _return_probability(power, facing, distance, noise)
+    power = surfaces.reflectance[surface] * (
+        1 - _GLOSS[material] * (1 - facing * facing)
+    )
+    probability = (1 - _DROPOUT[material]) * _return_probability(
+        power, facing, distance, noise
+    )
     kept = np.flatnonzero(rng.random(len(hit), np.float32) < probability)
     hit = hit[kept]
     distance = distance[kept]
@@ -199,13 +203,17 @@ def _return_probability(
 def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
     """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without
     noise."""
-    distance_bin = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1).astype(
-        np.int32
+    distance_bin = np.minimum(
+        distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1
+    ).astype(np.int32)
+    value = (
+        power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
     )
-    value = power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
     value = value + np.float32(_RISE - 1) * np.maximum(value - np.float32(_SHOULDER), 0)
     return np.asarray(
-        np.maximum(np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0)
+        np.maximum(
+            np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0
+        )
     )
 
 

@@ -53,7 +53,9 @@ class Scene:
 
     ground: TownGround
     surfaces: Finishes = field(default_factory=Finishes)
-    pending: list[tuple[StaticObject, float, float, float, float]] = field(default_factory=list)
+    pending: list[tuple[StaticObject, float, float, float, float]] = field(
+        default_factory=list
+    )
     meshes: list[Mesh] = field(default_factory=list)
     placed: list[PlacedObject] = field(default_factory=list)
     footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -89,17 +91,24 @@ class Scene:
     def mesh(self) -> Mesh:
         """All static triangles in the world, with surface numbers as slots."""
         places = np.array([row[1:] for row in self.pending]).reshape(-1, 4)
-        points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (0, 0, 1)
+        points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (
+            0,
+            0,
+            1,
+        )
         yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
         for (item, *_), point, yaw in zip(self.pending, points, yaws, strict=True):
             rows = [
-                self.surfaces.add(f, raw) for f, raw in zip(item.finishes, item.raw, strict=True)
+                self.surfaces.add(f, raw)
+                for f, raw in zip(item.finishes, item.raw, strict=True)
             ]
             self.add_mesh(item.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
         self.pending.clear()
         return merge(self.meshes)
 
-    def poses(self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike) -> Pose:
+    def poses(
+        self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike
+    ) -> Pose:
         """(..., 4, 4) poses of objects on the ground, tilted with the ground under them.
 
         Args:
@@ -114,10 +123,17 @@ class Scene:
         c = np.cos(yaw)
         d = np.sin(yaw)
         # One kind of ground under all probes: a wheel on the kerb does not tilt the whole car.
-        probes = [(s + a * half, t + b * half) for a, b in ((c, d), (-c, -d), (-d, c), (d, -c))]
+        probes = [
+            (s + a * half, t + b * half)
+            for a, b in ((c, d), (-c, -d), (-d, c), (d, -c))
+        ]
         front, back, left, right = (self.ground.height(*p, 0) for p in probes)
-        ahead = np.stack([np.cos(heading), np.sin(heading), (front - back) / (2 * half)], -1)
-        across = np.stack([-np.sin(heading), np.cos(heading), (left - right) / (2 * half)], -1)
+        ahead = np.stack(
+            [np.cos(heading), np.sin(heading), (front - back) / (2 * half)], -1
+        )
+        across = np.stack(
+            [-np.sin(heading), np.cos(heading), (left - right) / (2 * half)], -1
+        )
         up = np.cross(ahead, across)
         ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
         up /= np.linalg.norm(up, axis=-1, keepdims=True)
@@ -139,7 +155,13 @@ class Scene:
         return self.instances, np.array(rows, np.int32)
 
     def park(
-        self, prototype: Prototype, colour: RGB, s: float, t: float, yaw: float, scale: float = 1.0
+        self,
+        prototype: Prototype,
+        colour: RGB,
+        s: float,
+        t: float,
+        yaw: float,
+        scale: float = 1.0,
     ) -> None:
         """Put a static object with an instance number on the ground."""
         instance, surfaces = self.add_instance(prototype, colour, moving=False)

@@ -47,7 +47,11 @@ def sample_light(rng: np.random.Generator) -> Light:
     height = np.radians(rng.uniform(25, 62))
     azimuth = rng.uniform(0, 2 * np.pi)
     sun = np.array(
-        [np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)],
+        [
+            np.cos(azimuth) * np.cos(height),
+            np.sin(azimuth) * np.cos(height),
+            np.sin(height),
+        ],
         np.float32,
     )
     cloud = float(np.clip(rng.normal(0.3, 0.4), 0, 1))
@@ -58,14 +62,21 @@ def sky(directions: Floats, light: Light) -> Floats:
     """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun,
     as in photos."""
     up = np.clip(directions[:, 2:], 0, 1)
-    blue = np.array([0.22, 0.44, 0.86], np.float32) * (1 - light.cloud) + 0.85 * light.cloud
+    blue = (
+        np.array([0.22, 0.44, 0.86], np.float32) * (1 - light.cloud)
+        + 0.85 * light.cloud
+    )
     colour = blue * up**0.45 + np.array([1.0, 1.02, 1.04], np.float32) * (1 - up**0.45)
     flat: Floats = (directions[:, :2] / (up + 0.12)).astype(np.float32)
-    puffs = np.sum([_value_noise(flat * k, k) / k for k in (1.5, 3.0, 6.0)], axis=0)[:, None]
+    puffs = np.sum([_value_noise(flat * k, k) / k for k in (1.5, 3.0, 6.0)], axis=0)[
+        :, None
+    ]
     white = np.clip(2.2 * (puffs - 0.62 + 0.35 * light.cloud), 0, 1) * up**0.3
     colour = colour * (1 - white) + 1.05 * white
     near = np.clip(directions @ light.sun, 0, 1)[:, None]
-    return np.asarray(colour + light.direct * (0.25 * near**8 + 2 * near**300), np.float32)
+    return np.asarray(
+        colour + light.direct * (0.25 * near**8 + 2 * near**300), np.float32
+    )
 
 
 def _value_noise(places: Floats, layer: float) -> Floats:
@@ -77,7 +88,9 @@ def _value_noise(places: Floats, layer: float) -> Floats:
     value = np.zeros(len(places), np.float32)
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         weight = (f[:, 0] if i else 1 - f[:, 0]) * (f[:, 1] if j else 1 - f[:, 1])
-        corner = np.column_stack([base[:, 0] + i, base[:, 1] + j, np.full(len(base), layer)])
+        corner = np.column_stack(
+            [base[:, 0] + i, base[:, 1] + j, np.full(len(base), layer)]
+        )
         value += weight * cell_noise(corner.astype(np.float32) + np.float32(0.5), 1.0)
     return value
 
@@ -92,7 +105,9 @@ def camera_hits(
     rays = np.flatnonzero(hits.surface != MISS)
     for _ in range(4):
         material = surfaces.material[hits.surface[rays]]
-        share = np.select([material == m for m in _OPEN_SHARE], list(_OPEN_SHARE.values()), 0.0)
+        share = np.select(
+            [material == m for m in _OPEN_SHARE], list(_OPEN_SHARE.values()), 0.0
+        )
         rays = rays[share > 0]
         share = share[share > 0]
         place = eye + hits.distance[rays, None] * directions[rays]
@@ -112,7 +127,9 @@ def camera_hits(
     return hits
 
 
-def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.uint8]) -> Floats:
+def _texture(
+    place: Floats, normal: Floats, far: Floats, material: NDArray[np.uint8]
+) -> Floats:
     """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel,
     and the joints between bricks, tiles, stones and slabs."""
     size = np.float32(0.02) * 2 ** np.ceil(np.log2(np.maximum(far / 12, 1)))
@@ -127,15 +144,23 @@ def _texture(place: Floats, normal: Floats, far: Floats, material: NDArray[np.ui
     ):
         rays = np.flatnonzero((material == INDEX[name]) & (far < near))
         row = np.floor(place[rays, 2] / height)
-        edge = (place[rays, 2] / height % 1 < 0.16) | ((along[rays] / width + 0.5 * row) % 1 < 0.07)
+        edge = (place[rays, 2] / height % 1 < 0.16) | (
+            (along[rays] / width + 0.5 * row) % 1 < 0.07
+        )
         value[rays] *= np.where(edge, 0.72, 1)
-    rays = np.flatnonzero((material == INDEX["paving"]) & (far < 14) & (normal[:, 2] > 0.8))
+    rays = np.flatnonzero(
+        (material == INDEX["paving"]) & (far < 14) & (normal[:, 2] > 0.8)
+    )
     value[rays] *= np.where((place[rays, :2] / 0.4 % 1 < 0.05).any(1), 0.8, 1)
     return value.astype(np.float32)
 
 
 def shade(
-    snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable, light: Light
+    snapshot: Snapshot,
+    eye: Floats,
+    directions: Floats,
+    surfaces: SurfaceTable,
+    light: Light,
 ) -> tuple[Floats, SceneHits]:
     """Linear RGB (N, 3) along camera rays, and their hits."""
     hits = camera_hits(snapshot, eye, directions, surfaces)
@@ -146,10 +171,16 @@ def shade(
     ray = directions[rays]
     far = hits.distance[rays]
     surface = hits.surface[rays]
-    normal = hits.normal[rays] * -np.sign(np.einsum("ij,ij->i", hits.normal[rays], ray))[:, None]
+    normal = (
+        hits.normal[rays]
+        * -np.sign(np.einsum("ij,ij->i", hits.normal[rays], ray))[:, None]
+    )
     place = eye + far[:, None] * ray
     material = surfaces.material[surface]
-    colour = surfaces.colour[surface] ** 2.2 * _texture(place, normal, far, material)[:, None]
+    colour = (
+        surfaces.colour[surface] ** 2.2
+        * _texture(place, normal, far, material)[:, None]
+    )
     # Light passes through foliage: both sides of its triangles are lit.
     leaf = (material == INDEX["leaf"]) | (material == INDEX["grass"])
     facing = normal @ light.sun
@@ -167,7 +198,10 @@ def shade(
     under = 0.55 + 0.45 * normal[:, 2]
     glow = light.ambient * under[:, None] * np.array([0.92, 0.98, 1.08], np.float32)
     shaded = colour * (
-        glow + light.direct * (lit * facing)[:, None] * np.array([1.06, 1.0, 0.90], np.float32)
+        glow
+        + light.direct
+        * (lit * facing)[:, None]
+        * np.array([1.06, 1.0, 0.90], np.float32)
     )
     _reflect(shaded, ray, normal, material, lit, light)
     haze = 1 - np.exp(-far / 700)[:, None]
@@ -192,13 +226,19 @@ def _reflect(
     picture = above * sky(mirrored, light) + (1 - above) * 0.16 * light.ambient
     glass = np.isin(material[rays], _GLASS)
     share = np.where(glass, 0.18, 0.05) + 0.75 * (1 - np.abs(across)) ** 4
-    shaded[rays] = shaded[rays] * (1 - share[:, None]) + share[:, None] * np.minimum(picture, 1.6)
+    shaded[rays] = shaded[rays] * (1 - share[:, None]) + share[:, None] * np.minimum(
+        picture, 1.6
+    )
     glint = np.clip(mirrored @ light.sun, 0, 1) ** 90 * lit[rays] * light.direct
     shaded[rays] += 0.8 * glint[:, None]
 
 
 def render(
-    snapshot: Snapshot, pose: Pose, surfaces: SurfaceTable, light: Light, rng: np.random.Generator
+    snapshot: Snapshot,
+    pose: Pose,
+    surfaces: SurfaceTable,
+    light: Light,
+    rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB camera image of the scene.
 

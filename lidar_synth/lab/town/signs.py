@@ -32,7 +32,12 @@ BOARDS: dict[str, tuple[Outline, RGB, Outline, RGB]] = {
     "information": (_rectangle(0.60, 0.60), BLUE, _rectangle(0.24, 0.40), WHITE),
     "priority": (_regular(4, 0.42), WHITE, _regular(4, 0.28), YELLOW),
     "town": (_rectangle(1.20, 0.80), YELLOW, _rectangle(0.80, 0.08, 0.06), BLACK),
-    "street": (_rectangle(0.90, 0.14), (0.12, 0.20, 0.50), _rectangle(0.70, 0.04), WHITE),
+    "street": (
+        _rectangle(0.90, 0.14),
+        (0.12, 0.20, 0.50),
+        _rectangle(0.70, 0.04),
+        WHITE,
+    ),
 }
 """The board of each sign and the symbol on it: (outline, colour, outline, colour); outlines in
 metres (left, up)."""
@@ -47,7 +52,9 @@ def road_sign(kind: str, height: float) -> StaticObject:
         return fan([(x, y, height + z) for y, z in outline], slot)
 
     pole = tube([(0, 0, -0.2), (0, 0, height + 0.3)], 0.038, 6)
-    mesh = merge([pole, flat(board, 0.05, 1), flat(mark, 0.054, 2), flat(board, 0.042, 3)])
+    mesh = merge(
+        [pole, flat(board, 0.05, 1), flat(mark, 0.054, 2), flat(board, 0.042, 3)]
+    )
     return StaticObject(
         mesh,
         (GALVANISED, Finish("sign", ground), Finish("sign", colour), GALVANISED),
@@ -65,7 +72,10 @@ def traffic_light(height: float, reach: float) -> StaticObject:
         spots.append((reach, height - 0.6))
     for y, z in spots:
         parts.append(boxes([(-0.02, y - 0.15, z)], [(0.22, y + 0.15, z + 0.9)], 1))
-        parts += [disc((0.225, y, z + 0.15 + 0.3 * i), (1, 0, 0), 0.1, 8, 2 + i) for i in range(3)]
+        parts += [
+            disc((0.225, y, z + 0.15 + 0.3 * i), (1, 0, 0), 0.1, 8, 2 + i)
+            for i in range(3)
+        ]
     colours: tuple[RGB, ...] = ((0.1, 0.5, 0.25), (0.35, 0.25, 0.05), (0.3, 0.05, 0.05))
     dark = Finish("plastic", (0.07, 0.09, 0.08))
     return StaticObject(

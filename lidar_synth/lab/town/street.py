@@ -127,14 +127,18 @@ def _crossings(
 ) -> tuple[SideStreet, ...]:
     """Sampled side streets: at closed ends, at a junction, and at random elsewhere."""
     places = [
-        SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT)) for e in ends if np.isfinite(e)
+        SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT))
+        for e in ends
+        if np.isfinite(e)
     ]
     if kind == "junction":
         middle = length * rng.uniform(0.45, 0.75) + 5
         places = [p for p in places if abs(p.s - middle) > 30]
         return (
             *places,
-            SideStreet(middle, rng.uniform(3.3, 6.8), rng.uniform(2, 3.2), (RIGHT, LEFT)),
+            SideStreet(
+                middle, rng.uniform(3.3, 6.8), rng.uniform(2, 3.2), (RIGHT, LEFT)
+            ),
         )
     for s in np.arange(-70, length + 70, 14.0) + rng.uniform(0, 14):
         apart = all(abs(s - p.s) > 45 for p in places)
@@ -181,8 +185,12 @@ def _main(
     lanes += [Lane(median + width * (i + 0.5), -1) for i in range(each)]
     if each == 2 and rng.random() < 0.5:
         lanes[0], lanes[1] = lanes[1], lanes[0]
-    parking = [str(rng.choice(["none", "bay", "street"], p=[0.4, 0.4, 0.2])) for _ in range(2)]
-    edge = [median + width * each + 0.2 + (2.2 if p == "street" else 0.0) for p in parking]
+    parking = [
+        str(rng.choice(["none", "bay", "street"], p=[0.4, 0.4, 0.2])) for _ in range(2)
+    ]
+    edge = [
+        median + width * each + 0.2 + (2.2 if p == "street" else 0.0) for p in parking
+    ]
     bands = []
     for p in parking:
         side = [Band("parking", 2.2)] if p == "bay" else []
@@ -194,7 +202,9 @@ def _main(
     return bands, edge, parking, lanes, median
 
 
-def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
+def _edge(
+    rng: np.random.Generator,
+) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
     """Sampled bands, kerbs, parking and lanes of a road at the edge of town."""
     width = rng.uniform(3.1, 4.4)
     bands = []
@@ -203,7 +213,12 @@ def _edge(rng: np.random.Generator) -> tuple[list[list[Band]], list[float], list
         if rng.random() < 0.3:
             side.append(Band("cycleway", 2.0))
         bands.append(side)
-    return bands, [width, width], ["none", "none"], [Lane(-width / 2, 1), Lane(width / 2, -1)]
+    return (
+        bands,
+        [width, width],
+        ["none", "none"],
+        [Lane(-width / 2, 1), Lane(width / 2, -1)],
+    )
 
 
 _TURNS = {"residential": 0.3, "main": 0.1, "junction": 0.4, "square": 0.25, "edge": 0.0}
@@ -241,7 +256,10 @@ def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street
     exits = [(c, side) for c in crossings for side in c.sides if 12 < c.s < length - 10]
     if turns and not exits:
         added = SideStreet(
-            0.4 * length + 4, rng.uniform(2.7, 3.4), rng.uniform(1.5, 2.2), (RIGHT, LEFT)
+            0.4 * length + 4,
+            rng.uniform(2.7, 3.4),
+            rng.uniform(1.5, 2.2),
+            (RIGHT, LEFT),
         )
         crossings = (*(c for c in crossings if abs(c.s - added.s) > 30), added)
         exits = [(added, RIGHT), (added, LEFT)]

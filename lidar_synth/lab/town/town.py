@@ -110,15 +110,24 @@ class Town:
         # from straight ahead.
         azimuths = self.sensor.firing_azimuths()
         order = np.argsort(-azimuths % (2 * np.pi), axis=1)
-        self._laser, place = np.nonzero(np.take_along_axis(free_rays(self.sensor), order, 1))
+        self._laser, place = np.nonzero(
+            np.take_along_axis(free_rays(self.sensor), order, 1)
+        )
         azimuth = azimuths[self._laser, order[self._laser, place]]
         tilt = elevation[self._laser]
         self._rays = np.stack(
-            [np.cos(azimuth) * np.cos(tilt), -np.sin(azimuth) * np.cos(tilt), np.sin(tilt)], 1
+            [
+                np.cos(azimuth) * np.cos(tilt),
+                -np.sin(azimuth) * np.cos(tilt),
+                np.sin(tilt),
+            ],
+            1,
         ).astype(np.float32)
         self._heights = height[self._laser].astype(np.float32)
         # It turns counter-clockwise and looks straight ahead at the moment of the pose.
-        self._turned = (-(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5).astype(np.float32)
+        self._turned = (-(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5).astype(
+            np.float32
+        )
         self._gains = laser_gains(self.sensor, self._noise)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
@@ -139,14 +148,21 @@ class Town:
         skin = (
             {}
             if self.skin is None
-            else {"skin": self.skin.digest, "skin_licence": self.skin.provenance["licence"]}
+            else {
+                "skin": self.skin.digest,
+                "skin_licence": self.skin.provenance["licence"],
+            }
         )
         return {"made_by": "town", "seed": self.seed, "interval": self.interval, **skin}
 
     @property
     def settings(self) -> dict[str, Any]:
         """Plain values that determine the scans, apart from their number."""
-        plain = {"seed": self.seed, "interval": self.interval, "sensor": self.sensor.to_dict()}
+        plain = {
+            "seed": self.seed,
+            "interval": self.interval,
+            "sensor": self.sensor.to_dict(),
+        }
         return {
             **plain,
             "noise": asdict(self._noise),
@@ -157,7 +173,9 @@ class Town:
     @property
     def identity(self) -> str:
         """A text that tells it from other towns."""
-        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
+        digest = hashlib.sha256(
+            json.dumps(self.settings, sort_keys=True).encode()
+        ).hexdigest()
         return f"town:{len(self)}:{digest[:16]}"
 
     @property
@@ -188,9 +206,13 @@ class Town:
         rng = rng_for(SCAN, self.seed, stretch, frame)
         world = self.world(index)
         time = frame * self.interval
-        pose = ego_pose(world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2))
+        pose = ego_pose(
+            world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2)
+        )
         about = ego_place(world.street, time)[:2]
-        movers = place_movers(world.movers, world.scene, time, about, self.sensor.range_max + 20)
+        movers = place_movers(
+            world.movers, world.scene, time, about, self.sensor.range_max + 20
+        )
         return Snapshot(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
@@ -273,7 +295,9 @@ class Town:
         travelled: NDArray[np.float32],
         surfaces: SurfaceTable,
         rng: np.random.Generator,
-    ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[
+        NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]
+    ]:
         """Laser, surface number, point in the sensor frame and reflectance of each return of one
         revolution.
 
@@ -288,14 +312,23 @@ class Town:
         hits = snapshot.cast(origins, directions, eye)
         see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
         back, far, reflectance = measure(
-            hits, origins, directions, self._laser, surfaces, self._gains, self._noise, rng
+            hits,
+            origins,
+            directions,
+            self._laser,
+            surfaces,
+            self._gains,
+            self._noise,
+            rng,
         )
         points = far[:, None] * self._rays[back]
         points[:, 2] += self._heights[back]
         points += moved[back] @ turn
         if self.skin is not None:
             boxed = surfaces.instance[hits.surface[back]] > 0
-            dressed = self.skin.apply(points, reflectance, self._laser[back], boxed, rng)
+            dressed = self.skin.apply(
+                points, reflectance, self._laser[back], boxed, rng
+            )
             points += dressed.shift[:, None] * self._rays[back]
             back = back[dressed.kept]
             points = points[dressed.kept]
@@ -304,4 +337,9 @@ class Town:
         kept = np.flatnonzero(
             (distance >= self.sensor.range_min) & (distance <= self.sensor.range_max)
         )
-        return self._laser[back[kept]], hits.surface[back[kept]], points[kept], reflectance[kept]
+        return (
+            self._laser[back[kept]],
+            hits.surface[back[kept]],
+            points[kept],
+            reflectance[kept],
+        )

@@ -125,9 +125,22 @@ class Traffic:
             if len(footprints) and _overlap(track[None], footprints):
                 return
         self._tracks.append(track)
-        instance, surfaces = self._scene.add_instance(shapes[0], colour, moving=speed > 0)
+        instance, surfaces = self._scene.add_instance(
+            shapes[0], colour, moving=speed > 0
+        )
         self.movers.append(
-            Mover(shapes, stride, along, at, start, direction, speed, instance, surfaces, scale)
+            Mover(
+                shapes,
+                stride,
+                along,
+                at,
+                start,
+                direction,
+                speed,
+                instance,
+                surfaces,
+                scale,
+            )
         )
 
     def _sample_mover(self) -> tuple[tuple[Prototype, ...], RGB]:
@@ -135,15 +148,21 @@ class Traffic:
         rng = self._rng
         if rng.random() < 0.04:
             return (motorcyclist(),), CLOTHES[rng.integers(len(CLOTHES))]
-        return (vehicles()[sample_vehicle(rng, _DRIVEN)],), PAINTS[rng.integers(len(PAINTS))]
+        return (vehicles()[sample_vehicle(rng, _DRIVEN)],), PAINTS[
+            rng.integers(len(PAINTS))
+        ]
 
     def _add_vehicles(self) -> None:
         """Add vehicles on the lanes of the stretch, and a tram on its rails."""
         street = self._street
         rng = self._rng
-        density = {"residential": 0.25, "main": 0.6, "junction": 0.55, "square": 0.4, "edge": 0.4}[
-            street.kind
-        ]
+        density = {
+            "residential": 0.25,
+            "main": 0.6,
+            "junction": 0.55,
+            "square": 0.4,
+            "edge": 0.4,
+        }[street.kind]
         for lane in street.lanes:
             mean = street.speed * rng.uniform(0.9, 1.15)
             s = rng.uniform(-70, -40)
@@ -226,7 +245,12 @@ class Traffic:
                 )
             if street.plaza == side:
                 strips.append(
-                    (side, street.front(side) + 1, street.front(side) + PLAZA_DEPTH - 2, 16)
+                    (
+                        side,
+                        street.front(side) + 1,
+                        street.front(side) + PLAZA_DEPTH - 2,
+                        16,
+                    )
                 )
         for side, low, high, mean in strips:
             for _ in range(rng.poisson(mean)):
@@ -236,21 +260,37 @@ class Traffic:
                     sign * rng.uniform(low, max(low, high)),
                     rng.uniform(-50, street.length + 60),
                 )
-        for _ in range(rng.poisson({"residential": 1, "edge": 0.2}.get(street.kind, 3))):
-            self._add_pedestrian(False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10))
+        for _ in range(
+            rng.poisson({"residential": 1, "edge": 0.2}.get(street.kind, 3))
+        ):
+            self._add_pedestrian(
+                False, rng.uniform(-10, street.length + 40), rng.uniform(-10, 10)
+            )
 
     def _add_pedestrian(self, along: bool, at: float, start: float) -> None:
         """Add a pedestrian; some of those along the street stand."""
         rng = self._rng
         bag = bool(rng.random() < 0.3)
         standing = along and bool(rng.random() < 0.2)
-        shapes = tuple(walker(p, standing, bag) for p in range(1 if standing else PHASES))
+        shapes = tuple(
+            walker(p, standing, bag) for p in range(1 if standing else PHASES)
+        )
         scale = rng.uniform(0.6, 0.8) if rng.random() < 0.12 else rng.uniform(0.9, 1.08)
         direction = int(rng.choice([-1, 1]))
         speed = 0.0 if standing else rng.uniform(0.9, 1.7)
         colour = CLOTHES[rng.integers(len(CLOTHES))]
         self._add(
-            shapes, colour, along, at, start, direction, speed, 0.25, 1.4 * scale, scale, solid=True
+            shapes,
+            colour,
+            along,
+            at,
+            start,
+            direction,
+            speed,
+            0.25,
+            1.4 * scale,
+            scale,
+            solid=True,
         )
 
     def _add_cyclists(self) -> None:
@@ -261,7 +301,9 @@ class Traffic:
         for side, direction in ((RIGHT, 1), (LEFT, -1)):
             own = street.band(side, "cycleway")
             sign = 2 * side - 1
-            kerb = street.edge[side] - (2.9 if street.parking[side] == "street" else 0.7)
+            kerb = street.edge[side] - (
+                2.9 if street.parking[side] == "street" else 0.7
+            )
             for _ in range(rng.poisson(2.2 if own else 1.1)):
                 at = sign * ((own[0] + own[1]) / 2 if own else kerb)
                 self._add(

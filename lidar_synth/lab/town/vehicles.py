@@ -65,16 +65,40 @@ _SHAPES = {
     "estate": _CarShape(
         4.70, 1.78, 1.47, 0.92, 0.28, 0.43, 0.92, 0.975, pillars=(0.55, 0.70, 0.83)
     ),
-    "suv": _CarShape(4.55, 1.84, 1.70, 1.06, 0.25, 0.41, 0.90, 0.97, pillars=(0.54, 0.71)),
-    "mpv": _CarShape(4.40, 1.78, 1.64, 0.98, 0.18, 0.40, 0.92, 0.975, pillars=(0.54, 0.72)),
+    "suv": _CarShape(
+        4.55, 1.84, 1.70, 1.06, 0.25, 0.41, 0.90, 0.97, pillars=(0.54, 0.71)
+    ),
+    "mpv": _CarShape(
+        4.40, 1.78, 1.64, 0.98, 0.18, 0.40, 0.92, 0.975, pillars=(0.54, 0.72)
+    ),
     "minivan": _CarShape(
-        4.40, 1.79, 1.82, 1.02, 0.20, 0.37, 0.95, 0.985, pillars=(0.53,), panel_from=0.60, roof=0.86
+        4.40,
+        1.79,
+        1.82,
+        1.02,
+        0.20,
+        0.37,
+        0.95,
+        0.985,
+        pillars=(0.53,),
+        panel_from=0.60,
+        roof=0.86,
     ),
     "van": _CarShape(
         4.85, 1.88, 1.95, 1.10, 0.13, 0.29, 0.96, 0.99, pillars=(0.43, 0.66), roof=0.87
     ),
     "panel_van": _CarShape(
-        5.30, 1.95, 2.30, 1.20, 0.13, 0.27, 0.97, 0.99, pillars=(0.40,), panel_from=0.41, roof=0.88
+        5.30,
+        1.95,
+        2.30,
+        1.20,
+        0.13,
+        0.27,
+        0.97,
+        0.99,
+        pillars=(0.40,),
+        panel_from=0.41,
+        roof=0.88,
     ),
 }
 VANS = ("minivan", "van", "panel_van")
@@ -94,12 +118,21 @@ def _stations(s: _CarShape) -> list[Station]:
     for p in s.pillars:
         stations.append(Station(p - 0.011, 0.19, s.belt + 0.01, s.height, 1.0, s.roof))
         glass = PAINT if p + 0.011 >= s.panel_from else GLASS
-        stations.append(Station(p + 0.011, 0.19, s.belt + 0.01, s.height, 1.0, s.roof, side=glass))
+        stations.append(
+            Station(p + 0.011, 0.19, s.belt + 0.01, s.height, 1.0, s.roof, side=glass)
+        )
     end = PAINT if s.boot else GLASS
     rear = PAINT if s.panel_from < 1 else GLASS
     stations.append(
         Station(
-            s.roof_end, 0.21, s.belt + 0.03, s.height - 0.05, 0.985, s.roof, side=end, above=rear
+            s.roof_end,
+            0.21,
+            s.belt + 0.03,
+            s.height - 0.05,
+            0.985,
+            s.roof,
+            side=end,
+            above=rear,
         )
     )
     if s.boot:
@@ -175,7 +208,13 @@ def _lorry(length: float, height: float, open_bed: bool) -> Mesh:
             boxes([(-front + 0.5, -0.8, bed)], [(back - 1.0, 0.7, bed + 0.8)], TRIM),
         ]
     else:
-        load = [boxes([(-front, -width / 2, bed - 0.1)], [(back, width / 2, height)], SECONDARY)]
+        load = [
+            boxes(
+                [(-front, -width / 2, bed - 0.1)],
+                [(back, width / 2, height)],
+                SECONDARY,
+            )
+        ]
     return merge(
         [
             shell(cab_stations, cab, width - 0.15).moved((front - cab / 2, 0, 0)),
@@ -199,14 +238,30 @@ def _coach(length: float, width: float, height: float, low: float, rails: bool) 
     stations.append(Station(0.985, low, 1.0, height - 0.08, 1.0, 0.92, above=GLASS))
     stations.append(Station(1.0, low, 1.0, height - 0.4, 0.97, 0.9))
     axles = (
-        [0.36 * length, 0.27 * length, -0.3 * length] if rails else [0.31 * length, -0.2 * length]
+        [0.36 * length, 0.27 * length, -0.3 * length]
+        if rails
+        else [0.31 * length, -0.2 * length]
     )
     return merge(
         [
             shell(stations, length, width),
             wheels(axles, 0.36 if rails else 0.48, width, arch=not rails),
-            face(length / 2 + 0.006, low + 0.2, low + 0.4, width * 0.9, (HEAD, PLATE), low + 0.1),
-            face(-length / 2 - 0.006, low + 0.4, low + 0.7, width * 0.9, (TAIL, PLATE), low + 0.2),
+            face(
+                length / 2 + 0.006,
+                low + 0.2,
+                low + 0.4,
+                width * 0.9,
+                (HEAD, PLATE),
+                low + 0.1,
+            ),
+            face(
+                -length / 2 - 0.006,
+                low + 0.4,
+                low + 0.7,
+                width * 0.9,
+                (TAIL, PLATE),
+                low + 0.2,
+            ),
             boxes(
                 [(-0.45 * length, -0.4 * width, low + 0.1)],
                 [(0.42 * length, 0.4 * width, 1.15)],
@@ -252,10 +307,17 @@ def _trailer() -> Mesh:
         (front + 0.04, side, 0.9),
         (back + 0.04, side, 0.9),
     ]
-    bars = tubes([([(front, y, 0.5), (2.2, 0, 0.45)], 0.04) for y in (-0.6, 0.6)], 4, TRIM)
+    bars = tubes(
+        [([(front, y, 0.5), (2.2, 0, 0.45)], 0.04) for y in (-0.6, 0.6)], 4, TRIM
+    )
     lights = face(back - 0.01, 0.4, 0.5, 1.4, (TAIL, PLATE), 0.38)
     return merge(
-        [boxes(low, high, SECONDARY), bars, wheels([-0.1], 0.28, 1.75, arch=False), lights]
+        [
+            boxes(low, high, SECONDARY),
+            bars,
+            wheels([-0.1], 0.28, 1.75, arch=False),
+            lights,
+        ]
     )
 
 
@@ -263,14 +325,19 @@ def _trailer() -> Mesh:
 def vehicles() -> dict[str, Prototype]:
     """The prototypes of all vehicles without a rider, by kind."""
     kinds = {
-        k: Prototype(_car(k), FINISHES, "Van" if k in VANS else "Car", (10, 252)) for k in _SHAPES
+        k: Prototype(_car(k), FINISHES, "Van" if k in VANS else "Car", (10, 252))
+        for k in _SHAPES
     }
     return kinds | {
         "box_lorry": Prototype(_lorry(7.2, 3.3, False), FINISHES, "Truck", (18, 258)),
         "small_lorry": Prototype(_lorry(5.9, 2.9, False), FINISHES, "Truck", (18, 258)),
         "flatbed": Prototype(_lorry(6.6, 2.5, True), FINISHES, "Truck", (18, 258)),
-        "bus": Prototype(_coach(11.8, 2.55, 3.05, 0.35, False), FINISHES, "Misc", (13, 257)),
-        "tram": Prototype(_coach(26.0, 2.4, 3.5, 0.30, True), FINISHES, "Tram", (16, 256)),
+        "bus": Prototype(
+            _coach(11.8, 2.55, 3.05, 0.35, False), FINISHES, "Misc", (13, 257)
+        ),
+        "tram": Prototype(
+            _coach(26.0, 2.4, 3.5, 0.30, True), FINISHES, "Tram", (16, 256)
+        ),
         "caravan": Prototype(_caravan(), FINISHES, "Misc", (20, 259)),
         "trailer": Prototype(_trailer(), FINISHES, "Misc", (20, 259)),
         "bicycle": Prototype(bicycle_mesh(), FINISHES, "", (11, 11)),

@@ -33,7 +33,9 @@ WORLD, LIGHT, SCAN, IMAGE = range(4)
 """Purposes of random numbers; each has its own generator."""
 
 
-def rng_for(purpose: int, seed: int, stretch: int, frame: int = 0) -> np.random.Generator:
+def rng_for(
+    purpose: int, seed: int, stretch: int, frame: int = 0
+) -> np.random.Generator:
     """The random generator for one purpose in a stretch or in one of its frames."""
     return np.random.Generator(
         np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame))
@@ -89,7 +91,9 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
     paint = pave(street, rng)
     paint_lots(lots, paint, rng)
     fine = (-REACH, street.length + REACH)
-    ground = TownGround(course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners)
+    ground = TownGround(
+        course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners
+    )
     scene = Scene(ground)
     rows = [scene.surfaces.add(k.finish, k.raw) for k in KINDS.values()]
     scene.add_mesh(ground.mesh(rng), np.array(rows, np.int32))
@@ -101,4 +105,6 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
     second_row(street, scene, rng)
     movers = Traffic(street, scene, times, rng).movers
     mesh = scene.mesh()
-    return World(street, scene, mesh.triangles, mesh.slot, scene.surfaces.freeze(), movers)
+    return World(
+        street, scene, mesh.triangles, mesh.slot, scene.surfaces.freeze(), movers
+    )

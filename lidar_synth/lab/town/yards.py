@@ -37,7 +37,9 @@ def build_lot(lot: Lot, street: Street, scene: Scene, rng: Rng) -> None:
             openings = [(middle - 0.6, middle + 0.6)]
         low = lot.start + 0.1
         for a, b in [*openings, (lot.end - 0.1, 0.0)]:
-            put_boundary(scene, lot.boundary, (low, a), lot.sign * (lot.front + 0.3), True, rng)
+            put_boundary(
+                scene, lot.boundary, (low, a), lot.sign * (lot.front + 0.3), True, rng
+            )
             low = b
     if lot.driveway:
         _furnish_driveway(scene, lot, house, rng)
@@ -60,12 +62,23 @@ def _furnish_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
     middle = sum(lot.driveway) / 2
     if rng.random() < 0.6:
         shed = StaticObject(garage(2.9, 6.0), finishes(rng), HOUSE)
-        _put_facing_street(scene, shed, lot, middle - 1.45, house + rng.uniform(0.5, 3), 2.9)
+        _put_facing_street(
+            scene, shed, lot, middle - 1.45, house + rng.uniform(0.5, 3), 2.9
+        )
     if rng.random() < 0.4 and lot.setback > 2.5:
         kinds = vehicles()
         kind = str(
             rng.choice(
-                ["hatchback", "compact", "sedan", "estate", "suv", "mpv", "small", "caravan"]
+                [
+                    "hatchback",
+                    "compact",
+                    "sedan",
+                    "estate",
+                    "suv",
+                    "mpv",
+                    "small",
+                    "caravan",
+                ]
             )
         )
         yaw = np.pi / 2 * (1 if rng.random() < 0.5 else -1)
@@ -85,7 +98,9 @@ def _furnish_driveway(scene: Scene, lot: Lot, house: float, rng: Rng) -> None:
         )
 
 
-def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng) -> None:
+def _plant_garden(
+    scene: Scene, lot: Lot, street: Street, house: float, rng: Rng
+) -> None:
     """Put bushes and trees in front of, beside and behind the house."""
     depth = lot.setback if lot.plan else 16.0
     width = lot.end - lot.start
@@ -102,7 +117,9 @@ def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng
             )
         )
         near = t < 15 and -35 < s < street.length + 40
-        scene.put(furniture.random_plant(species, rng, near=near), s, lot.sign * t, solid=0.5)
+        scene.put(
+            furniture.random_plant(species, rng, near=near), s, lot.sign * t, solid=0.5
+        )
     behind = house + (lot.plan.depth if lot.plan else 0)
     for _ in range(rng.poisson(width / 6)):
         species = str(rng.choice(["round", "birch", "spruce", "poplar", "fruit"]))
@@ -112,10 +129,21 @@ def _plant_garden(scene: Scene, lot: Lot, street: Street, house: float, rng: Rng
             lot.sign * (behind + rng.uniform(2, 16)),
         )
     if lot.plan and rng.random() < 0.5:
-        gap = lot.start + lot.house_offset / 2 if lot.house_offset > 2 else lot.start + 0.3
-        item = fences.clipped_hedge(8.0, rng) if rng.random() < 0.5 else fences.wire_fence(8.0, 1.2)
+        gap = (
+            lot.start + lot.house_offset / 2
+            if lot.house_offset > 2
+            else lot.start + 0.3
+        )
+        item = (
+            fences.clipped_hedge(8.0, rng)
+            if rng.random() < 0.5
+            else fences.wire_fence(8.0, 1.2)
+        )
         scene.put(
-            item, lot.start + 0.2 if lot.driveway else gap, lot.sign * house, lot.sign * np.pi / 2
+            item,
+            lot.start + 0.2 if lot.driveway else gap,
+            lot.sign * house,
+            lot.sign * np.pi / 2,
         )
     if lot.plan:
         _close_gap(scene, lot, behind, rng)
@@ -135,7 +163,11 @@ def _close_gap(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
         if draw < 0.45:
             scene.put(fences.clipped_hedge(high - low, rng), low, t)
         elif draw < 0.6:
-            scene.put(fences.bar_fence(high - low, 1.6, 0.11, (0.45, 0.35, 0.25), True), low, t)
+            scene.put(
+                fences.bar_fence(high - low, 1.6, 0.11, (0.45, 0.35, 0.25), True),
+                low,
+                t,
+            )
         elif draw < 0.8 and high - low > 3.4:
             _put_facing_street(
                 scene,
@@ -148,5 +180,9 @@ def _close_gap(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
         else:
             for s in np.arange(low + 0.7, high, 1.6):
                 scene.put(
-                    furniture.random_plant("bush", rng, rng.uniform(1.0, 1.5), near=False), s, t
+                    furniture.random_plant(
+                        "bush", rng, rng.uniform(1.0, 1.5), near=False
+                    ),
+                    s,
+                    t,
                 )

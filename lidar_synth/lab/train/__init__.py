@@ -17,7 +17,14 @@ from lidar_synth.lab.train.cache import ImageCache, Other, cache_latents, cache_
 from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.lab.train.data import Batch, Batches, Conditioning, micro_batches
 from lidar_synth.lab.train.decoding import Decoding, decoding_loss, decoding_task
-from lidar_synth.lab.train.loop import Loss, Record, Task, steps, student_task, teacher_task
+from lidar_synth.lab.train.loop import (
+    Loss,
+    Record,
+    Task,
+    steps,
+    student_task,
+    teacher_task,
+)
 from lidar_synth.lab.train.model_plan import ModelPlan, plan_model
 from lidar_synth.lab.train.models import train_model
 from lidar_synth.lab.train.optimizers import OPTIMIZERS

@@ -57,10 +57,13 @@ class Autoencoding(nn.Module):
         self.metric = metric
         self.weights = weights
         self.discriminator = (
-            Discriminator(tensors.size, losses.discriminator_width) if losses.adversarial else None
+            Discriminator(tensors.size, losses.discriminator_width)
+            if losses.adversarial
+            else None
         )
         directions = (
-            torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0) / sensor.range_max
+            torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0)
+            / sensor.range_max
         )
         self.register_buffer("rays", directions, persistent=False)
 
@@ -68,7 +71,12 @@ class Autoencoding(nn.Module):
     def objective(self) -> Objective:
         """What the autoencoder is trained for."""
         return Objective(
-            self.tensors, self.rays, self.losses, self.metric, self.weights, self.discriminator
+            self.tensors,
+            self.rays,
+            self.losses,
+            self.metric,
+            self.weights,
+            self.discriminator,
         )
 
     def forward(self, x: Tensor, noise: Tensor | None = None) -> Tensor:
@@ -99,7 +107,9 @@ class Discriminator(nn.Module):
             inputs = channels if i == 0 else width << (i - 1)
             outputs = width << i
             layers += [WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2))]
-            layers += [Norm(outputs, 1e-6), nn.LeakyReLU(0.2)] if i else [nn.LeakyReLU(0.2)]
+            layers += (
+                [Norm(outputs, 1e-6), nn.LeakyReLU(0.2)] if i else [nn.LeakyReLU(0.2)]
+            )
         self.layers = nn.Sequential(*layers, WrapConv(width << (depth - 1), 1))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -124,7 +134,9 @@ def reconstruct(codec: Latent, x: Tensor, sensor: Sensor) -> list[RangeImage]:
     return codec.tensors.to_images(codec.decode(codec.encode(x)), sensor)
 
 
-def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str, float]:
+def reconstruction_figures(
+    codec: Latent, x: Tensor, sensor: Sensor
+) -> dict[str, float]:
     """Reconstruction errors of tensors (B, C, H, W).
 
     Returns:
@@ -147,10 +159,14 @@ def reconstruction_figures(codec: Latent, x: Tensor, sensor: Sensor) -> dict[str
             "mae": float(error[both].mean()),
             "within_5cm": float((error[both] <= 0.05).sum() / (a > 0).sum()),
             "drop_accuracy": float(((a > 0) == (b > 0)).float().mean()),
-            "chamfer": _chamfer((a[..., None] * rays)[a > 0], (b[..., None] * rays)[b > 0]),
+            "chamfer": _chamfer(
+                (a[..., None] * rays)[a > 0], (b[..., None] * rays)[b > 0]
+            ),
         }
         if real.label is not None and made.label is not None:
-            figures["label_accuracy"] = float((real.label == made.label)[both.numpy()].mean())
+            figures["label_accuracy"] = float(
+                (real.label == made.label)[both.numpy()].mean()
+            )
         for name, value in figures.items():
             sums.setdefault(name, []).append(value)
     return {name: sum(values) / len(values) for name, values in sums.items()}
@@ -162,7 +178,11 @@ def _chamfer(a: Tensor, b: Tensor) -> float:
         return float("nan")
     means = []
     for some, others in ((a, b), (b, a)):
-        queries = some[torch.linspace(0, len(some) - 1, min(len(some), _QUERIES)).long()]
-        nearest = [torch.cdist(part, others).amin(1) for part in torch.split(queries, 64)]
+        queries = some[
+            torch.linspace(0, len(some) - 1, min(len(some), _QUERIES)).long()
+        ]
+        nearest = [
+            torch.cdist(part, others).amin(1) for part in torch.split(queries, 64)
+        ]
         means.append(float(torch.cat(nearest).mean()))
     return sum(means) / 2

@@ -73,11 +73,16 @@ class ImageCache:
         }
         values["range"] = values["range"].float() * self.encoding.scale
         if "reflectance" in values:
-            values["reflectance"] = values["reflectance"].float() / LEVELS["reflectance"]
+            values["reflectance"] = (
+                values["reflectance"].float() / LEVELS["reflectance"]
+            )
         return values
 
     def write(
-        self, index: int, image: RangeImage, others: Mapping[str, NDArray[np.uint8]] | None = None
+        self,
+        index: int,
+        image: RangeImage,
+        others: Mapping[str, NDArray[np.uint8]] | None = None,
     ) -> None:
         """Put a range image, and what else is kept of its scan, into its place.
 
@@ -135,7 +140,9 @@ def cache_scans(
     shape = (len(source), *sensor.shape)
     names = [name for name in DTYPES if name in set(channels)]
     layout: Layout = {name: (shape, DTYPES[name]) for name in names}
-    layout |= {name: ((len(source), *other.shape), np.uint8) for name, other in others.items()}
+    layout |= {
+        name: ((len(source), *other.shape), np.uint8) for name, other in others.items()
+    }
     if folder is None:
         cache = ImageCache({n: np.empty(*kind) for n, kind in layout.items()}, sensor)
         sums: list[int | None] = [None] * -(-len(source) // BLOCK)
@@ -150,11 +157,15 @@ def cache_scans(
             facts["others"] = {name: other.shape for name, other in others.items()}
         cache, sums = _open_folder(folder, facts, layout, sensor)
     missing = [block for block, found in enumerate(sums) if found is None]
-    for block in tqdm(missing, desc="scans", unit_scale=BLOCK, disable=not progress or not missing):
+    for block in tqdm(
+        missing, desc="scans", unit_scale=BLOCK, disable=not progress or not missing
+    ):
         for i in range(len(source))[_span(block)]:
             scan = source[i]
             image = project(scan, sensor, [n for n in names if n != "range"])
-            cache.write(i, image, {name: other.read(i, scan) for name, other in others.items()})
+            cache.write(
+                i, image, {name: other.read(i, scan) for name, other in others.items()}
+            )
         if folder is not None:
             for values in cache.fields.values():
                 values.flush()  # type: ignore[attr-defined]  # a memmap
@@ -196,9 +207,9 @@ def cache_latents(
     if path is not None and path.exists():
         try:
             found: NDArray[np.float16] = _open_array(path, "r", shape, np.float16)
-            if read_sealed(path.with_suffix(".json"), "the sum of latents")["sum"] == zlib.crc32(
-                found.data
-            ):
+            if read_sealed(path.with_suffix(".json"), "the sum of latents")[
+                "sum"
+            ] == zlib.crc32(found.data):
                 return found
             raise DataError(f"{path} is damaged")
         except (DataError, FileError, KeyError) as error:
@@ -225,7 +236,9 @@ def _open_folder(
             warnings.warn(f"{error}; the cache is made again", stacklevel=2)
     try:
         maps = {
-            n: _open_array(folder / f"{n}.npy", "r+" if None in sums else "r", *layout[n])
+            n: _open_array(
+                folder / f"{n}.npy", "r+" if None in sums else "r", *layout[n]
+            )
             for n in layout
         }
         return ImageCache(maps, sensor), sums
@@ -233,7 +246,9 @@ def _open_folder(
         pass  # a new cache, or a damaged one
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in layout:  # another run may read the old files, which must not shrink under it
+        for name in (
+            layout
+        ):  # another run may read the old files, which must not shrink under it
             (folder / f"{name}.npy").unlink(missing_ok=True)
         new = {
             n: np.lib.format.open_memmap(folder / f"{n}.npy", "w+", d, s)
@@ -241,10 +256,13 @@ def _open_folder(
         }
     except OSError as error:
         raise FileError(
-            f"the cache {folder} cannot be opened ({error})", "a folder that can be written"
+            f"the cache {folder} cannot be opened ({error})",
+            "a folder that can be written",
         ) from error
     sums = [None] * len(sums)
-    _note(folder, facts, sums)  # another run that opens the folder now does not empty the files
+    _note(
+        folder, facts, sums
+    )  # another run that opens the folder now does not empty the files
     return ImageCache(new, sensor), sums
 
 
@@ -266,7 +284,10 @@ def _check(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int | No
             "Remove it, or name another folder.",
         )
     maps = {n: _open_array(folder / f"{n}.npy", "r", *layout[n]) for n in layout}
-    intact = [s if s is None or s == _sum(maps, block) else None for block, s in enumerate(sums)]
+    intact = [
+        s if s is None or s == _sum(maps, block) else None
+        for block, s in enumerate(sums)
+    ]
     if damaged := [
         block for block, s in enumerate(sums) if s is not None and intact[block] is None
     ]:
@@ -275,13 +296,17 @@ def _check(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int | No
         )
         more = f" and {len(damaged) - 5} more blocks" if len(damaged) > 5 else ""
         warnings.warn(
-            f"{folder}: scans {named}{more} are damaged, and are made again", stacklevel=2
+            f"{folder}: scans {named}{more} are damaged, and are made again",
+            stacklevel=2,
         )
     return intact
 
 
 def _open_array(
-    path: Path, mode: Literal["r", "r+"], shape: tuple[int, ...], dtype: type[np.generic]
+    path: Path,
+    mode: Literal["r", "r+"],
+    shape: tuple[int, ...],
+    dtype: type[np.generic],
 ) -> NDArray[Any]:
     """Map an ``.npy`` file of this shape and type into memory; its header has to be the one that
     numpy writes.

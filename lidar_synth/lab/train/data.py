@@ -94,7 +94,11 @@ class Batches:
     latents: NDArray[np.float16] | None = None
 
     def __post_init__(self) -> None:
-        if self.roll and self.conditioning and not CONDITIONS[self.conditioning.name].turns:
+        if (
+            self.roll
+            and self.conditioning
+            and not CONDITIONS[self.conditioning.name].turns
+        ):
             raise ConfigError(
                 f"roll with the condition {self.conditioning.name!r}",
                 "roll=false: it does not turn",
@@ -103,7 +107,10 @@ class Batches:
     def scans_at(self, positions: Sequence[int]) -> list[int]:
         """Index of the scan at each position; every epoch is a permutation of all scans."""
         count = len(self.cache)
-        return [int(_permutation(self.seed, p // count, count)[p % count]) for p in positions]
+        return [
+            int(_permutation(self.seed, p // count, count)[p % count])
+            for p in positions
+        ]
 
     def __call__(self, positions: Sequence[int]) -> Batch:
         """The samples at these positions of the sequence."""
@@ -140,7 +147,11 @@ class Batches:
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
         """The conditions (B, ...) of the scans at these positions, without dropout and
         augmentation; None if unconditional."""
-        return None if self.conditioning is None else self._stored(self.scans_at(positions))
+        return (
+            None
+            if self.conditioning is None
+            else self._stored(self.scans_at(positions))
+        )
 
     def _stored(self, scans: Sequence[int]) -> Tensor:
         """The cached conditions (B, ...) of these scans."""
@@ -155,7 +166,9 @@ class Batches:
         assert self.conditioning is not None
         about = self.conditioning
         if about.reduction:
-            less = CONDITIONS[about.name].reduced(cond, draws[:, 4] / about.reduction, about.views)
+            less = CONDITIONS[about.name].reduced(
+                cond, draws[:, 4] / about.reduction, about.views
+            )
             cond = _where(draws[:, 4] < about.reduction, less, cond)
         return (
             _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond)
@@ -178,7 +191,8 @@ class InTurns:
     def __post_init__(self) -> None:
         if self.first.conditioning is not None:
             raise ConfigError(
-                f"rehearsal for a model with the condition {self.first.conditioning.name!r}", "none"
+                f"rehearsal for a model with the condition {self.first.conditioning.name!r}",
+                "none",
             )
 
     @property
@@ -208,7 +222,8 @@ def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
     """(count,) a permutation, a function of the seed and the epoch."""
     # One number per scan and epoch, at indices that positions (< 2^62) do not use.
     keys = uniform(
-        seed + _TRAINING, range((1 << 62) + epoch * count, (1 << 62) + (epoch + 1) * count)
+        seed + _TRAINING,
+        range((1 << 62) + epoch * count, (1 << 62) + (epoch + 1) * count),
     )
     return np.argsort(keys.numpy(), kind="stable")
 
@@ -229,7 +244,8 @@ def micro_batches(
     """
     if batch % (accumulate * processes):
         raise ConfigError(
-            f"batch {batch} over {accumulate} micro-batches and {processes} processes", "a multiple"
+            f"batch {batch} over {accumulate} micro-batches and {processes} processes",
+            "a multiple",
         )
     size = batch // (accumulate * processes)
     for i in range(accumulate):

@@ -58,7 +58,9 @@ def decoding_task(
         t = torch.full_like(batch.u, time)
         y = interpolate(z, some, t)
         left = y - time * velocity(y, t, batch.cond).float()
-        shaken = z + (2 * u - 1).clamp_min(0) * noise * some / autoencoder.scale.view(1, -1, 1, 1)
+        shaken = z + (2 * u - 1).clamp_min(0) * noise * some / autoencoder.scale.view(
+            1, -1, 1, 1
+        )
         return Example(torch.where(u < 0.5, left, shaken), batch.u, batch.y0)
 
     return task

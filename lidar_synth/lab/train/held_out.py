@@ -51,7 +51,10 @@ def read_history(folder: Path) -> list[Measured]:
         return []
     values = parse_json(read_text(path), str(path))
     try:
-        return [Measured(int(step), float(loss), float(seconds)) for step, loss, seconds in values]
+        return [
+            Measured(int(step), float(loss), float(seconds))
+            for step, loss, seconds in values
+        ]
     except (TypeError, ValueError) as error:
         raise DataError(
             f"{path} is damaged ({error})", "steps, losses and seconds", "Remove it."
@@ -96,7 +99,8 @@ class Watch:
         losses = [m.loss for m in self.measured if m.step >= begin]
         return (
             bool(losses)
-            and len(losses) - 1 - losses.index(min(losses)) >= self.config.held_out.patience
+            and len(losses) - 1 - losses.index(min(losses))
+            >= self.config.held_out.patience
         )
 
     def measure(self, training: Training) -> bool:

@@ -44,11 +44,14 @@ Loss = Callable[[nn.Module, Example, Metric], Tensor]
 def teacher_task(timesteps: str = "uniform") -> Task:
     """Flow matching with t from one of ``TIMESTEPS`` (Eq. 1)."""
     return lambda batch: replace(
-        flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u)), cond=batch.cond
+        flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u)),
+        cond=batch.cond,
     )
 
 
-def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps: int) -> Task:
+def student_task(
+    strategy: str, teacher: Velocity, grid: Sequence[float], steps: int
+) -> Task:
     """Distillation of ``teacher`` by one of ``STRATEGIES`` on the student's ``grid`` with ``steps``
     Euler steps of the teacher per piece (Algorithm 1)."""
 
@@ -61,9 +64,13 @@ def student_task(strategy: str, teacher: Velocity, grid: Sequence[float], steps:
     return task
 
 
-def several_steps_task(teacher: Velocity, grids: Sequence[Sequence[float]], steps: int) -> Task:
+def several_steps_task(
+    teacher: Velocity, grids: Sequence[Sequence[float]], steps: int
+) -> Task:
     """Distillation of ``teacher`` for several numbers of steps (``every_piece``)."""
-    return lambda batch: every_piece(teacher, batch.y0, batch.y1, grids, steps, batch.cond)
+    return lambda batch: every_piece(
+        teacher, batch.y0, batch.y1, grids, steps, batch.cond
+    )
 
 
 class Record(NamedTuple):
@@ -84,12 +91,16 @@ class Record(NamedTuple):
     teacher_evaluations: int
 
 
-def weigh_metric(metric: Metric, weights: Mapping[str, float], tensors: TensorFormat) -> Metric:
+def weigh_metric(
+    metric: Metric, weights: Mapping[str, float], tensors: TensorFormat
+) -> Metric:
     """A metric of tensors whose channels are multiplied by the roots of their weights."""
     if not weights:
         return metric
     roots = [
-        weights.get(name, 1.0) ** 0.5 for name in tensors.channels for _ in range(CHANNELS[name])
+        weights.get(name, 1.0) ** 0.5
+        for name in tensors.channels
+        for _ in range(CHANNELS[name])
     ]
 
     def of_roots(a: Tensor, b: Tensor) -> Tensor:
@@ -129,7 +140,9 @@ def steps(
     training.network.train()
     while training.step < recipe.iterations:
         rate = recipe.rate * schedule(training.step, recipe.warmup, recipe.iterations)
-        for group in (group for optimizer in optimizers for group in optimizer.param_groups):
+        for group in (
+            group for optimizer in optimizers for group in optimizer.param_groups
+        ):
             group["lr"] = rate
         parts = list(
             micro_batches(
@@ -143,7 +156,11 @@ def steps(
         total = 0.0
         evaluations = 0
         for positions in parts:
-            with nullcontext() if positions is parts[-1] else accelerator.no_sync(network):
+            with (
+                nullcontext()
+                if positions is parts[-1]
+                else accelerator.no_sync(network)
+            ):
                 with accelerator.autocast():
                     example = task(batches(positions))
                     part = loss(network, example, metric) / len(parts)

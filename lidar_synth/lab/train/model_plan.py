@@ -71,7 +71,11 @@ class ModelPlan:
         """The runs of the stages; those with iterations of their own have no share of the time."""
         return StagedRuns(
             self.folder,
-            {name: s.minutes for name, s in self.stages.items() if s.minutes is not None},
+            {
+                name: s.minutes
+                for name, s in self.stages.items()
+                if s.minutes is not None
+            },
         )
 
     def __str__(self) -> str:
@@ -97,7 +101,8 @@ class ModelPlan:
                 if path not in map(runs.checkpoint, self.stages)
             ]
             lines.append(
-                f"  {name:<10} {stage.recipe:<24} {limit}" + "".join(f"; {one}" for one in given)
+                f"  {name:<10} {stage.recipe:<24} {limit}"
+                + "".join(f"; {one}" for one in given)
             )
         lines.append(
             "The minutes are those of training; casting scans and selecting timesteps take more."
@@ -146,12 +151,15 @@ def plan_model(
     if path is None:
         names = ", ".join(one.name for one in published_models())
         raise ConfigError(
-            f"model {str(model)!r}", f"a YAML file with the key 'stages', or one of {names}"
+            f"model {str(model)!r}",
+            f"a YAML file with the key 'stages', or one of {names}",
         )
     name = path.stem
     settings = load_model(path)
     if until is not None and until not in settings.stages:
-        raise ConfigError(f"--until {until!r}", f"a stage of {name}: {', '.join(settings.stages)}")
+        raise ConfigError(
+            f"--until {until!r}", f"a stage of {name}: {', '.join(settings.stages)}"
+        )
     last = until or list(settings.stages)[-1]
     given = _split(name, overrides, settings)
     folder = Path(given.pop(OUTPUT, [f"runs/{name}"])[-1])
@@ -160,7 +168,11 @@ def plan_model(
     for stage_name, stage in settings.stages.items():
         stages[stage_name] = _planned(stage_name, stage, path, runs, given[stage_name])
     stages = _needed(stages, last, runs)
-    limit = sum(stage.minutes or 0.0 for stage in stages.values()) if minutes is None else minutes
+    limit = (
+        sum(stage.minutes or 0.0 for stage in stages.values())
+        if minutes is None
+        else minutes
+    )
     out = runs.checkpoint(last) if until else folder / f"{name}.safetensors"
     plan = ModelPlan(name, folder, stages, limit, out)
     _check_minutes(plan)
@@ -173,7 +185,9 @@ def is_missing(path: Path) -> bool:
     return str(path) not in shipped_models() and not path.is_file()
 
 
-def _split(model: str, overrides: Sequence[str], settings: ModelConfig) -> dict[str, list[str]]:
+def _split(
+    model: str, overrides: Sequence[str], settings: ModelConfig
+) -> dict[str, list[str]]:
     """{name of a stage: overrides of its recipe, those for all stages first}; the model's folder
     under ``OUTPUT``."""
     every, own = [], {name: [] for name in settings.stages}  # type: ignore[var-annotated]
@@ -214,20 +228,26 @@ def _planned(
     if timed:
         values["recipe"] = {"iterations": ENDLESS, "schedule": "trapezoid"}
     distils = command_of({**read_values(recipe, Run), **values}) == "distill"
-    kind: type[TrainConfig] | type[DistillConfig] = DistillConfig if distils else TrainConfig
+    kind: type[TrainConfig] | type[DistillConfig] = (
+        DistillConfig if distils else TrainConfig
+    )
     config = load_config(kind, recipe, overrides, values)
     if timed and config.recipe.schedule != "trapezoid":
         given = f"{name}.recipe.schedule={config.recipe.schedule} with a limit of time"
         raise ConfigError(given, "trapezoid", f"Or give {name}.recipe.iterations=N.")
     starts = {
-        key: Path(start) for key in PARENTS if (start := getattr(config, key, None)) is not None
+        key: Path(start)
+        for key in PARENTS
+        if (start := getattr(config, key, None)) is not None
     }
     of_others = {
         key: other
         for key, other in stage.needs.items()
         if "/" in other and str(starts.get(key)) == values[key]
     }
-    return PlannedStage(str(recipe), config, stage.minutes if timed else None, starts, of_others)
+    return PlannedStage(
+        str(recipe), config, stage.minutes if timed else None, starts, of_others
+    )
 
 
 def _needed(

@@ -15,7 +15,11 @@ import torch
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import load_checkpoint, read_header, save_checkpoint
+from lidar_synth.generate.checkpoint import (
+    load_checkpoint,
+    read_header,
+    save_checkpoint,
+)
 from lidar_synth.generate.loading import find_model
 from lidar_synth.lab.train.model_plan import ModelPlan, is_missing
 from lidar_synth.lab.train.resume import check_resumed
@@ -57,7 +61,9 @@ def train_model(plan: ModelPlan) -> Path:
     for number, (name, stage) in enumerate(plan.stages.items(), 1):
         if runs.is_done(name) and _still_done(plan, name):
             continue
-        tqdm.write(f"{plan.name}: stage {number} of {len(plan.stages)}, {name} ({stage.recipe})")
+        tqdm.write(
+            f"{plan.name}: stage {number} of {len(plan.stages)}, {name} ({stage.recipe})"
+        )
         if stage.minutes is None:
             run(stage.config, resume=True)
         else:
@@ -78,10 +84,12 @@ def _check_starts(plan: ModelPlan, name: str) -> None:
         if key in stage.of_others:
             model, _, other = stage.of_others[key].partition("/")
             expected = f"the checkpoint of the stage {other} of {model}"
-            own = "" if path.parents[1] == Path("runs", model) else f" output={path.parents[1]}"
-            hint = (
-                f"Type `lidar-synth train {model} --until {other}{own}` first, or give {hint[5:]}"
+            own = (
+                ""
+                if path.parents[1] == Path("runs", model)
+                else f" output={path.parents[1]}"
             )
+            hint = f"Type `lidar-synth train {model} --until {other}{own}` first, or give {hint[5:]}"
         raise ConfigError(f"{name}.{key}={path}, which does not exist", expected, hint)
 
 
@@ -91,7 +99,9 @@ def _still_done(plan: ModelPlan, name: str) -> bool:
     stage = plan.stages[name]
     folder = plan.runs.folder_of(name)
     done = iterations_of(stage.config)
-    config = stage.config if stage.minutes is None else set_iterations(stage.config, done)
+    config = (
+        stage.config if stage.minutes is None else set_iterations(stage.config, done)
+    )
     check_resumed(config)
     facts = read_header(plan.runs.checkpoint(name))[0].provenance
     for key, path in stage.starts.items():
@@ -112,11 +122,18 @@ def _export(plan: ModelPlan, last: str) -> Path:
         facts = read_header(plan.runs.checkpoint(name))[0].provenance
         stages[name] = {"recipe": stage.recipe, "iterations": facts["iterations"]}
     header = checkpoint.header
-    header = replace(header, provenance=header.provenance | {"model": plan.name, "stages": stages})
+    header = replace(
+        header, provenance=header.provenance | {"model": plan.name, "stages": stages}
+    )
     size = 4 * sum(
-        p.numel() for network in checkpoint.networks.values() for p in network.parameters()
+        p.numel()
+        for network in checkpoint.networks.values()
+        for p in network.parameters()
     )
     save_checkpoint(
-        plan.out, header, checkpoint.networks, torch.float16 if size >= LARGE else torch.float32
+        plan.out,
+        header,
+        checkpoint.networks,
+        torch.float16 if size >= LARGE else torch.float32,
     )
     return plan.out

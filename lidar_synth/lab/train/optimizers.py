@@ -42,12 +42,15 @@ def muon(
     """
     if not hasattr(torch.optim, "Muon"):
         raise LibraryError(
-            f"torch {torch.__version__}, which has no Muon", "torch >= 2.9", "Or optimizer: adamw."
+            f"torch {torch.__version__}, which has no Muon",
+            "torch >= 2.9",
+            "Or optimizer: adamw.",
         )
     matrices = _matrices(network)
     if not matrices:
         raise ConfigError(
-            f"optimizer 'muon' for {type(network).__name__}", "a transformer such as hdit, or adamw"
+            f"optimizer 'muon' for {type(network).__name__}",
+            "a transformer such as hdit, or adamw",
         )
     chosen = {id(p) for p in matrices}
     rest = [p for p in network.parameters() if id(p) not in chosen]
@@ -76,8 +79,14 @@ def _in_float32() -> "type[torch.optim.Muon]":
 class _Float32(TorchFunctionMode):
     """``Tensor.bfloat16()`` gives a copy in the tensor's own precision."""
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return args[0].clone() if func is Tensor.bfloat16 else func(*args, **(kwargs or {}))
+    def __torch_function__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        return (
+            args[0].clone()
+            if func is Tensor.bfloat16
+            else func(*args, **(kwargs or {}))
+        )
 
 
 def _matrices(network: nn.Module) -> list[Tensor]:
@@ -91,7 +100,9 @@ def _matrices(network: nn.Module) -> list[Tensor]:
     return [layer.weight for layer in layers if isinstance(layer, nn.Linear)]
 
 
-OPTIMIZERS: dict[str, Callable[[nn.Module, float, tuple[float, float], float], list[Optimizer]]] = {
+OPTIMIZERS: dict[
+    str, Callable[[nn.Module, float, tuple[float, float], float], list[Optimizer]]
+] = {
     "adamw": adamw,
     "muon": muon,
 }

@@ -25,7 +25,11 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, resize_image
-from lidar_synth.generate.flow.path import METRICS, balanced_velocity_loss, velocity_loss
+from lidar_synth.generate.flow.path import (
+    METRICS,
+    balanced_velocity_loss,
+    velocity_loss,
+)
 from lidar_synth.generate.flow.solvers import mean_velocity, uniform_grid
 from lidar_synth.generate.flow.timesteps import Selection, select_timesteps
 from lidar_synth.generate.models import build_network
@@ -33,13 +37,27 @@ from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.town.town import Town
-from lidar_synth.lab.train.autoencoder import Autoencoding, autoencoder_loss, reconstruction_task
+from lidar_synth.lab.train.autoencoder import (
+    Autoencoding,
+    autoencoder_loss,
+    reconstruction_task,
+)
 from lidar_synth.lab.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.lab.train.config import Data, DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.data import Batches, Conditioning
 from lidar_synth.lab.train.decoding import Decoding, decoding_loss, decoding_task
-from lidar_synth.lab.train.loop import Loss, Task, several_steps_task, student_task, teacher_task
-from lidar_synth.lab.train.selection import load_selection, save_selection, selection_settings
+from lidar_synth.lab.train.loop import (
+    Loss,
+    Task,
+    several_steps_task,
+    student_task,
+    teacher_task,
+)
+from lidar_synth.lab.train.selection import (
+    load_selection,
+    save_selection,
+    selection_settings,
+)
 from lidar_synth.lab.train.start import (
     add_recordings,
     fresh_networks,
@@ -78,15 +96,23 @@ class TrainingPlan:
 
     def codec(self) -> Codec:
         """The codec between tensors and states."""
-        return make_codec(self.autoencoder, self.header.tensors, self.header.sensor.shape)
+        return make_codec(
+            self.autoencoder, self.header.tensors, self.header.sensor.shape
+        )
 
     def parts(self, network: nn.Module) -> dict[str, nn.Module]:
         """The parts of the checkpoint, from the network or its averaged copy."""
-        trained = {CODEC: network.network} if isinstance(network, Autoencoding) else split(network)
+        trained = (
+            {CODEC: network.network}
+            if isinstance(network, Autoencoding)
+            else split(network)
+        )
         return {**trained, **self.frozen}
 
 
-def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -> TrainingPlan:
+def make_plan(
+    config: TrainConfig | DistillConfig, accelerator: "Accelerator"
+) -> TrainingPlan:
     """The plan of a teacher, an autoencoder, a decoder or a student.
 
     Raises:
@@ -97,14 +123,20 @@ def make_plan(config: TrainConfig | DistillConfig, accelerator: "Accelerator") -
     elif config.decoder:
         plan = plan_decoder(config, accelerator)
     else:
-        plan = plan_autoencoder(config) if config.autoencodes else plan_teacher(config, accelerator)
+        plan = (
+            plan_autoencoder(config)
+            if config.autoencodes
+            else plan_teacher(config, accelerator)
+        )
     return replace(plan, header=add_recordings(config, plan.header))
 
 
 def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPlan:
     """Flow matching, from random weights or from those of ``config.init``."""
     task = teacher_task(config.timesteps)
-    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
+    networks, header = (
+        start_networks(config) if config.init is not None else fresh_networks(config)
+    )
     if config.codec is not None and CODEC not in networks:
         networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
     autoencoder = networks.get(CODEC)
@@ -115,7 +147,9 @@ def plan_teacher(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
 
 def plan_autoencoder(config: TrainConfig) -> TrainingPlan:
     """An autoencoder, from random weights or from those of ``config.init``."""
-    networks, header = start_networks(config) if config.init is not None else fresh_networks(config)
+    networks, header = (
+        start_networks(config) if config.init is not None else fresh_networks(config)
+    )
     recipe = config.recipe
     network: Any = networks[CODEC]
     trained = Autoencoding(
@@ -135,7 +169,8 @@ def plan_decoder(config: TrainConfig, accelerator: "Accelerator") -> TrainingPla
     network = networks[CODEC]
     if not isinstance(network, BoundedAutoencoder):
         raise ConfigError(
-            f"decoder with init {config.init}", "a model whose autoencoder predicts distributions"
+            f"decoder with init {config.init}",
+            "a model whose autoencoder predicts distributions",
         )
     frozen = {
         name: part.requires_grad_(False).to(accelerator.device)
@@ -167,10 +202,13 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         )
     teacher = load_checkpoint(config.teacher, accelerator.device)
     if VELOCITY not in teacher.networks:
-        raise ConfigError(f"teacher {config.teacher}, an autoencoder", "a model that generates")
+        raise ConfigError(
+            f"teacher {config.teacher}, an autoencoder", "a model that generates"
+        )
     if teacher.header.networks[VELOCITY].arguments.get("ends"):
         raise ConfigError(
-            f"teacher {config.teacher}, a student of several numbers of steps", "its teacher"
+            f"teacher {config.teacher}, a student of several numbers of steps",
+            "its teacher",
         )
     _check_scans(config, teacher.header)
     if CODEC in teacher.networks and config.recipe.weights:
@@ -186,13 +224,19 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         provenance=provenance,
     )
     student = join(load_checkpoint(config.teacher).networks)
-    plan = TrainingPlan(student, teacher_task(), header, frozen=_codec_of(teacher.networks))
+    plan = TrainingPlan(
+        student, teacher_task(), header, frozen=_codec_of(teacher.networks)
+    )
     if config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
-        provenance |= {"selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}}
+        provenance |= {
+            "selection": {"cost": found.cost, "uniform_cost": found.uniform_cost}
+        }
         others = tuple(found.grid_of(intervals) for intervals in config.also)
-        header = replace(header, time_grid=found.grid, other_grids=others, provenance=provenance)
+        header = replace(
+            header, time_grid=found.grid, other_grids=others, provenance=provenance
+        )
     if config.also:
         return _student_of_several_steps(config, plan, flow, header)
     return replace(
@@ -209,7 +253,11 @@ def _check_scans(config: DistillConfig, teacher: Header) -> None:
         ConfigError: naming the scans that the teacher learnt from.
     """
     learnt_from = teacher.provenance.get("data")
-    if config.data.town is None or not isinstance(learnt_from, dict) or not learnt_from.get("path"):
+    if (
+        config.data.town is None
+        or not isinstance(learnt_from, dict)
+        or not learnt_from.get("path")
+    ):
         return
     raise ConfigError(
         f"data.town={config.data.town} for teacher {config.teacher}, which learnt from "
@@ -232,11 +280,19 @@ def _student_of_several_steps(
         )
     part = held._replace(arguments=held.arguments | {"ends": True})
     networks[VELOCITY] = build_network(*part)
-    networks[VELOCITY].load_state_dict(split(plan.network)[VELOCITY].state_dict(), strict=False)
+    networks[VELOCITY].load_state_dict(
+        split(plan.network)[VELOCITY].state_dict(), strict=False
+    )
     header = replace(header, networks=header.networks | {VELOCITY: part})
-    task = several_steps_task(flow, (header.time_grid, *header.other_grids), config.steps)
+    task = several_steps_task(
+        flow, (header.time_grid, *header.other_grids), config.steps
+    )
     return replace(
-        plan, network=join(networks), task=task, header=header, loss=balanced_velocity_loss
+        plan,
+        network=join(networks),
+        task=task,
+        header=header,
+        loss=balanced_velocity_loss,
     )
 
 
@@ -271,7 +327,9 @@ def open_data(
         if condition.field == "label":  # a channel of the range image
             channels.add("label")
         else:
-            others[condition.field] = Other(shape, _reader(name, source, sensor, shape, options))
+            others[condition.field] = Other(
+                shape, _reader(name, source, sensor, shape, options)
+            )
     kept = given.cache or config.output / folder
     cache = cache_scans(source, sensor, channels, kept, given.describe(), others=others)
     codec = plan.codec() if plan.autoencoder is not None else None
@@ -281,11 +339,17 @@ def open_data(
     if codec is None or not given.latents:
         return batches
     made_by = network_hash(plan.parts(plan.network)[CODEC])
-    return replace(batches, latents=cache_latents(cache, tensors, codec, device, kept, made_by))
+    return replace(
+        batches, latents=cache_latents(cache, tensors, codec, device, kept, made_by)
+    )
 
 
 def _reader(
-    name: str, source: Source, sensor: Sensor, shape: tuple[int, ...], options: dict[str, Any]
+    name: str,
+    source: Source,
+    sensor: Sensor,
+    shape: tuple[int, ...],
+    options: dict[str, Any],
 ) -> Callable[[int, Scan], NDArray[np.uint8]]:
     """What reads the condition of a scan; the town renders its images when they are needed."""
     if name == "camera" and isinstance(source, Town):
@@ -309,7 +373,9 @@ def _selection(
         except DataError as error:
             warnings.warn(f"{error}; the timesteps are selected again", stacklevel=2)
     conditions = (
-        open_data(config, plan, accelerator.device).conditions if plan.header.conditioning else None
+        open_data(config, plan, accelerator.device).conditions
+        if plan.header.conditioning
+        else None
     )
     with accelerator.autocast():
         selection = select_timesteps(

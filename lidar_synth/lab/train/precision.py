@@ -16,7 +16,11 @@ def choose_precision(asked: str) -> str:
     Args:
         asked: "no" = float32, or "bf16".
     """
-    gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
+    gpu = (
+        torch.cuda.is_available()
+        or torch.xpu.is_available()
+        or torch.backends.mps.is_available()
+    )
     return asked if asked == "no" or gpu or faster_in_bfloat16() else "no"
 
 

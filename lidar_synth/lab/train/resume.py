@@ -41,7 +41,9 @@ def check_resumed(config: Run) -> None:
     now = flat(config.model_dump(mode="json"))
     if now[MORE] > before[MORE] or _same_steps(config, began.recipe.iterations):
         before[MORE] = now[MORE]
-    if differs := [k for k in before | now if before.get(k) != now.get(k) and k not in HARMLESS]:
+    if differs := [
+        k for k in before | now if before.get(k) != now.get(k) and k not in HARMLESS
+    ]:
         raise _other(config, differs, before, now)
 
 
@@ -84,7 +86,8 @@ def check_parents(config: Run, header: Header) -> None:
     if not path.exists():  # killed before its first checkpoint
         return
     before, now = (
-        {k: str(h.provenance.get(k)) for k in PARENTS} for h in (read_header(path)[0], header)
+        {k: str(h.provenance.get(k)) for k in PARENTS}
+        for h in (read_header(path)[0], header)
     )
     if differs := [k for k in PARENTS if before[k] != now[k]]:
         raise _other(config, differs, before, now)
@@ -93,7 +96,9 @@ def check_parents(config: Run, header: Header) -> None:
 def _other(
     config: Run, differs: list[str], before: Mapping[str, Any], now: Mapping[str, Any]
 ) -> ConfigError:
-    named = [f"{key}={now.get(key)!r} (it began with {before.get(key)!r})" for key in differs]
+    named = [
+        f"{key}={now.get(key)!r} (it began with {before.get(key)!r})" for key in differs
+    ]
     more = f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
     return ConfigError(
         f"--resume of {config.output} with {', '.join(named[:_SHOWN])}{more}",

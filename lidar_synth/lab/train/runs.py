@@ -31,7 +31,11 @@ from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.lab.train.autoencoder import Autoencoding, reconstruct, reconstruction_figures
+from lidar_synth.lab.train.autoencoder import (
+    Autoencoding,
+    reconstruct,
+    reconstruction_figures,
+)
 from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.data import Batches, InTurns
 from lidar_synth.lab.train.held_out import Watch, open_watch
@@ -49,7 +53,9 @@ _LOG_EVERY = 10  # steps between two numbers in the logs
 
 
 def run(
-    config: TrainConfig | DistillConfig, resume: bool = False, minutes: float | None = None
+    config: TrainConfig | DistillConfig,
+    resume: bool = False,
+    minutes: float | None = None,
 ) -> Path:
     """Train a teacher, an autoencoder or a student, with a progress bar, logs, pictures and saved
     states.
@@ -80,12 +86,16 @@ def run(
     if state.exists():
         if not resume:
             raise ConfigError(
-                f"{config.output} holds a run", "--resume to continue it, or another output=FOLDER"
+                f"{config.output} holds a run",
+                "--resume to continue it, or another output=FOLDER",
             )
         set_damaged_aside(config.output)
     if state.exists():
         check_resumed(config)
-    with _accelerator(config) as accelerator, _lock(config, accelerator.is_main_process):
+    with (
+        _accelerator(config) as accelerator,
+        _lock(config, accelerator.is_main_process),
+    ):
         plan = make_plan(config, accelerator)
         training = Training(plan.network.to(accelerator.device), config.recipe)
         if state.exists():
@@ -114,7 +124,9 @@ def require_accelerate() -> None:
         import accelerate  # noqa: F401
     except ImportError as error:
         hint = "pip install 'lidar_synth[train]'"
-        raise LibraryError("Accelerate is not installed", "the extra 'train'", hint) from error
+        raise LibraryError(
+            "Accelerate is not installed", "the extra 'train'", hint
+        ) from error
 
 
 @contextmanager
@@ -130,7 +142,10 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
 
     by_caller = is_initialized()
     precision = choose_precision(config.precision)
-    if by_caller and AcceleratorState().mixed_precision not in (config.precision, precision):
+    if by_caller and AcceleratorState().mixed_precision not in (
+        config.precision,
+        precision,
+    ):
         given = f"precision={config.precision}, where this process has set up Accelerate with"
         raise ConfigError(
             f"{given} {AcceleratorState().mixed_precision!r}",
@@ -138,9 +153,15 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
         )
     # Without cpu=True, Accelerate treats the processes of torchrun on a machine without GPU as
     # separate runs.
-    gpu = torch.cuda.is_available() or torch.xpu.is_available() or torch.backends.mps.is_available()
+    gpu = (
+        torch.cuda.is_available()
+        or torch.xpu.is_available()
+        or torch.backends.mps.is_available()
+    )
     try:
-        yield Accelerator(mixed_precision=precision, cpu="LOCAL_RANK" in os.environ and not gpu)
+        yield Accelerator(
+            mixed_precision=precision, cpu="LOCAL_RANK" in os.environ and not gpu
+        )
     finally:
         if not by_caller:
             AcceleratorState._reset_state()
@@ -185,10 +206,16 @@ def _train(
         data = open_data(config, plan, accelerator.device)
         batches: Batches | InTurns = data
         if config.rehearsal is not None:
-            others = open_data(config, plan, accelerator.device, config.rehearsal, "rehearsal")
+            others = open_data(
+                config, plan, accelerator.device, config.rehearsal, "rehearsal"
+            )
             batches = InTurns(data, replace(others, seed=config.seed + 1))
     training.began = time.monotonic()  # preparing the data is no training
-    log = _Log(config, training.step, minutes is not None) if accelerator.is_main_process else None
+    log = (
+        _Log(config, training.step, minutes is not None)
+        if accelerator.is_main_process
+        else None
+    )
     watch = (
         open_watch(config, plan, training, accelerator)
         if config.held_out and log is not None
@@ -200,13 +227,20 @@ def _train(
     for record in steps(training, plan.task, batches, accelerator, plan.loss):
         # All processes stop at the same step, whose clock ever is ahead.
         stops = time.monotonic() > end or (watch is not None and watch.exhausted)
-        late = accelerator.reduce(torch.tensor(float(stops), device=accelerator.device)).item() > 0
+        late = (
+            accelerator.reduce(
+                torch.tensor(float(stops), device=accelerator.device)
+            ).item()
+            > 0
+        )
         last = late or record.step == config.recipe.iterations
         if log is not None:
             log.add(record)
             if last or record.step % config.save_every == 0:
                 _save(config, plan, training, data, watch)
-            if config.samples.every and (last or record.step % config.samples.every == 0):
+            if config.samples.every and (
+                last or record.step % config.samples.every == 0
+            ):
                 with accelerator.autocast():
                     log.picture(plan, training, data)
         if late:
@@ -218,7 +252,11 @@ def _train(
 
 
 def _save(
-    config: Run, plan: TrainingPlan, training: Training, data: Batches, watch: Watch | None
+    config: Run,
+    plan: TrainingPlan,
+    training: Training,
+    data: Batches,
+    watch: Watch | None,
 ) -> None:
     """Write the checkpoint, if it is the best, and then the state: what is lost in between is
     trained again."""
@@ -253,7 +291,11 @@ class _Log:
         mean = sum(r.loss for r in self.records) / len(self.records)
         evaluations = sum(r.teacher_evaluations for r in self.records)
         self.records.clear()
-        for name, value in (("loss", mean), ("gradient", record.gradient), ("rate", record.rate)):
+        for name, value in (
+            ("loss", mean),
+            ("gradient", record.gradient),
+            ("rate", record.rate),
+        ):
             self.board.add_scalar(name, value, record.step)
         if evaluations:
             self.board.add_scalar("teacher_evaluations", evaluations, record.step)
@@ -272,7 +314,9 @@ class _Log:
         if isinstance(training.average, Autoencoding):
             given = self._reconstructions(plan, training.average, data)
         else:
-            generator = Generator(name, training.average, plan.header, autoencoder=plan.autoencoder)
+            generator = Generator(
+                name, training.average, plan.header, autoencoder=plan.autoencoder
+            )
             given = generator.scans(0, some, data.conditions(some))
         write_view(
             self.config.output / "samples" / f"{training.step:07d}.png",
@@ -286,7 +330,9 @@ class _Log:
         """Real range images, each followed by its reconstruction; figures go to the logs."""
         codec = Latent(trained.network, plan.header.tensors)
         images = data(range(self.config.samples.count)).y0
-        for name, value in reconstruction_figures(codec, images, plan.header.sensor).items():
+        for name, value in reconstruction_figures(
+            codec, images, plan.header.sensor
+        ).items():
             self.board.add_scalar(f"reconstruction/{name}", value, self.bar.n)
         pairs = zip(
             plan.header.tensors.to_images(images, plan.header.sensor),

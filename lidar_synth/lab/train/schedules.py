@@ -19,11 +19,18 @@ def cosine(step: int, warmup: int, iterations: int) -> float:
     return (1 + math.cos(math.pi * (step - warmup) / max(1, iterations - warmup))) / 2
 
 
-def trapezoid(step: int, warmup: int, iterations: int, decay: float = 1 - PLATEAU) -> float:
+def trapezoid(
+    step: int, warmup: int, iterations: int, decay: float = 1 - PLATEAU
+) -> float:
     """Linear from 0 over ``warmup`` steps, constant, then linear to 0 over the last quarter: up to
     there a run does not depend on ``iterations``, which may still be changed."""
-    return min(1.0, (step + 1) / max(1, warmup), (iterations - step) / (decay * iterations))
+    return min(
+        1.0, (step + 1) / max(1, warmup), (iterations - step) / (decay * iterations)
+    )
 
 
-SCHEDULES: dict[str, Callable[[int, int, int], float]] = {"cosine": cosine, "trapezoid": trapezoid}
+SCHEDULES: dict[str, Callable[[int, int, int], float]] = {
+    "cosine": cosine,
+    "trapezoid": trapezoid,
+}
 """Learning rates by name: (step, warm-up, iterations) to a factor in [0, 1]."""

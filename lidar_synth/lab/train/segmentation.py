@@ -25,7 +25,9 @@ RATE = 4e-3
 """The highest learning rate."""
 
 
-def endless_batches(mixed: MixedScans, batch: int, workers: int = 0) -> Iterator[Images]:
+def endless_batches(
+    mixed: MixedScans, batch: int, workers: int = 0
+) -> Iterator[Images]:
     """Epoch after epoch of a mixture.
 
     Args:
@@ -44,7 +46,9 @@ def endless_batches(mixed: MixedScans, batch: int, workers: int = 0) -> Iterator
         persistent_workers=workers > 0,
     )
     for epoch in count():
-        mixed.set_epoch(epoch)  # another order, fresh synthetic scans; persistent workers are told
+        mixed.set_epoch(
+            epoch
+        )  # another order, fresh synthetic scans; persistent workers are told
         yield from loader
 
 
@@ -89,7 +93,8 @@ def train_segmenter(
         target = batch["label"].long()
         if not bool((target != IGNORE).any()):
             raise DataError(
-                "a batch without one valid label", "at least one label that is not 255 = ignore"
+                "a batch without one valid label",
+                "at least one label that is not 255 = ignore",
             )
         inputs = segmenter_input(batch["range"], batch["reflectance"], height)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=half):
@@ -108,5 +113,7 @@ def train_segmenter(
     bar.close()
     network.eval()
     if len(losses) < steps:
-        raise DataError(f"{len(losses)} batches for {steps} steps", "as many batches as steps")
+        raise DataError(
+            f"{len(losses)} batches for {steps} steps", "as many batches as steps"
+        )
     return losses

@@ -34,7 +34,10 @@ def selection_settings(config: DistillConfig, header: Header) -> dict[str, Any]:
         "selection": config.selection.model_dump(exclude={"batch"}),
     }
     if config.weaker is not None:
-        settings |= {"weaker": header.provenance["weaker"], "within": list(config.within)}
+        settings |= {
+            "weaker": header.provenance["weaker"],
+            "within": list(config.within),
+        }
     if header.conditioning:  # each trajectory has the condition of a scan
         settings |= {"data": config.data.describe(), "seed": config.seed}
     return flat(json.loads(json.dumps(settings)))
@@ -47,7 +50,9 @@ def save_selection(path: Path, selection: Selection, settings: dict[str, Any]) -
         FileError: where it cannot be written.
     """
     write_arrays(
-        path, asdict(selection) | {"settings": np.array(json.dumps(settings, sort_keys=True))}
+        path,
+        asdict(selection)
+        | {"settings": np.array(json.dumps(settings, sort_keys=True))},
     )
 
 
@@ -59,7 +64,9 @@ def load_selection(path: Path, settings: dict[str, Any]) -> Selection:
         DataError: where it is damaged.
     """
     found, made = _read(path)
-    if other := sorted(key for key in made | settings if made.get(key) != settings.get(key)):
+    if other := sorted(
+        key for key in made | settings if made.get(key) != settings.get(key)
+    ):
         raise ConfigError(
             f"{path}, which was made with "
             + ", ".join(f"{key}={made.get(key)!r}" for key in other),
@@ -83,4 +90,6 @@ def _read(path: Path) -> tuple[Selection, dict[str, Any]]:
         )
         return found, dict(parse_json(str(values["settings"]), str(path)))
     except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(f"{path} is damaged ({error})", "a selection of timesteps") from error
+        raise DataError(
+            f"{path} is damaged ({error})", "a selection of timesteps"
+        ) from error

@@ -58,20 +58,32 @@ class StagedRuns:
     def budgets(self, limit: float) -> dict[str, float]:
         """Minutes of each stage that is not done, which share what the others have left of a
         ``limit`` for all."""
-        open_ = {name: share for name, share in self.shares.items() if not self.is_done(name)}
-        left = limit - sum(self.spent(name) for name in self.shares.keys() - open_.keys())
-        return {name: left * share / sum(open_.values()) for name, share in open_.items()}
+        open_ = {
+            name: share for name, share in self.shares.items() if not self.is_done(name)
+        }
+        left = limit - sum(
+            self.spent(name) for name in self.shares.keys() - open_.keys()
+        )
+        return {
+            name: left * share / sum(open_.values()) for name, share in open_.items()
+        }
 
 
 def iterations_of(config: Run) -> int:
     """The iterations of the run in a folder; ``ENDLESS`` before its rate falls, or if there is
     none."""
-    return began_with(config).recipe.iterations if (config.output / STATE).is_file() else ENDLESS
+    return (
+        began_with(config).recipe.iterations
+        if (config.output / STATE).is_file()
+        else ENDLESS
+    )
 
 
 def set_iterations(config: Config, iterations: int) -> Config:
     """The same configuration with other iterations."""
-    return config.model_copy(update={"recipe": replace(config.recipe, iterations=iterations)})
+    return config.model_copy(
+        update={"recipe": replace(config.recipe, iterations=iterations)}
+    )
 
 
 def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:

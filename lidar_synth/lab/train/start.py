@@ -45,8 +45,12 @@ def fresh_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     if config.codec is not None:
         codec = load_checkpoint(config.codec)
         if CODEC not in codec.networks:
-            raise ConfigError(f"codec {config.codec}", "the checkpoint of an autoencoder")
-        _check_held(config, codec.header, ("sensor", "channels", "normalisation"), config.codec)
+            raise ConfigError(
+                f"codec {config.codec}", "the checkpoint of an autoencoder"
+            )
+        _check_held(
+            config, codec.header, ("sensor", "channels", "normalisation"), config.codec
+        )
         sensor = codec.header.sensor
         tensors = codec.header.tensors
         fixed = {CODEC: codec.header.networks[CODEC]}
@@ -77,14 +81,21 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     """The networks of ``config.init``, and its header for the new run."""
     assert config.init is not None
     start = load_checkpoint(find_model(config.init))
-    wanted = {CODEC, VELOCITY} if config.decoder else {CODEC if config.autoencodes else VELOCITY}
+    wanted = (
+        {CODEC, VELOCITY}
+        if config.decoder
+        else {CODEC if config.autoencodes else VELOCITY}
+    )
     if not wanted <= set(start.networks) or config.codec is not None:
         raise ConfigError(
             f"init {config.init} with parts {sorted(start.networks)}",
             "a checkpoint of the same kind",
         )
     _check_held(
-        config, start.header, ("sensor", "channels", "normalisation", "network"), config.init
+        config,
+        start.header,
+        ("sensor", "channels", "normalisation", "network"),
+        config.init,
     )
     provenance = provenance_of(config) | {
         "init": start.hash,
@@ -114,7 +125,9 @@ def start_networks(config: TrainConfig) -> tuple[dict[str, nn.Module], Header]:
     return _add_condition(config, networks, header)
 
 
-def _same_condition(config: TrainConfig, condition: ConditionSection, header: Header) -> Header:
+def _same_condition(
+    config: TrainConfig, condition: ConditionSection, header: Header
+) -> Header:
     """The header of a conditional model that is trained further, with the shares of ``condition``
     that are given.
 
@@ -123,7 +136,11 @@ def _same_condition(config: TrainConfig, condition: ConditionSection, header: He
     """
     [(kind, held)] = header.conditioning.items()
     encoder = header.networks[ENCODER]
-    known = {"kind": kind, "encoder": encoder.architecture, "arguments": encoder.arguments} | held
+    known = {
+        "kind": kind,
+        "encoder": encoder.architecture,
+        "arguments": encoder.arguments,
+    } | held
     given = {
         name: value
         for name, value in condition
@@ -133,7 +150,9 @@ def _same_condition(config: TrainConfig, condition: ConditionSection, header: He
     if isinstance(
         given.get("arguments"), dict
     ):  # those that a configuration names: sizes follow from the data
-        known["arguments"] = {name: known["arguments"].get(name) for name in given["arguments"]}
+        known["arguments"] = {
+            name: known["arguments"].get(name) for name in given["arguments"]
+        }
     for name in sorted(given.keys() - shares.keys()):
         value = list(given[name]) if isinstance(given[name], tuple) else given[name]
         if value != known.get(name):
@@ -154,11 +173,17 @@ def _without_ends(
     if not held.arguments.get("ends"):
         return networks, header
     part = held._replace(
-        arguments={name: value for name, value in held.arguments.items() if name != "ends"}
+        arguments={
+            name: value for name, value in held.arguments.items() if name != "ends"
+        }
     )
     velocity = build_network(*part)
     velocity.load_state_dict(
-        {k: v for k, v in networks[VELOCITY].state_dict().items() if not k.startswith("step.")}
+        {
+            k: v
+            for k, v in networks[VELOCITY].state_dict().items()
+            if not k.startswith("step.")
+        }
     )
     return networks | {VELOCITY: velocity}, replace(
         header, networks=header.networks | {VELOCITY: part}, other_grids=()
@@ -175,13 +200,17 @@ def _add_condition(
     derived = network_class(held.architecture).derived_arguments
     own = {name: value for name, value in held.arguments.items() if name not in derived}
     asked = config.model_copy(
-        update={"network": NetworkSection(architecture=held.architecture, arguments=own)}
+        update={
+            "network": NetworkSection(architecture=held.architecture, arguments=own)
+        }
     )
     state = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape).shape
     parts = asked.parts(state, header.sensor.shape)
     made = _build(config, parts, header.sensor, state)
     try:
-        new = made[VELOCITY].load_state_dict(networks[VELOCITY].state_dict(), strict=False)
+        new = made[VELOCITY].load_state_dict(
+            networks[VELOCITY].state_dict(), strict=False
+        )
     except RuntimeError as error:
         raise ConfigError(
             f"a condition for init {config.init}, a {held.architecture}",
@@ -197,24 +226,35 @@ def _add_condition(
 
 
 def _build(
-    config: TrainConfig, parts: dict[str, NetworkSpec], sensor: Sensor, state: tuple[int, int, int]
+    config: TrainConfig,
+    parts: dict[str, NetworkSpec],
+    sensor: Sensor,
+    state: tuple[int, int, int],
 ) -> dict[str, nn.Module]:
     """Networks with fresh weights, some of which look where the cells of the state look."""
     torch.manual_seed(config.seed)
     angles = torch.from_numpy(sensor.ray_angles(config.rays))
-    pooled = F.avg_pool2d(angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2]))[
-        0
-    ]
+    pooled = F.avg_pool2d(
+        angles[None], (sensor.shape[0] // state[1], sensor.shape[1] // state[2])
+    )[0]
     networks: dict[str, nn.Module] = {}
     for name, part in parts.items():
-        needed = {"angles": pooled} if network_class(part.architecture).needs_ray_angles else {}
+        needed = (
+            {"angles": pooled}
+            if network_class(part.architecture).needs_ray_angles
+            else {}
+        )
         networks[name] = build_network(part.architecture, part.arguments | needed)
     return networks
 
 
-def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any) -> None:
+def _check_held(
+    config: TrainConfig, header: Header, keys: tuple[str, ...], path: Any
+) -> None:
     """What the configuration says, if it says it, has to be what the checkpoint holds."""
-    part = header.networks[CODEC if config.autoencodes or "network" not in keys else VELOCITY]
+    part = header.networks[
+        CODEC if config.autoencodes or "network" not in keys else VELOCITY
+    ]
     held = {
         "sensor": header.sensor.to_dict(),
         "channels": list(header.channels),
@@ -226,12 +266,19 @@ def _check_held(config: TrainConfig, header: Header, keys: tuple[str, ...], path
         "sensor": load_sensor(config.sensor).to_dict(),
         "channels": list(config.channels),
         "normalisation": config.tensors().normalisation.to_dict(),
-        "network": {"architecture": config.network.architecture, "arguments": arguments},
+        "network": {
+            "architecture": config.network.architecture,
+            "arguments": arguments,
+        },
     }
     for key in set(keys) & config.model_fields_set:
-        if json.dumps(asked[key], sort_keys=True) != json.dumps(held[key], sort_keys=True):
+        if json.dumps(asked[key], sort_keys=True) != json.dumps(
+            held[key], sort_keys=True
+        ):
             raise ConfigError(
-                f"{key} {asked[key]}", f"that of {path}: {held[key]}", f"Or leave out {key}."
+                f"{key} {asked[key]}",
+                f"that of {path}: {held[key]}",
+                f"Or leave out {key}.",
             )
 
 
@@ -278,7 +325,9 @@ def provenance_of(config: Run) -> dict[str, Any]:
         "rehearsal",
         *PARENTS,
     }
-    more = {} if config.rehearsal is None else {"rehearsal": config.rehearsal.describe()}
+    more = (
+        {} if config.rehearsal is None else {"rehearsal": config.rehearsal.describe()}
+    )
     return more | {
         "data": config.data.describe(),
         "data_licence": config.data.licence,

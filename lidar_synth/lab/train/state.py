@@ -78,9 +78,15 @@ class Recipe:
     ema_every: int = 10
 
     def __post_init__(self) -> None:
-        for key, table in (("metric", METRICS), ("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
+        for key, table in (
+            ("metric", METRICS),
+            ("optimizer", OPTIMIZERS),
+            ("schedule", SCHEDULES),
+        ):
             if getattr(self, key) not in table:
-                raise ConfigError(f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}")
+                raise ConfigError(
+                    f"{key} {getattr(self, key)!r}", f"one of {', '.join(table)}"
+                )
         if set(self.weights) - set(CHANNELS) or not all(
             weight > 0 for weight in self.weights.values()
         ):
@@ -130,9 +136,13 @@ class Training:
         keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
         with torch.no_grad():
             torch._foreach_lerp_(
-                list(self.average.parameters()), list(self.network.parameters()), 1 - keep
+                list(self.average.parameters()),
+                list(self.network.parameters()),
+                1 - keep,
             )
-            for mine, new in zip(self.average.buffers(), self.network.buffers(), strict=True):
+            for mine, new in zip(
+                self.average.buffers(), self.network.buffers(), strict=True
+            ):
                 mine.copy_(new)
 
     def save(self, path: Path) -> None:
@@ -145,8 +155,12 @@ class Training:
         tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
         for k, optimizer in enumerate(self.optimizers):
             for i, moments in optimizer.state_dict()["state"].items():
-                tensors |= {f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()}
-        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+                tensors |= {
+                    f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()
+                }
+        tensors = {
+            name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()
+        }
         facts = {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}
         write_file(path, save(tensors, facts | {"checksum": _checksum(facts, tensors)}))
 
@@ -158,7 +172,11 @@ class Training:
             DataError: if it is not the state of such a run.
         """
         progress, tensors = _read(path)
-        parts: dict[str, dict[str, Any]] = {"network": {}, "average": {}, "optimizer": {}}
+        parts: dict[str, dict[str, Any]] = {
+            "network": {},
+            "average": {},
+            "optimizer": {},
+        }
         try:
             for name, tensor in tensors.items():
                 part, key = name.split(".", 1)
@@ -171,12 +189,22 @@ class Training:
                 moments[int(which)].setdefault(int(number), {})[key] = tensor
             for optimizer, state in zip(self.optimizers, moments, strict=True):
                 optimizer.load_state_dict(
-                    {"state": state, "param_groups": optimizer.state_dict()["param_groups"]}
+                    {
+                        "state": state,
+                        "param_groups": optimizer.state_dict()["param_groups"],
+                    }
                 )
                 _check_moments(optimizer)
-        except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        except (
+            RuntimeError,
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+        ) as error:
             raise DataError(
-                f"{path} is the state of another network ({error})", "the same configuration"
+                f"{path} is the state of another network ({error})",
+                "the same configuration",
             ) from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
@@ -194,7 +222,9 @@ def _check_moments(optimizer: torch.optim.Optimizer) -> None:
         for name, value in moments.items():
             expected = () if name == "step" else tuple(parameter.shape)
             if tuple(value.shape) != expected:
-                raise ValueError(f"{name} of shape {tuple(value.shape)}, not {expected}")
+                raise ValueError(
+                    f"{name} of shape {tuple(value.shape)}, not {expected}"
+                )
 
 
 class Progress(NamedTuple):
@@ -233,7 +263,9 @@ def set_damaged_aside(folder: Path) -> None:
         _read(path)
     except DataError as error:
         kept = path.with_suffix(".damaged")
-        warnings.warn(f"{error}. It is kept as {kept.name}, and the run begins anew", stacklevel=2)
+        warnings.warn(
+            f"{error}. It is kept as {kept.name}, and the run begins anew", stacklevel=2
+        )
         path.replace(kept)
 
 
@@ -249,7 +281,9 @@ def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
 
 
 def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
-    return hashlib.sha256(f"{sorted(facts.items())} {weights_hash(tensors)}".encode()).hexdigest()
+    return hashlib.sha256(
+        f"{sorted(facts.items())} {weights_hash(tensors)}".encode()
+    ).hexdigest()
 
 
 def _progress(file: Any) -> Progress:
@@ -264,7 +298,9 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
     except OSError as error:
         raise FileError(
-            f"{path} cannot be read ({error})", "a saved state", "Start without --resume."
+            f"{path} cannot be read ({error})",
+            "a saved state",
+            "Start without --resume.",
         ) from error
     except (SafetensorError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(

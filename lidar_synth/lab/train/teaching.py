@@ -40,9 +40,14 @@ def target_flow(
         _check_weaker(config, teacher, weaker)
         made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
         return autoguide(
-            velocity, _frozen_flow(weaker, config.compile), config.guidance, config.within
+            velocity,
+            _frozen_flow(weaker, config.compile),
+            config.guidance,
+            config.within,
         ), made
-    return velocity if config.guidance == 1 else _from_blank(config, teacher, velocity), made
+    return velocity if config.guidance == 1 else _from_blank(
+        config, teacher, velocity
+    ), made
 
 
 def _frozen_flow(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
@@ -53,11 +58,14 @@ def _frozen_flow(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
     return velocity
 
 
-def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module) -> Velocity:
+def _from_blank(
+    config: DistillConfig, teacher: Checkpoint, velocity: nn.Module
+) -> Velocity:
     """The teacher with classifier-free guidance."""
     if not isinstance(velocity, Conditioned):
         raise ConfigError(
-            f"guidance {config.guidance} of an unconditional teacher", "1, or weaker=CHECKPOINT"
+            f"guidance {config.guidance} of an unconditional teacher",
+            "1, or weaker=CHECKPOINT",
         )
     [(name, options)] = teacher.header.conditioning.items()
     if not options.get("dropout"):
@@ -70,16 +78,23 @@ def _from_blank(config: DistillConfig, teacher: Checkpoint, velocity: nn.Module)
     return guide(velocity, config.guidance, blank(name, empty))
 
 
-def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint) -> None:
+def _check_weaker(
+    config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint
+) -> None:
     """Both models need the same states and conditions."""
     if config.guidance == 1:
         raise ConfigError(
-            f"weaker {config.weaker} with guidance 1", "a guidance scale other than 1, such as 2"
+            f"weaker {config.weaker} with guidance 1",
+            "a guidance scale other than 1, such as 2",
         )
     if not 0 <= config.within[0] < config.within[1] <= 1:
-        raise ConfigError(f"within {config.within}", "two increasing times within [0, 1]")
+        raise ConfigError(
+            f"within {config.within}", "two increasing times within [0, 1]"
+        )
     if VELOCITY not in weaker.networks:
-        raise ConfigError(f"weaker {config.weaker}, an autoencoder", "a model that generates")
+        raise ConfigError(
+            f"weaker {config.weaker}, an autoencoder", "a model that generates"
+        )
     differs = [
         k
         for k in ("sensor", "channels", "normalisation", "conditioning")
@@ -89,10 +104,13 @@ def _check_weaker(config: DistillConfig, teacher: Checkpoint, weaker: Checkpoint
         differs.append("autoencoder")
     if differs:
         raise ConfigError(
-            f"weaker {config.weaker} of another {', '.join(differs)}", f"those of {config.teacher}"
+            f"weaker {config.weaker} of another {', '.join(differs)}",
+            f"those of {config.teacher}",
         )
 
 
 def _hash_of_latents(checkpoint: Checkpoint) -> str:
     """Hash of the autoencoder of a latent model; "" for a pixel model."""
-    return network_hash(checkpoint.networks[CODEC]) if CODEC in checkpoint.networks else ""
+    return (
+        network_hash(checkpoint.networks[CODEC]) if CODEC in checkpoint.networks else ""
+    )

@@ -12,7 +12,11 @@ from lidar_synth.labels.edit.rays import ScanRays
 
 
 def replace_returns(
-    scan: Scan, removed: NDArray[np.bool_], rays: ScanRays, which: NDArray[np.intp], new: Scan
+    scan: Scan,
+    removed: NDArray[np.bool_],
+    rays: ScanRays,
+    which: NDArray[np.intp],
+    new: Scan,
 ) -> Scan:
     """Replace returns of a scan.
 
@@ -34,9 +38,13 @@ def replace_returns(
     if scan.time is not None:
         new = replace(new, time=scan.time[place])
     order = np.argsort(np.concatenate([np.flatnonzero(~removed), place]), kind="stable")
-    fields: dict[str, Any] = {"points": np.concatenate([kept.points, new.points])[order]}
+    fields: dict[str, Any] = {
+        "points": np.concatenate([kept.points, new.points])[order]
+    }
     for name, values in kept.fields().items():
-        fields[name] = np.concatenate([values, getattr(new, name)])[order].astype(values.dtype)
+        fields[name] = np.concatenate([values, getattr(new, name)])[order].astype(
+            values.dtype
+        )
     if scan.raw_label is not None:
         fields["raw_label"] = _raw(kept, new, order)
     return replace(scan, **fields, domain=SYNTHETIC)
@@ -51,7 +59,9 @@ def next_instance(scan: Scan) -> int:
 
 def _place(rays: ScanRays, which: NDArray[np.intp]) -> NDArray[np.int64]:
     """(n,) the return on each ray, or else the last one before it in the order of the rays."""
-    there = np.maximum.accumulate(np.where(rays.point >= 0, np.arange(len(rays.point)), 0))
+    there = np.maximum.accumulate(
+        np.where(rays.point >= 0, np.arange(len(rays.point)), 0)
+    )
     return rays.point[there[which]]
 
 
@@ -63,11 +73,15 @@ def _raw(kept: Scan, new: Scan, order: NDArray[np.intp]) -> NDArray[np.uint32] |
     if raw is None or label is None:
         return None
     try:
-        same = (SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16)) == kept.label).all()
+        same = (
+            SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16)) == kept.label
+        ).all()
     except ValueError:
         return None
     instance = (
-        np.zeros(len(new), np.uint32) if new.instance is None else new.instance.astype(np.uint32)
+        np.zeros(len(new), np.uint32)
+        if new.instance is None
+        else new.instance.astype(np.uint32)
     )
     added = SEMANTIC_KITTI.encode(label).astype(np.uint32) | instance << np.uint32(16)
     return np.concatenate([raw, added])[order] if same else None

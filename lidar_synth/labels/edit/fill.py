@@ -66,7 +66,9 @@ def continue_surfaces(
     donor = np.full(len(hole), -1, np.int64)
     rho = np.full(len(hole), np.inf)
     known = (rays.point >= 0) & ~hole
-    for first, stop in zip(rays.start[:-1].tolist(), rays.start[1:].tolist(), strict=True):
+    for first, stop in zip(
+        rays.start[:-1].tolist(), rays.start[1:].tolist(), strict=True
+    ):
         part = slice(first, stop)
         if hole[part].any() and not hole[part].all():
             given = (
@@ -98,7 +100,9 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             limit = min(limit, near[(i + length) % count])
             length += 1
         n = _side(hole, known, rho, ground, thing, i - 1, -1, limit, left)
-        m = _side(hole, known, rho, ground, thing, (i + length) % count, 1, limit, right)
+        m = _side(
+            hole, known, rho, ground, thing, (i + length) % count, 1, limit, right
+        )
         a = _edge(known, rho, left, n)
         b = _edge(known, rho, right, m)
         turn = (
@@ -107,14 +111,20 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
         levels = _level(known, ground, left, n), _level(known, ground, right, m)
         flat = levels[0] and levels[1]
         mixed = levels[0] != levels[1]
-        same = min(a, b) > 0 and abs(a - b) < SAME * max(a, b) and (turn < WIDE or not mixed)
+        same = (
+            min(a, b) > 0
+            and abs(a - b) < SAME * max(a, b)
+            and (turn < WIDE or not mixed)
+        )
         if min(a, b) > 0 and not same and turn < WIDE:
             same = abs(_ahead(known, rho, left, n, step, turn) - b) < SAME * b
             same |= abs(_ahead(known, rho, right, m, step, turn) - a) < SAME * a
         for k in range(length):
             share = (k + 1 + _SMOOTH) * step / turn
             use_left = n > 0 and (m == 0 or share < 0.5)
-            side, size, nth, edge = (left, n, k, a) if use_left else (right, m, length - 1 - k, b)
+            side, size, nth, edge = (
+                (left, n, k, a) if use_left else (right, m, length - 1 - k, b)
+            )
             if size == 0:
                 continue
             source = side[nth % size]
@@ -142,7 +152,9 @@ def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type
             elif not ground[source] and out[j] < far[j]:
                 beyond = _first_beyond(known, rho, side[:size], far[j])
                 if beyond < 0:
-                    beyond = _first_beyond(known, rho, right[:m] if use_left else left[:n], far[j])
+                    beyond = _first_beyond(
+                        known, rho, right[:m] if use_left else left[:n], far[j]
+                    )
                 donor[j] = beyond if beyond >= 0 else source
                 out[j] = rho[beyond] if beyond >= 0 else np.inf
 

@@ -78,11 +78,14 @@ class Placed(NamedTuple):
         c = np.cos(yaw)
         s = np.sin(yaw)
         return np.stack(
-            [along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z], 1
+            [along * c - across * s + x, along * s + across * c + y, offset[:, 2] + z],
+            1,
         )
 
 
-def insert(scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5) -> Scan:
+def insert(
+    scan: Scan, item: Object, pose: Pose | None = None, *, least: int = 5
+) -> Scan:
     """Set an object into a scan.
 
     Args:
@@ -135,7 +138,10 @@ def _set(
             f"at least {least}",
             "Choose a nearer place, or one that nothing hides.",
         )
-    replaced = estimated & Boxes(placed.box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
+    replaced = (
+        estimated
+        & Boxes(placed.box, ("Misc",)).contain(scan.points, above_floor=FLOOR)[0]
+    )
     hidden = seen | _behind(rays, window, rho)
     points = rays.point[window[hidden]]
     replaced[points[points >= 0]] = True
@@ -143,13 +149,20 @@ def _set(
     which = window[seen]
     fields = _fields(scan, item, hits, at[seen])
     new = replace(
-        scan[np.zeros(len(which), np.intp)], points=rays.points(which, rho[seen]), **fields
+        scan[np.zeros(len(which), np.intp)],
+        points=rays.points(which, rho[seen]),
+        **fields,
     )
     assert item.scan.boxes is not None
-    instance = np.array([next_instance(scan) if scan.instance is not None else -1], np.int32)
+    instance = np.array(
+        [next_instance(scan) if scan.instance is not None else -1], np.int32
+    )
     values = grow_box(placed.box, new.points)[None]
     own = Boxes(
-        values, item.scan.boxes.names, occlusion=item.scan.boxes.occlusion.copy(), instance=instance
+        values,
+        item.scan.boxes.names,
+        occlusion=item.scan.boxes.occlusion.copy(),
+        instance=instance,
     )
     own = update_occlusion(own, np.array([seen.sum() / np.isfinite(rho).sum()]))
     result = replace_returns(scan, ~remaining, rays, which, new)
@@ -193,7 +206,9 @@ def move(
     emptied = remove(scan, box, model=model, seed=seed)
     recorded = _shared(emptied, scan)
     ground = recorded if emptied.label is None else recorded | GROUND[emptied.label]
-    placed = _place(emptied[recorded], cut, pose, _with_foot(emptied[ground], cut), gone=box)
+    placed = _place(
+        emptied[recorded], cut, pose, _with_foot(emptied[ground], cut), gone=box
+    )
     return _set(emptied, cut, placed, least, ~recorded)
 
 
@@ -224,7 +239,9 @@ def cut_out(scan: Scan, box: int) -> Object:
         scan = replace(scan, ring=ring.astype(np.int16), sensor=sensor)
     found = objects_of(scan, least=1)
     if box not in found:
-        raise DataError(f"box {box} of scan {scan.id!r} without a return", "a box with an object")
+        raise DataError(
+            f"box {box} of scan {scan.id!r} without a return", "a box with an object"
+        )
     return found[box]
 
 
@@ -259,7 +276,10 @@ def _place(
             f"an object recorded at {recorded:.1f} m, to be seen at {distance:.1f} m",
             f"at least {NEARER * recorded:.1f} m, because it has too few returns for less",
         )
-    if scan.boxes is not None and (taken := find_overlapping(box, scan.boxes.values)).any():
+    if (
+        scan.boxes is not None
+        and (taken := find_overlapping(box, scan.boxes.values)).any()
+    ):
         number = int(np.flatnonzero(taken)[0])
         name = scan.boxes.names[number]
         number += gone is not None and number >= gone
@@ -297,17 +317,25 @@ def _recorded_here(scan: Scan, item: Object, box: NDArray[np.float32]) -> bool:
 
 def _shared(scan: Scan, other: Scan) -> NDArray[np.bool_]:
     """(N,) which points of a scan another one has too."""
-    one, two = (np.ascontiguousarray(s.points).view("V12").ravel() for s in (scan, other))
+    one, two = (
+        np.ascontiguousarray(s.points).view("V12").ravel() for s in (scan, other)
+    )
     return np.isin(one, two)
 
 
-def _complete(old: NDArray[np.float64], pose: Pose | None) -> tuple[float, float, float]:
+def _complete(
+    old: NDArray[np.float64], pose: Pose | None
+) -> tuple[float, float, float]:
     """x, y and yaw of a pose."""
     values = [float(v) for v in (old[[0, 1, 6]] if pose is None else pose)]
     if len(values) not in (2, 3) or not np.isfinite(values).all():
         raise DataError(f"pose {pose}", "x, y in metres, or x, y and yaw in radians")
     if len(values) == 2:
-        values.append(float(old[6] + np.arctan2(values[1], values[0]) - np.arctan2(old[1], old[0])))
+        values.append(
+            float(
+                old[6] + np.arctan2(values[1], values[0]) - np.arctan2(old[1], old[0])
+            )
+        )
     return values[0], values[1], values[2]
 
 
@@ -319,7 +347,10 @@ def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
     """
     recorded = np.arctan2(-old[1], -old[0]) - old[6]
     seen = np.arctan2(-y, -x) - yaw
-    off = [abs((seen - side + np.pi) % (2 * np.pi) - np.pi) for side in (recorded, -recorded)]
+    off = [
+        abs((seen - side + np.pi) % (2 * np.pi) - np.pi)
+        for side in (recorded, -recorded)
+    ]
     if min(off) > np.radians(TURN):
         raise DataError(
             f"an object seen from {np.degrees(off[0]):.0f} degrees beside the side that was "
@@ -338,16 +369,24 @@ def _hits(
     rho = np.full(len(window), np.inf)
     at = np.zeros((len(window), 2), np.intp)
     surfaces = _surfaces(item.scan)
-    rings, first, which = np.unique(rays.ring[window], return_index=True, return_inverse=True)
-    slope = np.array([np.median(rays.slope[window[which == k]]) for k in range(len(rings))])
+    rings, first, which = np.unique(
+        rays.ring[window], return_index=True, return_inverse=True
+    )
+    slope = np.array(
+        [np.median(rays.slope[window[which == k]]) for k in range(len(rings))]
+    )
     count = round(2 * np.pi / rays.step)
-    raster = rays_from(slope, rays.height[window[first]], rays.azimuth[window[first]], count)
+    raster = rays_from(
+        slope, rays.height[window[first]], rays.azimuth[window[first]], count
+    )
     hits = first_hits(
         surfaces, placed.points(surfaces.scan.points), raster, np.array([0.0, 0.0, 1.0])
     )
     if len(window):
         firing = (
-            np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(np.intp)
+            np.rint((rays.azimuth[window] - raster.first[which]) / rays.step).astype(
+                np.intp
+            )
             % count
         )
         at = np.stack([which, firing], 1)
@@ -384,17 +423,23 @@ def _behind(
         hit = np.flatnonzero(np.isfinite(rho[mine]))
         if len(hit):
             # After the widest gap.
-            start = hit[np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)]
+            start = hit[
+                np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)
+            ]
             length = len(mine) - np.diff(hit, append=hit[0] + len(mine)).max() + 1
             inner = mine[(start + np.arange(length)) % len(mine)]
             behind[inner] = rays.rho[window[inner]] > np.min(rho[mine][hit])
     return behind
 
 
-def _fields(scan: Scan, item: Object, hits: Hits, at: NDArray[np.intp]) -> dict[str, Any]:
+def _fields(
+    scan: Scan, item: Object, hits: Hits, at: NDArray[np.intp]
+) -> dict[str, Any]:
     """The fields of the object's points that the scan has."""
     row, firing = at.T
-    fields: dict[str, Any] = {"reflectance": hits.nearest.value[row, firing].astype(np.float32)}
+    fields: dict[str, Any] = {
+        "reflectance": hits.nearest.value[row, firing].astype(np.float32)
+    }
     if scan.label is not None:
         fields["label"] = hits.fields["label"][hits.nearest.vertex[row, firing]]
     if scan.instance is not None:

@@ -35,11 +35,15 @@ class ScanRays(NamedTuple):
     start: NDArray[np.int64]
     step: float
 
-    def points(self, which: NDArray[np.intp], rho: NDArray[np.float64]) -> NDArray[np.float32]:
+    def points(
+        self, which: NDArray[np.intp], rho: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
         """(n, 3) points on some rays at horizontal distances (n,), metres."""
         azimuth = self.azimuth[which]
         z = self.height[which] + self.slope[which] * rho
-        return np.stack([rho * np.cos(azimuth), -rho * np.sin(azimuth), z], 1).astype(np.float32)
+        return np.stack([rho * np.cos(azimuth), -rho * np.sin(azimuth), z], 1).astype(
+            np.float32
+        )
 
     def through(self, box: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(E,) whether each ray passes through a box (7,)."""
@@ -52,7 +56,11 @@ class ScanRays(NamedTuple):
         s = np.sin(float(box[6]))
         dx = np.cos(self.azimuth)
         dy = -np.sin(self.azimuth)
-        origin = (-box[0] * c - box[1] * s, box[0] * s - box[1] * c, self.height - box[2])
+        origin = (
+            -box[0] * c - box[1] * s,
+            box[0] * s - box[1] * c,
+            self.height - box[2],
+        )
         along = (dx * c + dy * s, dy * c - dx * s, self.slope)
         enter = np.zeros(len(dx))
         leave = np.full(len(dx), np.inf)
@@ -74,7 +82,11 @@ def rays_of_scan(scan: Scan) -> ScanRays:
     it (``Sensor.starts``).
     """
     ring, on_grid = rings_of(scan)
-    starts = scan.sensor.starts.astype(np.float64) if len(scan.sensor.starts) else np.zeros(1)
+    starts = (
+        scan.sensor.starts.astype(np.float64)
+        if len(scan.sensor.starts)
+        else np.zeros(1)
+    )
     optics = starts if on_grid else scan.sensor.optics()[1]
     x, y, z = scan.points.astype(np.float64).T
     azimuth = -np.arctan2(y, x)
@@ -92,7 +104,13 @@ def rays_of_scan(scan: Scan) -> ScanRays:
     following[last] = first
     gap = azimuth[following] - azimuth + 2 * np.pi * last
     step = (
-        2 * np.pi / (scan.sensor.columns if on_grid else scan.sensor.firings or scan.sensor.columns)
+        2
+        * np.pi
+        / (
+            scan.sensor.columns
+            if on_grid
+            else scan.sensor.firings or scan.sensor.columns
+        )
     )
     added = np.where(gap > WIDEST * step, np.rint(gap / step).astype(np.int64) - 1, 0)
     source = np.repeat(np.arange(len(ring)), added + 1)

@@ -71,7 +71,9 @@ def redraw_hole(
 
     check_model(model, kept.sensor)
     there = np.linalg.norm(filled.points, axis=1) > 0
-    asked = np.where(there[:, None], filled.points, rays.points(which, np.full(len(which), FAR)))
+    asked = np.where(
+        there[:, None], filled.points, rays.points(which, np.full(len(which), FAR))
+    )
     everything = locate(
         np.concatenate([kept.points, filled.points]).astype(np.float32), kept.sensor
     )
@@ -80,12 +82,16 @@ def redraw_hole(
     distance = np.where(known, everything.range[everything.point], 0).astype(np.float32)
     both = _joined(kept, filled)
     image = RangeImage(
-        distance, kept.sensor, carry(both, everything.point, _CARRIED & both.fields().keys())
+        distance,
+        kept.sensor,
+        carry(both, everything.point, _CARRIED & both.fields().keys()),
     )
     hole = np.zeros(distance.shape, bool)
     hole.reshape(-1)[cell[cell >= 0]] = True
     hole &= ~known | (everything.point >= len(kept))
-    [drawn] = inpaint(model, [image], [hole], seed, [0], START if start is None else start)
+    [drawn] = inpaint(
+        model, [image], [hole], seed, [0], START if start is None else start
+    )
     inside = (cell >= 0) & hole.reshape(-1)[np.maximum(cell, 0)]
     return _on_rays(filled, rays, which, drawn, cell, inside)
 
@@ -123,7 +129,9 @@ def _on_rays(
     if label is not None:
         slope = rays.slope[which]
         meets = (z - rays.height[which]) / np.where(np.abs(slope) < 1e-3, -1e-3, slope)
-        inside = inside & ~(label.reshape(-1)[cell] < THINGS)  # it may draw a new object
+        inside = inside & ~(
+            label.reshape(-1)[cell] < THINGS
+        )  # it may draw a new object
         level = GROUND[label.reshape(-1)[cell]] & (np.abs(meets - rho) < BEND * rho)
         rho = np.where(level, meets, rho)
     points = np.where(distance[:, None] > 0, rays.points(which, rho), np.float32(0))
@@ -131,8 +139,12 @@ def _on_rays(
         "points": np.where(inside[:, None], points, filled.points).astype(np.float32)
     }
     for name in (
-        {"reflectance", "label", "confidence"} & filled.fields().keys() & drawn.channels.keys()
+        {"reflectance", "label", "confidence"}
+        & filled.fields().keys()
+        & drawn.channels.keys()
     ):
         values = drawn.channels[name].reshape(-1)[cell]
-        fields[name] = np.where(inside, values, getattr(filled, name)).astype(values.dtype)
+        fields[name] = np.where(inside, values, getattr(filled, name)).astype(
+            values.dtype
+        )
     return replace(filled, **fields)

@@ -36,7 +36,11 @@ absorbed."""
 
 
 def remove(
-    scan: Scan, box: Which, *, model: "Generator | str | Path | None" = None, seed: int = 0
+    scan: Scan,
+    box: Which,
+    *,
+    model: "Generator | str | Path | None" = None,
+    seed: int = 0,
 ) -> Scan:
     """Remove objects from a scan, with their boxes, and fill the holes with what is behind them.
 
@@ -95,7 +99,8 @@ def select_boxes(scan: Scan, box: Which) -> tuple[Boxes, list[int] | None]:
         return Boxes(np.zeros((0, 7), np.float32), ()), None
     if given.dtype.kind in "iu" and given.shape == (7,) and len(np.unique(given)) < 7:
         raise DataError(
-            f"seven whole numbers {given.tolist()}", "each number once, or a box (7,) as floats"
+            f"seven whole numbers {given.tolist()}",
+            "each number once, or a box (7,) as floats",
         )
     if given.dtype.kind in "iu" and given.ndim < 2:
         numbers = np.atleast_1d(given).tolist()
@@ -189,11 +194,15 @@ def remove_returns(
             absorbed = ~there & rays.through(
                 box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32)
             )
-            near[absorbed] = np.minimum(near[absorbed], np.hypot(*scan.points[mine, :2].T).min())
+            near[absorbed] = np.minimum(
+                near[absorbed], np.hypot(*scan.points[mine, :2].T).min()
+            )
             hole |= absorbed
             place = widen_boxes(grow_box(box, scan.points[mine]), CLEARANCE + MARGIN)
             far = np.maximum(far, rays.leaving(place))
-    donor, rho = continue_surfaces(rays, hole, near, far, _ground(scan, rays), _things(scan, rays))
+    donor, rho = continue_surfaces(
+        rays, hole, near, far, _ground(scan, rays), _things(scan, rays)
+    )
     which = np.flatnonzero(hole & (donor >= 0))
     filled = _copies(scan, rays, which, donor[which], rho[which])
     if model is not None:
@@ -235,7 +244,9 @@ def _copies(
     """One point for each ray of the hole, with the fields of its source; points at the origin have
     no return."""
     found = np.isfinite(rho)
-    points = np.where(found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0))
+    points = np.where(
+        found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0)
+    )
     limits = scan.sensor.range_min, scan.sensor.range_max
     distance = np.linalg.norm(points, axis=1)
     points[(distance < limits[0]) | (distance > limits[1])] = 0

@@ -58,7 +58,9 @@ class Unboxed(NamedTuple):
         )
 
 
-def clusters(scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST) -> NDArray[np.int64]:
+def clusters(
+    scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST
+) -> NDArray[np.int64]:
     """(N,) number of the unboxed object of each point, from 1 on; 0 = none.
 
     Args:
@@ -82,7 +84,9 @@ def clusters(scan: Scan, classes: Iterable[int] = BOXED, least: int = LEAST) -> 
     return number
 
 
-def measure(scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = LEAST) -> Unboxed:
+def measure(
+    scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = LEAST
+) -> Unboxed:
     """Count the unboxed objects of scans.
 
     Example:
@@ -94,7 +98,9 @@ def measure(scans: Iterable[Scan], classes: Iterable[int] = BOXED, least: int = 
     """
     total = Unboxed(0, 0, 0, 0)
     for scan in scans:
-        points = 0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
+        points = (
+            0 if scan.label is None else int(np.isin(scan.label, list(classes)).sum())
+        )
         found = (
             1,
             int(clusters(scan, classes, least).max(initial=0)),
@@ -121,7 +127,9 @@ def remove_unboxed(
         classes, least: see ``clusters``.
     """
     number = clusters(scan, classes, least)
-    parts = [_with_rim(scan, number == k) for k in range(1, int(number.max(initial=0)) + 1)]
+    parts = [
+        _with_rim(scan, number == k) for k in range(1, int(number.max(initial=0)) + 1)
+    ]
     return remove_returns(scan, parts, model, seed) if parts else scan
 
 
@@ -163,7 +171,9 @@ def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
         ConfigError: on another name.
     """
     if name not in HANDLING:
-        raise ConfigError(f"unboxed={name!r}", f"one of {', '.join(map(repr, HANDLING))}")
+        raise ConfigError(
+            f"unboxed={name!r}", f"one of {', '.join(map(repr, HANDLING))}"
+        )
     return (
         partial(remove_unboxed, model=model)
         if name == "close" and model is not None
@@ -177,14 +187,22 @@ def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:
         return np.zeros(len(scan), bool)
     outside: NDArray[np.bool_] = np.isin(scan.label, list(classes))
     if scan.boxes is not None and len(scan.boxes) and outside.any():
-        wide = scan.boxes.values + np.array([0, 0, 0, *3 * [2 * TOLERANCE], 0], np.float32)
-        outside[outside] = ~Boxes(wide, scan.boxes.names).contain(scan.points[outside]).any(0)
+        wide = scan.boxes.values + np.array(
+            [0, 0, 0, *3 * [2 * TOLERANCE], 0], np.float32
+        )
+        outside[outside] = ~Boxes(wide, scan.boxes.names).contain(
+            scan.points[outside]
+        ).any(0)
         if scan.instance is not None:
-            outside &= ~((scan.instance > 0) & np.isin(scan.instance, scan.boxes.instance))
+            outside &= ~(
+                (scan.instance > 0) & np.isin(scan.instance, scan.boxes.instance)
+            )
     return outside
 
 
-def _with_rim(scan: Scan, mine: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+def _with_rim(
+    scan: Scan, mine: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """The returns of a cluster with those at its rim that have another label, and the box (7,)
     around it."""
     low = scan.points[mine].min(0)

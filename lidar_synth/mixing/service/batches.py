@@ -70,12 +70,15 @@ class BatchMixer:
     ) -> None:
         if (batch_size is None) == (batch_sampler is None):
             raise ConfigError(
-                f"batch_size={batch_size} and batch_sampler={batch_sampler}", "one of them"
+                f"batch_size={batch_size} and batch_sampler={batch_sampler}",
+                "one of them",
             )
         self.dataset = dataset
         self.batch_sampler = batch_sampler or dataset.batches(batch_size or 0)
         self._sources = {
-            n: source for n, source in enumerate(dataset.synthetic) if isinstance(source, Generated)
+            n: source
+            for n, source in enumerate(dataset.synthetic)
+            if isinstance(source, Generated)
         }
         others = _Others(dataset, self._sources)
         self._loader = DataLoader(
@@ -101,12 +104,17 @@ class BatchMixer:
         scans: dict[tuple[int, int], Scan] = {}
         for number, source in self._sources.items():
             indices = list(
-                dict.fromkeys(p.missing[1] for p in places if p.missing and p.missing[0] == number)
+                dict.fromkeys(
+                    p.missing[1] for p in places if p.missing and p.missing[0] == number
+                )
             )
             if indices:
                 with self._stream(source.generator.device):
                     made = source.scans(indices)
-                scans |= {(number, index): scan for index, scan in zip(indices, made, strict=True)}
+                scans |= {
+                    (number, index): scan
+                    for index, scan in zip(indices, made, strict=True)
+                }
         return self.dataset.collate(
             [
                 self.dataset.finish(scans[p.missing], p.epoch, p.position)
@@ -133,7 +141,8 @@ class _Others(Dataset[Place]):
     def __init__(self, dataset: MixedScans, missing: Collection[int]) -> None:
         # Workers get no network: one on a GPU could not be sent to them.
         sources: list[Any] = [
-            None if n in missing else source for n, source in enumerate(dataset.synthetic)
+            None if n in missing else source
+            for n, source in enumerate(dataset.synthetic)
         ]
         self._dataset = copy(dataset)
         self._dataset.synthetic = tuple(sources)
@@ -145,6 +154,9 @@ class _Others(Dataset[Place]):
         epoch = self._dataset.epoch_of(position)
         plan = self._dataset.plan(epoch)
         source, index = plan[position]
-        if source >= plan.reals and self._dataset.synthetic[source - plan.reals] is None:
+        if (
+            source >= plan.reals
+            and self._dataset.synthetic[source - plan.reals] is None
+        ):
             return Place(epoch, position, (source - plan.reals, index))
         return Place(epoch, position, sample=self._dataset.sample(epoch, position))

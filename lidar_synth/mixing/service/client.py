@@ -44,7 +44,9 @@ class Client:
         self.timeout = timeout
         self._slots = slots
         self._secret = plan.secret
-        self._connections: dict[tuple[int, int], Connection] = {}  # by process and thread
+        self._connections: dict[
+            tuple[int, int], Connection
+        ] = {}  # by process and thread
         context = get_context("spawn")
         started, end = context.Pipe(duplex=False)
         self._process = context.Process(
@@ -59,7 +61,9 @@ class Client:
                 raise self._late("loaded the model")
             self._address = started.recv_bytes().decode()
         except EOFError as error:
-            guard = "A script that starts processes begins with: if __name__ == '__main__':"
+            guard = (
+                "A script that starts processes begins with: if __name__ == '__main__':"
+            )
             raise self._died("" if slots.last_words else guard) from error
         except BaseException:
             self.close()
@@ -85,7 +89,9 @@ class Client:
         except (EOFError, OSError) as error:
             raise error if isinstance(error, ProcessError) else self._died() from error
         finally:
-            if not answered:  # a late answer must not be taken for that of another request
+            if (
+                not answered
+            ):  # a late answer must not be taken for that of another request
                 self._connections.pop(_here(), None)
 
     def tell(self, *request: int) -> None:
@@ -99,10 +105,12 @@ class Client:
             self._end()
 
     def __getstate__(self) -> dict[str, Any]:
-        assert_spawning(self)  # in any other pickle the slots would be a copy that no process fills
-        return {k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")} | {
-            "_connections": {}
-        }
+        assert_spawning(
+            self
+        )  # in any other pickle the slots would be a copy that no process fills
+        return {
+            k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")
+        } | {"_connections": {}}
 
     def _line(self) -> Connection:
         """This thread's own connection; a forked process must not use the ones inherited from its
@@ -110,7 +118,9 @@ class Client:
         if _here() not in self._connections:
             if os.getpid() == self._owner and not self._end.alive:
                 raise ConfigError("a rolling bank that is closed", "an open one")
-            for inherited in [key for key in self._connections if key[0] != os.getpid()]:
+            for inherited in [
+                key for key in self._connections if key[0] != os.getpid()
+            ]:
                 del self._connections[inherited]
             line = self._connections[_here()] = connection.Client(self._address)
             line.send_bytes(self._secret)

@@ -64,7 +64,11 @@ class Ledger:
     """
 
     def __init__(
-        self, slots: int, counters: NDArray[np.int64], starved: Starved = "wait", replaced: int = 0
+        self,
+        slots: int,
+        counters: NDArray[np.int64],
+        starved: Starved = "wait",
+        replaced: int = 0,
     ) -> None:
         empty = [Slot(place, -1 - place) for place in range(slots)]
         # By scan number, in the order in which they were claimed.
@@ -73,7 +77,9 @@ class Ledger:
         self._starved = starved
         self._awaited: list[int] = []  # numbers of scans for which readers wait
         self._outlook: Outlook = (
-            RotatingPool(slots - replaced, replaced) if replaced else SequentialPrefetch(slots)
+            RotatingPool(slots - replaced, replaced)
+            if replaced
+            else SequentialPrefetch(slots)
         )
         lock = Lock()
         self._work = Condition(lock)  # a scan may have to be made
@@ -134,7 +140,9 @@ class Ledger:
 
     def _substitute(self) -> Slot | None:
         """With ``starved="reuse"``, the scan that was served least, if there is any."""
-        readable = [slot for slot in self._slots.values() if slot.ready and slot.number >= 0]
+        readable = [
+            slot for slot in self._slots.values() if slot.ready and slot.number >= 0
+        ]
         if self._starved == "wait" or not readable:
             return None
         self._counters[_REUSED] += 1
@@ -155,7 +163,11 @@ class Ledger:
     def _claim(self, most: int) -> Iterator[Slot]:
         for _ in range(most):
             awaited = next((n for n in self._awaited if n not in self._slots), None)
-            wanted = self._outlook.upcoming(self._slots) if awaited is None else (-1.0, awaited)
+            wanted = (
+                self._outlook.upcoming(self._slots)
+                if awaited is None
+                else (-1.0, awaited)
+            )
             slot = None if wanted is None else self._room(wanted[0])
             if wanted is None or slot is None:
                 return
@@ -167,7 +179,11 @@ class Ledger:
             yield slot
 
     def _use(self, slot: Slot) -> float:
-        return self._outlook.next_use(slot.number, slot.served) if slot.number >= 0 else NEVER
+        return (
+            self._outlook.next_use(slot.number, slot.served)
+            if slot.number >= 0
+            else NEVER
+        )
 
     def _room(self, use: float) -> Slot | None:
         """The slot to overwrite for a scan with this use: the oldest that is not needed, or the one

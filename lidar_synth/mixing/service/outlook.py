@@ -46,7 +46,9 @@ class SequentialPrefetch:
 
     def answer(self, number: int) -> int:
         if not self._past <= number < self._next + self._window:
-            self._past = self._next = number  # a jump: training has resumed at another position
+            self._past = self._next = (
+                number  # a jump: training has resumed at another position
+            )
         self._past = max(self._past, number - self._window)
         return number
 

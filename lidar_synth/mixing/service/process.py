@@ -95,7 +95,9 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
         # Linux: an abstract socket name, which has no file and disappears with the process.
         name = f"\0lidar-synth-{token_hex(16)}" if sys.platform == "linux" else None
         listener = Listener(name, backlog=128)
-        Thread(target=_accept, args=(listener, plan.secret, ledger), daemon=True).start()
+        Thread(
+            target=_accept, args=(listener, plan.secret, ledger), daemon=True
+        ).start()
         started.send_bytes((name or str(listener.address)).encode())
         while True:
             _make(generator, plan, ledger.claim(generator.batch), slots, ledger)
@@ -107,9 +109,15 @@ def run(plan: GeneratorJob, slots: Slots, started: Connection) -> None:
 
 
 def _make(
-    generator: Generator, plan: GeneratorJob, claimed: Sequence[Slot], slots: Slots, ledger: Ledger
+    generator: Generator,
+    plan: GeneratorJob,
+    claimed: Sequence[Slot],
+    slots: Slots,
+    ledger: Ledger,
 ) -> None:
-    images = generator.range_images(plan.seed, [slot.number for slot in claimed], **plan.sampling)
+    images = generator.range_images(
+        plan.seed, [slot.number for slot in claimed], **plan.sampling
+    )
     for slot, image in zip(claimed, images, strict=True):
         ledger.publish(slot, slots.write(slot.place, slot.number, image))
 
@@ -128,7 +136,9 @@ def _watch_parent() -> None:
 def _accept(listener: Listener, secret: bytes, ledger: Ledger) -> None:
     while True:
         with suppress(OSError, EOFError):
-            Thread(target=_answer, args=(listener.accept(), secret, ledger), daemon=True).start()
+            Thread(
+                target=_answer, args=(listener.accept(), secret, ledger), daemon=True
+            ).start()
 
 
 def _answer(connection: Connection, secret: bytes, ledger: Ledger) -> None:

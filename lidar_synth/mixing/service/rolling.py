@@ -26,7 +26,13 @@ from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan
 from lidar_synth.mixing.service.client import Client
 from lidar_synth.mixing.service.ledger import COUNTERS, Starved
-from lidar_synth.mixing.service.process import EXPECT, GET, GIVE_BACK, SET_EPOCH, GeneratorJob
+from lidar_synth.mixing.service.process import (
+    EXPECT,
+    GET,
+    GIVE_BACK,
+    SET_EPOCH,
+    GeneratorJob,
+)
 from lidar_synth.mixing.service.slots import Slots
 
 # numbers in one message: fewer than fit into a socket's buffer, so that sending never blocks
@@ -102,21 +108,28 @@ class RollingBank:
         header, checksum = read_header(path)
         if header.conditioning:
             raise ConfigError(
-                f"a rolling bank of {path}, a conditional model", "an unconditional model"
+                f"a rolling bank of {path}, a conditional model",
+                "an unconditional model",
             )
-        channels = set(header.channels) | ({"confidence"} if "label" in header.channels else set())
+        channels = set(header.channels) | (
+            {"confidence"} if "label" in header.channels else set()
+        )
         replaced = max(1, round(refresh * slots)) if refresh else 0
         self.sensor = header.sensor
         self.fields = frozenset(channels - {"range"} | {"reflectance"})
         dtype = str(options.get("dtype", "torch.float32"))
         precision = "" if dtype.endswith("float32") else f":{dtype}"
-        self.identity = (
-            f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
-        )
+        self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
         self._name = f"{path.stem}/{seed}"
         self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
         plan = GeneratorJob(
-            path, seed, starved, replaced, threads, options, {"steps": steps, "solver": solver}
+            path,
+            seed,
+            starved,
+            replaced,
+            threads,
+            options,
+            {"steps": steps, "solver": solver},
         )
         self._client = Client(plan, self._slots, timeout)
 
@@ -153,7 +166,9 @@ class RollingBank:
         try:
             return served, self._slots.read(slot, served, checksum)
         finally:
-            with suppress(OSError):  # if the process is dead, the next request raises an error
+            with suppress(
+                OSError
+            ):  # if the process is dead, the next request raises an error
                 self._client.tell(GIVE_BACK)
 
     def expect(self, numbers: Sequence[int]) -> None:
@@ -188,10 +203,13 @@ class RollingBank:
         self.close()
 
 
-def _check(slots: int, seed: int, starved: str, refresh: float | None, timeout: float) -> None:
+def _check(
+    slots: int, seed: int, starved: str, refresh: float | None, timeout: float
+) -> None:
     if slots < 1 or timeout <= 0:
         raise ConfigError(
-            f"slots={slots}, timeout={timeout}", "at least 1 slot, and more than 0 seconds"
+            f"slots={slots}, timeout={timeout}",
+            "at least 1 slot, and more than 0 seconds",
         )
     if not 0 <= seed < 2**64:
         raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")

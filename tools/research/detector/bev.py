@@ -87,7 +87,9 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
             count[cell] += 1
 
 
-def targets(boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float) -> Target:
+def targets(
+    boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float
+) -> Target:
     """The targets of M boxes (M, 7) with classes (M,); pixels have sides of ``pixel`` metres."""
     count = round(2 * REACH / pixel)
     heat = np.zeros((len(CLASSES), count, count), np.float32)
@@ -100,14 +102,19 @@ def targets(boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float
         spread = max(0.6, np.sqrt(box[3] * box[4]) / pixel / 6)
         reach = int(np.ceil(3 * spread))
         rows, columns = (
-            np.arange(max(c - reach, 0), min(c + reach + 1, count)) for c in centre.astype(int)
+            np.arange(max(c - reach, 0), min(c + reach + 1, count))
+            for c in centre.astype(int)
         )
         at = np.ix_(rows, columns)
         square = (rows - int(centre[0]))[:, None] ** 2 + (columns - int(centre[1])) ** 2
         bump = np.exp(-square / (2 * spread**2)).astype(np.float32)
         heat[each][at] = np.maximum(heat[each][at], bump)
-        nearest = (bump > weight[at]) & (square <= 2)  # the pixel of the centre and its neighbours
-        for channel, value in enumerate((*_offsets(centre, rows, columns), *_shape(box))):
+        nearest = (bump > weight[at]) & (
+            square <= 2
+        )  # the pixel of the centre and its neighbours
+        for channel, value in enumerate(
+            (*_offsets(centre, rows, columns), *_shape(box))
+        ):
             values[channel][at] = np.where(nearest, value, values[channel][at])
         weight[at] = np.where(nearest, bump, weight[at])
     return Target(*map(torch.from_numpy, (heat, values, weight)))
@@ -119,7 +126,9 @@ def _offsets(
     """From the middle of each pixel to a centre, in pixels: along the rows and along the
     columns."""
     return list(
-        np.broadcast_arrays((centre[0] - rows - 0.5)[:, None], (centre[1] - columns - 0.5)[None])
+        np.broadcast_arrays(
+            (centre[0] - rows - 0.5)[:, None], (centre[1] - columns - 0.5)[None]
+        )
     )
 
 
@@ -151,9 +160,9 @@ def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) ->
         pixels = np.stack(np.divmod(index.numpy(), heat.shape[-1])) + 0.5
         x, y = (pixels + found[:2]) * pixel - REACH
         yaw = np.arctan2(found[7], found[6]) / 2
-        candidates = np.stack([x, y, found[2], *np.exp(found[3:6].clip(-3, 4)), yaw], 1).astype(
-            np.float32
-        )
+        candidates = np.stack(
+            [x, y, found[2], *np.exp(found[3:6].clip(-3, 4)), yaw], 1
+        ).astype(np.float32)
         kept = _apart(candidates[:, :2], APART[each])
         boxes.append(candidates[kept])
         scores.append(top.values.numpy()[: len(index)][kept])

@@ -7,7 +7,9 @@ CLASSES = {
 }
 """Names of the boxes of each class; other boxes (trucks, trams) are background."""
 
-CLASS_OF = {name: number for number, names in enumerate(CLASSES.values()) for name in names}
+CLASS_OF = {
+    name: number for number, names in enumerate(CLASSES.values()) for name in names
+}
 """From a box's name to the number of its class."""
 
 LEAST = 5

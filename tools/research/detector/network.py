@@ -32,13 +32,17 @@ Sample = tuple[Tensor, Target]
 def sample(scan: Scan, rng: np.random.Generator) -> Sample:
     """The view and the targets of a scan with boxes."""
     boxes = detected(scan)
-    return view(scan.points, scan.reflectance), targets(boxes.values, classes_of(boxes), PIXEL)
+    return view(scan.points, scan.reflectance), targets(
+        boxes.values, classes_of(boxes), PIXEL
+    )
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
     """A batch of samples."""
     views, each = zip(*samples, strict=True)
-    return torch.stack(views), Target(*(torch.stack(part) for part in zip(*each, strict=True)))
+    return torch.stack(views), Target(
+        *(torch.stack(part) for part in zip(*each, strict=True))
+    )
 
 
 def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -65,7 +69,9 @@ class Detector(nn.Module):
             )
             for width, scale in ((second, 2), (third, 4))
         )
-        self.head = nn.Sequential(_layer(3 * first, 48), nn.Conv2d(48, len(CLASSES) + REGRESSED, 1))
+        self.head = nn.Sequential(
+            _layer(3 * first, 48), nn.Conv2d(48, len(CLASSES) + REGRESSED, 1)
+        )
         nn.init.constant_(self.head[1].bias[: len(CLASSES)], RARE_HEAT)
 
     def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,7 +98,9 @@ def answer(network: nn.Module, views: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _input(views: Tensor) -> Tensor:
-    return views.to(torch.bfloat16 if faster_in_bfloat16() else torch.float32).permute(0, 3, 1, 2)
+    return views.to(torch.bfloat16 if faster_in_bfloat16() else torch.float32).permute(
+        0, 3, 1, 2
+    )
 
 
 def _precision() -> torch.autocast:
@@ -105,22 +113,34 @@ def loss_of(logits: Tensor, values: Tensor, target: Target) -> Tensor:
     log_p = F.logsigmoid(logits)
     log_q = F.logsigmoid(-logits)
     centre = target.heat == 1
-    heat = torch.where(centre, (1 - p) ** 2 * log_p, (1 - target.heat) ** 4 * p**2 * log_q)
+    heat = torch.where(
+        centre, (1 - p) ** 2 * log_p, (1 - target.heat) ** 4 * p**2 * log_q
+    )
     error = (values - target.values).abs() * target.weight[:, None]
-    return -heat.sum() / centre.sum().clamp(min=1) + error.sum() / target.weight.sum().clamp(min=1)
+    return -heat.sum() / centre.sum().clamp(
+        min=1
+    ) + error.sum() / target.weight.sum().clamp(min=1)
 
 
 def train(
-    network: Detector, batches: Iterable[Sample], iterations: int, rate: float, name: str
+    network: Detector,
+    batches: Iterable[Sample],
+    iterations: int,
+    rate: float,
+    name: str,
 ) -> list[float]:
     """Train a network in place; the loss of every iteration. AdamW, one cycle of the learning
     rate."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     network.train()
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=iterations)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, rate, total_steps=iterations
+    )
     losses: list[float] = []
-    bar = tqdm(islice(batches, iterations), name, iterations, mininterval=5, unit="iteration")
+    bar = tqdm(
+        islice(batches, iterations), name, iterations, mininterval=5, unit="iteration"
+    )
     for views, target in bar:
         loss = loss_of(*answer(network, views), target)
         optimizer.zero_grad()
@@ -142,7 +162,9 @@ def settled(network: Detector, batches: Iterable[Sample]) -> Detector:
     return network.eval()
 
 
-def detect(network: Detector, views: Callable[[int], Tensor], count: int) -> list[Found]:
+def detect(
+    network: Detector, views: Callable[[int], Tensor], count: int
+) -> list[Found]:
     """The boxes that a network in evaluation mode finds in views 0 to ``count`` - 1."""
     every = []
     with torch.no_grad():

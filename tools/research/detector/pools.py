@@ -37,7 +37,9 @@ def make_pool(folder: Path, count: int, make: Callable[[int], Scan]) -> Source:
     return open_scans(folder)
 
 
-def streets(folder: Path, seed: int, first: int, count: int, every_box: bool = False) -> Source:
+def streets(
+    folder: Path, seed: int, first: int, count: int, every_box: bool = False
+) -> Source:
     """One scan of each of ``count`` stretches of a town, from the stretch ``first`` on.
 
     Of three moments of a stretch, the one with most pedestrians and cyclists near the vehicle is
@@ -50,7 +52,9 @@ def streets(folder: Path, seed: int, first: int, count: int, every_box: bool = F
         first, count: its stretches.
         every_box: whether to keep boxes with few points, too.
     """
-    town = Town(seed, SENSOR, (first + count) * STRETCH_FRAMES, interval=2.0, motion=False)
+    town = Town(
+        seed, SENSOR, (first + count) * STRETCH_FRAMES, interval=2.0, motion=False
+    )
 
     def make(number: int) -> Scan:
         moments = [(first + number) * STRETCH_FRAMES + frame for frame in FRAMES]
@@ -65,7 +69,9 @@ def _rare(town: Town, index: int) -> int:
     two."""
     snapshot, pose, _ = town.moment(index)
     objects = [
-        o for o in (*town.world(index).scene.placed, *snapshot.movers) if o.prototype.name in RARE
+        o
+        for o in (*town.world(index).scene.placed, *snapshot.movers)
+        if o.prototype.name in RARE
     ]
     places = [(np.linalg.inv(pose) @ o.pose)[:2, 3] for o in objects]
     return sum(
@@ -94,7 +100,9 @@ def laid_out(folder: Path, model: str, layouts: Source) -> Source:
     return make_pool(
         folder,
         len(layouts),
-        lambda i: with_points(remove_unboxed(generator.scans(0, [i], condition=layouts[i])[0])),
+        lambda i: with_points(
+            remove_unboxed(generator.scans(0, [i], condition=layouts[i])[0])
+        ),
     )
 
 

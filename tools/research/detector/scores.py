@@ -33,7 +33,9 @@ class Truth:
         """The boxes of a scan."""
         boxes = detected(scan)
         inside = (np.abs(boxes.values[:, :2]) < REACH).all(1)
-        return cls(boxes.values, classes_of(boxes), inside & (points_in(boxes, scan) >= LEAST))
+        return cls(
+            boxes.values, classes_of(boxes), inside & (points_in(boxes, scan) >= LEAST)
+        )
 
 
 def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
@@ -46,12 +48,18 @@ def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
             mine = some.classes == each
             real = truth.classes == each
             right = matched(
-                some.boxes[mine], some.scores[mine], truth.boxes[real], truth.wanted[real], least
+                some.boxes[mine],
+                some.scores[mine],
+                truth.boxes[real],
+                truth.wanted[real],
+                least,
             )
             scores.append(some.scores[mine][right >= 0])
             hits.append(right[right >= 0])
         wanted = sum(int(truth.wanted[truth.classes == each].sum()) for truth in truths)
-        every.append(average_precision(np.concatenate(scores), np.concatenate(hits), wanted))
+        every.append(
+            average_precision(np.concatenate(scores), np.concatenate(hits), wanted)
+        )
     return every
 
 
@@ -77,18 +85,25 @@ def matched(
     return result
 
 
-def footprint_ious(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+def footprint_ious(
+    a: NDArray[np.float32], b: NDArray[np.float32]
+) -> NDArray[np.float64]:
     """(A, B) intersection over union of the footprints of boxes (A, 7) and (B, 7)."""
     ious = np.zeros((len(a), len(b)))
     if not ious.size:
         return ious
     distance = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
-    near = distance < (np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])) / 2
+    near = (
+        distance
+        < (np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])) / 2
+    )
     first = _footprints(a)
     second = _footprints(b)
     for i, j in np.argwhere(near):
         common = _common_area(first[i], second[j])
-        ious[i, j] = common / (float(a[i, 3]) * a[i, 4] + float(b[j, 3]) * b[j, 4] - common)
+        ious[i, j] = common / (
+            float(a[i, 3]) * a[i, 4] + float(b[j, 3]) * b[j, 4] - common
+        )
     return ious
 
 
@@ -103,14 +118,17 @@ def _common_area(polygon: NDArray[np.float64], window: NDArray[np.float64]) -> f
     Hodgman (1974)."""
     for start, end in zip(window, np.roll(window, -1, 0), strict=True):
         along = end - start
-        left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0])
+        left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (
+            polygon[:, 0] - start[0]
+        )
         clipped = []
         for k in range(len(polygon)):
             before = left[k - 1]
             here = left[k]
             if (before < 0) != (here < 0):
                 clipped.append(
-                    polygon[k - 1] + (polygon[k] - polygon[k - 1]) * before / (before - here)
+                    polygon[k - 1]
+                    + (polygon[k] - polygon[k - 1]) * before / (before - here)
                 )
             if here >= 0:
                 clipped.append(polygon[k])
@@ -122,7 +140,9 @@ def _common_area(polygon: NDArray[np.float64], window: NDArray[np.float64]) -> f
 
 
 def average_precision(
-    confidence: NDArray[np.floating], hits: NDArray[np.floating] | NDArray[np.integer], boxes: int
+    confidence: NDArray[np.floating],
+    hits: NDArray[np.floating] | NDArray[np.integer],
+    boxes: int,
 ) -> float:
     """Area under precision over recall, where precision is the best at that recall or a higher one.
 
@@ -134,5 +154,7 @@ def average_precision(
     if not boxes:
         return float("nan")
     right = np.cumsum(hits[np.argsort(-confidence, kind="stable")])
-    precision = np.maximum.accumulate((right / np.arange(1, len(right) + 1))[::-1])[::-1]
+    precision = np.maximum.accumulate((right / np.arange(1, len(right) + 1))[::-1])[
+        ::-1
+    ]
     return float((precision * np.diff(right, prepend=0)).sum() / boxes)

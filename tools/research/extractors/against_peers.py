@@ -58,7 +58,9 @@ def _functions(path: Path, names: Iterable[str], env: dict[str, Any]) -> Namespa
 
 
 def _namespace(values: dict[str, Any]) -> Namespace:
-    return Namespace(**{k: _namespace(v) if isinstance(v, dict) else v for k, v in values.items()})
+    return Namespace(
+        **{k: _namespace(v) if isinstance(v, dict) else v for k, v in values.items()}
+    )
 
 
 class R2Flow:
@@ -83,7 +85,9 @@ class R2Flow:
         depth = grid[:, 4:5]
         mask = grid[:, 5:6]
         return (
-            torch.cat([depth, xyz, rflct], 1) * mask * torch.logical_and(depth > 0.5, depth < 63.0)
+            torch.cat([depth, xyz, rflct], 1)
+            * mask
+            * torch.logical_and(depth > 0.5, depth < 63.0)
         )
 
     def rangenet(self, archive: Path, agg_type: str, channels: int) -> Peer:
@@ -118,15 +122,20 @@ class R2Flow:
 
         from r2flow.metrics.models import utls
 
-        model = getattr(importlib.import_module(f"r2flow.metrics.models.{module}"), name)
+        model = getattr(
+            importlib.import_module(f"r2flow.metrics.models.{module}"), name
+        )
         net = _loaded(
-            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive
+            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))),
+            archive,
         )
         utls.unique = _unique
         before = utls.PreProcess()
         after = utls.PostProcess()
         return Peer(
-            lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[0].numpy()
+            lambda p: after(net(before(self.image(p)[:, 1:4].flatten(2).mT)), "depth")[
+                0
+            ].numpy()
         )
 
 
@@ -175,7 +184,9 @@ class LiDM:
         def of_image(image: torch.Tensor) -> NDArray[np.floating]:
             return net(image, return_final_logits=True, agg_type="depth")[0]
 
-        return Peer(lambda p: of_image(torch.from_numpy(self.image(p)[None]).float()), of_image)
+        return Peer(
+            lambda p: of_image(torch.from_numpy(self.image(p)[None]).float()), of_image
+        )
 
     def voxels(self, archive: Path, module: str) -> Peer:
         """MinkowskiNet or SPVCNN."""
@@ -183,14 +194,17 @@ class LiDM:
 
         model = importlib.import_module(f"lidm.modules.{module}.model").Model
         net = _loaded(
-            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))), archive
+            model(_namespace(yaml.safe_load((archive / "config.yaml").read_text()))),
+            archive,
         )
 
         def features(points: Points) -> NDArray[np.floating]:
             voxels = self.metrics.pcd2voxel(
                 self.metrics.preprocess_pcd(self.cloud(points), **self.config)
             )
-            out = net(self.metrics.sparse_collate_fn([voxels]), return_final_logits=True)
+            out = net(
+                self.metrics.sparse_collate_fn([voxels]), return_final_logits=True
+            )
             return self.metrics.batch2list(out, "depth", **self.config)[0]
 
         return Peer(features)
@@ -203,7 +217,9 @@ class R3DPA:
         sys.path.insert(0, str(clones / "R3DPA"))
         env = {"np": np, "torch": torch}
         dataset = _functions(clones / "R3DPA" / "dataset_kitti.py", ("pcd2range",), env)
-        config = yaml.safe_load((clones / "R3DPA" / "configs" / "kitti.yaml").read_text())
+        config = yaml.safe_load(
+            (clones / "R3DPA" / "configs" / "kitti.yaml").read_text()
+        )
         self.arguments = {
             "size": config["size"],
             "fov": config["fov"],
@@ -213,7 +229,9 @@ class R3DPA:
 
     def image(self, points: Points) -> NDArray[np.float32]:
         """(2, 64, 1024) range in metres, -1 where there is none, and intensity."""
-        depth, intensity = self.project(points[:, :3], labels=points[:, 3], **self.arguments)
+        depth, intensity = self.project(
+            points[:, :3], labels=points[:, 3], **self.arguments
+        )
         return np.stack([np.where(depth > 0, depth, -1), intensity]).astype(np.float32)
 
     def network(self, archive: Path, name: str) -> Peer:
@@ -226,7 +244,9 @@ class R3DPA:
         net = _loaded(model(_namespace(settings)), archive)
 
         def of_image(image: torch.Tensor) -> NDArray[np.floating]:
-            inputs = ((image - net.image_mean) / net.image_std)[:, : settings["in_channels"]]
+            inputs = ((image - net.image_mean) / net.image_std)[
+                :, : settings["in_channels"]
+            ]
             return (
                 net.rangevit.forward_2d_features(inputs)[0]
                 .unflatten(1, (8, -1))
@@ -236,7 +256,8 @@ class R3DPA:
             )
 
         return Peer(
-            lambda p: net([self.image(p)])[0].numpy(), of_image if name == "rangevit" else None
+            lambda p: net([self.image(p)])[0].numpy(),
+            of_image if name == "rangevit" else None,
         )
 
 
@@ -246,12 +267,17 @@ def _loaded(net: torch.nn.Module, archive: Path) -> torch.nn.Module:
     state = torch.load(archive / "model.ckpt", weights_only=True)["state_dict"]
     missing, unexpected = net.load_state_dict(state, strict=False)
     assert not unexpected, unexpected
-    assert all(k.startswith(("rangevit.kpclassifier", "image_")) for k in missing), missing
+    assert all(k.startswith(("rangevit.kpclassifier", "image_")) for k in missing), (
+        missing
+    )
     return net.eval()
 
 
 def _bonnetal(
-    clones: Path, archive: Path, name: str, pool: Callable[[torch.Tensor, torch.Tensor], Any]
+    clones: Path,
+    archive: Path,
+    name: str,
+    pool: Callable[[torch.Tensor, torch.Tensor], Any],
 ) -> Peer:
     """lidar-bonnetal's own network on its own projection; ``pool`` makes features of (1, C, H, W)
     and the image.
@@ -278,17 +304,25 @@ def _bonnetal(
         settings["decoder"], skips, OS=stride, feature_depth=backbone.get_last_depth()
     )
     backbone.load_state_dict(torch.load(archive / "backbone", weights_only=True))
-    decoder.load_state_dict(torch.load(archive / "segmentation_decoder", weights_only=True))
+    decoder.load_state_dict(
+        torch.load(archive / "segmentation_decoder", weights_only=True)
+    )
     backbone.eval(), decoder.eval()
     sensor = settings["dataset"]["sensor"]
-    mean, std = (torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds"))
+    mean, std = (
+        torch.tensor(sensor[k])[:, None, None] for k in ("img_means", "img_stds")
+    )
 
     def of_image(image: torch.Tensor) -> NDArray[np.floating]:
         return pool(decoder(*backbone(image)), image).numpy()  # type: ignore[no-any-return]
 
     def features(points: Points) -> NDArray[np.floating]:
-        scan = LaserScan(project=True, H=64, W=sensor["img_prop"]["width"], fov_up=3, fov_down=-25)
-        hidden_first = np.concatenate([points[:1] * np.float32([1.5, 1.5, 1.5, 1]), points])
+        scan = LaserScan(
+            project=True, H=64, W=sensor["img_prop"]["width"], fov_up=3, fov_down=-25
+        )
+        hidden_first = np.concatenate(
+            [points[:1] * np.float32([1.5, 1.5, 1.5, 1]), points]
+        )
         scan.set_points(hidden_first[:, :3].copy(), hidden_first[:, 3].copy())
         channels = [
             scan.proj_range[None],
@@ -296,7 +330,9 @@ def _bonnetal(
             scan.proj_remission[None],
         ]
         mask = torch.from_numpy(scan.proj_mask).float()
-        return of_image(((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None])
+        return of_image(
+            ((torch.from_numpy(np.concatenate(channels)) - mean) / std * mask)[None]
+        )
 
     return Peer(features, of_image)
 
@@ -317,7 +353,9 @@ def _rangenet21(clones: Path, archive: Path) -> Peer:
     from r2flow.metrics.models import rangenet
 
     pool = rangenet.PostProcess()
-    return _bonnetal(clones, archive, "darknet", lambda maps, image: pool(maps, "subsample")[0])
+    return _bonnetal(
+        clones, archive, "darknet", lambda maps, image: pool(maps, "subsample")[0]
+    )
 
 
 def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
@@ -339,7 +377,10 @@ def peers(clones: Path) -> dict[str, tuple[Callable[[Path], Peer], str]]:
             lambda a: r2flow.voxels(a, "minkowskinet", "MinkowskiNet"),
             "r2flow",
         ),
-        "lidm_spvcnn as r2flow": (lambda a: r2flow.voxels(a, "spvcnn", "SPVCNN"), "r2flow"),
+        "lidm_spvcnn as r2flow": (
+            lambda a: r2flow.voxels(a, "spvcnn", "SPVCNN"),
+            "r2flow",
+        ),
         "r3dpa_rangevit": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
         "r3dpa_rangevit_remission": (lambda a: r3dpa.network(a, "rangevit"), "r3dpa"),
         "liploc": (lambda a: r3dpa.network(a, "liploc"), "r3dpa"),
@@ -353,13 +394,17 @@ def read(path: Path) -> Points:
     points = np.fromfile(path, np.float32).reshape(-1, 4)
     cells = locate(points[:, :3].copy(), presets()["hdl64e_kitti360"])
     _, first = np.unique(
-        np.column_stack([cells.cell, cells.range.view(np.int32)]), axis=0, return_index=True
+        np.column_stack([cells.cell, cells.range.view(np.int32)]),
+        axis=0,
+        return_index=True,
     )
     points = points[np.sort(first)]
     x, y, z = points[:, :3].T.astype(np.float64)
     column = (1 - np.arctan2(y, x) / np.pi) / 2 * 2048
     row = (3 - np.degrees(np.arcsin(z / np.sqrt(x**2 + y**2 + z**2)))) / 28 * 64
-    inside = np.logical_and.reduce([abs(v - np.round(v)) > 0.002 for v in (column, row)])
+    inside = np.logical_and.reduce(
+        [abs(v - np.round(v)) > 0.002 for v in (column, row)]
+    )
     return points[inside]
 
 
@@ -400,7 +445,10 @@ def compare(clones: Path, files: list[Path], only: list[str]) -> None:
             theirs = reduced(b, half - 1)
             distances = [
                 f"{v:.6g}"
-                for v in (frechet_distance(ours[:half], ours[half:]), frechet(theirs, half))
+                for v in (
+                    frechet_distance(ours[:half], ours[half:]),
+                    frechet(theirs, half),
+                )
             ]
         print(
             f"| {name} | {preparation} | {a.shape[1]} | {error:.1e} | {distances[0]} | "
@@ -417,7 +465,9 @@ def peers_frechet(clones: Path) -> Callable[[NDArray[np.float64], int], float]:
 
     def distance(x: NDArray[np.float64], first: int) -> float:
         moments = [
-            m for part in (x[:first], x[first:]) for m in (part.mean(0), np.cov(part, rowvar=False))
+            m
+            for part in (x[:first], x[first:])
+            for m in (part.mean(0), np.cov(part, rowvar=False))
         ]
         return float(code.calculate_frechet_distance(*moments))
 
@@ -448,11 +498,15 @@ def golden(clones: Path, path: Path) -> None:
                 seed: int, scale: float, peer: Peer = peer, channels: int = channels
             ) -> NDArray[np.floating]:
                 if peer.of_image:
-                    return np.asarray(peer.of_image(random_image(channels, seed, scale)))
+                    return np.asarray(
+                        peer.of_image(random_image(channels, seed, scale))
+                    )
                 return np.asarray(peer.features(random_points(1000, seed, scale)))
 
             features = (
-                peer.of_image(random_image(channels)) if peer.of_image else peer.features(points)
+                peer.of_image(random_image(channels))
+                if peer.of_image
+                else peer.features(points)
             )
             found[key] = np.ascontiguousarray(features, np.float32)
             both = reduced(np.stack([of(*one) for one in two_sets()]))
@@ -474,7 +528,9 @@ def main() -> None:
     if given.golden:
         golden(given.clones, given.golden)
     else:
-        compare(given.clones, sorted(given.folder.rglob("*.bin"))[: given.scans], given.only)
+        compare(
+            given.clones, sorted(given.folder.rglob("*.bin"))[: given.scans], given.only
+        )
 
 
 if __name__ == "__main__":

@@ -44,7 +44,12 @@ RANGEVIT = {
     "D_h": 128,
     "use_kpconv": True,
     "original_image_size": [64, 1024],
-    "sensor": {"fov_up": 3, "fov_down": -25, "depth_range": [1.0, 56.0], "depth_scale": 56},
+    "sensor": {
+        "fov_up": 3,
+        "fov_down": -25,
+        "depth_range": [1.0, 56.0],
+        "depth_scale": 56,
+    },
 }
 
 
@@ -61,10 +66,14 @@ def fill(module: nn.Module, seed: int) -> dict[str, torch.Tensor]:
             low = 0.5
             high = 1.5
         elif last == "kernel" and value.ndim == 3:
-            high = (1 / value.shape[1]) ** 0.5  # sparse: about three of 27 neighbours are there
+            high = (
+                1 / value.shape[1]
+            ) ** 0.5  # sparse: about three of 27 neighbours are there
             low = -high
         elif value.ndim > 1 and last in ("weight", "kernel"):
-            high = (3 / (value.shape[0] if last == "kernel" else value[0].numel())) ** 0.5
+            high = (
+                3 / (value.shape[0] if last == "kernel" else value[0].numel())
+            ) ** 0.5
             low = -high
         else:
             low = -0.1
@@ -134,42 +143,64 @@ def _lidm_rangenet(folder: Path, seed: int) -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(settings))
 
 
-def _checkpoint(folder: Path, settings: dict[str, Any], state: dict[str, torch.Tensor]) -> None:
+def _checkpoint(
+    folder: Path, settings: dict[str, Any], state: dict[str, torch.Tensor]
+) -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(settings))
     torch.save({"state_dict": state, "epoch": 1}, folder / "model.ckpt")
 
 
 def _voxels(network: type[MinkowskiNet]) -> Callable[[Path, int], None]:
-    widths = [int(VOXELS["model_params"]["cr"] * w) for w in VOXELS["model_params"]["layer_num"]]  # type: ignore
+    widths = [
+        int(VOXELS["model_params"]["cr"] * w)
+        for w in VOXELS["model_params"]["layer_num"]
+    ]  # type: ignore
     return lambda folder, seed: _checkpoint(folder, VOXELS, fill(network(widths), seed))
 
 
 def _rangevit(channels: int) -> Callable[[Path, int], None]:
     settings = RANGEVIT | {"in_channels": channels}
-    return lambda folder, seed: _checkpoint(folder, settings, fill(build(settings), seed))
+    return lambda folder, seed: _checkpoint(
+        folder, settings, fill(build(settings), seed)
+    )
 
 
 def _liploc(folder: Path, seed: int) -> None:
     import timm
 
-    settings = {"trained_image_model_name": "resnet50", "pretrained": False, "trainable": False}
+    settings = {
+        "trained_image_model_name": "resnet50",
+        "pretrained": False,
+        "trainable": False,
+    }
     state = fill(
-        timm.create_model("resnet50", pretrained=False, num_classes=0, global_pool="avg"), seed
+        timm.create_model(
+            "resnet50", pretrained=False, num_classes=0, global_pool="avg"
+        ),
+        seed,
     )
     _checkpoint(folder, settings, {PREFIX + k: v for k, v in state.items()})
 
 
 WRITERS: dict[str, Callable[[Path, int], None]] = {
-    "rangenet53": lambda f, s: _bonnetal(f, RangeNet(5, 20, 53), "darknet", s, 1024, True, 53),
-    "rangenet21": lambda f, s: _bonnetal(f, RangeNet(5, 20, 21), "darknet", s, 2048, True, 21),
-    "squeezeseg": lambda f, s: _bonnetal(f, SqueezeSeg(5, 20), "squeezeseg", s, 2048, True, 0),
+    "rangenet53": lambda f, s: _bonnetal(
+        f, RangeNet(5, 20, 53), "darknet", s, 1024, True, 53
+    ),
+    "rangenet21": lambda f, s: _bonnetal(
+        f, RangeNet(5, 20, 21), "darknet", s, 2048, True, 21
+    ),
+    "squeezeseg": lambda f, s: _bonnetal(
+        f, SqueezeSeg(5, 20), "squeezeseg", s, 2048, True, 0
+    ),
     "lidm_rangenet": _lidm_rangenet,
     "r2flow_rangenet": lambda f, s: _bonnetal(
         f, RangeNet(4, 20, 21), "darknet", s, 1024, False, 21
     ),
     "r3dpa_rangevit": _rangevit(4),
     "r3dpa_rangevit_remission": _rangevit(5),
-    "sparenet_pointnet": lambda f, s: torch.save(fill(PointNet(), s), f / "cls_model_39.pth"),
+    "sparenet_pointnet": lambda f, s: torch.save(
+        fill(PointNet(), s), f / "cls_model_39.pth"
+    ),
     "lidm_minkowski": _voxels(MinkowskiNet),
     "lidm_spvcnn": _voxels(SPVCNN),
     "liploc": _liploc,

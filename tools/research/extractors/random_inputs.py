@@ -17,7 +17,9 @@ SCALES = (1.0, 1.25)
 the features."""
 
 
-def random_points(count: int = 3000, seed: int = 5, scale: float = 1.0) -> NDArray[np.float32]:
+def random_points(
+    count: int = 3000, seed: int = 5, scale: float = 1.0
+) -> NDArray[np.float32]:
     """(N, 4) points all around a sensor, 2 m to 70 m away, and their reflectance."""
     rng = np.random.RandomState(seed)
     azimuth = rng.uniform(-np.pi, np.pi, count)
@@ -38,7 +40,11 @@ def random_points(count: int = 3000, seed: int = 5, scale: float = 1.0) -> NDArr
 def random_image(channels: int, seed: int = 6, scale: float = 1.0) -> torch.Tensor:
     """(1, C, 64, 64) normalised image with empty cells."""
     rng = np.random.RandomState(seed)
-    image = rng.uniform(-1, 1, (channels, 64, 64)) * (rng.random_sample((64, 64)) < 0.8) * scale
+    image = (
+        rng.uniform(-1, 1, (channels, 64, 64))
+        * (rng.random_sample((64, 64)) < 0.8)
+        * scale
+    )
     return torch.from_numpy(image.astype(np.float32))[None]
 
 

@@ -12,7 +12,9 @@ def import_torchvision() -> None:
     except RuntimeError:
         library = torch.library.Library("torchvision", "DEF")
         for name in ("nms", "qnms"):
-            library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+            library.define(
+                f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
+            )
         _declared.append(library)  # its operators live as long as it does
         import torchvision  # noqa: F401
 

@@ -44,11 +44,20 @@ def kitti(out: Path, scans: int) -> None:
     for split in ("train", "val"):
         kitti_list(root, root / f"kitti_infos_{split}.pkl", split)
     where = {"data_root": root, "points": "training/velodyne_reduced"}
-    settings = MIX | {"synthetic": layouts(out / "layouts", scans, root), "labels": "boxes"}
-    write_infos(out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", settings, **where)
+    settings = MIX | {
+        "synthetic": layouts(out / "layouts", scans, root),
+        "labels": "boxes",
+    }
+    write_infos(
+        out / "data" / "kitti_mixed", root / "kitti_infos_train.pkl", settings, **where
+    )
     objects = ObjectBank.from_scans(open_scans(town(out / "synthetic", scans, "town")))
     write_gt_database(
-        objects, root, origin="bottom", folder="kitti_gt_database", infos="kitti_dbinfos_train.pkl"
+        objects,
+        root,
+        origin="bottom",
+        folder="kitti_gt_database",
+        infos="kitti_dbinfos_train.pkl",
     )
 
 
@@ -64,9 +73,17 @@ def nuscenes(out: Path, scans: int, frame: Path | None) -> None:
             nuscenes_list(root, root / "town.json", "train", "v1.0-mini"), frame, root
         )
     made = town(out / "synthetic32", scans, "hdl32e_nuscenes")
-    where = {"data_root": root, "points": "samples/LIDAR_TOP", "sweeps": "sweeps/LIDAR_TOP"}
+    where = {
+        "data_root": root,
+        "points": "samples/LIDAR_TOP",
+        "sweeps": "sweeps/LIDAR_TOP",
+    }
     write_infos(
-        out / "data" / "nuscenes_mixed", listed, MIX | {"synthetic": made}, balance=True, **where
+        out / "data" / "nuscenes_mixed",
+        listed,
+        MIX | {"synthetic": made},
+        balance=True,
+        **where,
     )
     objects = ObjectBank.from_scans(open_scans(made))
     write_gt_database(
@@ -112,13 +129,18 @@ def layouts(out: Path, scans: int, kitti: Path) -> Path:
             str(scans),
         ]
         subprocess.run(
-            [*bake, "--condition", kitti, "--condition-layout", "kitti_object"], check=True
+            [*bake, "--condition", kitti, "--condition-layout", "kitti_object"],
+            check=True,
         )
     return out
 
 
 def shorten(
-    name: str, out: Path, iterations: int = 4, batch_size: int = 1, extra: Iterable[str] = ()
+    name: str,
+    out: Path,
+    iterations: int = 4,
+    batch_size: int = 1,
+    extra: Iterable[str] = (),
 ) -> Path:
     """Write a configuration of ours with few iterations, small batches and one worker; the network
     is the stock one.
@@ -134,7 +156,11 @@ def shorten(
     config = Config.fromfile(str(CONFIGS / name))
     loader = config.train_dataloader
     loader.update(batch_size=batch_size, num_workers=1)
-    dataset = loader.dataset.dataset if loader.dataset.type == "RepeatDataset" else loader.dataset
+    dataset = (
+        loader.dataset.dataset
+        if loader.dataset.type == "RepeatDataset"
+        else loader.dataset
+    )
     for step in dataset.pipeline:
         if step.type == "ObjectSample":
             few_objects(step.db_sampler)
@@ -145,7 +171,10 @@ def shorten(
     }
     config.param_scheduler = []
     if config.optim_wrapper.type == "AmpOptimWrapper":  # mixed precision is a GPU's
-        config.optim_wrapper = {"type": "OptimWrapper", "optimizer": config.optim_wrapper.optimizer}
+        config.optim_wrapper = {
+            "type": "OptimWrapper",
+            "optimizer": config.optim_wrapper.optimizer,
+        }
     config.default_hooks.logger = {"type": "LoggerHook", "interval": 1}
     config.default_hooks.checkpoint = {
         "type": "CheckpointHook",
@@ -168,7 +197,10 @@ def few_objects(sampler: Any) -> None:
     kept = [name for name in sampler.classes if name in ("Car", "car")]
     sampler.classes = kept
     sampler.sample_groups = dict.fromkeys(kept, 2)
-    sampler.prepare = {"filter_by_difficulty": [], "filter_by_min_points": dict.fromkeys(kept, 5)}
+    sampler.prepare = {
+        "filter_by_difficulty": [],
+        "filter_by_min_points": dict.fromkeys(kept, 5),
+    }
 
 
 def main() -> None:
@@ -180,10 +212,16 @@ def main() -> None:
     parser.add_argument("--kitti", type=Path)
     parser.add_argument("--nuscenes", type=Path)
     parser.add_argument(
-        "--frame", type=Path, help="a real nuScenes key frame: info.json and samples/LIDAR_TOP"
+        "--frame",
+        type=Path,
+        help="a real nuScenes key frame: info.json and samples/LIDAR_TOP",
     )
-    parser.add_argument("--scans", type=int, default=4, help="number of synthetic scans")
-    parser.add_argument("--configs", nargs="*", default=[], help="configurations to shorten")
+    parser.add_argument(
+        "--scans", type=int, default=4, help="number of synthetic scans"
+    )
+    parser.add_argument(
+        "--configs", nargs="*", default=[], help="configurations to shorten"
+    )
     options = parser.parse_args()
     out = options.out.resolve()
     given = {"kitti": options.kitti, "nuscenes": options.nuscenes}

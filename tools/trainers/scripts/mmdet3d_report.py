@@ -21,7 +21,11 @@ def read_named(self: Fetch, indices: list[tuple[int, int]]) -> list[Any]:
     samples = read(self, indices)
     for sample in samples:
         path = str(sample["data_samples"].lidar_path)
-        name = scan_of(*split_url(path)[:2]).id if path.startswith(PREFIX) else Path(path).name
+        name = (
+            scan_of(*split_url(path)[:2]).id
+            if path.startswith(PREFIX)
+            else Path(path).name
+        )
         sample["data_samples"].set_metainfo({"scan": name})
     return samples
 

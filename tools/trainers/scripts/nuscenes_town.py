@@ -47,7 +47,9 @@ class Tables:
     def __init__(self) -> None:
         names = """attribute calibrated_sensor category ego_pose instance log map sample sample_annotation sample_data
         scene sensor visibility"""
-        self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in names.split()}
+        self.rows: dict[str, list[dict[str, Any]]] = {
+            name: [] for name in names.split()
+        }
 
     def add(self, table: str, token: str, **values: Any) -> dict[str, Any]:
         """Add a row."""
@@ -72,18 +74,30 @@ def write_dataset(out: Path, seed: int) -> None:
     tables = Tables()
     tables.add("visibility", "4", level="v80-100", description="")
     tables.add("sensor", "lidar", channel="LIDAR_TOP", modality="lidar")
-    mount = {"translation": [0, 0, HEIGHT], "rotation": Quaternion(matrix=AHEAD).elements.tolist()}
-    tables.add("calibrated_sensor", "mount", sensor_token="lidar", camera_intrinsic=[], **mount)
+    mount = {
+        "translation": [0, 0, HEIGHT],
+        "rotation": Quaternion(matrix=AHEAD).elements.tolist(),
+    }
+    tables.add(
+        "calibrated_sensor", "mount", sensor_token="lidar", camera_intrinsic=[], **mount
+    )
     for category, attribute in CATEGORIES.values():
         tables.add("category", category, name=category, description="")
         tables.add("attribute", attribute, name=attribute, description="")
     town = Town(
-        seed=seed, sensor="hdl32e_nuscenes", scans=STRETCH_FRAMES * len(SCENES), interval=INTERVAL
+        seed=seed,
+        sensor="hdl32e_nuscenes",
+        scans=STRETCH_FRAMES * len(SCENES),
+        interval=INTERVAL,
     )
     # The devkit asks for a map of each log.
     tables.add("log", "log", logfile="", vehicle="", date_captured="", location="")
     tables.add(
-        "map", "map", category="semantic_prior", filename="maps/empty.png", log_tokens=["log"]
+        "map",
+        "map",
+        category="semantic_prior",
+        filename="maps/empty.png",
+        log_tokens=["log"],
     )
     (out / "maps").mkdir(parents=True, exist_ok=True)
     Image.new("L", (8, 8)).save(out / "maps" / "empty.png")
@@ -103,7 +117,9 @@ def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -
         key = frame in KEYS
         sample = f"{name}-{KEYS[0] if frame <= KEYS[0] else KEYS[1]}"
         if key:
-            samples.append(tables.add("sample", sample, timestamp=stamp, scene_token=name))
+            samples.append(
+                tables.add("sample", sample, timestamp=stamp, scene_token=name)
+            )
             annotate(tables, scan, sample, tracks, name)
         token = f"{name}-{frame:02d}"
         file = f"{'samples' if key else 'sweeps'}/LIDAR_TOP/{name}__LIDAR_TOP__{stamp}.pcd.bin"
@@ -148,14 +164,27 @@ def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -
             nbr_annotations=len(rows),
             **ends,
         )
-    ends = {"first_sample_token": samples[0]["token"], "last_sample_token": samples[-1]["token"]}
+    ends = {
+        "first_sample_token": samples[0]["token"],
+        "last_sample_token": samples[-1]["token"],
+    }
     tables.add(
-        "scene", name, name=name, description="", log_token="log", nbr_samples=len(samples), **ends
+        "scene",
+        name,
+        name=name,
+        description="",
+        log_token="log",
+        nbr_samples=len(samples),
+        **ends,
     )
 
 
 def annotate(
-    tables: Tables, scan: Scan, sample: str, tracks: dict[int, list[dict[str, Any]]], scene: str
+    tables: Tables,
+    scan: Scan,
+    sample: str,
+    tracks: dict[int, list[dict[str, Any]]],
+    scene: str,
 ) -> None:
     """Add the boxes of a key frame to the tables, and to the tracks of their instances."""
     assert scan.boxes is not None

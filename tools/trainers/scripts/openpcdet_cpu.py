@@ -51,7 +51,11 @@ def prepare(tree: Path) -> None:
         _module(f"pcdet.ops.{name}")
     # Imports av2 and kornia for its own data.
     _module("pcdet.datasets.argo2.argo2_dataset", Argo2Dataset=None)
-    functions = {name: value for name, value in vars(compiled).items() if not name.startswith("__")}
+    functions = {
+        name: value
+        for name, value in vars(compiled).items()
+        if not name.startswith("__")
+    }
     _module("pcdet.ops.roiaware_pool3d.roiaware_pool3d_cuda", **functions)
     overlaps = Overlaps(compiled.boxes_iou_bev_cpu)
     functions |= {"nms_gpu": overlaps.suppress, "boxes_overlap_bev_gpu": overlaps.areas}
@@ -67,10 +71,14 @@ def compile_functions(tree: Path) -> Any:
     """Compile OpenPCDet's functions for a CPU, once for each version of torch; takes half a
     minute."""
     cache = Path(
-        os.environ.get("TORCH_EXTENSIONS_DIR", Path.home() / ".cache" / "torch_extensions")
+        os.environ.get(
+            "TORCH_EXTENSIONS_DIR", Path.home() / ".cache" / "torch_extensions"
+        )
     )
     folder = cache / f"openpcdet_cpu_{torch.__version__}"
-    headers = folder / "include"  # its sources for a CPU include CUDA's headers without use
+    headers = (
+        folder / "include"
+    )  # its sources for a CPU include CUDA's headers without use
     headers.mkdir(parents=True, exist_ok=True)
     for name in ("cuda.h", "cuda_runtime_api.h"):
         if not (headers / name).exists():
@@ -83,7 +91,11 @@ def compile_functions(tree: Path) -> Any:
         "openpcdet_cpu",
         [str(Path(__file__).with_suffix(".cpp"))],
         extra_cflags=["-O1", "-w"],
-        extra_include_paths=[str(headers), str(operators), str(operators / "iou3d_nms" / "src")],
+        extra_include_paths=[
+            str(headers),
+            str(operators),
+            str(operators / "iou3d_nms" / "src"),
+        ],
         build_directory=str(folder),
     )
 
@@ -98,7 +110,9 @@ class Overlaps:
     def ratios(self, boxes: Any, others: Any) -> Any:
         """(N, M) intersection over union seen from above."""
         out = torch.zeros(len(boxes), len(others))
-        self._compute(boxes[:, :7].float().contiguous(), others[:, :7].float().contiguous(), out)
+        self._compute(
+            boxes[:, :7].float().contiguous(), others[:, :7].float().contiguous(), out
+        )
         return out
 
     def suppress(self, boxes: Any, keep: Any, threshold: float) -> int:
@@ -116,7 +130,9 @@ class Overlaps:
     def areas(self, boxes: Any, others: Any, out: Any) -> None:
         """Fill (N, M) with the areas of intersection in square metres."""
         ratio = self.ratios(boxes, others)
-        both = (boxes[:, 3] * boxes[:, 4])[:, None] + (others[:, 3] * others[:, 4])[None]
+        both = (boxes[:, 3] * boxes[:, 4])[:, None] + (others[:, 3] * others[:, 4])[
+            None
+        ]
         out.copy_(ratio * both / (1 + ratio))
 
 

@@ -40,7 +40,13 @@ def main() -> None:
     from lidar_synth.labels import ObjectBank
 
     torch.Tensor.cuda = lambda self, *args, **kwargs: self  # type: ignore[method-assign]
-    stock = options.tree / "tools" / "cfgs" / "dataset_configs" / f"{options.kind}_dataset.yaml"
+    stock = (
+        options.tree
+        / "tools"
+        / "cfgs"
+        / "dataset_configs"
+        / f"{options.kind}_dataset.yaml"
+    )
     config = EasyDict(yaml.safe_load(stock.read_text()))
     {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[options.kind](
         config, options.folder, ObjectBank.load(options.objects)
@@ -63,32 +69,47 @@ def prepare_kitti(config: Any, folder: Path, objects: Any) -> None:
         file = folder / f"kitti_infos_{split}.pkl"
         file.write_bytes(pickle.dumps(dataset.get_infos(num_workers=1)))
     dataset.create_groundtruth_database(file, split="train")
-    write_gt_database(objects, folder, origin="gravity", infos="kitti_dbinfos_train.pkl")
+    write_gt_database(
+        objects, folder, origin="gravity", infos="kitti_dbinfos_train.pkl"
+    )
 
 
 def prepare_nuscenes(config: Any, folder: Path, objects: Any) -> None:
     """Info lists of both splits and GT database."""
-    from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset, create_nuscenes_info
+    from pcdet.datasets.nuscenes.nuscenes_dataset import (
+        NuScenesDataset,
+        create_nuscenes_info,
+    )
     from pcdet.utils.common_utils import create_logger
 
     add_camera(folder / VERSION / VERSION)
     create_nuscenes_info(VERSION, folder, folder, config.MAX_SWEEPS)
     config.VERSION = VERSION
-    dataset = NuScenesDataset(config, None, training=True, root_path=folder, logger=create_logger())
+    dataset = NuScenesDataset(
+        config, None, training=True, root_path=folder, logger=create_logger()
+    )
     dataset.create_groundtruth_database(max_sweeps=config.MAX_SWEEPS)
     names = [
-        group.partition(":")[0] for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS
+        group.partition(":")[0]
+        for group in config.DATA_AUGMENTOR.AUG_CONFIG_LIST[0].SAMPLE_GROUPS
     ]
-    complete(folder / VERSION / f"nuscenes_dbinfos_{config.MAX_SWEEPS}sweeps_withvelo.pkl", names)
+    complete(
+        folder / VERSION / f"nuscenes_dbinfos_{config.MAX_SWEEPS}sweeps_withvelo.pkl",
+        names,
+    )
 
 
 def add_camera(folder: Path) -> None:
     """Add a front camera to nuScenes' tables that have none, because OpenPCDet reads its pose;
     there is no picture."""
-    tables = {name: json.loads((folder / f"{name}.json").read_text()) for name in TABLES}
+    tables = {
+        name: json.loads((folder / f"{name}.json").read_text()) for name in TABLES
+    }
     if any(row["channel"] == "CAM_FRONT" for row in tables["sensor"]):
         return
-    tables["sensor"].append({"token": "camera", "channel": "CAM_FRONT", "modality": "camera"})
+    tables["sensor"].append(
+        {"token": "camera", "channel": "CAM_FRONT", "modality": "camera"}
+    )
     # Z ahead, x right, y down.
     pose = {
         "translation": [1.7, 0, 1.5],

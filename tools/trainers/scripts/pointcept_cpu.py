@@ -39,8 +39,12 @@ def main() -> None:
 
     stay_on_cpu()
     torch.UntypedStorage.cuda = lambda self, *args, **options: self  # type: ignore[method-assign,assignment]
-    count = torch.histc  # integers on a GPU only, and Pointcept's evaluation counts classes
-    torch.histc = lambda values, *args, **options: count(values.float(), *args, **options)  # type: ignore[assignment]
+    count = (
+        torch.histc
+    )  # integers on a GPU only, and Pointcept's evaluation counts classes
+    torch.histc = lambda values, *args, **options: count(
+        values.float(), *args, **options
+    )  # type: ignore[assignment]
     from lidar_synth.integrations.pointcept import MixedSemanticKITTI
 
     read = MixedSemanticKITTI.get_data

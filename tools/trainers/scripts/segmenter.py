@@ -34,7 +34,10 @@ class Segmenter(lightning.LightningModule):
         )
 
     def on_validation_epoch_end(self) -> None:
-        print(f"validation loss {self.trainer.callback_metrics['validation loss']:.4f}", flush=True)
+        print(
+            f"validation loss {self.trainer.callback_metrics['validation loss']:.4f}",
+            flush=True,
+        )
 
     def configure_optimizers(self) -> Any:
         return torch.optim.AdamW(self.parameters(), 1e-3)

@@ -66,12 +66,16 @@ class SightEncoder(Encoder):
         self.distance = distance
         self.matrix = [[float(v) for v in row] for row in image_from_sensor]
         if [len(row) for row in self.matrix] != [4, 4, 4]:
-            raise ConfigError(f"image_from_sensor {image_from_sensor}", "3 rows of 4 numbers")
+            raise ConfigError(
+                f"image_from_sensor {image_from_sensor}", "3 rows of 4 numbers"
+            )
         reduced(self.resolution, [(2, 2)] * len(widths), "an image")
         self.angles = RayAngles(target, angles)
         self.body = nn.Sequential()
         for a, b in zip([3, *widths[:-1]], widths, strict=True):
-            self.body.extend([nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()])
+            self.body.extend(
+                [nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()]
+            )
         self.body.append(nn.Conv2d(widths[-1], channels - 1, 3, 1, 1))
 
     def pixel_coordinates(self) -> Tensor:
@@ -79,7 +83,9 @@ class SightEncoder(Encoder):
         the image, and 9 for points behind the camera."""
         elevation, azimuth = self.angles.cells
         flat = elevation.cos()
-        ray = torch.stack([flat * azimuth.cos(), -flat * azimuth.sin(), elevation.sin()], -1)
+        ray = torch.stack(
+            [flat * azimuth.cos(), -flat * azimuth.sin(), elevation.sin()], -1
+        )
         points = torch.cat([self.distance * ray, torch.ones_like(ray[..., :1])], -1)
         pixels = points @ torch.tensor(self.matrix, device=ray.device).T
         ahead = pixels[..., 2:] > 1.0
@@ -97,7 +103,12 @@ class SightEncoder(Encoder):
         x = image.to(next(self.body.parameters()).dtype) / 127.5 - 1
         features = self.body(x.contiguous(memory_format=torch.channels_last)).float()
         positions = self.pixel_coordinates()
-        visible = (positions.abs() <= 1).all(-1).float().expand(len(x), 1, *positions.shape[:2])
+        visible = (
+            (positions.abs() <= 1)
+            .all(-1)
+            .float()
+            .expand(len(x), 1, *positions.shape[:2])
+        )
         maps = F.grid_sample(
             features, positions.expand(len(x), *positions.shape), align_corners=False
         )

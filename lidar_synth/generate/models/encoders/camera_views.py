@@ -38,12 +38,16 @@ class ViewEncoder(Encoder):
         self.channels = channels
         self.views = views
         grid = reduced(
-            self.resolution, [(1, views)] + [(2, 2)] * len(widths), f"an image of {views} views"
+            self.resolution,
+            [(1, views)] + [(2, 2)] * len(widths),
+            f"an image of {views} views",
         )
         inputs = [3, *widths[:-1]]
         self.body = nn.Sequential()
         for a, b in zip(inputs, widths, strict=True):
-            self.body.extend([nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()])
+            self.body.extend(
+                [nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()]
+            )
         self.place = nn.Parameter(torch.empty(widths[-1], *grid))
         self.view_embedding = nn.Parameter(torch.empty(views, 1, widths[-1]))
         nn.init.trunc_normal_(self.place, std=0.02)
@@ -68,4 +72,8 @@ class ViewEncoder(Encoder):
 def split_views(image: Tensor, views: int) -> Tensor:
     """(B, 3, h, w) to (B views, 3, h, w / views), views from left to right."""
     batch, channels, rows, columns = image.shape
-    return image.reshape(batch, channels, rows, views, columns // views).movedim(3, 1).flatten(0, 1)
+    return (
+        image.reshape(batch, channels, rows, views, columns // views)
+        .movedim(3, 1)
+        .flatten(0, 1)
+    )

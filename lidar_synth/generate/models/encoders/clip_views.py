@@ -55,7 +55,9 @@ class ClipViewEncoder(Encoder):
             mean, std = (x.new_tensor(v).view(3, 1, 1) for v in (_CLIP_MEAN, _CLIP_STD))
             tower = load_frozen_clip(os.environ.get(CLIP_VARIABLE, ""), str(x.device))
             features = tower((x - mean) / std).reshape(-1, self.views, CLIP_WIDTH)
-        out: Tensor = self.project(features.to(self.project.weight.dtype) + self.view_embedding)
+        out: Tensor = self.project(
+            features.to(self.project.weight.dtype) + self.view_embedding
+        )
         return out
 
 
@@ -95,7 +97,9 @@ def load_frozen_clip(location: str, device: str) -> nn.Module:
         "'views', which needs neither."
     )
     if not location or not path.exists():
-        given = f"{CLIP_VARIABLE}={location}" if location else f"{CLIP_VARIABLE} is not set"
+        given = (
+            f"{CLIP_VARIABLE}={location}" if location else f"{CLIP_VARIABLE} is not set"
+        )
         raise FileError(f"CLIP's weights: {given}", "an existing folder or file", hint)
     try:
         if path.is_dir():
@@ -109,7 +113,9 @@ def load_frozen_clip(location: str, device: str) -> nn.Module:
 
             model = open_clip.create_model("ViT-L-14-quickgelu", pretrained=location)
         else:
-            raise FileError(f"CLIP's weights in {path}", "a folder, or a .safetensors file", hint)
+            raise FileError(
+                f"CLIP's weights in {path}", "a folder, or a .safetensors file", hint
+            )
     except ImportError as error:
         library = "transformers" if path.is_dir() else "open_clip_torch"
         raise LibraryError(
@@ -117,6 +123,8 @@ def load_frozen_clip(location: str, device: str) -> nn.Module:
         ) from error
     except OSError as error:
         raise FileError(
-            f"CLIP's weights in {path} cannot be read ({error})", "a complete copy", hint
+            f"CLIP's weights in {path} cannot be read ({error})",
+            "a complete copy",
+            hint,
         ) from error
     return _Tower(model, path.is_dir()).to(device).eval().requires_grad_(False)

@@ -51,7 +51,10 @@ class SemanticMapEncoder(Encoder):
         target = pair(target)
         if method not in METHODS:
             raise ConfigError(f"method {method!r}", f"one of {', '.join(METHODS)}")
-        patch = (max(1, self.resolution[0] // target[0]), max(1, self.resolution[1] // target[1]))
+        patch = (
+            max(1, self.resolution[0] // target[0]),
+            max(1, self.resolution[1] // target[1]),
+        )
         if reduced(self.resolution, [patch], "a label map") != target:
             raise ConfigError(
                 f"a label map of {self.resolution} for a state of {target}",
@@ -83,7 +86,10 @@ class SemanticMapEncoder(Encoder):
         if self.method == "rescale":
             for rows, columns in self.halvings:
                 x = F.interpolate(
-                    x, scale_factor=(1 / rows, 1 / columns), mode="bilinear", align_corners=True
+                    x,
+                    scale_factor=(1 / rows, 1 / columns),
+                    mode="bilinear",
+                    align_corners=True,
                 )
         out: Tensor = self.mix(x)
         return out

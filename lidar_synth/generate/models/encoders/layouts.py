@@ -96,7 +96,9 @@ class LayoutEncoder(Encoder):
         return torch.cat([codes, torch.stack(values, -1).to(dtype)], -1).movedim(-1, 1)
 
 
-def _strides(resolution: tuple[int, int], target: tuple[int, int]) -> list[tuple[int, int]]:
+def _strides(
+    resolution: tuple[int, int], target: tuple[int, int]
+) -> list[tuple[int, int]]:
     """Strides of up to (2, 4), the largest number of columns first."""
     rows, columns = (
         max(1, a // b).bit_length() - 1 for a, b in zip(resolution, target, strict=True)
@@ -105,4 +107,6 @@ def _strides(resolution: tuple[int, int], target: tuple[int, int]) -> list[tuple
     columns -= 2 * len(first)
     while columns < 0:
         first[-1], columns = (1, 2), columns + 1
-    return first + [(1 + (i < rows), 1 + (i < columns)) for i in range(max(rows, columns))]
+    return first + [
+        (1 + (i < rows), 1 + (i < columns)) for i in range(max(rows, columns))
+    ]

@@ -49,7 +49,9 @@ class Denoiser(HDiT):
     ) -> Tensor:
         """The velocity dy/dt at y and t; arguments and result are those of ``HDiT``."""
         output = super().forward(y, t, cond, end)
-        t = torch.as_tensor(t, device=y.device, dtype=torch.float32).reshape(-1, 1, 1, 1)
+        t = torch.as_tensor(t, device=y.device, dtype=torch.float32).reshape(
+            -1, 1, 1, 1
+        )
         data = (1 - t) * self.detail**2
         spread = (1 - t) * data + t**2
         return ((t - data) / spread * y + spread.rsqrt() * output).to(y.dtype)

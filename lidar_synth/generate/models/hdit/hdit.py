@@ -126,14 +126,17 @@ class HDiT(Network):
         if ends:
             self.step = StepEmbedding(time_width)
         self.rotary = nn.ModuleList(
-            Rotary(g, h, w // h) for g, h, w in zip(self.grids, heads, widths, strict=True)
+            Rotary(g, h, w // h)
+            for g, h, w in zip(self.grids, heads, widths, strict=True)
         )
         self.near = nn.ModuleList(
             NeighbourhoodAttention(grid, self.window) for grid in self.grids[:-1]
         )
         self.tokenize = nn.Linear(cells * channels, width, bias=False)
         if condition_channels:
-            self.tokenize_condition = nn.Linear(cells * condition_channels, width, bias=False)
+            self.tokenize_condition = nn.Linear(
+                cells * condition_channels, width, bias=False
+            )
             nn.init.zeros_(self.tokenize_condition.weight)
 
         def blocks(i: int, context: int = 0) -> nn.ModuleList:
@@ -187,7 +190,8 @@ class HDiT(Network):
             time = time + self.step(t - _times(end, y))
         angles = self.angles(self.patch, len(self.grids))
         levels = [
-            self._level(i, angle, self.tokenize.weight.dtype) for i, angle in enumerate(angles)
+            self._level(i, angle, self.tokenize.weight.dtype)
+            for i, angle in enumerate(angles)
         ]
         place = self.position(angles[0]).flatten(0, 1)
         x = self.tokenize(self._patches(y)) + place
@@ -198,7 +202,9 @@ class HDiT(Network):
             x = self._run(self.down[i], x, time, levels[i])
             skips.append(x)
             x = merge(x, self.grids[i])
-        context = cond.to(x.dtype) if cond is not None and self.context_channels else None
+        context = (
+            cond.to(x.dtype) if cond is not None and self.context_channels else None
+        )
         x = self._run(self.middle, x, time, levels[-1]._replace(context=context))
         for i in reversed(range(len(skips))):
             x = self.expand[i](x, skips.pop(), self.grids[i])
@@ -229,10 +235,14 @@ class HDiT(Network):
         shape = (self.channels, *self.resolution)
         if y.shape[1:] != shape:
             raise DataError(
-                f"a state of shape {tuple(y.shape)}", f"(B, {', '.join(map(str, shape))})"
+                f"a state of shape {tuple(y.shape)}",
+                f"(B, {', '.join(map(str, shape))})",
             )
         check_condition(
-            cond, len(y), (self.condition_channels, *self.resolution), self.context_channels
+            cond,
+            len(y),
+            (self.condition_channels, *self.resolution),
+            self.context_channels,
         )
 
 
@@ -269,7 +279,9 @@ def _grids(resolution: Grid, patch: Grid, levels: int) -> list[Grid]:
 def _check(grids: list[Grid], width: int, heads: Sequence[int], position: str) -> None:
     if position not in POSITIONS:
         raise ConfigError(f"position {position!r}", f"one of {', '.join(POSITIONS)}")
-    if len(heads) != len(grids) or any((width << i) % (4 * h) for i, h in enumerate(heads)):
+    if len(heads) != len(grids) or any(
+        (width << i) % (4 * h) for i, h in enumerate(heads)
+    ):
         raise ConfigError(
             f"heads {tuple(heads)} for width {width} and {len(grids)} levels",
             "for each level a number that divides its width into multiples of 4",

@@ -6,7 +6,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention, attention
+from lidar_synth.generate.models.attention import (
+    Grid,
+    NeighbourhoodAttention,
+    attention,
+)
 from lidar_synth.generate.models.convolution import attend
 from lidar_synth.generate.models.layers import (
     EPS,
@@ -56,7 +60,9 @@ class SelfAttention(nn.Module):
         """Tokens (B, N, C) and time (B, E) to (B, N, C)."""
         length = piece_length(x, x.shape[1], len(x) * self.qkv.out_features)
         tables = zip(
-            torch.split(level.cosine, length), torch.split(level.sine, length), strict=True
+            torch.split(level.cosine, length),
+            torch.split(level.sine, length),
+            strict=True,
         )
         pieces = [
             self._project(p, time, *t)
@@ -75,12 +81,20 @@ class SelfAttention(nn.Module):
         self, x: Tensor, time: Tensor, cosine: Tensor, sine: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (B, N, heads, D); q k^T includes the temperature."""
-        q, k, v = self.qkv(self.norm(x, time)).reshape(*x.shape[:2], 3, self.heads, -1).unbind(2)
+        q, k, v = (
+            self.qkv(self.norm(x, time))
+            .reshape(*x.shape[:2], 3, self.heads, -1)
+            .unbind(2)
+        )
         # A vector of root mean square 1 has the length sqrt(D).
         scale = self.temperature.clamp(max=math.log(100.0)).exp() / q.shape[-1]
         q = rms_norm(q, EPS**2)
         k = rms_norm(k, EPS**2)
-        return rotate(q * scale, cosine, sine).to(v.dtype), rotate(k, cosine, sine).to(v.dtype), v
+        return (
+            rotate(q * scale, cosine, sine).to(v.dtype),
+            rotate(k, cosine, sine).to(v.dtype),
+            v,
+        )
 
 
 class ContextAttention(nn.Module):
@@ -107,7 +121,9 @@ class ContextAttention(nn.Module):
     def forward(self, x: Tensor, time: Tensor, context: Tensor) -> Tensor:
         """Tokens (B, N, C), time (B, E) and a context (B, M, K) to (B, N, C)."""
         k, v = self.key_value(self.context_norm(context)).chunk(2, -1)
-        out: Tensor = x + self.out(attend(self.query(self.norm(x, time)), k, v, self.heads))
+        out: Tensor = x + self.out(
+            attend(self.query(self.norm(x, time)), k, v, self.heads)
+        )
         return out
 
 
@@ -128,7 +144,9 @@ class FeedForward(nn.Module):
     def forward(self, x: Tensor, time: Tensor) -> Tensor:
         """Tokens (B, N, C) and time (B, E) to (B, N, C)."""
         length = piece_length(x, x.shape[1], len(x) * self.layer.contract.in_features)
-        return torch.cat([p + self.layer(self.norm(p, time)) for p in torch.split(x, length, 1)], 1)
+        return torch.cat(
+            [p + self.layer(self.norm(p, time)) for p in torch.split(x, length, 1)], 1
+        )
 
 
 class TransformerBlock(nn.Module):

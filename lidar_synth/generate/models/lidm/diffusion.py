@@ -53,16 +53,22 @@ class DiffusionUNet(UNet):
             )
         self.schedule = beta_start, beta_end, steps
 
-    def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
+    def forward(
+        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None
+    ) -> Tensor:
         """The velocity dy/dt at y and t; arguments and result are those of ``UNet``."""
         t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
         times = schedule_times(*self.schedule).to(y.device)
         time = t.double().reshape(-1, *[1] * (y.ndim - 1))
         x = y.double() / ((1 - time) ** 2 + time**2).sqrt()
         noise = self.evaluate(x.to(y.dtype), step_of(t, times), cond).double()
-        known = time.clamp(float(times[0]), float(times[-1]))  # the range of the schedule
+        known = time.clamp(
+            float(times[0]), float(times[-1])
+        )  # the range of the schedule
         data = (x * ((1 - known) ** 2 + known**2).sqrt() - known * noise) / (1 - known)
-        return torch.where(time < 0.5, (noise - y) / (1 - time), (y - data) / time).to(y.dtype)
+        return torch.where(time < 0.5, (noise - y) / (1 - time), (y - data) / time).to(
+            y.dtype
+        )
 
 
 def schedule_times(beta_start: float, beta_end: float, steps: int) -> Tensor:

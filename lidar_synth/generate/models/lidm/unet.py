@@ -116,7 +116,8 @@ class UNet(Network):
         )
         if width % 2 or any(c % min(head_channels, c) for c in widths):
             raise ConfigError(
-                f"widths {widths}", f"even, and multiples of head_channels {head_channels}"
+                f"widths {widths}",
+                f"even, and multiples of head_channels {head_channels}",
             )
         cells = self.patch[0] * self.patch[1]
         embedding = 4 * width
@@ -128,8 +129,12 @@ class UNet(Network):
         if self.table is not None:
             nn.init.trunc_normal_(self.table, std=0.02)
 
-        def stage(row: _Row, attends: bool, resample: nn.Module | None = None) -> _Stage:
-            attention_layer = self._attention(row.outputs, head_channels) if attends else None
+        def stage(
+            row: _Row, attends: bool, resample: nn.Module | None = None
+        ) -> _Stage:
+            attention_layer = (
+                self._attention(row.outputs, head_channels) if attends else None
+            )
             residual = Residual(
                 row.inputs, row.outputs, embedding=embedding, eps=_EPS, groups=groups
             )
@@ -137,13 +142,19 @@ class UNet(Network):
 
         down, up = _plan(widths, blocks)
         self.down = nn.ModuleList(
-            Downsample(row.outputs) if row.resample else stage(row, row.level in attention)
+            Downsample(row.outputs)
+            if row.resample
+            else stage(row, row.level in attention)
             for row in down
         )
         middle = _Row(widths[-1], widths[-1], len(widths) - 1)
         self.middle = nn.ModuleList([stage(middle, True), stage(middle, False)])
         self.up = nn.ModuleList(
-            stage(row, row.level in attention, Upsample(row.outputs) if row.resample else None)
+            stage(
+                row,
+                row.level in attention,
+                Upsample(row.outputs) if row.resample else None,
+            )
             for row in up
         )
         self.norm = Norm(widths[0], _EPS, groups)
@@ -151,7 +162,9 @@ class UNet(Network):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]  # the convolution has a bias
 
-    def forward(self, y: Tensor, t: Tensor | float, cond: Tensor | None = None) -> Tensor:
+    def forward(
+        self, y: Tensor, t: Tensor | float, cond: Tensor | None = None
+    ) -> Tensor:
         """The velocity dy/dt at y and t.
 
         Args:
@@ -175,7 +188,9 @@ class UNet(Network):
         dtype = self.head.weight.dtype
         time = self._time(step, len(y), dtype)
         maps, context = self._condition(y, cond, dtype)
-        x = fold(maps.to(dtype), self.patch).contiguous(memory_format=torch.channels_last)
+        x = fold(maps.to(dtype), self.patch).contiguous(
+            memory_format=torch.channels_last
+        )
         x = self.stem(x)
         if self.table is not None:
             x = x + self.table.to(x.dtype)
@@ -187,7 +202,11 @@ class UNet(Network):
             x = run(block, self.gradient_checkpointing, x, time, context)
         for block in self.up:
             x = run(
-                block, self.gradient_checkpointing, torch.cat((x, skips.pop()), 1), time, context
+                block,
+                self.gradient_checkpointing,
+                torch.cat((x, skips.pop()), 1),
+                time,
+                context,
             )
         return unfold(self.head(activate(self.norm(x))), self.patch).to(y.dtype)
 
@@ -211,14 +230,19 @@ class UNet(Network):
         turn = step.float().expand(count)[:, None] * torch.exp(
             half * (-math.log(_LONGEST) / (self.width // 2))
         )
-        return nn.functional.silu(self.time(torch.cat((turn.cos(), turn.sin()), 1).to(dtype)))
+        return nn.functional.silu(
+            self.time(torch.cat((turn.cos(), turn.sin()), 1).to(dtype))
+        )
 
     def _condition(
         self, y: Tensor, cond: Tensor | None, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor | None]:
         """The state concatenated with the condition's maps, and the condition's tokens."""
         check_condition(
-            cond, len(y), (self.condition_channels, *self.resolution), self.context_channels
+            cond,
+            len(y),
+            (self.condition_channels, *self.resolution),
+            self.context_channels,
         )
         if cond is None:
             return y, None
@@ -261,7 +285,9 @@ class Upsample(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to (B, C, 2 H, 2 W)."""
-        out: Tensor = self.conv(nn.functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        out: Tensor = self.conv(
+            nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
+        )
         return out
 
 
@@ -269,7 +295,10 @@ class _Stage(nn.Module):
     """A residual block, then optional attention, then optional resampling."""
 
     def __init__(
-        self, residual: Residual, attention: nn.Module | None, resample: nn.Module | None
+        self,
+        residual: Residual,
+        attention: nn.Module | None,
+        resample: nn.Module | None,
     ) -> None:
         super().__init__()
         self.residual = residual
@@ -304,6 +333,8 @@ def _plan(widths: list[int], blocks: int) -> tuple[list[_Row], list[_Row]]:
     up = []
     for level, width in reversed(list(enumerate(widths))):
         for i in range(blocks + 1):
-            up.append(_Row(channels + skips.pop(), width, level, bool(level) and i == blocks))
+            up.append(
+                _Row(channels + skips.pop(), width, level, bool(level) and i == blocks)
+            )
             channels = width
     return down, up

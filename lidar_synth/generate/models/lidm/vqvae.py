@@ -137,7 +137,8 @@ class VQVAE(Autoencoder):
             )
         if not set(attention_levels) <= set(range(len(multipliers))):
             raise ConfigError(
-                f"attention_levels {list(attention_levels)}", f"levels 0 to {len(multipliers) - 1}"
+                f"attention_levels {list(attention_levels)}",
+                f"levels 0 to {len(multipliers) - 1}",
             )
         self.draws = 0
         self.latent_shape = (
@@ -173,10 +174,14 @@ class VQVAE(Autoencoder):
         ``uniform_noise`` is ignored, since decoding is deterministic.
         """
         check_shape(z, self.latent_shape, "a latent")
-        z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(self.shift)
+        z = z.to(self.to_latent.weight.dtype) * _channel(self.scale) + _channel(
+            self.shift
+        )
         output = self._decode(self.codebook(z)[0])
         return (
-            torch.where(output[:, self.channels :] < 0, -1.0, output[:, : self.channels])
+            torch.where(
+                output[:, self.channels :] < 0, -1.0, output[:, : self.channels]
+            )
             if self.mask
             else output
         )
@@ -196,7 +201,9 @@ class VQVAE(Autoencoder):
         through = z + (quantised - z).detach() if len(self.codebook) else z
         gap = (z - quantised.detach()).float().square().flatten(1).mean(1)
         return Reconstruction(
-            self._decode(through), gap, (quantised - z.detach()).float().square().flatten(1).mean(1)
+            self._decode(through),
+            gap,
+            (quantised - z.detach()).float().square().flatten(1).mean(1),
         )
 
     def loss(self, x: Tensor, noise: Tensor, objective: Objective) -> Tensor:
@@ -218,13 +225,18 @@ class VQVAE(Autoencoder):
         output, mask = result.output.float().tensor_split([self.channels], 1)
         loss = objective.reconstruction(output, x)
         if self.mask:
-            loss = loss + losses.mask * objective.metric(mask, objective.returned(x)).mean()
+            loss = (
+                loss
+                + losses.mask * objective.metric(mask, objective.returned(x)).mean()
+            )
         if losses.geometric:
             off = objective.points(output) - objective.points(x)
             loss = loss + losses.geometric * off.square().sum(1).mean()
         if objective.discriminator is not None:
             image = expected(output, objective.tensors)
-            loss = loss + self._adversarial(objective.discriminator, image, x, loss, objective)
+            loss = loss + self._adversarial(
+                objective.discriminator, image, x, loss, objective
+            )
         loss = loss + losses.commitment * result.gap.mean()
         total: Tensor = loss + losses.codebook * result.code_gap.mean()
         return total
@@ -241,7 +253,9 @@ class VQVAE(Autoencoder):
         weights, the second uses detached reconstructions."""
         frozen = {name: p.detach() for name, p in judge.named_parameters()}
         fooled: Tensor = -torch.func.functional_call(judge, frozen, (output,)).mean()
-        verdict = F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
+        verdict = (
+            F.relu(1 - judge(x)).mean() + F.relu(1 + judge(output.detach())).mean()
+        )
         losses = objective.losses
         balance = self._balance(reconstruction, fooled) if losses.adaptive else 1.0
         return losses.adversarial * balance * fooled + verdict / 2
@@ -267,7 +281,9 @@ class VQVAE(Autoencoder):
         return z if len(self.codebook) else z.tanh()
 
     def _decode(self, z: Tensor) -> Tensor:
-        return unfold(self.decoder(self.from_latent(z), self.gradient_checkpointing), self.patch)
+        return unfold(
+            self.decoder(self.from_latent(z), self.gradient_checkpointing), self.patch
+        )
 
 
 class ImageEncoder(nn.Module):
@@ -331,17 +347,22 @@ class Decoder(nn.Module):
         inputs = [*widths[1:], widths[-1]]
         levels = [
             _level(a, b, blocks + 1, groups, has_attention, k)
-            for a, b, has_attention, k in zip(inputs, widths, attends, kernels, strict=True)
+            for a, b, has_attention, k in zip(
+                inputs, widths, attends, kernels, strict=True
+            )
         ]
         self.levels = nn.ModuleList(reversed(levels))
         self.up = nn.ModuleList(
-            _Upsample(w, s) for w, s in reversed(list(zip(widths[1:], strides, strict=True)))
+            _Upsample(w, s)
+            for w, s in reversed(list(zip(widths[1:], strides, strict=True)))
         )
         self.norm = Norm(widths[0], 1e-6, groups)
         self.head = WrapConv(widths[0], channels, CURVE)
 
     def forward(self, z: Tensor, checkpointing: bool) -> Tensor:
-        x = run(self.levels[0], checkpointing, run(self.middle, checkpointing, self.stem(z)))
+        x = run(
+            self.levels[0], checkpointing, run(self.middle, checkpointing, self.stem(z))
+        )
         for up, level in zip(self.up, list(self.levels)[1:], strict=True):
             x = run(level, checkpointing, up(x))
         return self.head(activate(self.norm(x)))  # type: ignore[no-any-return]
@@ -356,23 +377,34 @@ class _Upsample(nn.Module):
         self.conv = WrapConv(channels, channels, _STEPS[stride].up)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True)
+        x = F.interpolate(
+            x, scale_factor=self.stride, mode="bilinear", align_corners=True
+        )
         return self.conv(x)  # type: ignore[no-any-return]
 
 
 def _level(
-    inputs: int, outputs: int, blocks: int, groups: int, attends: bool, kernel: Grid = (3, 3)
+    inputs: int,
+    outputs: int,
+    blocks: int,
+    groups: int,
+    attends: bool,
+    kernel: Grid = (3, 3),
 ) -> nn.Sequential:
     parts: list[nn.Module] = []
     for i in range(blocks):
-        parts.append(Residual(inputs if i == 0 else outputs, outputs, kernel, groups=groups))
+        parts.append(
+            Residual(inputs if i == 0 else outputs, outputs, kernel, groups=groups)
+        )
         parts += [Attention(outputs, groups=groups)] if attends else []
     return nn.Sequential(*parts)
 
 
 def _middle(channels: int, attention: bool, groups: int) -> nn.Sequential:
     first, last = (Residual(channels, channels, groups=groups) for _ in range(2))
-    return nn.Sequential(first, *([Attention(channels, groups=groups)] if attention else []), last)
+    return nn.Sequential(
+        first, *([Attention(channels, groups=groups)] if attention else []), last
+    )
 
 
 def _channel(x: Tensor) -> Tensor:

@@ -62,7 +62,11 @@ class SurfaceAutoencoder(BoundedAutoencoder):
     """
 
     decodes_given: ClassVar[frozenset[str]] = frozenset({"layout", "semantic"})
-    derived_arguments: ClassVar[tuple[str, ...]] = ("resolution", "channels", "normalisation")
+    derived_arguments: ClassVar[tuple[str, ...]] = (
+        "resolution",
+        "channels",
+        "normalisation",
+    )
 
     roughness: Tensor
     relief: Tensor
@@ -83,7 +87,11 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         normalisation: str = "r2flow",
     ) -> None:
         super().__init__()
-        if channels != 2 + bits or not 2**bits >= codes > 1 or normalisation not in NORMALISATIONS:
+        if (
+            channels != 2 + bits
+            or not 2**bits >= codes > 1
+            or normalisation not in NORMALISATIONS
+        ):
             raise ConfigError(
                 f"{channels} channels, {codes} codes in {bits} bits, normalisation "
                 f"{normalisation!r}",
@@ -105,7 +113,10 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         self.codes = codes
         self.surfaces = surfaces
         self.normalisation = NORMALISATIONS[normalisation]
-        self.latent_shape = (latent_channels, *reduced(self.resolution, [DOWN], "an image"))
+        self.latent_shape = (
+            latent_channels,
+            *reduced(self.resolution, [DOWN], "an image"),
+        )
         """Channels, rows and columns of a latent."""
         self.draws = DRAWS
         """Random numbers per cell that sampling an image takes."""
@@ -122,10 +133,16 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         self.decode_inner = nn.Sequential(*(Block(inner, reach) for reach in reaches))
         self.split = nn.Conv2d(inner, 4 * outer, 1)
         self.decode_outer = nn.Sequential(*(Block(outer) for _ in range(depth)))
-        self.head = nn.Linear(outer, surfaces * (NUMBERS + codes) + cells * (surfaces + PER_CELL))
-        with torch.no_grad():  # starts near and far, facing the sensor, with a wide scale
+        self.head = nn.Linear(
+            outer, surfaces * (NUMBERS + codes) + cells * (surfaces + PER_CELL)
+        )
+        with (
+            torch.no_grad()
+        ):  # starts near and far, facing the sensor, with a wide scale
             self.head.weight.mul_(0.5)
-            start = self.head.bias.zero_()[: surfaces * (NUMBERS + codes)].view(surfaces, -1)
+            start = self.head.bias.zero_()[: surfaces * (NUMBERS + codes)].view(
+                surfaces, -1
+            )
             start[:, 0] = torch.linspace(1.2, 4.0, surfaces + 2)[1:-1]
             start[:, 3], start[:, 6] = -3, -1.5
         # As ``measure_noise`` finds them in scans.
@@ -148,7 +165,9 @@ class SurfaceAutoencoder(BoundedAutoencoder):
     def expand(self, z: Tensor, merged: int = 1) -> Surfaces:
         """Bounded latents (B, *latent_shape) to the surfaces of all patches, N = B H W / 16 row by
         row; ``merged`` columns become one."""
-        z = z.to(self.from_latent.weight.dtype).contiguous(memory_format=torch.channels_last)
+        z = z.to(self.from_latent.weight.dtype).contiguous(
+            memory_format=torch.channels_last
+        )
         h = self.decode_inner(self.from_latent(z) + self.place_latent)
         h = self.decode_outer(split(self.split(h), (2, 2)) + self.place_outer)
         numbers = self.head(cell_norm(h).movedim(1, -1).flatten(0, 2))
@@ -159,14 +178,18 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         of return, class, range and reflectance together; the weights of channels are exponents of
         the likelihoods of range and reflectance."""
         code = _codes_of(x)
-        share = torch.bincount(code.flatten(), minlength=self.codes).float() / code.numel()
+        share = (
+            torch.bincount(code.flatten(), minlength=self.codes).float() / code.numel()
+        )
         rarity = share.pow(-objective.losses.rare)[code]
         cells = to_patches(torch.cat([x[:, :2], rarity[:, None]], 1), PATCH)
         distance, value, weight = cells.unbind(1)
         codes = to_patches(code[:, None], PATCH)[:, 0]
         weights = objective.weights
         temper = weights.get("range", 1.0), weights.get("reflectance", 1.0)
-        likely = predicted.log_likelihood(distance, value, codes, self.normalisation, temper)
+        likely = predicted.log_likelihood(
+            distance, value, codes, self.normalisation, temper
+        )
         return -(weight * likely).sum() / weight.sum()
 
     def measure(self, images: Iterable[Tensor], objective: Objective) -> None:
@@ -184,7 +207,9 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             z = z + noise * torch.randn(z.shape, generator=generator)
             return Seen(x, _codes_of(x), self.expand(z))
 
-        found = measure_noise(map(measured, images), self.codes, self.normalisation, generator)
+        found = measure_noise(
+            map(measured, images), self.codes, self.normalisation, generator
+        )
         self.roughness.copy_(found.roughness)
         self.relief.copy_(found.relief)
         self.alike.copy_(found.reflectance)
@@ -210,12 +235,17 @@ class SurfaceAutoencoder(BoundedAutoencoder):
             code, whose magnitude grows with its probability.
         """
         check_shape(z, self.latent_shape, "a latent")
-        rows, columns = self.resolution if uniform_noise is None else uniform_noise.shape[-2:]
+        rows, columns = (
+            self.resolution if uniform_noise is None else uniform_noise.shape[-2:]
+        )
         if uniform_noise is None:
-            uniform_noise = torch.full((len(z), DRAWS, rows, columns), 0.5, device=z.device)
+            uniform_noise = torch.full(
+                (len(z), DRAWS, rows, columns), 0.5, device=z.device
+            )
         if columns not in self.widths:
             raise DataError(
-                f"noise for {columns} columns", f"one of {', '.join(map(str, self.widths))}"
+                f"noise for {columns} columns",
+                f"one of {', '.join(map(str, self.widths))}",
             )
         merged = self.resolution[1] // columns
         patch = PATCH[0], PATCH[1] // merged
@@ -226,7 +256,9 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         bounds = None
         codes = None
         if "layout" in given:
-            bounds = bounds_of(given["layout"], columns, patch, self.codes, self.normalisation)
+            bounds = bounds_of(
+                given["layout"], columns, patch, self.codes, self.normalisation
+            )
         if "semantic" in given:
             codes = codes_of(given["semantic"], columns, patch)
         cells = surfaces.sample(*drawn, self.noise, self.normalisation, bounds, codes)
@@ -236,7 +268,9 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         bits = torch.cat(
             [(code.long() >> b & 1) * 2.0 - 1.0 for b in reversed(range(self.bits))], 1
         )
-        return torch.cat([distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1)
+        return torch.cat(
+            [distance, value, bits * (2 * torch.atanh(likely.clamp(max=0.9999)))], 1
+        )
 
 
 def _codes_of(x: Tensor) -> Tensor:

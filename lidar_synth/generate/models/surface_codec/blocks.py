@@ -47,11 +47,15 @@ def split(x: Tensor, patch: tuple[int, int]) -> Tensor:
 def to_patches(x: Tensor, patch: tuple[int, int]) -> Tensor:
     """(B, C, H, W) to (N, C, P), all patches of all images row by row, P = rows * columns."""
     batch, channels, height, width = x.shape
-    x = x.reshape(batch, channels, height // patch[0], patch[0], width // patch[1], patch[1])
+    x = x.reshape(
+        batch, channels, height // patch[0], patch[0], width // patch[1], patch[1]
+    )
     return x.permute(0, 2, 4, 1, 3, 5).reshape(-1, channels, patch[0] * patch[1])
 
 
-def from_patches(x: Tensor, patch: tuple[int, int], resolution: tuple[int, int]) -> Tensor:
+def from_patches(
+    x: Tensor, patch: tuple[int, int], resolution: tuple[int, int]
+) -> Tensor:
     """The inverse of ``to_patches``."""
     rows = resolution[0] // patch[0]
     columns = resolution[1] // patch[1]

@@ -32,7 +32,11 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(
-    layout: Tensor, columns: int, patch: tuple[int, int], codes: int, normalisation: Normalisation
+    layout: Tensor,
+    columns: int,
+    patch: tuple[int, int],
+    codes: int,
+    normalisation: Normalisation,
 ) -> Bounds:
     """The bounds of the cells of N patches.
 
@@ -53,7 +57,9 @@ def bounds_of(
     boxed = code >= CODES["Car"]
     blank = (code == 0).all(2).all(1)[:, None, None]
     near = torch.where(boxed, normalisation.encode(depth), 1.0).masked_fill(blank, -1.0)
-    far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(blank, 1.0)
+    far = torch.where(boxed, normalisation.encode(depth + chord), -1.0).masked_fill(
+        blank, 1.0
+    )
     labels = torch.tensor(_LABELS, device=layout.device)[code.long()]
     shape = (*near.shape[:2], columns, -1)
     near, nearest = near.reshape(shape).min(3)

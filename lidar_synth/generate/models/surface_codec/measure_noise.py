@@ -18,9 +18,21 @@ import torch
 from torch import Tensor
 
 from lidar_synth.datasets.classes import TRAIN_ID
-from lidar_synth.generate.models.surface_codec.blocks import PATCH, from_patches, to_patches
-from lidar_synth.generate.models.surface_codec.relief import SPANS, correlation, to_normal
-from lidar_synth.generate.models.surface_codec.surfaces import Noise, Surfaces, normalise_inverse
+from lidar_synth.generate.models.surface_codec.blocks import (
+    PATCH,
+    from_patches,
+    to_patches,
+)
+from lidar_synth.generate.models.surface_codec.relief import (
+    SPANS,
+    correlation,
+    to_normal,
+)
+from lidar_synth.generate.models.surface_codec.surfaces import (
+    Noise,
+    Surfaces,
+    normalise_inverse,
+)
 from lidar_synth.geometry.normalize import Normalisation
 
 LEAST = 200
@@ -48,7 +60,10 @@ class Seen(NamedTuple):
 
 
 def measure_noise(
-    images: Iterable[Seen], codes: int, normalisation: Normalisation, generator: torch.Generator
+    images: Iterable[Seen],
+    codes: int,
+    normalisation: Normalisation,
+    generator: torch.Generator,
 ) -> Noise:
     """The noise of cells in images.
 
@@ -64,12 +79,22 @@ def measure_noise(
     for x, code, surfaces in images:
         distance, value = to_patches(x[:, :2], PATCH).unbind(1)
         kinds = to_patches(code[:, None], PATCH)[:, 0]
-        error, score, surface = _scores(surfaces, distance, value, kinds, normalisation, generator)
+        error, score, surface = _scores(
+            surfaces, distance, value, kinds, normalisation, generator
+        )
         left, right = (
-            [part.view(-1, *PATCH)[..., some] for part in (error, score, surface, kinds, distance)]
+            [
+                part.view(-1, *PATCH)[..., some]
+                for part in (error, score, surface, kinds, distance)
+            ]
             for some in (slice(0, -1), slice(1, None))
         )
-        same = (left[2] == right[2]) & (left[3] == right[3]) & (left[4] > -1) & (right[4] > -1)
+        same = (
+            (left[2] == right[2])
+            & (left[3] == right[3])
+            & (left[4] > -1)
+            & (right[4] > -1)
+        )
         terms = [
             torch.ones_like(left[0]),
             (left[0] - right[0]).abs(),
@@ -84,7 +109,9 @@ def measure_noise(
     total = sums.sum(0)
     known = sums[:, 0] >= LEAST
     roughness = torch.where(known, sums[:, 1] / sums[:, 0], total[1] / total[0]) / 1.5
-    alike = torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(0, 0.95)
+    alike = torch.where(known, sums[:, 2] / sums[:, 3], total[2] / total[3]).clamp(
+        0, 0.95
+    )
     return Noise(roughness, _relief(relief), alike)
 
 
@@ -99,7 +126,11 @@ def _scores(
     """(N, P) errors of ranges in scales, normal scores of reflectances, and the surface that each
     cell shows."""
     far = normalise_inverse(surfaces.inverse, normalisation)
-    fit = surfaces.weights - (distance[:, None] - far).abs() / surfaces.scale - surfaces.scale.log()
+    fit = (
+        surfaces.weights
+        - (distance[:, None] - far).abs() / surfaces.scale
+        - surfaces.scale.log()
+    )
     fit = fit + surfaces.classes.gather(2, kinds[:, None].expand(-1, far.shape[1], -1))
     shown = fit.argmax(1)
 
@@ -125,7 +156,11 @@ def _products(error: Tensor, kinds: Tensor, distance: Tensor, codes: int) -> Ten
         of = kinds[same].long()
         sums.append(
             torch.stack(
-                [torch.bincount(of, products, codes), torch.bincount(of, minlength=codes)], 1
+                [
+                    torch.bincount(of, products, codes),
+                    torch.bincount(of, minlength=codes),
+                ],
+                1,
             )
         )
     return torch.stack(sums, 1)
@@ -135,8 +170,12 @@ def _relief(sums: Tensor) -> Tensor:
     """(C, 2) factors of the fields, from the sums of ``_products``."""
     square, near, far = (sums[..., 0] / sums[..., 1].clamp_min(1)).unbind(1)
     wide = torch.minimum((far / correlation(SPANS[1], LAGS[1])).clamp_min(0), square)
-    narrow = (near - wide * correlation(SPANS[1], LAGS[0])) / correlation(SPANS[0], LAGS[0])
-    factors = torch.stack([torch.minimum(narrow.clamp_min(0), square - wide), wide], 1).sqrt()
+    narrow = (near - wide * correlation(SPANS[1], LAGS[0])) / correlation(
+        SPANS[0], LAGS[0]
+    )
+    factors = torch.stack(
+        [torch.minimum(narrow.clamp_min(0), square - wide), wide], 1
+    ).sqrt()
     plants = torch.zeros(len(factors), 1, dtype=torch.float64)
     plants[list(PLANTS)] = 1
     return factors * plants * (sums[:, :1, 1] >= LEAST)

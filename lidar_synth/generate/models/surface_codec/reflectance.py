@@ -42,5 +42,7 @@ class ZeroInflatedLogistic(NamedTuple):
         distribution function."""
         blank = torch.sigmoid(self.blank)
         rest = ((uniform_noise - blank) / (1 - blank)).clamp(_SURE, 1 - _SURE)
-        numbers = (self.middles + self.spreads.exp() * torch.logit(rest)).clamp(min=BLANK)
+        numbers = (self.middles + self.spreads.exp() * torch.logit(rest)).clamp(
+            min=BLANK
+        )
         return torch.where(uniform_noise < blank, BLANK, numbers)

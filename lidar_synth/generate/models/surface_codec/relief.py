@@ -34,9 +34,13 @@ def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
     fields = []
     for first, span in enumerate(SPANS):
         step = span // merged
-        nodes = to_normal(rows[..., first::step]).unsqueeze(-1)  # no number is used twice
+        nodes = to_normal(rows[..., first::step]).unsqueeze(
+            -1
+        )  # no number is used twice
         turn = torch.arange(step, device=rows.device) * (math.pi / 2 / step)
-        fields.append((nodes * turn.cos() + nodes.roll(-1, -2) * turn.sin()).flatten(-2))
+        fields.append(
+            (nodes * turn.cos() + nodes.roll(-1, -2) * turn.sin()).flatten(-2)
+        )
     return torch.stack(fields, 1).repeat_interleave(PATCH[0], -2)
 
 

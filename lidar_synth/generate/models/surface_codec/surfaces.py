@@ -101,7 +101,10 @@ class Surfaces(NamedTuple):
         distance = -(x - far).abs() / self.scale - (2 * self.scale).log()
         shown = -self.reflectance.nll(value)
         seen = (
-            F.logsigmoid(self.returned) + temper[0] * distance + temper[1] * shown + self._of(code)
+            F.logsigmoid(self.returned)
+            + temper[0] * distance
+            + temper[1] * shown
+            + self._of(code)
         )
         return torch.logsumexp(
             self.weights + torch.where(x > -1, seen, F.logsigmoid(-self.returned)), 1
@@ -158,15 +161,21 @@ class Surfaces(NamedTuple):
         if bounds is not None:
             object_ = bounds.codes[kind.long()]
             kind = torch.where(object_ & (bounds.label >= 0), bounds.label, kind)
-        tables = torch.cat([noise.reflectance[:, None], noise.roughness[:, None], noise.relief], 1)
+        tables = torch.cat(
+            [noise.reflectance[:, None], noise.roughness[:, None], noise.relief], 1
+        )
         alike, rough, *bumps = F.embedding(kind.long(), tables).unbind(2)
-        values = ZeroInflatedLogistic(median, dull, blank).sample(_mixed(dim, alike, patch))
+        values = ZeroInflatedLogistic(median, dull, blank).sample(
+            _mixed(dim, alike, patch)
+        )
         error = rough * laplace_noise(near) + sum(
             a * b for a, b in zip(bumps, relief.unbind(1), strict=True)
         )
         distance = normalise_inverse(distance, normalisation) + scale * error
         if bounds is not None:  # where no box is, far = -1: no return
-            distance = torch.where(object_, distance.clamp(bounds.near, bounds.far), distance)
+            distance = torch.where(
+                object_, distance.clamp(bounds.near, bounds.far), distance
+            )
         distance = torch.where(returned + torch.logit(back) > 0, distance, -1.0)
         return torch.stack([distance, values, kind, likely], 1)
 
@@ -216,7 +225,9 @@ def normalise_inverse(inverse: Tensor, normalisation: Normalisation) -> Tensor:
     """Inverse ranges as normalised ranges, inside the limits of a return."""
     low = normalisation.range_min
     high = normalisation.range_max
-    return normalisation.encode(1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low)))
+    return normalisation.encode(
+        1 / inverse.clamp(1 / (0.999 * high), 1 / (1.001 * low))
+    )
 
 
 def surfaces_of(
@@ -235,13 +246,19 @@ def surfaces_of(
     """
     rows, columns = patch
     whole, each = torch.split(
-        x.float(), [surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)], 1
+        x.float(),
+        [surfaces * (NUMBERS + classes), rows * columns * (surfaces + PER_CELL)],
+        1,
     )
-    numbers, kinds = torch.split(whole.reshape(len(x), surfaces, -1), [NUMBERS, classes], 2)
+    numbers, kinds = torch.split(
+        whole.reshape(len(x), surfaces, -1), [NUMBERS, classes], 2
+    )
     parts = each.reshape(len(x), surfaces + PER_CELL, -1, merged).unbind(3)
     each = torch.stack(parts).mean(0) if merged > 1 else parts[0]
     choice, offsets = torch.split(each, [surfaces, PER_CELL], 1)
-    distance, down, across, spread, returned, median, dim, blank = numbers[..., None].unbind(2)
+    distance, down, across, spread, returned, median, dim, blank = numbers[
+        ..., None
+    ].unbind(2)
     cell = torch.arange(each.shape[2], device=x.device)
     columns = columns // merged
     i = cell // columns - (rows - 1) / 2

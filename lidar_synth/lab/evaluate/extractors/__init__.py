@@ -9,16 +9,30 @@ from functools import partial
 from pathlib import Path
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.lab.evaluate.extractors import bonnetal, liploc, pointnet, rangevit, voxel_networks
+from lidar_synth.lab.evaluate.extractors import (
+    bonnetal,
+    liploc,
+    pointnet,
+    rangevit,
+    voxel_networks,
+)
 from lidar_synth.lab.evaluate.extractors.specification import (
     FOLDER_VARIABLE,
     Extractor,
     ExtractorSpec,
 )
 
-__all__ = ["EXTRACTORS", "FOLDER_VARIABLE", "Extractor", "ExtractorSpec", "load_extractor"]
+__all__ = [
+    "EXTRACTORS",
+    "FOLDER_VARIABLE",
+    "Extractor",
+    "ExtractorSpec",
+    "load_extractor",
+]
 
-_BONNETAL = "https://github.com/PRBonn/lidar-bonnetal, its README, section Pre-trained Models"
+_BONNETAL = (
+    "https://github.com/PRBonn/lidar-bonnetal, its README, section Pre-trained Models"
+)
 _LIDM = (
     "https://github.com/hancyran/LiDAR-Diffusion, lidm/eval/README.md, section Model Zoo, 64-beam "
     "LiDAR"
@@ -26,9 +40,7 @@ _LIDM = (
 _R2FLOW = "https://github.com/kazuto1011/r2flow, release 'weights'"
 _R3DPA = "https://github.com/valeoai/R3DPA, its releases"
 _SEMANTIC_KITTI = "that of SemanticKITTI: CC BY-NC-SA 4.0, non-commercial"
-_UNSTATED = (
-    "none stated for the weights (code: MIT); trained on SemanticKITTI, which is CC BY-NC-SA 4.0"
-)
+_UNSTATED = "none stated for the weights (code: MIT); trained on SemanticKITTI, which is CC BY-NC-SA 4.0"
 
 _SEGMENTER = (
     "arch_cfg.yaml",
@@ -200,5 +212,6 @@ def load_extractor(
         return spec.load(Path(path), preparation or spec.preparation)
     except (ConfigError, DataError, FileError) as error:
         raise type(error)(
-            str(error).removesuffix("."), hint=f"{name} takes {spec.archives[0]} of {spec.source}."
+            str(error).removesuffix("."),
+            hint=f"{name} takes {spec.archives[0]} of {spec.source}.",
         ) from error

@@ -46,7 +46,9 @@ class Archive:
             DataError: if it is not YAML, or not a mapping.
         """
         where = self.path / name
-        content = parse_yaml(self._read(name, LONGEST_YAML).decode(errors="replace"), str(where))
+        content = parse_yaml(
+            self._read(name, LONGEST_YAML).decode(errors="replace"), str(where)
+        )
         if not isinstance(content, dict):
             raise DataError(
                 f"{where} holds {type(content).__name__}",
@@ -61,7 +63,9 @@ class Archive:
             FileError: if the file is missing.
             DataError: if it is damaged, or contains code.
         """
-        return unpickle(BytesIO(self._read(name, MOST_BYTES)), self.path / name, self.project)
+        return unpickle(
+            BytesIO(self._read(name, MOST_BYTES)), self.path / name, self.project
+        )
 
     def _read(self, name: str, at_most: int) -> bytes:
         if self.path.is_dir():
@@ -86,7 +90,9 @@ class Archive:
         least, factor = MOST_PACKED
         most = least + factor * self.path.stat().st_size
         for member in tar:
-            if member.offset_data + member.size > most:  # the next one would unpack all of it
+            if (
+                member.offset_data + member.size > most
+            ):  # the next one would unpack all of it
                 raise DataError(
                     f"{self.path}: {member.name[:100]} declares {member.size} bytes",
                     f"an archive that unpacks into at most {most} bytes",
@@ -95,19 +101,24 @@ class Archive:
             if parts[-1:] == (name,) and len(parts) <= 3 and member.isfile():
                 if member.size > at_most:
                     raise DataError(
-                        f"{self.path}: {name} declares {member.size} bytes", f"at most {at_most}"
+                        f"{self.path}: {name} declares {member.size} bytes",
+                        f"at most {at_most}",
                     )
                 file = tar.extractfile(member)
                 assert file is not None  # it is a file
                 return file.read()
-        raise FileError(f"{self.path} without {name}", f"the archive that {self.project} publishes")
+        raise FileError(
+            f"{self.path} without {name}", f"the archive that {self.project} publishes"
+        )
 
 
 def _some(names: Sequence[str]) -> str:
     return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
-def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False) -> None:
+def load_weights(
+    module: nn.Module, state: Any, where: str, extra: bool = False
+) -> None:
     """Load a state dictionary, checking names and shapes.
 
     Args:
@@ -124,7 +135,8 @@ def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False)
         isinstance(value, Tensor) for value in state.values()
     ):
         raise DataError(
-            f"{where}: its weights are not tensors by name", "the state dictionary of a network"
+            f"{where}: its weights are not tensors by name",
+            "the state dictionary of a network",
         )
     own = module.state_dict()
     # Absent before PyTorch 0.4.1.
@@ -142,8 +154,13 @@ def load_weights(module: nn.Module, state: Any, where: str, extra: bool = False)
             f"it {what} {_some(names)}" for what, names in differences.items() if names
         )
         raise DataError(
-            f"{where}: weights of another architecture ({found})", "those of the published network"
+            f"{where}: weights of another architecture ({found})",
+            "those of the published network",
         )
     module.load_state_dict(chosen)
-    if bad := [k for k, v in chosen.items() if v.is_floating_point() and not v.isfinite().all()]:
-        raise DataError(f"{where}: {bad[0]} holds values that are not finite", "finite weights")
+    if bad := [
+        k for k, v in chosen.items() if v.is_floating_point() and not v.isfinite().all()
+    ]:
+        raise DataError(
+            f"{where}: {bad[0]} holds values that are not finite", "finite weights"
+        )

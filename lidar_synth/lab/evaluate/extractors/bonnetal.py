@@ -20,7 +20,11 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.darknet import BLOCKS, RangeNet
-from lidar_synth.lab.evaluate.extractors.inputs import CHANNELS, nearest_points, preparation
+from lidar_synth.lab.evaluate.extractors.inputs import (
+    CHANNELS,
+    nearest_points,
+    preparation,
+)
 from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some
 from lidar_synth.lab.evaluate.extractors.pooling import mean_over_bands, subsample
 from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
@@ -74,9 +78,9 @@ class Segmenter:
         """(5, H, W) of ``CHANNELS`` to the network's input (C, H, W), 0 where there is no
         return."""
         values = torch.from_numpy(image)
-        scaled = (values[list(self.channels)] - self.mean[:, None, None]) / self.deviation[
-            :, None, None
-        ]
+        scaled = (
+            values[list(self.channels)] - self.mean[:, None, None]
+        ) / self.deviation[:, None, None]
         return scaled * (values[0] > 0)
 
     def decode(self, image: Tensor) -> Tensor:
@@ -108,12 +112,18 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
             torch.tensor(sensor[key], dtype=torch.float32)[: len(channels)]
             for key in ("img_means", "img_stds")
         )
-        if names[0] != names[1] or names[0] not in NETWORKS or names[2] != "segmentation":
+        if (
+            names[0] != names[1]
+            or names[0] not in NETWORKS
+            or names[2] != "segmentation"
+        ):
             raise ConfigError(
                 f"backbone, decoder and head {names}", f"one of {', '.join(NETWORKS)}"
             )
         grid = _grid(sensor, columns, HALVINGS[names[0]])
-        network = NETWORKS[names[0]](len(channels), _classes(states["segmentation_head"]), backbone)
+        network = NETWORKS[names[0]](
+            len(channels), _classes(states["segmentation_head"]), backbone
+        )
     except MISFITS as error:
         if isinstance(error, ConfigError):
             raise ConfigError(f"{archive.path}: {error}") from error
@@ -121,7 +131,11 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
             f"{archive.path}: its settings lack or misstate {error}",
             "arch_cfg.yaml and data_cfg.yaml as lidar-bonnetal writes them",
         ) from error
-    if mean.shape != (len(channels),) or deviation.shape != mean.shape or not (deviation > 0).all():
+    if (
+        mean.shape != (len(channels),)
+        or deviation.shape != mean.shape
+        or not (deviation > 0).all()
+    ):
         raise ConfigError(
             f"{archive.path} with {len(channels)} inputs, {mean.tolist()} and {deviation.tolist()}",
             "a mean and a positive deviation for each input",
@@ -134,7 +148,8 @@ def read_segmenter(archive: Archive, columns: int | None = None) -> Segmenter:
 def _channels(inputs: Mapping[str, bool]) -> tuple[int, ...]:
     if inputs.get("range") is not True or inputs.get("xyz") is not True:
         raise ConfigError(
-            f"a network with input {dict(inputs)}", "range and xyz, with or without remission"
+            f"a network with input {dict(inputs)}",
+            "range and xyz, with or without remission",
         )
     return tuple(range(len(CHANNELS) if inputs.get("remission") else len(CHANNELS) - 1))
 
@@ -156,7 +171,13 @@ def _grid(sensor: Mapping[str, Any], columns: int | None, factor: int) -> Sensor
     up = float(sensor["fov_up"])
     down = float(sensor["fov_down"])
     return Sensor(
-        name, width, range_min=0.0, range_max=1000.0, rows=size["height"], fov_up=up, fov_down=down
+        name,
+        width,
+        range_min=0.0,
+        range_max=1000.0,
+        rows=size["height"],
+        fov_up=up,
+        fov_down=down,
     )
 
 
@@ -173,7 +194,9 @@ POOLS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """``(features (C, H, W), input (C, H, W)) -> (D,)``."""
 
 
-def load_bonnetal(path: Path, prepared: str, pool: str, project: str = "lidar-bonnetal") -> PerScan:
+def load_bonnetal(
+    path: Path, prepared: str, pool: str, project: str = "lidar-bonnetal"
+) -> PerScan:
     """An extractor from an archive; see ``load_extractor``.
 
     Args:
@@ -187,7 +210,9 @@ def load_bonnetal(path: Path, prepared: str, pool: str, project: str = "lidar-bo
 
     def describe(scan: Scan, generated: bool) -> Tensor:
         image = (
-            inputs.image(scan, generated) if inputs else nearest_points(scan, segmenter.sensor)[0]
+            inputs.image(scan, generated)
+            if inputs
+            else nearest_points(scan, segmenter.sensor)[0]
         )
         some(image[0][image[0] > 0])
         normalised = segmenter.normalise(image)
@@ -207,10 +232,13 @@ def load_lidm(path: Path, prepared: str) -> PerScan:
         )
     except MISFITS as error:
         raise ConfigError(
-            f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's RangeNet"
+            f"{path}: config.yaml lacks or misstates {error}",
+            "the settings of LiDM's RangeNet",
         ) from error
     for part in PARTS[:2]:
-        load_weights(network.get_submodule(part), archive.weights(part), str(path / part))
+        load_weights(
+            network.get_submodule(part), archive.weights(part), str(path / part)
+        )
     network.eval()
     inputs = preparation(prepared)
     channels = network.backbone.conv1.in_channels

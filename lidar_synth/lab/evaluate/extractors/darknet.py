@@ -31,9 +31,15 @@ class _DarknetResidual(nn.Module):
 def _stage(
     name: str, conv: nn.Module, inputs: int, outputs: int, residuals: list[str]
 ) -> nn.Sequential:
-    layers = [(name, conv), ("bn", nn.BatchNorm2d(outputs)), ("relu", nn.LeakyReLU(0.1))]
+    layers = [
+        (name, conv),
+        ("bn", nn.BatchNorm2d(outputs)),
+        ("relu", nn.LeakyReLU(0.1)),
+    ]
     return nn.Sequential(
-        OrderedDict(layers + [(r, _DarknetResidual(outputs, inputs)) for r in residuals])
+        OrderedDict(
+            layers + [(r, _DarknetResidual(outputs, inputs)) for r in residuals]
+        )
     )
 
 
@@ -48,7 +54,13 @@ class _DarknetEncoder(nn.Module):
             conv = nn.Conv2d(inputs, outputs, 3, stride=(1, 2), padding=1, bias=False)
             self.add_module(
                 f"enc{i + 1}",
-                _stage("conv", conv, inputs, outputs, [f"residual_{k}" for k in range(count)]),
+                _stage(
+                    "conv",
+                    conv,
+                    inputs,
+                    outputs,
+                    [f"residual_{k}" for k in range(count)],
+                ),
             )
 
     def forward(self, x: Tensor) -> list[Tensor]:
@@ -62,9 +74,15 @@ class _DarknetEncoder(nn.Module):
 class _DarknetDecoder(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
-        for i, (inputs, outputs) in enumerate(pairwise(width << j for j in (5, 4, 3, 2, 1, 0))):
-            conv = nn.ConvTranspose2d(inputs, outputs, (1, 4), stride=(1, 2), padding=(0, 1))
-            self.add_module(f"dec{5 - i}", _stage("upconv", conv, inputs, outputs, ["residual"]))
+        for i, (inputs, outputs) in enumerate(
+            pairwise(width << j for j in (5, 4, 3, 2, 1, 0))
+        ):
+            conv = nn.ConvTranspose2d(
+                inputs, outputs, (1, 4), stride=(1, 2), padding=(0, 1)
+            )
+            self.add_module(
+                f"dec{5 - i}", _stage("upconv", conv, inputs, outputs, ["residual"])
+            )
 
     def forward(self, maps: list[Tensor]) -> Tensor:
         """The feature maps of the encoder to (B, width, H, W)."""

@@ -37,7 +37,9 @@ class NetworkInputs(NamedTuple):
     cloud: Callable[[Scan, bool], NDArray[np.float32]]
 
 
-def nearest_points(scan: Scan, sensor: Sensor) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def nearest_points(
+    scan: Scan, sensor: Sensor
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """(5, H, W) range, position and reflectance of the nearest point in each cell, 0 where there is
     none; and the index (H, W) of that point, -1 = none."""
     cells = locate(scan.points, sensor)
@@ -69,7 +71,9 @@ def _r2flow_cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
 def _lidm_cloud(scan: Scan, generated: bool) -> NDArray[np.float32]:
     """The returns of the range image on rays through the cells' corners, real or generated."""
     image = project(scan, SENSOR, ())
-    xyz = (_corner_rays()[image.mask] * image.range[image.mask, None]).astype(np.float32)
+    xyz = (_corner_rays()[image.mask] * image.range[image.mask, None]).astype(
+        np.float32
+    )
     distance = np.linalg.norm(xyz, axis=1)
     kept: NDArray[np.float32] = xyz[(distance > NEAREST) & (distance < FURTHEST)]
     return kept
@@ -88,7 +92,8 @@ def _lidm_image(scan: Scan, generated: bool) -> NDArray[np.float32]:
     column = 0.5 * (-np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1.0) * 1024
     row = (1.0 - (np.arcsin(points[:, 2] / distance) + _DOWN) / (_DOWN + _UP)) * 64
     cell = [
-        np.floor(v).clip(0, size - 1).astype(np.int32) for v, size in ((row, 64), (column, 1024))
+        np.floor(v).clip(0, size - 1).astype(np.int32)
+        for v, size in ((row, 64), (column, 1024))
     ]
     furthest_first = np.argsort(distance)[::-1]
     depth = np.full((64, 1024), -1, np.float32)

@@ -33,8 +33,12 @@ def picture(depth: Tensor) -> Tensor:
         depth: (H, W) metres, -1 where there is no return.
     """
     grey = ((depth * 5.1).long() & 255).float() / 255
-    resized = F.interpolate(grey[None, None], (SIZE, SIZE), mode="bilinear", antialias=True)[0]
-    return (resized - torch.tensor(MEAN)[:, None, None]) / torch.tensor(DEVIATION)[:, None, None]
+    resized = F.interpolate(
+        grey[None, None], (SIZE, SIZE), mode="bilinear", antialias=True
+    )[0]
+    return (resized - torch.tensor(MEAN)[:, None, None]) / torch.tensor(DEVIATION)[
+        :, None, None
+    ]
 
 
 def load_liploc(path: Path, prepared: str) -> PerScan:
@@ -58,15 +62,23 @@ def load_liploc(path: Path, prepared: str) -> PerScan:
     archive = Archive(path, "R3DPA")
     name = archive.yaml("config.yaml").get("trained_image_model_name")
     if not isinstance(name, str) or not timm.is_model(name):
-        raise ConfigError(f"{path}: config.yaml names the network {name!r}", "a network of timm")
-    network = timm.create_model(name, pretrained=False, num_classes=0, global_pool="avg").eval()
+        raise ConfigError(
+            f"{path}: config.yaml names the network {name!r}", "a network of timm"
+        )
+    network = timm.create_model(
+        name, pretrained=False, num_classes=0, global_pool="avg"
+    ).eval()
     content = archive.weights("model.ckpt")
     state = content.get("state_dict") if isinstance(content, dict) else None
     if isinstance(state, dict):
         # Averaging patches, timm normalises with a layer that LIP-Loc's weights lack; R3DPA leaves
         # it as it is made.
-        made = {k: v for k, v in network.state_dict().items() if k.startswith("fc_norm.")}
-        state = made | {k.removeprefix(PREFIX): v for k, v in state.items() if k.startswith(PREFIX)}
+        made = {
+            k: v for k, v in network.state_dict().items() if k.startswith("fc_norm.")
+        }
+        state = made | {
+            k.removeprefix(PREFIX): v for k, v in state.items() if k.startswith(PREFIX)
+        }
     load_weights(network, state, str(path / "model.ckpt"), extra=True)
     inputs = preparation(prepared)
 

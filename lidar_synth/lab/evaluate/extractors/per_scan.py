@@ -22,7 +22,9 @@ class PerScan:
 
     describe: Callable[[Scan, bool], Tensor]
 
-    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> NDArray[np.float32]:
+    def __call__(
+        self, scans: Sequence[Scan], generated: bool = False
+    ) -> NDArray[np.float32]:
         """n scans to (n, D) features; see ``Extractor``.
 
         Raises:
@@ -41,7 +43,8 @@ class PerScan:
             raise DataError(f"scan {scan.id!r}: {error}") from error
         if not np.isfinite(row).all():
             raise DataError(
-                f"scan {scan.id!r}: features that are not finite", "finite points and reflectances"
+                f"scan {scan.id!r}: features that are not finite",
+                "finite points and reflectances",
             )
         return row
 

@@ -32,7 +32,9 @@ class _Points(nn.Module):
 
     def __init__(self, widths: tuple[int, int, int]) -> None:
         super().__init__()
-        for i, (inputs, outputs) in enumerate(zip((3, *widths[:2]), widths, strict=True), 1):
+        for i, (inputs, outputs) in enumerate(
+            zip((3, *widths[:2]), widths, strict=True), 1
+        ):
             self.add_module(f"conv{i}", nn.Conv1d(inputs, outputs, 1))
             self.add_module(f"bn{i}", nn.BatchNorm1d(outputs))
 

@@ -30,7 +30,9 @@ def mean_over_bands(features: Tensor) -> Tensor:
     return features.reshape(len(features), BANDS, -1).mean(2).flatten()
 
 
-def mean_over_rings(features: Tensor, voxels: Tensor, size: float, furthest: float) -> Tensor:
+def mean_over_rings(
+    features: Tensor, voxels: Tensor, size: float, furthest: float
+) -> Tensor:
     """Means of the features over 16 rings of distance from the centre of gravity of the voxels
     (LiDM's FSVD, FPVD).
 

@@ -82,7 +82,9 @@ class _Stem(nn.Module):
             _Context(base, base),
             _Wide(base, hidden),
         )
-        pool = nn.AvgPool2d((PATCH[0] + 1, PATCH[1] + 1), PATCH, (PATCH[0] // 2, PATCH[1] // 2))
+        pool = nn.AvgPool2d(
+            (PATCH[0] + 1, PATCH[1] + 1), PATCH, (PATCH[0] // 2, PATCH[1] // 2)
+        )
         self.proj_block = nn.Sequential(pool, nn.Conv2d(hidden, width, 1))
 
 
@@ -95,7 +97,9 @@ class _Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        y: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        y: Tensor = self.proj(
+            F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+        )
         return y
 
 
@@ -132,8 +136,12 @@ class _TransformerEncoder(nn.Module):
         self.patch_embed = stem
         self._grid = (size[0] // PATCH[0], size[1] // PATCH[1])
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.zeros(1, self._grid[0] * self._grid[1] + 1, width))
-        self.blocks = nn.ModuleList(_TransformerBlock(width, heads) for _ in range(blocks))
+        self.pos_embed = nn.Parameter(
+            torch.zeros(1, self._grid[0] * self._grid[1] + 1, width)
+        )
+        self.blocks = nn.ModuleList(
+            _TransformerBlock(width, heads) for _ in range(blocks)
+        )
         self.norm = nn.LayerNorm(width)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
@@ -142,7 +150,11 @@ class _TransformerEncoder(nn.Module):
         fine = self.patch_embed.conv_block(image)
         patches = self.patch_embed.proj_block(fine)
         x = torch.cat(
-            [self.cls_token.expand(len(image), -1, -1), patches.flatten(2).transpose(1, 2)], 1
+            [
+                self.cls_token.expand(len(image), -1, -1),
+                patches.flatten(2).transpose(1, 2),
+            ],
+            1,
         )
         x = x + self._positions(patches.shape[2:])
         for block in self.blocks:
@@ -153,7 +165,11 @@ class _TransformerEncoder(nn.Module):
         if grid.numel() == self._grid[0] * self._grid[1]:
             return self.pos_embed
         maps = self.pos_embed[:, 1:].transpose(1, 2).reshape(1, -1, *self._grid)
-        resized = F.interpolate(maps, size=tuple(grid), mode="bilinear").flatten(2).transpose(1, 2)
+        resized = (
+            F.interpolate(maps, size=tuple(grid), mode="bilinear")
+            .flatten(2)
+            .transpose(1, 2)
+        )
         return torch.cat([self.pos_embed[:, :1], resized], 1)
 
 
@@ -162,14 +178,18 @@ class _ConvolutionDecoder(nn.Module):
         super().__init__()
         self.up_conv_block = nn.ModuleDict(
             {
-                "conv_upsample": nn.Sequential(nn.Conv2d(width, decoded * PATCH[0] * PATCH[1], 1)),
+                "conv_upsample": nn.Sequential(
+                    nn.Conv2d(width, decoded * PATCH[0] * PATCH[1], 1)
+                ),
                 "conv1": nn.Sequential(
                     nn.Conv2d(decoded + hidden, decoded, 3, padding=1),
                     nn.LeakyReLU(),
                     nn.BatchNorm2d(decoded),
                 ),
                 "conv_output": nn.Sequential(
-                    nn.Conv2d(decoded, decoded, 1), nn.LeakyReLU(), nn.BatchNorm2d(decoded)
+                    nn.Conv2d(decoded, decoded, 1),
+                    nn.LeakyReLU(),
+                    nn.BatchNorm2d(decoded),
                 ),
             }
         )
@@ -260,7 +280,8 @@ def build(settings: Mapping[str, Any]) -> RangeViT:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(
-            f"config.yaml lacks or misstates {error}", "the settings of R3DPA's RangeViT"
+            f"config.yaml lacks or misstates {error}",
+            "the settings of R3DPA's RangeViT",
         ) from error
 
 
@@ -272,7 +293,10 @@ def load_rangevit(path: Path, prepared: str) -> PerScan:
     content = archive.weights("model.ckpt")
     state = content.get("state_dict") if isinstance(content, dict) else None
     if isinstance(state, dict):
-        state = {"image_mean": network.image_mean, "image_std": network.image_std} | state
+        state = {
+            "image_mean": network.image_mean,
+            "image_std": network.image_std,
+        } | state
     load_weights(network, state, str(path / "model.ckpt"), extra=True)
     network.eval()
     inputs = preparation(prepared)

@@ -60,9 +60,12 @@ def keys(voxels: Tensor) -> Tensor:
     Raises:
         DataError: on coordinates outside.
     """
-    if len(voxels) and not (int(voxels.min()) >= -1 and int(voxels.max()) < 2**_BITS - 1):
+    if len(voxels) and not (
+        int(voxels.min()) >= -1 and int(voxels.max()) < 2**_BITS - 1
+    ):
         raise DataError(
-            f"voxels from {int(voxels.min())} to {int(voxels.max())}", "a scan of less than 100 km"
+            f"voxels from {int(voxels.min())} to {int(voxels.max())}",
+            "a scan of less than 100 km",
         )
     x, y, z = (voxels + 1).unbind(1)
     return (x << 2 * _BITS) | (y << _BITS) | z
@@ -71,7 +74,10 @@ def keys(voxels: Tensor) -> Tensor:
 def voxels_of(packed: Tensor) -> Tensor:
     """The voxels (N, 3) of ``keys``."""
     mask = 2**_BITS - 1
-    return torch.stack([packed >> 2 * _BITS, (packed >> _BITS) & mask, packed & mask], 1) - 1
+    return (
+        torch.stack([packed >> 2 * _BITS, (packed >> _BITS) & mask, packed & mask], 1)
+        - 1
+    )
 
 
 def find(wanted: Tensor, among: Tensor) -> Tensor:
@@ -84,7 +90,9 @@ def neighbours(voxels: Tensor) -> Pairs:
     """The pairs of a kernel of size 3 over sorted voxels. An offset and its opposite have the same
     pairs, exchanged."""
     sorted_keys = keys(voxels)
-    steps = torch.tensor([(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    steps = torch.tensor(
+        [(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    )
     shifts = (steps[:, 0] << 2 * _BITS) + (steps[:, 1] << _BITS) + steps[:, 2]
     before = []
     for shift in shifts[:_CENTRE]:
@@ -92,7 +100,11 @@ def neighbours(voxels: Tensor) -> Pairs:
         target = (found >= 0).nonzero()[:, 0]
         before.append((found[target], target))
     all_of_them = torch.arange(len(voxels))
-    pairs = [*before, (all_of_them, all_of_them), *((t, s) for s, t in reversed(before))]
+    pairs = [
+        *before,
+        (all_of_them, all_of_them),
+        *((t, s) for s, t in reversed(before)),
+    ]
     return Pairs(
         torch.cat([s for s, _ in pairs]),
         torch.cat([t for _, t in pairs]),
@@ -115,7 +127,9 @@ def pyramid(voxels: Tensor, depth: int) -> list[SparseLevel]:
         x, y, z = (fine & 1).unbind(1)
         offset = 4 * x + 2 * y + z
         order = offset.argsort(stable=True)
-        children = Pairs(order, parent[order], torch.bincount(offset, minlength=8).tolist())
+        children = Pairs(
+            order, parent[order], torch.bincount(offset, minlength=8).tolist()
+        )
         levels.append(SparseLevel(coarse, neighbours(coarse), children, parent))
     return levels
 
@@ -132,15 +146,23 @@ def convolve(features: Tensor, kernel: Tensor, pairs: Pairs, count: int) -> Tens
     Returns:
         (M, C_out).
     """
-    own = kernel.shape[0] == 27  # then each voxel also contributes to itself, without a gather
-    total = features @ kernel[_CENTRE] if own else features.new_zeros(count, kernel.shape[2])
+    own = (
+        kernel.shape[0] == 27
+    )  # then each voxel also contributes to itself, without a gather
+    total = (
+        features @ kernel[_CENTRE]
+        if own
+        else features.new_zeros(count, kernel.shape[2])
+    )
     start = 0
     for k, size in enumerate(pairs.sizes):
         part = slice(start, start + size)
         start += size
         if size and not (own and k == _CENTRE):
             total.index_add_(
-                0, pairs.target[part], features.index_select(0, pairs.source[part]) @ kernel[k]
+                0,
+                pairs.target[part],
+                features.index_select(0, pairs.source[part]) @ kernel[k],
             )
     return total
 
@@ -165,7 +187,9 @@ class Convolution(nn.Module):
         """(N, C_in) to (M, C_out); M is N by default."""
         if pairs is None:
             return features @ self.kernel
-        return convolve(features, self.kernel, pairs, len(features) if count is None else count)
+        return convolve(
+            features, self.kernel, pairs, len(features) if count is None else count
+        )
 
 
 def mean_in(features: Tensor, voxel: Tensor, count: int) -> Tensor:

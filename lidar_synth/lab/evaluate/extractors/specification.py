@@ -18,7 +18,9 @@ FOLDER_VARIABLE = "LIDAR_SYNTH_METRICS"
 class Extractor(Protocol):
     """Features of a few scans."""
 
-    def __call__(self, scans: Sequence[Scan], generated: bool = False) -> NDArray[np.floating]:
+    def __call__(
+        self, scans: Sequence[Scan], generated: bool = False
+    ) -> NDArray[np.floating]:
         """n scans to (n, D) features.
 
         Args:
@@ -61,7 +63,9 @@ class ExtractorSpec(NamedTuple):
     def paths(self, folder: Path) -> list[Path]:
         """Where in a folder the weights may lie, an unpacked archive first."""
         return [
-            folder / f"{archive}{suffix}" for archive in self.archives for suffix in ("", ".tar.gz")
+            folder / f"{archive}{suffix}"
+            for archive in self.archives
+            for suffix in ("", ".tar.gz")
         ]
 
     def found(self, folder: Path | None = None) -> Path | None:
@@ -69,12 +73,18 @@ class ExtractorSpec(NamedTuple):
         None without."""
         named = os.environ.get(FOLDER_VARIABLE)
         folder = folder or (Path(named) if named else None)
-        return next((p for p in self.paths(folder) if p.exists()), None) if folder else None
+        return (
+            next((p for p in self.paths(folder) if p.exists()), None)
+            if folder
+            else None
+        )
 
     def is_published(self, path: Path) -> bool:
         """Whether a file has the hash of the published one."""
         content = path.read_bytes()
         return (
-            hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+            hashlib.sha1(
+                b"blob %d\0" % len(content) + content, usedforsecurity=False
+            ).hexdigest()
             == self.git_blob
         )

@@ -22,7 +22,9 @@ class Fire(nn.Module):
         upsample: whether the columns are doubled in between.
     """
 
-    def __init__(self, inputs: int, squeezed: int, expanded: int, upsample: bool = False) -> None:
+    def __init__(
+        self, inputs: int, squeezed: int, expanded: int, upsample: bool = False
+    ) -> None:
         super().__init__()
         self.squeeze = nn.Conv2d(inputs, squeezed, 1)
         if upsample:
@@ -48,12 +50,18 @@ def _pool() -> nn.MaxPool2d:
 class _FireEncoder(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.conv1a = nn.Sequential(nn.Conv2d(channels, 64, 3, stride=(1, 2), padding=1), nn.ReLU())
+        self.conv1a = nn.Sequential(
+            nn.Conv2d(channels, 64, 3, stride=(1, 2), padding=1), nn.ReLU()
+        )
         self.conv1b = nn.Conv2d(channels, 64, 1)
         self.fire23 = nn.Sequential(_pool(), Fire(64, 16, 64), Fire(128, 16, 64))
         self.fire45 = nn.Sequential(_pool(), Fire(128, 32, 128), Fire(256, 32, 128))
         self.fire6789 = nn.Sequential(
-            _pool(), Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
+            _pool(),
+            Fire(256, 48, 192),
+            Fire(384, 48, 192),
+            Fire(384, 64, 256),
+            Fire(512, 64, 256),
         )
 
     def forward(self, x: Tensor) -> list[Tensor]:
@@ -92,7 +100,9 @@ class SqueezeSeg(nn.Module):
         super().__init__()
         self.backbone = _FireEncoder(channels)
         self.segmentation_decoder = _FireDecoder()
-        self.segmentation_head = nn.Sequential(nn.Identity(), nn.Conv2d(64, classes, 3, padding=1))
+        self.segmentation_head = nn.Sequential(
+            nn.Identity(), nn.Conv2d(64, classes, 3, padding=1)
+        )
 
     def decode(self, x: Tensor) -> Tensor:
         """(B, channels, H, W), W a multiple of 16, to the decoder's feature map (B, 64, H, W)."""

@@ -41,7 +41,9 @@ class _SparseBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.net = nn.Sequential(Convolution(inputs, outputs, 2), nn.BatchNorm1d(outputs))
+        self.net = nn.Sequential(
+            Convolution(inputs, outputs, 2), nn.BatchNorm1d(outputs)
+        )
 
     def forward(self, features: Tensor, pairs: Pairs, count: int) -> Tensor:
         return F.relu(self.net[1](self.net[0](features, pairs, count)))
@@ -53,7 +55,11 @@ class _SparseResidual(nn.Module):
         first = Convolution(inputs, outputs, 3)
         second = Convolution(outputs, outputs, 3)
         self.net = nn.Sequential(
-            first, nn.BatchNorm1d(outputs), nn.Identity(), second, nn.BatchNorm1d(outputs)
+            first,
+            nn.BatchNorm1d(outputs),
+            nn.Identity(),
+            second,
+            nn.BatchNorm1d(outputs),
         )
         own = inputs == outputs
         self.downsample = (
@@ -77,7 +83,9 @@ class MinkowskiNet(nn.Module):
         classes: number of classes.
     """
 
-    def __init__(self, widths: Sequence[int], inputs: int = 4, classes: int = 20) -> None:
+    def __init__(
+        self, widths: Sequence[int], inputs: int = 4, classes: int = 20
+    ) -> None:
         super().__init__()
         w = list(widths)
         self.stem = nn.Sequential(
@@ -95,8 +103,12 @@ class MinkowskiNet(nn.Module):
             )
             self.add_module(f"stage{i + 1}", down)
             out = w[i + 5]
-            after = nn.Sequential(_SparseResidual(out + w[3 - i], out), _SparseResidual(out, out))
-            self.add_module(f"up{i + 1}", nn.ModuleList([_SparseBlock(w[i + 4], out), after]))
+            after = nn.Sequential(
+                _SparseResidual(out + w[3 - i], out), _SparseResidual(out, out)
+            )
+            self.add_module(
+                f"up{i + 1}", nn.ModuleList([_SparseBlock(w[i + 4], out), after])
+            )
         self.classifier = nn.Sequential(nn.Linear(w[8], classes))
 
     def forward(self, features: Tensor, levels: list[SparseLevel]) -> Tensor:
@@ -139,11 +151,14 @@ class SPVCNN(MinkowskiNet):
     The points are the finest voxels, so that at that resolution both branches have the same places.
     """
 
-    def __init__(self, widths: Sequence[int], inputs: int = 4, classes: int = 20) -> None:
+    def __init__(
+        self, widths: Sequence[int], inputs: int = 4, classes: int = 20
+    ) -> None:
         super().__init__(widths, inputs, classes)
         pairs = [(widths[0], widths[4]), (widths[4], widths[6]), (widths[6], widths[8])]
         self.point_transforms = nn.ModuleList(
-            nn.Sequential(nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()) for a, b in pairs
+            nn.Sequential(nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU())
+            for a, b in pairs
         )
 
     def forward(self, features: Tensor, levels: list[SparseLevel]) -> Tensor:
@@ -213,7 +228,8 @@ def load_voxel_network(path: Path, prepared: str, network: str) -> PerScan:
         net = NETWORKS[network](widths, given["input_dims"], given["num_class"])
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ConfigError(
-            f"{path}: config.yaml lacks or misstates {error}", "the settings of LiDM's network"
+            f"{path}: config.yaml lacks or misstates {error}",
+            "the settings of LiDM's network",
         ) from error
     content = archive.weights("model.ckpt")
     state = content.get("state_dict") if isinstance(content, dict) else None
@@ -225,6 +241,8 @@ def load_voxel_network(path: Path, prepared: str, network: str) -> PerScan:
         cloud = inputs.cloud(scan, generated)
         some(cloud)
         voxels, features = voxelise(cloud)
-        return mean_over_rings(net(features, pyramid(voxels, 5)), voxels, VOXEL, FURTHEST)
+        return mean_over_rings(
+            net(features, pyramid(voxels, 5)), voxels, VOXEL, FURTHEST
+        )
 
     return PerScan(describe)

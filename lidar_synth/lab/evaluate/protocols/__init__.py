@@ -119,9 +119,13 @@ class Measure(_Data):
 
     def model_post_init(self, _: Any) -> None:
         if self.kind not in KINDS and self.kind != FEATURES:
-            raise ValueError(f"kind {self.kind!r} is none of {', '.join([*KINDS, FEATURES])}")
+            raise ValueError(
+                f"kind {self.kind!r} is none of {', '.join([*KINDS, FEATURES])}"
+            )
         if (self.kind == FEATURES) != (self.extractor is not None):
-            raise ValueError(f"{self.title}: {FEATURES} and no other kind has an extractor")
+            raise ValueError(
+                f"{self.title}: {FEATURES} and no other kind has an extractor"
+            )
 
 
 class Reference(_Data):
@@ -177,12 +181,20 @@ class Protocol(_Data):
     def limit(self) -> int | None:
         """Most real scans that any figure without features takes; None = all."""
         taken = [m.real for m in self.measures.values() if m.kind != FEATURES]
-        return None if None in taken else max((t for t in taken if t is not None), default=None)
+        return (
+            None
+            if None in taken
+            else max((t for t in taken if t is not None), default=None)
+        )
 
 
 def alike(a: Sensor, b: Sensor) -> bool:
     """Whether two sensors have as many rows and about the same field of view."""
-    return a.shape[0] == b.shape[0] and abs(a.up - b.up) <= VIEW and abs(a.down - b.down) <= VIEW
+    return (
+        a.shape[0] == b.shape[0]
+        and abs(a.up - b.up) <= VIEW
+        and abs(a.down - b.down) <= VIEW
+    )
 
 
 def parse_protocol(text: str, where: str) -> Protocol:
@@ -195,16 +207,20 @@ def parse_protocol(text: str, where: str) -> Protocol:
         return Protocol(**yaml.safe_load(text))
     except (ValidationError, TypeError, yaml.YAMLError) as error:
         raise ConfigError(
-            f"{where}: {error}", "a protocol as lidar_synth/lab/evaluate/protocols/ has them"
+            f"{where}: {error}",
+            "a protocol as lidar_synth/lab/evaluate/protocols/ has them",
         ) from error
 
 
 @cache
 def _shipped() -> Mapping[str, Protocol]:
     folder = files("lidar_synth.lab.evaluate.protocols")
-    names = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    names = sorted(
+        entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml")
+    )
     read = (
-        parse_protocol(folder.joinpath(name).read_text(encoding="utf-8"), name) for name in names
+        parse_protocol(folder.joinpath(name).read_text(encoding="utf-8"), name)
+        for name in names
     )
     return {protocol.name: protocol for protocol in read}
 
@@ -223,5 +239,7 @@ def find_protocol(protocol: str | Protocol) -> Protocol:
         return protocol
     if protocol not in PROTOCOLS:
         hint = suggest(protocol, PROTOCOLS)
-        raise ConfigError(f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}", hint)
+        raise ConfigError(
+            f"protocol {protocol!r}", f"one of {', '.join(PROTOCOLS)}", hint
+        )
     return PROTOCOLS[protocol]

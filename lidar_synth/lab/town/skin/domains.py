@@ -74,7 +74,9 @@ def returns_of(
         reflectance = reflectance[order]
         rows = rows[order]
     distance = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
-    away = np.abs(np.arcsin(points[:, 2] / distance) - lasers.laser_elevations[rows])[distance > 5]
+    away = np.abs(np.arcsin(points[:, 2] / distance) - lasers.laser_elevations[rows])[
+        distance > 5
+    ]
     if len(away) and np.median(away) > _ANOTHER:
         raise DataError(
             f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
@@ -84,7 +86,9 @@ def returns_of(
     dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step
     bright = (reflectance + dither).astype(np.float32)
     laser = rows.astype(np.int32)
-    return Returns(features_of(points, bright, laser, lasers), points, bright, laser, boxed)
+    return Returns(
+        features_of(points, bright, laser, lasers), points, bright, laser, boxed
+    )
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,9 @@ class Domain:
         )
         coarse = np.arange(CELLS) // (len(RANGES) + 1)
         [table] = pool_quantiles(
-            [(rough, cell)], [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)], ROUGH + 1
+            [(rough, cell)],
+            [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)],
+            ROUGH + 1,
         )
         cuts = np.ascontiguousarray(table[:, 1:-1])
         return cls(scans, cuts, [strata_of(s.found, cuts) for s in scans])

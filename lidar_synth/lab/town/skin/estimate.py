@@ -62,7 +62,9 @@ def estimate(
     wanted = _tables(real, offset)
     found = _tables(town, np.zeros_like(offset))
     for name in wanted:
-        arrays[f"{name}_town"], arrays[f"{name}_real"] = _both(name, found[name], wanted[name])
+        arrays[f"{name}_town"], arrays[f"{name}_real"] = _both(
+            name, found[name], wanted[name]
+        )
     arrays["missing"], arrays["missing_laser"] = missing(real, town, sensor.shape[0])
     skin = Skin(sensor, step, provenance, arrays)
     for _ in range(ROUNDS):
@@ -70,11 +72,16 @@ def estimate(
     return skin
 
 
-def _tables(domain: Domain, offset: Floats, quantiles: Floats | None = None) -> dict[str, Pair]:
+def _tables(
+    domain: Domain, offset: Floats, quantiles: Floats | None = None
+) -> dict[str, Pair]:
     """Values and groups of the local mean, the residual of reflectance and that of range."""
     kinds = [np.minimum(STRATUM_KIND[stratum], 1) for stratum in domain.strata]
     mean = np.concatenate(
-        [s.found.mean - offset[k, s.rows] for s, k in zip(domain.scans, kinds, strict=True)]
+        [
+            s.found.mean - offset[k, s.rows]
+            for s, k in zip(domain.scans, kinds, strict=True)
+        ]
     )
     residual = np.concatenate([s.bright - s.found.mean for s in domain.scans])
     distance = np.concatenate([s.found.residual for s in domain.scans])
@@ -107,7 +114,12 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     scans = []
     for one, stratum in zip(town.scans, town.strata, strict=True):
         dressed = level.dress(
-            one.found, stratum, one.bright, one.rows, one.boxed, np.ones(len(stratum), np.float32)
+            one.found,
+            stratum,
+            one.bright,
+            one.rows,
+            one.boxed,
+            np.ones(len(stratum), np.float32),
         )
         far = np.maximum(np.linalg.norm(one.points, axis=1), 1e-3)
         points = one.points * (1 + dressed.shift / far)[:, None].astype(np.float32)
@@ -131,7 +143,9 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     difference = []
     ring = []
     for scan, stratum in zip(domain.scans, domain.strata, strict=True):
-        pairs = np.flatnonzero((scan.found.below >= 0) & (STRATUM_KIND[stratum] == kind))
+        pairs = np.flatnonzero(
+            (scan.found.below >= 0) & (STRATUM_KIND[stratum] == kind)
+        )
         below = scan.found.below[pairs]
         difference.append(scan.found.mean[below] - scan.found.mean[pairs])
         ring.append(scan.rows[pairs])
@@ -140,7 +154,9 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     [table] = pool_quantiles([(value, upper)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
-    return np.asarray(total - np.median(sliding_window_view(padded, _SMOOTH), axis=1), np.float32)
+    return np.asarray(
+        total - np.median(sliding_window_view(padded, _SMOOTH), axis=1), np.float32
+    )
 
 
 def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
@@ -160,7 +176,9 @@ def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
     expected = np.bincount(laser, of_real[stratum] * gap, rows)
     factor = (lost + 1) / (expected + 1)
     excess = np.clip((of_real - of_town) / np.maximum(1 - of_town, 0.1), 0, 0.9)
-    return excess.astype(np.float32), np.clip(factor, 0, _LARGEST_FACTOR).astype(np.float32)
+    return excess.astype(np.float32), np.clip(factor, 0, _LARGEST_FACTOR).astype(
+        np.float32
+    )
 
 
 def _rate(stratum: Ints, gap: Ints) -> NDArray[np.float64]:

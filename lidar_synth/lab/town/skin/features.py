@@ -30,7 +30,9 @@ STRATA = CELLS * ROUGH
 BANDS = len(RANGES) + 1
 BAND = (np.arange(STRATA) // ROUGH % BANDS).astype(np.int32)
 """(STRATA,) the bin of range of each stratum."""
-STRATUM_KIND = (np.arange(STRATA) // (ROUGH * BANDS * (len(HEIGHTS) + 1))).astype(np.int32)
+STRATUM_KIND = (np.arange(STRATA) // (ROUGH * BANDS * (len(HEIGHTS) + 1))).astype(
+    np.int32
+)
 """(STRATA,) the kind of each stratum."""
 
 _WINDOW = 3
@@ -66,7 +68,9 @@ class RayFeatures(NamedTuple):
     gap: Ints
 
 
-def features(points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor) -> RayFeatures:
+def features(
+    points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor
+) -> RayFeatures:
     """Compute the features of a scan.
 
     Args:
@@ -143,7 +147,8 @@ def _along(
                 if step < 3.5 and back < 3.5:
                     value = distance[i] - (distance[i - 1] + distance[i + 1]) / 2
                     ends = max(
-                        abs(distance[i - 1] - distance[i]), abs(distance[i + 1] - distance[i])
+                        abs(distance[i - 1] - distance[i]),
+                        abs(distance[i + 1] - distance[i]),
                     )
                     if abs(value) < LARGEST and ends < LARGEST + limit:
                         residual[i] = value
@@ -159,7 +164,9 @@ def _roughness(ring: Ints, residual: Floats) -> Floats:
         weight = np.float32(0)
         for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
             if ring[j] == ring[i]:
-                total += np.float32(LARGEST) if np.isnan(residual[j]) else abs(residual[j])
+                total += (
+                    np.float32(LARGEST) if np.isnan(residual[j]) else abs(residual[j])
+                )
                 weight += np.float32(1)
         out[i] = total / weight
     return out
@@ -167,7 +174,13 @@ def _roughness(ring: Ints, residual: Floats) -> Floats:
 
 @njit(cache=True)
 def _across(
-    ring: Ints, turn: Floats, distance: Floats, level: Floats, z: Floats, rows: int, firings: int
+    ring: Ints,
+    turn: Floats,
+    distance: Floats,
+    level: Floats,
+    z: Floats,
+    rows: int,
+    firings: int,
 ) -> tuple[Ints, Ints]:
     """Kind of each return, and the return below it on the same surface."""
     count = len(ring)
@@ -195,7 +208,8 @@ def _across(
             if kind[i] == 2:
                 kind[i] = 0 if rise < _LEVEL * along else 1
             if side == 1 and (
-                abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i] or rise < 0.05 * along
+                abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i]
+                or rise < 0.05 * along
             ):
                 below[i] = other
     return kind, below

@@ -68,7 +68,8 @@ def fit_skin(
     """
     if len(scans) < FEWEST_SCANS:
         raise DataError(
-            f"{len(scans)} scans", f"at least {FEWEST_SCANS} scans of one sensor, better 20 to 100"
+            f"{len(scans)} scans",
+            f"at least {FEWEST_SCANS} scans of one sensor, better 20 to 100",
         )
     own = scans[0].sensor if sensor is None else load_sensor(sensor)
     rng = np.random.Generator(np.random.Philox(key=seed))
@@ -77,10 +78,16 @@ def fit_skin(
     real = []
     for i in tqdm(range(len(scans)), desc="real scans", disable=not progress):
         scan = scans[i]
-        digest.update(np.ascontiguousarray(scan.points).tobytes() + scan.reflectance.tobytes())
+        digest.update(
+            np.ascontiguousarray(scan.points).tobytes() + scan.reflectance.tobytes()
+        )
         real.append(returns_of(scan, own, step, rng, centred=True))
     town = Town(seed, own, streets * STRETCH_FRAMES, noise=ReturnNoise(gain_std=0))
-    picked = [STRETCH_FRAMES * street + frame for street in range(streets) for frame in (4, 14)]
+    picked = [
+        STRETCH_FRAMES * street + frame
+        for street in range(streets)
+        for frame in (4, 14)
+    ]
     cast = [
         returns_of(town[i], own, 1 / LEVELS, rng, centred=False)
         for i in tqdm(picked, desc="town", disable=not progress)
@@ -102,7 +109,9 @@ def _step(reflectance: NDArray[np.float32]) -> float:
         DataError: if all values are equal.
     """
     if np.ptp(reflectance) == 0:
-        raise DataError("scans whose reflectance is the same everywhere", "scans with reflectance")
+        raise DataError(
+            "scans whose reflectance is the same everywhere", "scans with reflectance"
+        )
     for step in _STEPS:
         if np.abs(reflectance / step - np.round(reflectance / step)).max() < 0.01:
             return step

@@ -128,10 +128,13 @@ class Skin:
             for array in self.arrays.values()
         ):
             raise ConfigError(
-                "a skin with values that are not finite, or too large", "those of fit_skin"
+                "a skin with values that are not finite, or too large",
+                "those of fit_skin",
             )
         if not 0 <= self.step <= 0.5:
-            raise ConfigError(f"a skin whose reflectance has a step of {self.step}", "0 to 0.5")
+            raise ConfigError(
+                f"a skin whose reflectance has a step of {self.step}", "0 to 0.5"
+            )
 
     def __reduce__(self) -> tuple[type["Skin"], tuple[object, ...]]:
         return Skin, (self.sensor, self.step, self.provenance, self.arrays)
@@ -162,7 +165,8 @@ class Skin:
         fired = [s.firings or s.columns for s in (self.sensor, sensor)]
         if fired[0] != fired[1]:
             raise ConfigError(
-                f"{fired[1]} firings with a skin of {fired[0]} firings per turn", "the same number"
+                f"{fired[1]} firings with a skin of {fired[0]} firings per turn",
+                "the same number",
             )
 
     def apply(
@@ -227,19 +231,27 @@ class Skin:
     def summary(self) -> dict[str, Any]:
         """Provenance and a few figures, as plain values."""
         spread = {
-            name: np.ptp(self.arrays[name][:, [RESIDUALS // 4, -1 - RESIDUALS // 4]], axis=1)
+            name: np.ptp(
+                self.arrays[name][:, [RESIDUALS // 4, -1 - RESIDUALS // 4]], axis=1
+            )
             for name in ("residual_town", "residual_real", "range_town", "range_real")
         }
         return {
             "sensor": self.sensor.name,
             **{k: v for k, v in self.provenance.items() if k != "town"},
-            **{f"town: {k}": v for k, v in dict(self.provenance.get("town", {})).items()},
+            **{
+                f"town: {k}": v
+                for k, v in dict(self.provenance.get("town", {})).items()
+            },
             "reflectance, step": self.step,
             "reflectance, median": float(np.median(self.arrays["mean_real"]).round(3)),
-            "lasers, spread of reflectance": float(self.arrays["offset"][0].std().round(3)),
+            "lasers, spread of reflectance": float(
+                self.arrays["offset"][0].std().round(3)
+            ),
             "returns missing, at most": float(self.arrays["missing"].max().round(3)),
             **{
-                f"{name}, median spread": float(np.median(v).round(4)) for name, v in spread.items()
+                f"{name}, median spread": float(np.median(v).round(4))
+                for name, v in spread.items()
             },
         }
 
@@ -295,7 +307,9 @@ def _at(table: Floats, row: int, x: float) -> float:
     """The value of a table's row at x in [0, 1], between its grid points."""
     place = min(max(x, 0.0), 1.0) * (table.shape[1] - 1)
     low = min(int(place), table.shape[1] - 2)
-    return float(table[row, low] + (place - low) * (table[row, low + 1] - table[row, low]))
+    return float(
+        table[row, low] + (place - low) * (table[row, low + 1] - table[row, low])
+    )
 
 
 @njit(cache=True)
@@ -342,7 +356,9 @@ def _dress(
         value[i] = round(v / step) * step if step > 0 else v
         if not np.isnan(residual[i]):
             limit = BOXED if boxed[i] else SOFT
-            moved = WHITE * (_at(to_range, s, _root(residual[i] / LARGEST)) - residual[i])
+            moved = WHITE * (
+                _at(to_range, s, _root(residual[i] / LARGEST)) - residual[i]
+            )
             shift[i] = min(max(moved, -limit), limit)
         kept[i] = uniform[i] >= missing[s] * missing_laser[ring[i]]
     return shift, value, kept
@@ -353,7 +369,8 @@ def _checksum(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(
-            f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode() + arrays[name].tobytes()
+            f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode()
+            + arrays[name].tobytes()
         )
     return digest.hexdigest()
 
@@ -395,7 +412,9 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
         stored = load(content)
         if header.pop("checksum", None) != _checksum(header, stored):
             raise ConfigError(
-                "content that does not match its checksum", "an intact file", "Copy it again."
+                "content that does not match its checksum",
+                "an intact file",
+                "Copy it again.",
             )
         arrays = {name: values.astype(np.float32) for name, values in stored.items()}
         return Skin(
@@ -413,5 +432,6 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
         RecursionError,
     ) as error:
         raise DataError(
-            f"{path} is not a skin of this version ({error})", f"an intact file of {FORMAT}"
+            f"{path} is not a skin of this version ({error})",
+            f"an intact file of {FORMAT}",
         ) from error

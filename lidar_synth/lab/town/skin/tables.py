@@ -29,12 +29,17 @@ def grouped_quantiles(
     ordered = _sorted_in_groups(value, group)
     number = np.bincount(group, minlength=groups)
     start = np.cumsum(number) - number
-    place = start[:, None] + np.linspace(0, 1, count)[None] * np.maximum(number - 1, 0)[:, None]
+    place = (
+        start[:, None]
+        + np.linspace(0, 1, count)[None] * np.maximum(number - 1, 0)[:, None]
+    )
     place = np.clip(place, 0, max(len(value) - 1, 0))
     low = np.floor(place).astype(np.int64)
     high = np.minimum(low + 1, np.maximum(start + number - 1, low[:, 0])[:, None])
     table = ordered[low] + (place - low) * (ordered[high] - ordered[low])
-    return np.where(number[:, None] > 0, table, 0).astype(np.float32), number.astype(np.float32)
+    return np.where(number[:, None] > 0, table, 0).astype(np.float32), number.astype(
+        np.float32
+    )
 
 
 def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
@@ -46,7 +51,11 @@ def _sorted_in_groups(value: Floats, group: NDArray[np.integer]) -> Floats:
     keys = np.sort(group.astype(np.uint64) << np.uint64(32) | ascending)
     low = keys.astype(np.uint32)
     positive = (low >> np.uint32(31)).astype(bool)
-    return np.where(positive, low & np.uint32(0x7FFFFFFF), ~low).astype(np.uint32).view(np.float32)
+    return (
+        np.where(positive, low & np.uint32(0x7FFFFFFF), ~low)
+        .astype(np.uint32)
+        .view(np.float32)
+    )
 
 
 def pool_quantiles(
@@ -88,7 +97,9 @@ def lookup(source: Floats, target: Floats, grid: Floats) -> Floats:
     Values beyond the outer quantiles keep their distance from them.
     """
     out = np.empty((len(source), len(grid)), np.float32)
-    for k, (x, y) in enumerate(zip(source.astype(float), target.astype(float), strict=True)):
+    for k, (x, y) in enumerate(
+        zip(source.astype(float), target.astype(float), strict=True)
+    ):
         x, first = np.unique(x, return_index=True)
         # Equal quantiles of the source map to the mean of their targets.
         last = np.append(first[1:], len(y))

@@ -76,14 +76,22 @@ def _nearest(
     made: Checkpoint, train: Sequence[RangeImage], held: Sequence[RangeImage]
 ) -> dict[str, float]:
     generator = Generator(
-        "adapted", join(made.networks), made.header, made.hash, autoencoder=made.networks.get(CODEC)
+        "adapted",
+        join(made.networks),
+        made.header,
+        made.hash,
+        autoencoder=made.networks.get(CODEC),
     )
     conditions = None
     if generator.condition is not None:  # label maps of scans that it has not seen
-        conditions = np.stack([held[i % len(held)].channels["label"] for i in range(GENERATED)])
+        conditions = np.stack(
+            [held[i % len(held)].channels["label"] for i in range(GENERATED)]
+        )
     with torch.inference_mode():
         generated = generator.scans(0, range(GENERATED), conditions)
-    known, fake, others = (features(scans) for scans in (_scans(train), generated, _scans(held)))
+    known, fake, others = (
+        features(scans) for scans in (_scans(train), generated, _scans(held))
+    )
     novelty = nearest_training(known, fake, others)
     apart = np.linalg.norm(known[:, None] - known[None], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -122,7 +130,10 @@ def provenance_of(
         "labels": "those of the scans"
         if work.scans.labelled
         else "guesses of a model that learnt them on the town",
-        "scans": {"train": list(work.scans.train), "held_out": list(work.scans.held_out)},
+        "scans": {
+            "train": list(work.scans.train),
+            "held_out": list(work.scans.held_out),
+        },
         "seen": seen_by(made.header.provenance).to_list(),
         "figures": found,
         "software": made.header.provenance["software"],
@@ -169,7 +180,8 @@ def write_card(
     if "reconstruction" in found:
         lines += ["held-out scans, encoded and decoded |", "---|---:"]
         lines += [
-            f"{_NAMES[name]} | {value:.3f}" for name, value in found["reconstruction"].items()
+            f"{_NAMES[name]} | {value:.3f}"
+            for name, value in found["reconstruction"].items()
         ] + [""]
     lines += [
         "median distance to the nearest training scan (features of the shipped segmenter) |",

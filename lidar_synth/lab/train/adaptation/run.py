@@ -22,7 +22,12 @@ from lidar_synth.generate.regrid import attach_codec, check_movable, fit_grid, r
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
 from lidar_synth.lab.train.adaptation.scans import Split, label, prepare, split
-from lidar_synth.lab.train.adaptation.stages import AdaptationStage, Work, shares, stages_for
+from lidar_synth.lab.train.adaptation.stages import (
+    AdaptationStage,
+    Work,
+    shares,
+    stages_for,
+)
 from lidar_synth.lab.train.runs import require_accelerate
 from lidar_synth.lab.train.staged import StagedRuns
 
@@ -103,10 +108,13 @@ def plan_adaptation(
     root = Path(scans)
     if out.suffix != ".safetensors" or out.exists():
         given = f"{out}, which exists" if out.exists() else str(out)
-        raise ConfigError(f"the output {given}", "a new file whose name ends in .safetensors")
+        raise ConfigError(
+            f"the output {given}", "a new file whose name ends in .safetensors"
+        )
     if minutes <= 0 or town < 0:
         raise ConfigError(
-            f"{minutes:g} minutes and {town} scans of the town", "more than 0, and at least 0"
+            f"{minutes:g} minutes and {town} scans of the town",
+            "more than 0, and at least 0",
         )
     start = load_checkpoint(find_model(model))
     check_movable(start.header)
@@ -116,7 +124,11 @@ def plan_adaptation(
     first = source[0]
     labelled = first.label is not None
     header = start.header
-    if not labelled and "label" in header.channels and (CODEC not in header.networks or not town):
+    if (
+        not labelled
+        and "label" in header.channels
+        and (CODEC not in header.networks or not town)
+    ):
         raise DataError(
             f"scans without labels, such as {first.id!r}, for a model with labels",
             "scans with labels; or a model with an autoencoder and scans of the town, on which "
@@ -201,7 +213,8 @@ def adapt(
     )
     if prepared.labelled != plan.labelled:
         raise DataError(
-            f"{plan.root}: some scans have labels, some have none", "labels for all or none"
+            f"{plan.root}: some scans have labels, some have none",
+            "labels for all or none",
         )
     start = plan.work / "start.safetensors"
     if not start.is_file():
@@ -233,7 +246,9 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
             if name == "labels":
                 codec = load_checkpoint(start)
                 latent: Any = Latent(codec.networks[CODEC], codec.header.tensors)  # type: ignore[arg-type]
-                work = replace(work, scans=label(work.scans, latent, work.folder / "labelled"))
+                work = replace(
+                    work, scans=label(work.scans, latent, work.folder / "labelled")
+                )
         elif name == "student":
             flow = work.train(name, flow, minutes)
         else:

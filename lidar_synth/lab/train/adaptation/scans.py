@@ -65,8 +65,12 @@ def split(names: Sequence[str]) -> Split:
     """
     count = len(names)
     if count < FEWEST:
-        raise DataError(f"{count} scans", f"at least {FEWEST} to adapt a model, better 20 to 200")
-    picked = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int)).tolist()
+        raise DataError(
+            f"{count} scans", f"at least {FEWEST} to adapt a model, better 20 to 200"
+        )
+    picked = np.unique(
+        np.linspace(0, count - 1, min(count, MOST)).round().astype(int)
+    ).tolist()
     first = len(picked) - round(HELD_OUT * len(picked))
     gap = max(1, round(GAP * len(picked)))
     drives = [names[i].rpartition("/")[0] for i in picked]
@@ -76,7 +80,9 @@ def split(names: Sequence[str]) -> Split:
         first = min(near, key=lambda n: abs(n - first))
         gap = 0
     return Split(
-        tuple(picked[: first - gap]), tuple(picked[first - gap : first]), tuple(picked[first:])
+        tuple(picked[: first - gap]),
+        tuple(picked[first - gap : first]),
+        tuple(picked[first:]),
     )
 
 
@@ -108,7 +114,12 @@ class Prepared:
 
 
 def prepare(
-    source: ScanFiles, layout: str, root: Path, sensor: Sensor, folder: Path, progress: bool = True
+    source: ScanFiles,
+    layout: str,
+    root: Path,
+    sensor: Sensor,
+    folder: Path,
+    progress: bool = True,
 ) -> Prepared:
     """Check the scans, and write them as range images of ``sensor``; an interrupted call is
     continued.
@@ -144,10 +155,14 @@ def prepare(
                     "labels for all or none",
                 )
             hashes.setdefault(part, []).append(content_of(scan))
-            channels = [name for name in ("reflectance", "label") if name in scan.fields()]
+            channels = [
+                name for name in ("reflectance", "label") if name in scan.fields()
+            ]
             path = folder / part / f"{place:06d}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_range_image(path, project(scan, sensor, channels), replace(scan, sensor=sensor))
+            write_range_image(
+                path, project(scan, sensor, channels), replace(scan, sensor=sensor)
+            )
     ids = {
         part: [source.ids[i] for i in some]
         for part, some in ((TRAIN, parts.train), (HELD, parts.held_out))
@@ -163,11 +178,17 @@ def prepare(
 def _read(folder: Path, values: Any) -> Prepared:
     recordings = Recordings.from_list(values["recordings"])
     return Prepared(
-        folder, values["labelled"], tuple(values[TRAIN]), tuple(values[HELD]), recordings
+        folder,
+        values["labelled"],
+        tuple(values[TRAIN]),
+        tuple(values[HELD]),
+        recordings,
     )
 
 
-def _recorded(source: ScanFiles, layout: str, root: Path, ids: Sequence[str]) -> Recordings:
+def _recorded(
+    source: ScanFiles, layout: str, root: Path, ids: Sequence[str]
+) -> Recordings:
     """The recordings of some scans of a source; of the whole one where frames cannot be told
     apart."""
     every = recordings_of(source, layout, root)
@@ -236,5 +257,7 @@ def _labelled(image: RangeImage, codec: Latent) -> RangeImage:
     tensors: TensorFormat = codec.tensors
     decoded = codec.decode(codec.encode(tensors.from_images([drop_labels(image)])))
     [made] = tensors.to_images(decoded, image.sensor)
-    given = np.where(image.mask & made.mask, made.channels["label"], IGNORE).astype(np.uint8)
+    given = np.where(image.mask & made.mask, made.channels["label"], IGNORE).astype(
+        np.uint8
+    )
     return RangeImage(image.range, image.sensor, {**image.channels, "label": given})

@@ -171,7 +171,11 @@ class Work:
         }
         if name == "student":
             grid = self.header.time_grid
-            return values | {"teacher": str(start), "grid": list(grid), "intervals": len(grid) - 1}
+            return values | {
+                "teacher": str(start),
+                "grid": list(grid),
+                "intervals": len(grid) - 1,
+            }
         if name == "codec" and self.town:
             town = self._town(TOWN_SEED, self.town)
             values["rehearsal"] = town | {"flip": True, "roll": True}

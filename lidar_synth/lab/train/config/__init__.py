@@ -4,7 +4,13 @@ What a run needs is built from the checked values by the caller, so that nothing
 configurations.
 """
 
-from lidar_synth.files.recipes import Listed, command_of, find_recipe, published, validate
+from lidar_synth.files.recipes import (
+    Listed,
+    command_of,
+    find_recipe,
+    published,
+    validate,
+)
 from lidar_synth.lab.train.config.load import load_config, read_values
 from lidar_synth.lab.train.config.models import (
     PARENTS,
@@ -23,7 +29,11 @@ from lidar_synth.lab.train.config.sections import (
     Samples,
     Section,
 )
-from lidar_synth.lab.train.config.training import DistillConfig, SelectionSettings, TrainConfig
+from lidar_synth.lab.train.config.training import (
+    DistillConfig,
+    SelectionSettings,
+    TrainConfig,
+)
 
 __all__ = [
     "PARENTS",

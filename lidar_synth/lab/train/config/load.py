@@ -75,7 +75,9 @@ def check(config: Run) -> None:
     """
     for data in (config.data, *([config.held_out.data] if config.held_out else [])):
         if (data.town is None) == (data.path is None):
-            raise ConfigError(f"data with town={data.town} and path={data.path}", "one of the two")
+            raise ConfigError(
+                f"data with town={data.town} and path={data.path}", "one of the two"
+            )
     if isinstance(config, TrainConfig):
         _check_train(config)
     if isinstance(config, DistillConfig) and config.grid is not None:
@@ -86,21 +88,27 @@ def check(config: Run) -> None:
             or sorted(set(grid))[::-1] != list(grid)
         ):
             raise ConfigError(
-                f"grid {list(grid)}", f"{config.intervals + 1} descending times from 1 to 0"
+                f"grid {list(grid)}",
+                f"{config.intervals + 1} descending times from 1 to 0",
             )
 
 
 def _check_train(config: TrainConfig) -> None:
     if config.autoencodes and (config.codec or config.condition):
         raise ConfigError(
-            "an autoencoder with a codec or a condition", "neither: they belong to a flow"
+            "an autoencoder with a codec or a condition",
+            "neither: they belong to a flow",
         )
     if config.decoder and (config.init is None or config.condition):
         raise ConfigError(
             "decoder without init, or with a condition",
             "init: a latent model, with its own condition",
         )
-    if config.data.roll and config.condition and not CONDITIONS[config.condition.kind].turns:
+    if (
+        config.data.roll
+        and config.condition
+        and not CONDITIONS[config.condition.kind].turns
+    ):
         raise ConfigError(
             f"data.roll with the condition {config.condition.kind!r}", "data.roll=false"
         )
@@ -109,7 +117,9 @@ def _check_train(config: TrainConfig) -> None:
             f"recipe.weights {dict(config.recipe.weights)} of a latent model",
             "none: latents are mixed",
         )
-    if config.init is None and config.codec is None:  # what a codec makes is in its file
+    if (
+        config.init is None and config.codec is None
+    ):  # what a codec makes is in its file
         resolution = load_sensor(config.sensor).shape
         config.parts((config.tensors().size, *resolution), resolution)
 
@@ -122,5 +132,7 @@ def _override(values: dict[str, Any], override: str) -> None:
     for level in levels:
         values = values.setdefault(level, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"override {override!r}: {level} is a single value", "a section")
+            raise ConfigError(
+                f"override {override!r}: {level} is a single value", "a section"
+            )
     values[last] = parse_yaml(text, f"override {override!r}")

@@ -77,17 +77,20 @@ def load_model(path: Path) -> ModelConfig:
     for name, stage in model.stages.items():
         if not name.isidentifier() or name in Run.model_fields:
             raise ConfigError(
-                f"{path}: stage {name!r}", "a name of letters, digits and _, and no key of a recipe"
+                f"{path}: stage {name!r}",
+                "a name of letters, digits and _, and no key of a recipe",
             )
         for key, other in stage.needs.items():
             if key not in PARENTS:
                 raise ConfigError(
-                    f"{path}: {name}.needs with {key!r}", f"keys among {', '.join(PARENTS)}"
+                    f"{path}: {name}.needs with {key!r}",
+                    f"keys among {', '.join(PARENTS)}",
                 )
             if "/" not in other and other not in earlier:
                 known = ", ".join(earlier) or "none"
                 raise ConfigError(
-                    f"{path}: {name}.needs with the stage {other!r}", f"an earlier one ({known})"
+                    f"{path}: {name}.needs with the stage {other!r}",
+                    f"an earlier one ({known})",
                 )
         earlier.append(name)
     return model
@@ -95,8 +98,12 @@ def load_model(path: Path) -> ModelConfig:
 
 def published_models() -> Iterator[Listed]:
     """The models of stages that come with the package, by name; their time is that of training."""
-    for path in sorted((folder() / "models").glob("*.yaml"), key=lambda path: path.stem):
+    for path in sorted(
+        (folder() / "models").glob("*.yaml"), key=lambda path: path.stem
+    ):
         about = read_file(path)["about"]
         hours = sum(stage.minutes for stage in load_model(path).stages.values()) / 60
         time = f"{hours:.1f} h, the default limit"
-        yield Listed(path.stem, "train", about["data"], about["size"], time, head_of(path))
+        yield Listed(
+            path.stem, "train", about["data"], about["size"], time, head_of(path)
+        )

@@ -70,16 +70,24 @@ class Data(Section):
         path = os.path.expandvars(self.path or "")
         if "$" in path:
             raise ConfigError(
-                f"data.path {self.path!r}", "variables that are set", "Or give data.path=FOLDER."
+                f"data.path {self.path!r}",
+                "variables that are set",
+                "Or give data.path=FOLDER.",
             )
-        return open_scans(path, layout=self.layout, split=self.split, on_bad=self.on_bad)
+        return open_scans(
+            path, layout=self.layout, split=self.split, on_bad=self.on_bad
+        )
 
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
         keys = (
-            {"seed", "interval", "motion"} if self.path else {"path", "layout", "split", "on_bad"}
+            {"seed", "interval", "motion"}
+            if self.path
+            else {"path", "layout", "split", "on_bad"}
         )
-        keys |= {"motion"} if self.motion else set()  # caches of earlier versions do not name it
+        keys |= (
+            {"motion"} if self.motion else set()
+        )  # caches of earlier versions do not name it
         return self.model_dump(
             mode="json", exclude=keys | {"cache", "flip", "roll", "latents", "seen"}
         )
@@ -199,19 +207,30 @@ class ConditionSection(Section):
         """
         encoders = encoders_of(self.kind)
         if (encoder := self.encoder or encoders[0]) not in encoders:
-            raise ConfigError(f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}")
+            raise ConfigError(
+                f"condition.encoder {encoder!r}", f"one of {', '.join(encoders)}"
+            )
         sizes = {
             "resolution": list(resolution),
             "target": list(target),
             "image": list(self.image or ()),
         }
         derived = network_class(encoder).derived_arguments
-        return NetworkSpec(encoder, {name: sizes[name] for name in derived} | self.arguments)
+        return NetworkSpec(
+            encoder, {name: sizes[name] for name in derived} | self.arguments
+        )
 
     def options(self) -> dict[str, Any]:
         """What the checkpoint's header says about it."""
         values = self.model_dump(
             mode="json",
-            include={"dropout", "view_dropout", "outline_dropout", "height", "image", "focal"},
+            include={
+                "dropout",
+                "view_dropout",
+                "outline_dropout",
+                "height",
+                "image",
+                "focal",
+            },
         )
         return {key: value for key, value in values.items() if value}

@@ -58,7 +58,9 @@ class TrainConfig(Run):
     condition: ConditionSection | None = None
     init: Path | None = None
     decoder: bool = False
-    timesteps: Literal["uniform", "u_shaped", "logit_normal", "logit_normal_shifted"] = "uniform"
+    timesteps: Literal[
+        "uniform", "u_shaped", "logit_normal", "logit_normal_shifted"
+    ] = "uniform"
     steps: Count = 50
     losses: Losses = Losses()
 
@@ -75,7 +77,8 @@ class TrainConfig(Run):
         """
         if self.normalisation not in NORMALISATIONS:
             raise ConfigError(
-                f"normalisation {self.normalisation!r}", f"one of {', '.join(NORMALISATIONS)}"
+                f"normalisation {self.normalisation!r}",
+                f"one of {', '.join(NORMALISATIONS)}",
             )
         return TensorFormat(self.channels, NORMALISATIONS[self.normalisation])
 
