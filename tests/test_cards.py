@@ -92,7 +92,7 @@ def test_tables_of_models_show_their_names_as_text(
 
     classes = dict.fromkeys((*CLASSES, BEND), 1.0)
     text = (
-        table([Measured(MARKUP, [], classes)])
+        table([Measured(MARKUP, [], classes, np.full(20, 0.5))])
         + f"\n\n| a |{' b |' * 6}\n|---|{'---|' * 6}\n{line(MARKUP, None)}"
     )
     assert tags_of(text) == {"table", "thead", "tbody", "tr", "th", "td"}

@@ -43,7 +43,7 @@ def test_scans_in_parts_are_scans_at_once() -> None:
     for part in (REAL[:4], REAL[4:], []):
         metric.update(part, real=True)
     whole = evaluate(REAL, FAKE, "general", {"moments": moments}, progress=False)
-    assert metric.compute() == {s.metric: s.value for s in whole} and len(whole) == 6
+    assert metric.compute() == {s.metric: s.value for s in whole} and len(whole) == 7
     assert metric.compute() == metric.compute()
 
 
@@ -232,7 +232,7 @@ def test_measures_of_classes_are_left_out_without_labels() -> None:
     scores = evaluate(bare, FAKE, "general", progress=False, left_out=left_out)
     assert (
         left_out == {"s_jsd": "scans without labels", "s_mmd": "scans without labels"}
-        and len(scores) == 2
+        and len(scores) == 3
     )
     with pytest.raises(DataError, match="no figure of spiral: .*scans without labels"):
         evaluate(bare, FAKE, "spiral", progress=False)

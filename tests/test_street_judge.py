@@ -125,13 +125,15 @@ def test_recognition_by_hand() -> None:
     table[8, 8] = 3
     table[8, 9] = 1
     table[8, 10] = 2
-    found = Recognition(table, np.zeros((2, 3)))
+    isolated = np.zeros((2, 20), np.int64)
+    isolated[:, 8] = 1, 4
+    found = Recognition(table, np.zeros((2, 3)), isolated)
     assert found.accuracy == 9 / 14 and found.iou() == {"car": 6 / 8, "road": 3 / 6}
     assert found.confusions("road") == [("sidewalk", 2 / 6), ("parking", 1 / 6)]
-    other = Recognition(table, np.random.default_rng(0).normal(size=(5, 3)))
+    other = replace(found, features=np.random.default_rng(0).normal(size=(5, 3)))
     text = as_text(compare(other, other))
     assert (
-        "| road | 50.0 | 50.0 | sidewalk 33, parking 17 |" in text
+        "| road | 50.0 | 50.0 | sidewalk 33, parking 17 | 25.0 | 25.0 |" in text
         and "| accuracy | 64.3 | 64.3 | |" in text
     )
 

@@ -170,8 +170,8 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (146_900, 6.0, 141),
-    "laboratory": (113_100, 6.0, 173),
+    "plugin": (147_100, 6.0, 141),
+    "laboratory": (113_400, 6.0, 172),
     "tools": (48_000, 6.0, 192),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

@@ -15,7 +15,7 @@ from lidar_synth.generate.checkpoint import CODEC, VELOCITY
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.flow.path import METRICS
 from lidar_synth.generate.loading import _compile
-from lidar_synth.generate.models.objective import Losses
+from lidar_synth.generate.models.objective import Losses, expected
 from lidar_synth.generate.models.surface_codec.autoencoder import SurfaceAutoencoder
 from lidar_synth.generate.models.surface_codec.blocks import (
     PATCH,
@@ -253,10 +253,11 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(
     layout = layout_with_a_box()
     sensor = replace(COARSE, columns=width)
 
+    @torch.no_grad()
     def image_of(layout: Tensor | None) -> RangeImage:
         known = None if layout is None else {"layout": layout}
         [image] = FORMAT.to_images(
-            Latent(network, FORMAT).decode(z, noise, known), sensor
+            expected(network.decode(z, noise, known), FORMAT), sensor
         )
         assert image.label is not None
         return image
@@ -286,6 +287,7 @@ def test_objects_are_decoded_in_the_boxes_of_a_layout_only(
     )
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("width", [256, 128])
 def test_returns_have_the_labels_of_a_map(width: int) -> None:
     network = small().eval()
@@ -304,10 +306,10 @@ def test_returns_have_the_labels_of_a_map(width: int) -> None:
         given_map[..., 0::2] = (
             IGNORE  # a column that stands for two has the label of the one that is known
         )
-    states = Latent(network, FORMAT)
     made, free = (
         FORMAT.to_images(
-            states.decode(z, noise, known), replace(COARSE, columns=width)
+            expected(network.decode(z, noise, known), FORMAT),
+            replace(COARSE, columns=width),
         )[0]
         for known in ({"semantic": given_map}, None)
     )

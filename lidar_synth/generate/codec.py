@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import DataError
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.generate.models.objective import expected
+from lidar_synth.generate.support import find_unsupported
 from lidar_synth.geometry.normalize import TensorFormat
 
 
@@ -114,7 +115,8 @@ class Latent:
 
         Args:
             y: latents.
-            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with; None = the mode.
+            uniform_noise: (B, draws, H, W) numbers in (0, 1) to sample with, whereupon returns
+                without support are left out (``support``); None = the mode.
             given: {name of a condition: values (B, ...)}; those not among the autoencoder's
                 ``decodes_given`` are not used.
 
@@ -132,9 +134,18 @@ class Latent:
             for name, values in (given or {}).items()
             if name in self.network.decodes_given
         }
-        return expected(
+        image = expected(
             decode(y, uniform_noise, *([taken] if taken else [])).float(), self.tensors
         )
+        if uniform_noise is not None:
+            self._clear_unsupported(image[:, 0])  # the range
+        return image
+
+    def _clear_unsupported(self, distance: Tensor) -> None:
+        """Clear returns without support from sampled ranges (B, H, W), normalised, in place."""
+        metres = self.tensors.normalisation.decode(distance).cpu().numpy()
+        lost = torch.from_numpy(find_unsupported(metres))
+        distance.masked_fill_(lost.to(distance.device), -1.0)
 
 
 def make_codec(

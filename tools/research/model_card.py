@@ -47,6 +47,7 @@ from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.evaluate import Metric, Score, bootstrap
+from lidar_synth.lab.evaluate.isolated import count_isolated, share_of_isolated
 from lidar_synth.lab.evaluate.segmentation import (
     Judge,
     class_ious,
@@ -190,11 +191,13 @@ class Measured(NamedTuple):
         scores: distances from the reference, and the mIoU between labels and the segmenter's
             prediction, %.
         classes: {class: its IoU, %, and the bend of walls, %}; NaN without labels.
+        isolated: (20,) share of isolated returns by class, %.
     """
 
     name: str
     scores: list[Score]
     classes: dict[str, float]
+    isolated: NDArray[np.float64]
 
 
 def opened(root: Path, count: int) -> list[Scan]:
@@ -249,15 +252,16 @@ class Comparison:
                 s for s in metric.scores() if own or not s.metric.startswith("Frechet")
             ]
         columns = (*CLASSES, BEND)
+        isolated = 100 * share_of_isolated(np.sum(list(map(count_isolated, scans)), 0))
         if any(scan.label is None for scan in scans):
-            return Measured(name, scores, dict.fromkeys(columns, float("nan")))
+            nothing = dict.fromkeys(columns, float("nan"))
+            return Measured(name, scores, nothing, isolated)
         tables = np.stack([self._judge.agreement([scan]) for scan in scans])
         ious = 100 * class_ious(tables.sum(0))
         values = [ious[TRAIN_ID[one]] for one in CLASSES] + [100 * bend(scans)]
         agreement = _agreement(tables, self._count, self._replicates)
-        return Measured(
-            name, [*scores, agreement], dict(zip(columns, values, strict=True))
-        )
+        classes = dict(zip(columns, values, strict=True))
+        return Measured(name, [*scores, agreement], classes, isolated)
 
 
 def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
@@ -288,7 +292,7 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
 
 def table(sets: Sequence[Measured]) -> str:
     """Figures as rows, sets as columns; then IoU between the labels and the segmenter's prediction
-    by class, and the bend of walls."""
+    by class, and the bend of walls; then isolated returns by class."""
     titles = list(
         dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores)
     )
@@ -315,6 +319,14 @@ def table(sets: Sequence[Measured]) -> str:
             f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}"
             for c in columns
         ]
+        lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
+    lines += [
+        "",
+        f"| isolated returns, % | {' | '.join(CLASSES)} |",
+        f"|---|{'---:|' * len(CLASSES)}",
+    ]
+    for one in sets:
+        values = [f"{one.isolated[TRAIN_ID[c]]:.1f}" for c in CLASSES]
         lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
     return "\n".join(lines)
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, IGNORE, NAMES
+from lidar_synth.generate.support import find_unsupported
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 
@@ -69,6 +70,10 @@ def _speckle(image: RangeImage, scan: Scan) -> float:
     )
 
 
+def _isolated(image: RangeImage, scan: Scan) -> float:
+    return _share(find_unsupported(image.range[None])[0][image.mask])
+
+
 def _confidence(image: RangeImage, scan: Scan) -> float:
     return (
         float(image.channels["confidence"][image.mask].mean())
@@ -79,6 +84,11 @@ def _confidence(image: RangeImage, scan: Scan) -> float:
 
 MEASURES: dict[str, ScanMeasure] = {
     "empty": ScanMeasure("share of cells without a return", None, _empty),
+    "isolated": ScanMeasure(
+        "share of returns without three neighbours at almost the same range",
+        None,
+        _isolated,
+    ),
     "unlabelled": ScanMeasure("share of returns without a label", "label", _unlabelled),
     "floating": ScanMeasure(
         "share of ground returns (road to terrain) above the sensor", "label", _floating

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate import lidm
+from lidar_synth.lab.evaluate.isolated import count_isolated, isolated_ratio
 from lidar_synth.lab.evaluate.labels import CLASSES, class_histogram
 from lidar_synth.lab.evaluate.r2flow import BINS, bev_histogram
 from lidar_synth.lab.evaluate.ranges import range_histogram, step_histogram
@@ -96,6 +97,16 @@ def _steps(scan: Scan, options: Options) -> NDArray[np.uint32]:
     return step_histogram(scan)
 
 
+def _isolated(scan: Scan, options: Options) -> NDArray[np.int64]:
+    return count_isolated(scan)
+
+
+def _isolated_ratio(
+    real: Sequence[Any], fake: Sequence[Any], options: Options
+) -> Statistic:
+    return isolated_ratio(real, fake)
+
+
 def _jsd(real: Sequence[Any], fake: Sequence[Any], options: Options) -> Statistic:
     return histogram_distance(real, fake)
 
@@ -156,5 +167,6 @@ KINDS = {
     "class_mmd": Kind(_classes, _class_mmd, labels=True),
     "range_jsd": Kind(_ranges, _jsd),
     "step_mmd": Kind(_steps, _mmd),
+    "isolated_ratio": Kind(_isolated, _isolated_ratio),
 }
 """Kinds by name; those of features are in ``features.py``."""

@@ -13,6 +13,7 @@ from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Source
 from lidar_synth.lab.evaluate.distances import frechet_distance, squared_mmd
+from lidar_synth.lab.evaluate.isolated import count_isolated, share_of_isolated
 from lidar_synth.lab.evaluate.segmentation import class_ious, mean_iou
 from lidar_synth.lab.evaluate.street_judge import StreetJudge
 
@@ -24,10 +25,12 @@ class Recognition:
     Args:
         table: (19, 19) number of cells by label (row) and prediction (column).
         features: (n, D) features of the n scans.
+        isolated_counts: (2, 20) as ``count_isolated``, of all scans.
     """
 
     table: NDArray[np.int64]
     features: NDArray[np.floating]
+    isolated_counts: NDArray[np.int64]
 
     @property
     def accuracy(self) -> float:
@@ -45,6 +48,13 @@ class Recognition:
         return {
             name: float(ious[i]) for i, name in enumerate(NAMES) if self.table[i].sum()
         }
+
+    def isolated(self) -> dict[str, float]:
+        """Share of isolated returns, in [0, 1], of the classes that occur in the
+        labels."""
+        shares = share_of_isolated(self.isolated_counts)
+        counts = self.isolated_counts[1]
+        return {name: float(shares[i]) for i, name in enumerate(NAMES) if counts[i]}
 
     def confusions(
         self, name: str, most: int = 2, least: float = 0.05
@@ -73,16 +83,18 @@ def recognise(
         DataError: on scans without labels, or without one labelled return.
     """
     table = np.zeros((len(NAMES), len(NAMES)), np.int64)
+    isolated = np.zeros((2, len(NAMES) + 1), np.int64)
     features = []
     for i in tqdm(range(len(scans)), desc=name, disable=not progress):
         scan = scans[i]
         table += judge.confusion([scan])
         features.append(judge.features([scan]))
+        isolated += count_isolated(scan)
     if not table.sum():
         raise DataError(
             f"{name}: no labelled return", "at least one label that is not 255 = ignore"
         )
-    return Recognition(table, np.concatenate(features))
+    return Recognition(table, np.concatenate(features), isolated)
 
 
 def compare(real: Recognition, fake: Recognition) -> dict[str, Any]:
@@ -94,6 +106,7 @@ def compare(real: Recognition, fake: Recognition) -> dict[str, Any]:
             "accuracy": r.accuracy,
             "mean_iou": r.mean_iou,
             "iou": r.iou(),
+            "isolated": r.isolated(),
             "confusions": {k: dict(r.confusions(k)) for k in r.iou()},
         }
         for name, r in (("real", real), ("fake", fake))
@@ -110,24 +123,28 @@ def as_text(figures: Mapping[str, Any]) -> str:
     fake = figures["fake"]
     lines = [
         f"| % | real ({real['scans']} scans) | fake ({fake['scans']} scans) | fake, predicted "
-        "instead |",
-        "|---|---:|---:|---|",
-        f"| accuracy | {100 * real['accuracy']:.1f} | {100 * fake['accuracy']:.1f} | |",
-        f"| mean IoU | {100 * real['mean_iou']:.1f} | {100 * fake['mean_iou']:.1f} | |",
+        "instead | isolated returns, real | fake |",
+        "|---|---:|---:|---|---:|---:|",
+        f"| accuracy | {100 * real['accuracy']:.1f} | {100 * fake['accuracy']:.1f} | | | |",
+        f"| mean IoU | {100 * real['mean_iou']:.1f} | {100 * fake['mean_iou']:.1f} | | | |",
     ]
     for name in (n for n in NAMES if n in real["iou"] or n in fake["iou"]):
-        values = (
-            f"{100 * r['iou'][name]:.1f}" if name in r["iou"] else ""
-            for r in (real, fake)
-        )
         instead = ", ".join(
             f"{k} {100 * v:.0f}" for k, v in fake["confusions"].get(name, {}).items()
         )
-        lines.append(f"| {name} | {' | '.join(values)} | {instead} |")
+        ious = _shown(real["iou"], fake["iou"], name)
+        isolated = _shown(real["isolated"], fake["isolated"], name)
+        lines.append(f"| {name} | {ious} | {instead} | {isolated} |")
     for key, label in (
         ("frechet_distance", "Frechet distance"),
         ("squared_mmd", "squared MMD"),
     ):
         if key in figures:
-            lines.append(f"| {label} of features | | {figures[key]:.4g} | |")
+            lines.append(f"| {label} of features | | {figures[key]:.4g} | | | |")
     return "\n".join(lines)
+
+
+def _shown(real: Mapping[str, float], fake: Mapping[str, float], name: str) -> str:
+    """The values of a class in both sets, per cent, as two cells of a table."""
+    cells = [f"{100 * side[name]:.1f}" if name in side else "" for side in (real, fake)]
+    return " | ".join(cells)
