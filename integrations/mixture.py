@@ -134,7 +134,7 @@ def class_ids(scan: Scan, table: NDArray[Any]) -> NDArray[Any]:
         raise DataError(
             f"synthetic scan {scan.id!r} has no valid label",
             "at least one, or the loss of a batch can be NaN",
-            "Use a model or bank with labels, or labels='mix' with real scans.",
+            "Use a model or bank with labels, or labels='polarmix' with real scans.",
         )
     ids: NDArray[Any] = table[scan.label]
     return ids

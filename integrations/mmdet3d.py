@@ -104,7 +104,7 @@ class SynthBoxes:
                 f"{name} with filter_empty_gt=True, which replaces every scan without a box by a "
                 "random one",
                 "filter_empty_gt=False",
-                "Give synthetic scans boxes by labels='mix'; ObjectSample adds more.",
+                "Give synthetic scans boxes by labels='paste'; ObjectSample adds more.",
             )
         if str(options.get("box_type_3d", "LiDAR")).lower() != "lidar":
             raise ConfigError(

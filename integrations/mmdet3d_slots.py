@@ -268,7 +268,7 @@ def require_boxes(scan: Scan) -> Boxes:
         raise DataError(
             f"synthetic scan {scan.id!r} has no boxes",
             "boxes, for a detector",
-            "Write the list with labels='mix' and a bank of objects, or labels='boxes' if the "
+            "Write the list with labels='paste' and a bank of objects, or labels='boxes' if the "
             "scans have boxes.",
         )
     return scan.boxes

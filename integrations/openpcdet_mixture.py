@@ -22,7 +22,7 @@ class Mixed:
 
     OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the
     ratio, a real scan is replaced by a real one here, and a synthetic one raises an error:
-    ``labels: mix`` gives synthetic scans boxes.
+    ``labels: paste`` gives synthetic scans boxes.
     """
 
     _current: int | None = None  # the position whose sample is being made
@@ -97,12 +97,12 @@ class Mixed:
             f"synthetic scan {scan.id!r} has no box of {list(self.class_names)} in range after "
             "augmentation",
             "at least one, because OpenPCDet would replace the scan by another one",
-            "Use labels: mix with a bank of objects, and gt_sampling.",
+            "Use labels: paste with a bank of objects, and gt_sampling.",
         )
 
     def _check_boxes(self, known: Collection[str]) -> None:
         """Check that the first synthetic scans have boxes, and only of known classes."""
-        hint = "labels: mix with a bank of objects gives a scan boxes, labels: boxes keeps its own."
+        hint = "labels: paste with a bank of objects gives a scan boxes, labels: boxes keeps its own."
         used = False
         for position in np.flatnonzero(self.mixed.plan().domain)[:LOOKED_AT]:
             scan = self.mixed[int(position)]

@@ -23,6 +23,7 @@ from lidar_synth.integrations.reader import PLAN_FORMAT
 from lidar_synth.bank import is_bank
 from lidar_synth.errors import ConfigError, LidarSynthError
 from lidar_synth.files.disk import write_arrays
+from lidar_synth.labels.policies import read_labels
 from lidar_synth.mixing.plan import VERSION
 
 POLICIES = ("generated", "condition", "boxes", "none")
@@ -50,12 +51,11 @@ def write_plan(
             refuses.
         FileError: if the file cannot be written.
     """
-    labels = settings.get("labels", "generated")
-    options = dict(settings.get("label_options") or {})
+    labels, options = read_labels(settings.get("labels", "generated"))
     if labels not in POLICIES or set(options) - {"threshold"}:
         raise ConfigError(
-            f"labels={labels!r} with options {sorted(options)} for a plan file",
-            f"{', '.join(POLICIES)}, and no option but threshold",
+            f"labels={labels!r} with arguments {sorted(options)} for a plan file",
+            f"{', '.join(POLICIES)}, and no argument but threshold",
             "The reader takes a bank's own labels; other policies need the package in the "
             "trainer's environment.",
         )
@@ -94,6 +94,7 @@ def write_plan(
         f"epoch-{plan.epoch}": np.stack(plan.at(np.arange(len(plan))), 1)
         for plan in plans
     }
+    hashes = [plan.hash for plan in plans]
     values = {
         "format": PLAN_FORMAT,
         "order": VERSION,
@@ -102,11 +103,11 @@ def write_plan(
         "labels": labels,
         "threshold": float(options.get("threshold", 0)),
         "lengths": [len(plan) for plan in plans],
-        "hashes": [plan.hash for plan in plans],
+        "hashes": hashes,
     }
     text = np.frombuffer(json.dumps(values).encode(), np.uint8)
     write_arrays(Path(out), {"settings": text, **arrays}, compressed=True)
-    return list(values["hashes"])
+    return hashes
 
 
 def main() -> None:

@@ -25,24 +25,30 @@ _HOME = {
     "KITTI360": "formats",
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
-    "LidarSynthError": "errors",
+    "KeepLabels": "labels",
+    "LaserMix": "labels",
     "Layout": "geometry.layout",
+    "LidarSynthError": "errors",
     "Linear": "mixing",
     "MixedScans": "mixing",
     "MixedStream": "mixing",
     "NuScenes": "formats",
     "ObjectBank": "labels",
     "PandaSet": "formats",
+    "PasteObjects": "labels",
+    "PolarMix": "labels",
+    "PolarMixOrLaserMix": "labels",
+    "PredictLabels": "labels",
     "ProofSettings": "lab.proof",
     "RangeImage": "geometry.scan",
     "RollingBank": "mixing.service",
     "Scan": "geometry.scan",
     "SemanticKITTI": "formats",
     "Sensor": "geometry.sensor",
+    "SensorFit": "lab.fitting",
     "Skin": "lab.town",
     "Source": "geometry.scan",
     "Sources": "mixing",
-    "SensorFit": "lab.fitting",
     "Town": "lab.town",
     "Trajectory": "geometry.deskew",
     "adapt": "lab.train.adaptation",
@@ -104,7 +110,13 @@ if TYPE_CHECKING:
     from lidar_synth.lab.town import fit_skin as fit_skin
     from lidar_synth.lab.town import load_skin as load_skin
     from lidar_synth.lab.train.adaptation import adapt as adapt
+    from lidar_synth.labels import KeepLabels as KeepLabels
+    from lidar_synth.labels import LaserMix as LaserMix
     from lidar_synth.labels import ObjectBank as ObjectBank
+    from lidar_synth.labels import PasteObjects as PasteObjects
+    from lidar_synth.labels import PolarMix as PolarMix
+    from lidar_synth.labels import PolarMixOrLaserMix as PolarMixOrLaserMix
+    from lidar_synth.labels import PredictLabels as PredictLabels
     from lidar_synth.labels import make_policy as make_policy
     from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans

@@ -107,7 +107,7 @@ MIXTURES: dict[str, tuple[str, int, dict[str, Any]]] = {
     "threshold": (
         "all fields",
         11,
-        {"ratio": 0.5, "label_options": {"threshold": 0.5}},
+        {"ratio": 0.5, "labels": {"generated": {"threshold": 0.5}}},
     ),
     "condition": ("conditional", 5, {"ratio": [0.0, 0.3, 0.6], "labels": "condition"}),
     "without confidence": (
@@ -159,17 +159,9 @@ def boxes_of(scan: Scan) -> dict[str, Any]:
 
 def expected_samples(root: Path, real: int, settings: dict[str, Any]) -> dict[str, Any]:
     """Arrays of every sample of the first epochs, as ``MixedScans`` gives them."""
-    options = {
-        key: value
-        for key, value in settings.items()
-        if key not in ("labels", "label_options")
-    }
+    options = {key: value for key, value in settings.items() if key != "labels"}
     bank = Bank(root)
-    policy = make_policy(
-        settings.get("labels", "generated"),
-        fields=bank.fields,
-        **settings.get("label_options", {}),
-    )
+    policy = make_policy(settings.get("labels", "generated"), fields=bank.fields)
     mixed = MixedScans.wrap(
         range(real),
         bank,

@@ -94,12 +94,10 @@ def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> No
 def test_settings_come_from_a_file_or_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wanted = {"synthetic": "bank", "ratio": 0.5, "label_options": {"kind": "objects"}}
+    wanted = {"synthetic": "bank", "ratio": 0.5, "labels": {"paste": {"count": 8}}}
     path = tmp_path / "mix.yaml"
     path.write_text(
-        yaml.safe_dump(
-            {"SYNTHETIC": "bank", "RATIO": 0.5, "LABEL_OPTIONS": {"KIND": "objects"}}
-        )
+        yaml.safe_dump({"SYNTHETIC": "bank", "RATIO": 0.5, "LABELS": wanted["labels"]})
     )
     monkeypatch.delenv(VARIABLE, raising=False)
     with pytest.raises(ConfigError, match=f"{VARIABLE}=mix.yaml"):

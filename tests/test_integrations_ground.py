@@ -109,14 +109,13 @@ def test_objects_of_unknown_occlusion_are_pasted_too(
     assert len(found) == len(objects) and set(found) == {0}
 
 
-def test_a_detectors_mixture_has_boxes_by_the_mix_policy(tmp_path: Path) -> None:
+def test_a_detectors_mixture_has_boxes_by_pasting(tmp_path: Path) -> None:
     """As a configuration says it: a bank of objects by its file, scans without a box."""
     ObjectBank.from_scans([street(i) for i in range(6)]).save(tmp_path / "objects.npz")
     settings = {
         "synthetic": synthetic(tmp_path / "bare", 4, boxes=False),
         "ratio": 0.5,
-        "labels": "mix",
-        "label_options": {"objects": str(tmp_path / "objects.npz"), "count": 4},
+        "labels": {"paste": {"bank": str(tmp_path / "objects.npz"), "count": 4}},
     }
     given = mix_for_trainer(4, settings, as_is)
     scans = [s for s in (given[i] for i in range(len(given))) if isinstance(s, Scan)]

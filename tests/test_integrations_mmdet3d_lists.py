@@ -222,7 +222,7 @@ def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:
         )
     bare = tmp_path / "bare"
     write_all("npz", bare, [replace(street(i), boxes=None) for i in range(5)])
-    with pytest.raises(DataError, match="no boxes.*labels='mix'"):
+    with pytest.raises(DataError, match="no boxes.*labels='paste'"):
         write_infos(
             tmp_path / "a",
             listed,

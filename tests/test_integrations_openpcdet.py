@@ -213,7 +213,7 @@ def test_synthetic_scans_without_boxes_are_refused_not_replaced(made: Path) -> N
     dataset.data_processor.data_processor_queue.insert(0, no_boxes)
     for position in (i for i in range(len(dataset)) if dataset.domain(i)):
         with pytest.raises(
-            DataError, match="synthetic scan '.*' has no box .*labels: mix"
+            DataError, match="synthetic scan '.*' has no box .*labels: paste"
         ):
             dataset[position]
 
@@ -327,7 +327,7 @@ def test_synthetic_scans_that_cannot_be_trained_on_are_refused_before(
     write_all("npz", tmp_path / "named", renamed)
     for sampling in (True, False):
         with pytest.raises(
-            DataError, match="synthetic scan '.*' has no boxes.*labels: mix"
+            DataError, match="synthetic scan '.*' has no boxes.*labels: paste"
         ):
             build(made, tmp_path / "without", sampling=sampling)
     with pytest.raises(

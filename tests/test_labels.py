@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable
 from dataclasses import fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,12 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan, Source
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import (
-    KINDS,
     POLICIES,
+    KeepLabels,
+    LaserMix,
     ObjectBank,
+    PasteObjects,
+    PolarMix,
     make_policy,
     swap_bands,
     swap_sector,
@@ -43,10 +47,10 @@ CALLS: dict[str, dict[str, Any]] = {
     "generated": {"threshold": 0.5},
     "condition": {},
     "pseudo": {"teacher": teacher},
-    "mix": {"count": 6, "turn": 180.0},
-    "mix polar": {"kind": "polar"},
-    "mix exchange": {"kind": "exchange"},
-    "mix laser": {"kind": "laser"},
+    "paste": {"count": 6, "turn": 180.0},
+    "polarmix": {},
+    "polarmix_or_lasermix": {},
+    "lasermix": {},
     "boxes": {},
 }
 
@@ -83,15 +87,12 @@ def same(a: Scan, b: Scan) -> bool:
     )
 
 
-def call(name: str) -> tuple[str, dict[str, Any]]:
-    return name.split()[0], CALLS[name]
+MIXES = ("paste", "polarmix", "lasermix", "polarmix_or_lasermix")
+"""Policies that insert parts of real scans."""
 
 
-def test_every_policy_and_kind_is_called_here() -> None:
-    assert {name.split()[0] for name in CALLS} == set(POLICIES)
-    assert {"objects", *(c["kind"] for c in CALLS.values() if "kind" in c)} == set(
-        KINDS
-    )
+def test_every_policy_is_called_here() -> None:
+    assert set(CALLS) == set(POLICIES)
 
 
 @pytest.mark.slow
@@ -99,20 +100,19 @@ def test_every_policy_and_kind_is_called_here() -> None:
 def test_a_policy_is_a_function_of_scan_and_generator(
     name: str, synthetic: Scan, real: list[Scan]
 ) -> None:
-    policy_name, options = call(name)
     known = FIELDS
-    if policy_name == "boxes":
+    if name == "boxes":
         synthetic = replace(synthetic, boxes=real[0].boxes)
         known = FIELDS | {"boxes"}
     before = [{n: a.copy() for n, a in arrays(s).items()} for s in (synthetic, *real)]
-    policy = make_policy(policy_name, real=real, fields=known, **options)
+    policy = make_policy(name, real=real, fields=known, **CALLS[name])
     first = policy(synthetic, keyed_rng(4, 1))
     again = policy(synthetic, keyed_rng(4, 1))
     # As spawned workers get it.
     copied = pickle.loads(pickle.dumps(policy))(synthetic, keyed_rng(4, 1))
     assert same(first, again) and same(first, copied)
     other = policy(synthetic, keyed_rng(4, 2))
-    assert same(first, other) == (policy_name != "mix")
+    assert same(first, other) == (name not in MIXES)
     for scan, held in zip((synthetic, *real), before, strict=True):
         assert all(np.array_equal(a, held[n]) for n, a in arrays(scan).items())
     assert (first.domain, first.id, first.sensor) == (
@@ -361,9 +361,7 @@ def test_a_partner_of_other_lasers_lends_no_rings() -> None:
 def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
     synthetic: Scan, real: list[Scan]
 ) -> None:
-    policy = make_policy(
-        "mix", real=real, fields=FIELDS, kind="laser", bands=[4], threshold=0.5
-    )
+    policy = make_policy(LaserMix(bands=[4], threshold=0.5), real=real, fields=FIELDS)
     mixed = policy(synthetic, keyed_rng(3))
     own = np.isin(
         mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
@@ -376,9 +374,7 @@ def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
     assert (mixed.confidence[~own] == (mixed.label[~own] != IGNORE)).all()
     assert ((mixed.confidence[own] >= 0.5) | (mixed.label[own] == IGNORE)).all()
     unlabelled = replace(synthetic, label=None, confidence=None)
-    policy = make_policy(
-        "mix", real=real, fields=frozenset({"reflectance"}), kind="laser"
-    )
+    policy = make_policy("lasermix", real=real, fields=frozenset({"reflectance"}))
     mixed = policy(unlabelled, keyed_rng(3))
     own = np.isin(
         mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
@@ -390,7 +386,7 @@ def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
 
 def test_polar_turns_objects_about_the_sensor() -> None:
     real = [cast([car(9, 0), car(14, -6)])]
-    policy = make_policy("mix", real=real, fields=FIELDS, kind="polar", width=0)
+    policy = make_policy(PolarMix(width=0), real=real, fields=FIELDS)
     mixed = policy(cast(), keyed_rng(1))
     assert mixed.boxes is not None
     assert np.allclose(
@@ -398,7 +394,7 @@ def test_polar_turns_objects_about_the_sensor() -> None:
     )
     assert abs(np.arctan2(*mixed.boxes.values[0, 1::-1])) > 0.05
     bare = [replace(real[0], boxes=None)]
-    mixed = make_policy("mix", real=bare, fields=FIELDS, kind="polar", width=0)(
+    mixed = make_policy({"PolarMix": {"WIDTH": 0}}, real=bare, fields=FIELDS)(
         cast(), keyed_rng(1)
     )
     assert (mixed.label == CAR).sum() > 500 and mixed.boxes is None
@@ -410,13 +406,11 @@ def test_objects_by_name_and_in_place_of_the_scans_own() -> None:
     bank = ObjectBank.from_scans([scan])
     host = replace(cast([car(20, 0)]), boxes=None)
     mixed = make_policy(
-        "mix", fields=FIELDS, objects=bank, count={"Van": 3}, clear=False
+        PasteObjects(bank, count={"Van": 3}, clear=False), fields=FIELDS
     )(host, keyed_rng(0))
     assert mixed.boxes is not None and mixed.boxes.names == ("Van",)
     assert (mixed.label == CAR).sum() == (host.label == CAR).sum() + bank.counts[1]
-    clear = make_policy("mix", fields=FIELDS, objects=bank, clear=True)(
-        host, keyed_rng(0)
-    )
+    clear = make_policy(PasteObjects(bank), fields=FIELDS)(host, keyed_rng(0))
     assert clear.boxes is not None and sorted(clear.boxes.names) == ["Car", "Van"]
     assert clear.boxes.contain(clear.points[clear.label == CAR]).any(0).all()
 
@@ -449,41 +443,40 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
         ),
         ("pseudo", {}, "teacher=None; expected a function"),
         ("pseudo", {"teacher": teacher, "threshold": -1}, "threshold -1"),
-        ("none", {"threshold": 0.5}, "labels='none'.*'threshold'; expected no options"),
-        ("generated", {"treshold": 0.5}, "'treshold'; expected options"),
-        ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
         (
-            "mix",
-            {"kind": "cut"},
-            "kind='cut'; expected one of 'objects', 'polar', 'laser', 'exchange'",
+            "none",
+            {"threshold": 0.5},
+            "labels='none'.*'threshold'; expected no arguments",
         ),
-        ("mix", {}, "no box with 5 points in 0 scans"),
+        ("generated", {"treshold": 0.5}, "'treshold'; expected arguments"),
+        ("best", {}, "labels='best'; expected one of 'none', 'ignore'"),
+        ("paste", {}, "no box with 5 points in 0 scans"),
         (
-            "mix",
+            "paste",
             {"real": bare},
             "no box with 5 points in 1 scans.*ObjectBank.from_scans",
         ),
         (
-            "mix",
+            "paste",
             {"real": [cast([car(8, 2)])], "count": {"Tram": 1}},
             "names and points",
         ),
-        ("mix", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
+        ("paste", {"real": [cast([car(8, 2)])], "count": 0}, "count=0"),
         (
-            "mix",
+            "paste",
             {"real": [cast([car(8, 2)])], "fields": plain},
             "neither labels nor boxes.*clear=False",
         ),
         (
-            "mix",
-            {"real": bare, "kind": "polar"},
-            "kind='polar', with scans without labels",
+            "polarmix",
+            {"real": bare},
+            "labels='polarmix', with scans without labels",
         ),
-        ("mix", {"real": [], "kind": "laser"}, "kind='laser', with none"),
-        ("mix", {"kind": "laser"}, "kind='laser', with none"),
-        ("mix", {"real": labelled, "kind": "polar"}, "neither boxes nor instances"),
-        ("mix", {"real": labelled, "kind": "polar", "width": 400}, "width=400"),
-        ("mix", {"real": labelled, "kind": "laser", "bands": [1]}, r"bands=\[1\]"),
+        ("lasermix", {"real": []}, "labels='lasermix', with none"),
+        ("lasermix", {}, "labels='lasermix', with none"),
+        ("polarmix", {"real": labelled}, "neither boxes nor instances"),
+        ("polarmix", {"real": labelled, "width": 400}, "width=400"),
+        ("lasermix", {"real": labelled, "bands": [1]}, r"bands=\[1\]"),
     ]
 
 
@@ -505,7 +498,7 @@ def test_scans_that_break_their_promise_are_refused(synthetic: Scan) -> None:
             replace(synthetic, label=None), keyed_rng(0)
         )
     real = [cast(), replace(cast(id="second"), label=None)]
-    policy = make_policy("mix", real=real, fields=FIELDS, kind="laser")
+    policy = make_policy("lasermix", real=real, fields=FIELDS)
     with pytest.raises(DataError, match="scan 'second' has no labels"):
         for seed in range(9):
             policy(synthetic, keyed_rng(seed))
@@ -516,35 +509,35 @@ def test_a_policy_of_ones_own_is_taken_as_it_is(synthetic: Scan) -> None:
         return scan
 
     assert make_policy(own) is own
-    with pytest.raises(ConfigError, match="a policy that is a function"):
+    with pytest.raises(ConfigError, match="a policy that is an object"):
         make_policy(own, threshold=0.5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", MIXES)
 def test_mixed_scans_lose_their_times(
-    kind: str, synthetic: Scan, real: list[Scan]
+    name: str, synthetic: Scan, real: list[Scan]
 ) -> None:
     """PandaSet's scans have times; those of two scans count from different moments."""
     timed = [
         replace(scan, time=np.linspace(0, 0.1, len(scan), dtype=np.float32))
         for scan in (synthetic, *real)
     ]
-    policy = make_policy("mix", real=timed[1:], fields=FIELDS | {"time"}, kind=kind)
+    policy = make_policy(name, real=timed[1:], fields=FIELDS | {"time"})
     mixed = policy(timed[0], keyed_rng(4, 1))
     assert mixed.time is None and len(mixed) != len(synthetic)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", MIXES)
 def test_real_scans_as_the_labelled_side(
-    kind: str, real_scans: Path, synthetic: Scan
+    name: str, real_scans: Path, synthetic: Scan
 ) -> None:
     source: Source = SemanticKITTI(real_scans / "semantic_kitti", split="train")
-    if kind == "objects":
+    if name == "paste":
         source = KITTIObject(real_scans / "kitti_object")
     # Else the scan's own objects leave holes, which are filled.
-    options = {"clear": False} if kind == "objects" else {}
-    policy = make_policy("mix", real=source, fields=FIELDS, kind=kind, **options)
+    options = {"clear": False} if name == "paste" else {}
+    policy = make_policy(name, real=source, fields=FIELDS, **options)
     for seed in range(3):
         mixed = policy(synthetic, keyed_rng(seed))
         assert (
@@ -555,22 +548,52 @@ def test_real_scans_as_the_labelled_side(
         own = np.isin(
             mixed.points.view("V12").ravel(), synthetic.points.view("V12").ravel()
         )
-        assert (~own).sum() > (50 if kind == "objects" else 5000) and own.sum() > 5000
+        assert (~own).sum() > (50 if name == "paste" else 5000) and own.sum() > 5000
         assert (mixed.confidence[~own & (mixed.label != IGNORE)] == 1).all()
         cells = locate(mixed.points, mixed.sensor).cell
         assert (
             np.bincount(cells[cells >= 0]) <= 1
         ).all()  # as the model's own scans: one return per cell
-        assert (mixed.boxes is not None) == (kind == "objects")
+        assert (mixed.boxes is not None) == (name == "paste")
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_real_scans_that_cannot_serve(kind: str, real_scans: Path) -> None:
+@pytest.mark.parametrize("name", MIXES)
+def test_real_scans_that_cannot_serve(name: str, real_scans: Path) -> None:
     source = (
         KITTI360(real_scans / "kitti360")
-        if kind == "objects"
+        if name == "paste"
         else KITTIObject(real_scans / "kitti_object")
     )
-    named = "polar" if kind == "exchange" else kind  # an exchange is one of both
-    with pytest.raises(ConfigError, match=f"kind='{named}'"):
-        make_policy("mix", real=source, fields=FIELDS, kind=kind)
+    named = name.removesuffix("_or_lasermix")
+    with pytest.raises(ConfigError, match=f"labels='{named}'"):
+        make_policy(name, real=source, fields=FIELDS)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_policy_is_the_same_by_name_by_mapping_and_as_an_object(name: str) -> None:
+    if name == "pseudo":
+        pytest.skip("it cannot be made without a function")
+    module, cls = POLICIES[name].split(".")
+    options = CALLS[name]
+    made = getattr(import_module(f"lidar_synth.labels.{module}"), cls)(**options)
+    bank = [cast([car(8, 2)])]
+    given = {"real": bank, "fields": FIELDS | {"boxes"}}
+    scan = replace(bank[0], confidence=np.ones(len(bank[0]), np.float32))
+    scans = [
+        make_policy(labels, **given, **more)(scan, keyed_rng(3))
+        for labels, more in ((made, {}), ({name: options}, {}), (name, options))
+    ]
+    assert same(scans[0], scans[1]) and same(scans[0], scans[2])
+
+
+@pytest.mark.parametrize(
+    "labels", [7, None, {"generated": {}, "none": {}}, {"generated": 0.5}, {3: {}}, []]
+)
+def test_what_is_no_policy_is_refused(labels: Any) -> None:
+    with pytest.raises(ConfigError, match=r"labels=.*expected a policy, its name, or"):
+        make_policy(labels, fields=FIELDS)
+
+
+def test_policies_are_equal_by_value() -> None:
+    assert KeepLabels(0.5) == KeepLabels(threshold=0.5) != KeepLabels()
+    assert PolarMix(90) == PolarMix(width=90) != PolarMix(90, objects=0)

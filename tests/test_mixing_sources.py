@@ -303,7 +303,7 @@ def wrong_labels() -> Any:
             r"str as a source of synthetic scans.*load_generator",
         ),
         (
-            lambda: MixedScans(Scans("r", 2), label_options={"threshold": 2}),
+            lambda: MixedScans(Scans("r", 2), labels="ignore"),
             ConfigError,
             r"without a synthetic source",
         ),

@@ -396,7 +396,7 @@ for stage in job["stages"]:
     synth = SemanticKITTI(stage["synthetic"]) if stage["synthetic"] else None
     size = stage["iterations"] * job["batch"]
     mixed = MixedScans(None if stage["ratio"] == 1 else real, synth, stage["ratio"], labels=stage["labels"],
-                       label_options=stage["label_options"], seed=job["seed"], epoch_size=size)
+                       seed=job["seed"], epoch_size=size)
     seen += sum(len(mixed[i]["points"]) > 0 for i in range(2)) > 0
 assert seen == len(job["stages"])
 held_out = SemanticKITTI(job["held_out"])
@@ -424,11 +424,9 @@ def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) 
 def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
     task = job("paste", tmp_path)
     [stage] = describe(task)["stages"]
-    assert stage["label_options"]["count"] == {"Pedestrian": 3}
-    assert (
-        ObjectBank.load(stage["label_options"]["objects"]).boxes.names
-        == task.objects.boxes.names
-    )
+    pasting = stage["labels"]["paste"]
+    assert pasting["count"] == {"Pedestrian": 3}
+    assert ObjectBank.load(pasting["bank"]).boxes.names == task.objects.boxes.names
 
 
 @pytest.mark.parametrize("classes", GROUPS)

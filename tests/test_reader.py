@@ -414,8 +414,8 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"labels": "mix"}, "labels='mix'.*generated, condition, boxes, none"),
-        ({"label_options": {"kind": "polar"}}, "no option but threshold"),
+        ({"labels": "paste"}, "labels='paste'.*generated, condition, boxes, none"),
+        ({"labels": {"generated": {"kind": 1}}}, "no argument but threshold"),
         ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         (

@@ -27,12 +27,12 @@ WRONG: dict[str, tuple[str, str]] = {
         "ratio: {'0': 0.5}",
         "epoch of a ratio='0'; expected an integer",
     ),
-    "options without names": (
-        "label_options: 0.3",
-        "label_options: 0.3; expected options by name",
+    "arguments without names": (
+        "labels: {generated: 0.3}",
+        "labels=.*expected a policy, its name, or",
     ),
     "text for a threshold": (
-        "label_options: {threshold: high}",
+        "labels: {generated: {threshold: high}}",
         "threshold 'high'; expected a number",
     ),
     "a number as a sensor": (

@@ -11,7 +11,7 @@ import pytest
 from sizes import size_of
 
 import lidar_synth
-from lidar_synth.labels import KINDS, POLICIES
+from lidar_synth.labels import POLICIES
 
 ORDER = """
 errors files datasets noise geometry generate.models generate.flow generate labels bank formats mixing bake viz cli
@@ -161,16 +161,13 @@ def test_every_module_is_imported_by_something() -> None:
     used |= set().union(*(imports_of(path, known) for path in outside))
     # Loaded by name, with the command.
     used |= {name for name in known if name.startswith("lidar_synth.lab.cli.")}
-    used |= {
-        f"lidar_synth.labels.{home.split('.')[0]}"
-        for home in (*POLICIES.values(), *KINDS.values())
-    }
+    used |= {f"lidar_synth.labels.{home.split('.')[0]}" for home in POLICIES.values()}
     packages = {name for name, path in known.items() if path.name == "__init__.py"}
     assert known.keys() - used - packages == PUBLIC
 
 
 LIMITS = {
-    "plugin": (147_100, 6.0, 141),
+    "plugin": (147_400, 6.0, 141),
     "laboratory": (113_400, 6.0, 172),
     "tools": (48_000, 6.0, 192),
 }

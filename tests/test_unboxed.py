@@ -9,7 +9,15 @@ import pytest
 from box_scenes import CAR, car, cast, wall
 from mixtures import Endless
 
-from lidar_synth import Boxes, MixedScans, ObjectBank, make_policy
+from lidar_synth import (
+    Boxes,
+    KeepLabels,
+    MixedScans,
+    ObjectBank,
+    PasteObjects,
+    PolarMix,
+    make_policy,
+)
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
@@ -100,13 +108,13 @@ def test_low_confidence_does_not_hide_an_object() -> None:
     scan = with_boxes(BOTH, [0])
     scan.confidence = np.where(scan.label == CAR, 0.2, 1).astype(np.float32)
     own = make_policy(
-        "mix", fields=FIELDS | {"confidence"}, objects=BANK, count=1, threshold=0.5
+        PasteObjects(BANK, count=1, threshold=0.5), fields=FIELDS | {"confidence"}
     )
     assert BOTH.boxes is not None
     assert not BOTH.boxes.contain(
         own(replace(scan, boxes=None), keyed_rng(0)).points, above_floor=0.4
     ).any()
-    item = mixed(scan, labels="generated", label_options={"threshold": 0.5})
+    item = mixed(scan, labels=KeepLabels(threshold=0.5))
     assert len(item["points"]) > 0  # type: ignore[arg-type]
     near = np.linalg.norm(np.asarray(item["points"])[:, :2] - (10, -5), axis=1) < 1.2  # type: ignore[call-overload]
     assert not (np.asarray(item["points"])[near, 2] > -1.2).any()  # type: ignore[call-overload]
@@ -118,14 +126,9 @@ def test_scans_without_boxes_keep_their_objects() -> None:
     assert (item["label"] == CAR).sum() == (BOTH.label == CAR).sum()  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("kind", ["objects", "polar"])
-def test_mix_hands_out_no_object_without_a_box(kind: str) -> None:
-    options = (
-        {"objects": BANK}
-        if kind == "objects"
-        else {"real": [cast([car(9, 3)])], "width": 30}
-    )
-    policy = make_policy("mix", fields=FIELDS, kind=kind, **options)
+@pytest.mark.parametrize("made", [PasteObjects(BANK), PolarMix(width=30)])
+def test_mixing_hands_out_no_object_without_a_box(made: object) -> None:
+    policy = make_policy(made, real=[cast([car(9, 3)])], fields=FIELDS)
     train = MixedScans.wrap(
         [0],
         [with_boxes(BOTH, None)],
@@ -149,7 +152,7 @@ def test_scans_with_boxes_and_no_labels_pass() -> None:
     bare = replace(BOTH, label=None, instance=None)
     item = mixed(bare, labels="boxes")
     assert len(item["boxes"]) == 2 and len(item["points"]) == len(BOTH)  # type: ignore[arg-type]
-    pasted = mixed(bare, labels="mix", label_options={"objects": BANK, "count": 2})
+    pasted = mixed(bare, labels=PasteObjects(BANK, count=2))
     assert len(pasted["boxes"]) > 2  # type: ignore[arg-type]
 
 
@@ -164,14 +167,14 @@ def test_a_source_without_boxes_is_refused_for_a_detector() -> None:
     ):
         MixedScans([BOTH], [with_boxes(BOTH, None)], labels="boxes")
     with pytest.raises(
-        ConfigError, match="labels='boxes', but .*labels='mix' pastes objects"
+        ConfigError, match="labels='boxes', but .*labels='paste' pastes objects"
     ):
         make_policy("boxes", fields=Endless().fields)
     with pytest.raises(
         ConfigError,
         match="neither labels nor boxes.*own objects cannot be found.*clear=False",
     ):
-        make_policy("mix", fields=frozenset({"reflectance"}), objects=BANK)
+        make_policy("paste", fields=frozenset({"reflectance"}), bank=BANK)
 
 
 def test_unboxed_objects_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -181,8 +184,7 @@ def test_unboxed_objects_are_reported_once(caplog: pytest.LogCaptureFixture) -> 
             real,
             [with_boxes(BOTH, None)] * 3,
             0.5,
-            labels="mix",
-            label_options={"objects": BANK},
+            labels={"paste": {"bank": BANK}},
         )
         [train[i] for i in range(len(train))]
         assert (

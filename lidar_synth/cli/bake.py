@@ -120,7 +120,7 @@ def _report_unboxed(bank: Path, scans: int = 8) -> None:
     found = measure(opened[i] for i in range(min(scans, len(opened))))
     if found.objects:
         typer.echo(
-            f"  {found}; a detector needs labels: mix, which removes them and pastes objects with "
+            f"  {found}; a detector needs labels: paste, which removes them and pastes objects with "
             "boxes"
         )
 

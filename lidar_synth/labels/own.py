@@ -16,7 +16,7 @@ from lidar_synth.geometry.scan import Scan, Source
 
 
 @dataclass(frozen=True)
-class Unlabelled:
+class RemoveLabels:
     """``none``: an unlabelled pool; labels, instances, confidence and boxes are removed."""
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -26,7 +26,7 @@ class Unlabelled:
 
 
 @dataclass(frozen=True)
-class Ignored:
+class IgnoreLabels:
     """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample
     keeps its keys.
 
@@ -50,31 +50,108 @@ class Ignored:
 
 
 @dataclass(frozen=True)
-class Own:
-    """``generated`` and ``condition``: the scan keeps its own labels.
+class KeepLabels:
+    """``generated``: the labels that the model generated with the scan.
 
     Args:
         threshold: minimum confidence, 0 to 1; labels below it become 255 = ignore.
-        kept: whether to keep the scan's confidence; otherwise it becomes 1 for every labelled
-            point.
+
+    Raises:
+        ConfigError: on another threshold.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, KeepLabels
+        >>> scan = Bank("demo_out/bank")[0]
+        >>> sure = KeepLabels(threshold=0.6)(scan, np.random.default_rng(0))
+        >>> np.unique(sure.label[scan.confidence < 0.6])  # labels of low confidence are ignored
+        array([255], dtype=uint8)
     """
 
     threshold: float = 0.0
-    kept: bool = True
+
+    def __post_init__(self) -> None:
+        check_share("threshold", self.threshold)
+
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepLabels":
+        """Check that the scans have labels, and confidence for a threshold.
+
+        Raises:
+            ConfigError: if they do not.
+        """
+        _require_label("generated", fields)
+        if self.threshold and "confidence" not in fields:
+            raise ConfigError(
+                f"threshold {self.threshold} for synthetic scans without confidence",
+                "threshold=0",
+            )
+        return self
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        if scan.label is None:
-            raise DataError(
-                f"scan {scan.id!r} has no labels",
-                "a label for each point",
-                "Use labels='ignore'.",
+        return trust_labels(scan, _label_of(scan), scan.confidence, self.threshold)
+
+
+@dataclass(frozen=True)
+class KeepCondition:
+    """``condition``: the labels of the semantic map that conditioned the scan, with confidence
+    1."""
+
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepCondition":
+        """Check that the scans have labels.
+
+        Raises:
+            ConfigError: if they do not.
+        """
+        _require_label("condition", fields)
+        return self
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        return trust_labels(scan, _label_of(scan), None)
+
+
+@dataclass(frozen=True)
+class KeepBoxes:
+    """``boxes``: for detectors; the scan keeps its own boxes, and its labels if it has any."""
+
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepBoxes":
+        """Check that the scans have boxes.
+
+        Raises:
+            ConfigError: if they do not.
+        """
+        if "boxes" not in fields:
+            raise ConfigError(
+                "labels='boxes', but besides points the synthetic scans only have "
+                f"{sorted(fields) or 'no fields'}",
+                "scans with boxes, such as the town's or those of a layout model",
+                "Other models generate none: labels='paste' pastes objects with their boxes.",
             )
-        return trusted(
-            scan, scan.label, scan.confidence if self.kept else None, self.threshold
-        )
+        return self
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if scan.boxes is None:
+            raise DataError(
+                f"synthetic scan {scan.id!r} has no boxes",
+                "boxes, for a detector",
+                "labels='paste' pastes objects with their boxes.",
+            )
+        return scan
 
 
-def trusted(
+def keep_own(fields: frozenset[str], threshold: float) -> KeepLabels | IgnoreLabels:
+    """The policy for the synthetic scan's own part of a mixed scan: its labels, or 255 if it has
+    none.
+
+    Raises:
+        ConfigError: as ``KeepLabels``.
+    """
+    own = KeepLabels(threshold)
+    if "label" in fields:
+        return own.bind(None, fields)
+    return IgnoreLabels(boxed="boxes" in fields)
+
+
+def trust_labels(
     scan: Scan,
     label: NDArray[np.uint8],
     confidence: NDArray[np.float32] | None,
@@ -95,73 +172,6 @@ def trusted(
     return replace(scan, label=label, raw_label=None, confidence=confidence)
 
 
-@dataclass(frozen=True)
-class OwnBoxes:
-    """``boxes``: for detectors; the scan keeps its own boxes, and its labels if it has any."""
-
-    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        if scan.boxes is None:
-            raise DataError(
-                f"synthetic scan {scan.id!r} has no boxes",
-                "boxes, for a detector",
-                "labels='mix' pastes objects with their boxes.",
-            )
-        return scan
-
-
-def boxes(real: Source | None, fields: frozenset[str]) -> OwnBoxes:
-    """Make the policy ``boxes``: the scans' own boxes, for a detector; point labels are not needed.
-
-    Raises:
-        ConfigError: if the scans have no boxes.
-    """
-    if "boxes" not in fields:
-        raise ConfigError(
-            "labels='boxes', but besides points the synthetic scans only have "
-            f"{sorted(fields) or 'no fields'}",
-            "scans with boxes, such as the town's or those of a layout model",
-            "Other models generate none: labels='mix' pastes objects with their boxes.",
-        )
-    return OwnBoxes()
-
-
-def unlabelled(real: Source | None, fields: frozenset[str]) -> Unlabelled:
-    """Make the policy ``none``, which works with any source."""
-    return Unlabelled()
-
-
-def ignored(real: Source | None, fields: frozenset[str]) -> Ignored:
-    """Make the policy ``ignore``, which works with any source."""
-    return Ignored()
-
-
-def generated(
-    real: Source | None, fields: frozenset[str], threshold: float = 0.0
-) -> Own:
-    """Make the policy ``generated``: the labels that the model generated with the scan.
-
-    Raises:
-        ConfigError: if the scans have no labels, or no confidence for a threshold.
-    """
-    _require_label("generated", fields)
-    if threshold and "confidence" not in fields:
-        raise ConfigError(
-            f"threshold {threshold} for synthetic scans without confidence",
-            "threshold=0",
-        )
-    return Own(check_share("threshold", threshold))
-
-
-def condition(real: Source | None, fields: frozenset[str]) -> Own:
-    """Make the policy ``condition``: the labels of the semantic map that conditioned the scan.
-
-    Raises:
-        ConfigError: if the scans have no labels.
-    """
-    _require_label("condition", fields)
-    return Own(kept=False)
-
-
 def check_share(name: str, value: float) -> float:
     """Check that ``value`` is a number from 0 to 1, and return it.
 
@@ -173,6 +183,16 @@ def check_share(name: str, value: float) -> float:
     return value
 
 
+def _label_of(scan: Scan) -> NDArray[np.uint8]:
+    if scan.label is None:
+        raise DataError(
+            f"scan {scan.id!r} has no labels",
+            "a label for each point",
+            "Use labels='ignore'.",
+        )
+    return scan.label
+
+
 def _require_label(policy: str, fields: frozenset[str]) -> None:
     if "label" not in fields:
         raise ConfigError(
@@ -180,5 +200,5 @@ def _require_label(policy: str, fields: frozenset[str]) -> None:
             f"{sorted(fields) or 'no fields'}",
             "a model or bank with labels",
             "Use labels='none' for an unlabelled pool, 'ignore', 'pseudo' with a teacher, or "
-            "'mix' with real scans.",
+            "'paste', 'polarmix' or 'lasermix' with real scans.",
         )

@@ -8,8 +8,8 @@ import numpy as np
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
-from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.labels.own import check_share, trusted
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.labels.own import check_share, trust_labels
 
 Teacher = Callable[[Scan], Any]
 """``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or ``scan -> scan`` with
@@ -17,16 +17,35 @@ labels."""
 
 
 @dataclass(frozen=True)
-class Pseudo:
-    """Labels predicted by a teacher; those below a minimum confidence are ignored.
+class PredictLabels:
+    """``pseudo``: labels that a teacher predicts for the finished scan.
 
     Args:
         teacher: any callable; it must be picklable if DataLoader workers are spawned.
-        threshold: minimum confidence, 0 to 1.
+        threshold: minimum confidence, 0 to 1; labels below it become 255 = ignore.
+
+    Raises:
+        ConfigError: without a teacher, or on a threshold outside [0, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, PredictLabels
+        >>> def teacher(scan):  # your network
+        ...     return scan.label, scan.confidence
+        >>> PredictLabels(teacher)(Bank("demo_out/bank")[0], np.random.default_rng(0)).label.dtype
+        dtype('uint8')
     """
 
-    teacher: Teacher
-    threshold: float
+    teacher: Teacher | None = None
+    threshold: float = 0.9
+
+    def __post_init__(self) -> None:
+        check_share("threshold", self.threshold)
+        if not callable(self.teacher):
+            raise ConfigError(
+                f"labels='pseudo' with teacher={self.teacher!r}",
+                "a function scan -> (labels, confidence), or scan -> scan",
+            )
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         """The scan with the teacher's labels.
@@ -34,6 +53,7 @@ class Pseudo:
         Raises:
             DataError: on an answer that is not one label and one confidence per point.
         """
+        assert self.teacher is not None
         answer = self.teacher(scan)
         if isinstance(answer, Scan):
             answer = (answer.label, answer.confidence)
@@ -62,23 +82,4 @@ class Pseudo:
                 f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} points",
                 "train ids 0..18 or 255 and confidences in [0, 1], one of each per point",
             )
-        return trusted(scan, label.astype(np.uint8), confidence, self.threshold)
-
-
-def pseudo(
-    real: Source | None,
-    fields: frozenset[str],
-    teacher: Teacher | None = None,
-    threshold: float = 0.9,
-) -> Pseudo:
-    """Make the policy ``pseudo``: a teacher's confident predictions.
-
-    Raises:
-        ConfigError: without a teacher, or on a threshold outside [0, 1].
-    """
-    if not callable(teacher):
-        raise ConfigError(
-            f"labels='pseudo' with teacher={teacher!r}",
-            "a function scan -> (labels, confidence), or scan -> scan",
-        )
-    return Pseudo(teacher, check_share("threshold", threshold))
+        return trust_labels(scan, label.astype(np.uint8), confidence, self.threshold)

@@ -119,7 +119,7 @@ class Notices:
         if scan.boxes is None:
             log.warning(
                 "real scans have boxes, synthetic ones have none: a detector would learn that "
-                "their objects are background. For a detector, use labels='mix' with objects, or "
+                "their objects are background. For a detector, use labels='paste', or "
                 "labels='boxes' if the scans have boxes."
             )
             return

@@ -15,6 +15,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels import LabelPolicy, make_policy
+from lidar_synth.labels.policies import read_labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
@@ -60,10 +61,10 @@ class MixedScans(Dataset[Any]):
         synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
         ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch,
             ``{epoch: share}``, ``Linear(first, last, epochs)`` or a function of the epoch.
-        labels: label policy of the synthetic scans: a name of ``lidar_synth.labels.POLICIES`` or a
-            function.
+        labels: label policy of the synthetic scans: a policy of ``lidar_synth.labels`` such as
+            ``PasteObjects(bank, count=8)``, a name of ``lidar_synth.labels.POLICIES``, ``{name:
+            {argument: value}}``, or your own ``(scan, rng) -> scan``.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
-        label_options: keyword arguments of the label policy.
         epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds
             synthetic ones, as many as the largest ratio of a schedule needs; where the ratio is
             smaller, real scans are used more often. ``"replace"`` has as many samples as there are
@@ -120,10 +121,9 @@ class MixedScans(Dataset[Any]):
         real: Any,
         synth: Any = None,
         ratio: Ratio = 0.25,
-        labels: str | LabelPolicy = "generated",
+        labels: Any = "generated",
         seed: int = 0,
         *,
-        label_options: Mapping[str, Any] | None = None,
         epoch_size: EpochSize = "add",
         reuse: int = 1,
         balanced: bool = False,
@@ -175,10 +175,9 @@ class MixedScans(Dataset[Any]):
             [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics),
         )
         scans = None if real_as_is else real
-        options = dict(label_options or {})
         rings = frozenset() if target is None else frozenset({"ring"})
         self._policies = [
-            make_policy(labels, real=scans, fields=s.fields | rings, **options)
+            make_policy(labels, real=scans, fields=s.fields | rings)
             for s in self.synthetic
         ]
         self._without_unboxed = (
@@ -193,7 +192,7 @@ class MixedScans(Dataset[Any]):
             collate = Collate(
                 collate,
                 sensors[0] if sensors else None,
-                "allow" if labels == "none" else unlabelled,
+                "allow" if read_labels(labels)[0] == "none" else unlabelled,
             )
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()

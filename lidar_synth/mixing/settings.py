@@ -9,14 +9,13 @@ import numpy as np
 
 from lidar_synth.bank import Bank, is_bank
 from lidar_synth.bank.storage import is_url
-from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import read_transfer
 from lidar_synth.formats.description import same_grid
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.labels.policies import LabelPolicy
 from lidar_synth.mixing.scans import MixedScans, Ratio
 from lidar_synth.mixing.sources import each, sensor_of
 
@@ -31,7 +30,6 @@ OPTIONS = (
     "seed",
     "reuse",
     "epoch_size",
-    "label_options",
     "unboxed",
     "as_sensor",
     "classes",
@@ -86,25 +84,14 @@ def read_settings(given: Any = None) -> dict[str, Any]:
             f"a dict of {', '.join(OPTIONS)}, or a YAML file of them",
             f"Set the file in the trainer's configuration or by {VARIABLE}=mix.yaml.",
         )
-    settings = {str(key).lower(): value for key, value in given.items()}
-    options = settings.get("label_options")
-    if isinstance(options, Mapping):
-        settings["label_options"] = {
-            str(key).lower(): value for key, value in options.items()
-        }
-    elif options is not None:
-        raise ConfigError(
-            f"label_options: {shorten(str(options), 40)}",
-            "options by name, such as threshold: 0.5",
-        )
-    return settings
+    return {str(key).lower(): value for key, value in given.items()}
 
 
 def mix(
     real: Any,
     synth: Any,
     ratio: Ratio = 0.25,
-    labels: str | LabelPolicy = "generated",
+    labels: Any = "generated",
     *,
     as_sensor: Any = "auto",
     **options: Any,

@@ -266,8 +266,7 @@ def make_mixture(root: Path) -> None:
     settings = {
         "synthetic": "bank",
         "ratio": {0: 0.5, 3: 0.25},
-        "labels": "generated",
-        "label_options": {"threshold": 0.3},
+        "labels": {"generated": {"threshold": 0.3}},
         "seed": 7,
         "reuse": 2,
         "epoch_size": "add",

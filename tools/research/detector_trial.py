@@ -91,13 +91,13 @@ ARMS = {
         "unconditional scans with unboxed objects, objects pasted",
         _MODEL,
         "unboxed",
-        "mix",
+        "paste",
     ),
     "closed": Arm(
         "unconditional scans without unboxed objects, objects pasted",
         _MODEL,
         "closed",
-        "mix",
+        "paste",
     ),
     "layout": Arm("layout scans", _LAYOUT, "layout"),
     "layout_gt": Arm("layout scans, GT sampling", _LAYOUT, "layout", pasted=True),
@@ -201,7 +201,7 @@ def mixture(
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
     options: dict[str, Any] = {
-        "objects": objects,
+        "bank": objects,
         "count": there,
         "turn": 180.0,
         "clear": False,
@@ -209,15 +209,14 @@ def mixture(
     steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
         steps.insert(
-            0, make_policy("mix", fields=frozenset({"label", "boxes"}), **options)
+            0, make_policy("paste", fields=frozenset({"label", "boxes"}), **options)
         )
     share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
         labelled,
         pool,
         share if pool is not None else 0,
-        arm.labels,
-        label_options=options if arm.labels == "mix" else None,
+        {"paste": options} if arm.labels == "paste" else arm.labels,
         seed=seed,
         balanced=True,
         epoch_size=count // PHASES if arm.first else count,

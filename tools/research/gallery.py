@@ -128,14 +128,14 @@ def from_layout() -> list[list[tuple[str, Picture]]]:
 
 def pasted() -> list[list[tuple[str, Picture]]]:
     """A generated scan, and the same with objects of the town in place of its own (the label policy
-    ``mix``)."""
+    ``paste``)."""
     generator = load_generator("town")
     scans = Town(0, "hdl64e_lasers", 5 * STRETCH_FRAMES, motion=False)
     bank = ObjectBank.from_scans(
         [scans[i] for i in range(0, len(scans), STRETCH_FRAMES // 2)]
     )
     policy = make_policy(
-        "mix", fields=generator.fields, objects=bank, count=12, clear=True
+        "paste", fields=generator.fields, bank=bank, count=12, clear=True
     )
     [scan] = generator.scans(0, [0])
     mixed = policy(scan, np.random.default_rng(0))

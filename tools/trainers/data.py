@@ -151,7 +151,7 @@ class Data:
 
     @cached_property
     def objects(self) -> Path:
-        """A bank of objects of 20 streets of the town, for ``labels: mix``."""
+        """A bank of objects of 20 streets of the town, for ``labels: paste``."""
         out = self.folder / "objects.npz"
         if not out.exists():
             town = Town(seed=2, scans=20 * STRETCH_FRAMES)

@@ -49,8 +49,8 @@ def kitti(trial: Trial, python: Path, tree: Path) -> Row:
             trial.data.objects,
         ],
     )
-    mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "mix"}
-    mixture |= {"label_options": {"objects": str(trial.data.objects)}}
+    mixture = {"synthetic": str(trial.data.bank), "ratio": 0.5}
+    mixture |= {"labels": {"paste": {"bank": str(trial.data.objects)}}}
 
     def train(title: str, out: str) -> str:
         changes = f"DATA_CONFIG.DATA_PATH {data}"

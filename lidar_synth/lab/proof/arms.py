@@ -67,13 +67,12 @@ class Arm:
         found = {stage.pool for stage in self.stages(0.5)} - {"", REAL}
         return found | (
             {"skin"}
-            if any("objects" in stage.options for stage in self.stages(0.5))
+            if any("bank" in stage.options for stage in self.stages(0.5))
             else set()
         )
 
 
-_EXCHANGE = {"kind": "exchange"}
-_RARE = {"kind": "objects", "objects": True, "turn": 180.0}
+_RARE = {"bank": True, "turn": 180.0}
 RARE = {"Pedestrian": 3, "Person_sitting": 1, "Cyclist": 2, "Truck": 1, "Tram": 1}
 """Largest number of pasted objects in a scan by name of their boxes."""
 
@@ -102,7 +101,7 @@ ARMS: dict[str, Arm] = {
     ),
     "exchange": Arm(
         "real scans, PolarMix and LaserMix",
-        lambda ratio: (ArmStage(1, 0.5, REAL, "mix", _EXCHANGE),),
+        lambda ratio: (ArmStage(1, 0.5, REAL, "polarmix_or_lasermix"),),
         synthetic=False,
     ),
     "town": Arm(
@@ -140,7 +139,7 @@ ARMS: dict[str, Arm] = {
     ),
     "paste": Arm(
         "real scans, rare objects pasted",
-        lambda ratio: (ArmStage(1, 0.5, REAL, "mix", _RARE),),
+        lambda ratio: (ArmStage(1, 0.5, REAL, "paste", _RARE),),
         budget=_SKIN,
     ),
 }
@@ -238,7 +237,7 @@ def options_of(
 ) -> dict[str, Any]:
     """The options of the label policy of a stage; arguments as for ``policy_of``."""
     options = dict(stage.options)
-    if options.pop("objects", False):
+    if options.pop("bank", False):
         assert objects is not None
         there = {
             n
@@ -246,7 +245,7 @@ def options_of(
             if points >= 5
         }
         options |= {
-            "objects": objects,
+            "bank": objects,
             "count": {name: most for name, most in RARE.items() if name in there},
         }
     elif options.get("kind") == "exchange" and real[0].instance is None:

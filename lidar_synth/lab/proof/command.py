@@ -32,11 +32,10 @@ class CommandTrainer:
 
     ``{job}`` in it stands for a YAML file with ``seed``, ``batch``, ``iterations``; ``real``, the
     folder of the labelled scans; ``stages``, one after the other, each with ``iterations``,
-    ``ratio``, ``synthetic`` (a folder, or null), ``labels`` and ``label_options``, which are
-    arguments of ``MixedScans``, and ``rate``, its learning rate as a share of yours; ``held_out``,
-    a folder of scans without labels; and ``predictions``, the folder to write one ``NNNNNN.label``
-    to for each of them. All folders of scans have SemanticKITTI's layout, and predictions its
-    values: (N,) uint32, one for each point.
+    ``ratio``, ``synthetic`` (a folder, or null), ``labels``, as for ``MixedScans``, and ``rate``,
+    its learning rate as a share of yours; ``held_out``, a folder of scans without labels; and
+    ``predictions``, the folder to write one ``NNNNNN.label`` to for each of them. All folders of
+    scans have SemanticKITTI's layout, and predictions its values: (N,) uint32, one for each point.
 
     Args:
         command: the words of the command, as a shell would split them.
@@ -99,8 +98,8 @@ def describe(job: Job) -> dict[str, Any]:
             else job.pool_folders.get(stage.pool)
         )
         options = options_of(stage, list(job.real), job.objects)
-        if isinstance(options.get("objects"), ObjectBank):
-            options["objects"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
+        if isinstance(options.get("bank"), ObjectBank):
+            options["bank"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
         stages.append(
             {
                 "iterations": iterations,
@@ -108,8 +107,7 @@ def describe(job: Job) -> dict[str, Any]:
                 "synthetic": None
                 if not stage.ratio or folder is None
                 else str(folder.resolve()),
-                "labels": stage.labels,
-                "label_options": options,
+                "labels": {stage.labels: options} if options else stage.labels,
                 "rate": stage.rate,
             }
         )
