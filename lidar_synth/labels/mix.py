@@ -49,8 +49,8 @@ class PasteObjects:
 
     Example:
         >>> import numpy as np
-        >>> from lidar_synth import Bank, ObjectBank, PasteObjects, open_scans
-        >>> objects = ObjectBank.from_scans(open_scans("demo_out/town"))
+        >>> from lidar_synth import Bank, ObjectBank, PasteObjects, Town
+        >>> objects = ObjectBank.from_scans(Town(0, "hdl64e_lasers", scans=2))
         >>> bank = Bank("demo_out/bank")
         >>> policy = PasteObjects(objects, count=2).bind(None, bank.fields)
         >>> len(policy(bank[0], np.random.default_rng(0)).boxes) <= 2
