@@ -54,6 +54,7 @@ _HOME = {
     "adapt": "lab.train.adaptation",
     "assign_beams": "geometry.assign",
     "deskew": "geometry.deskew",
+    "evaluate": "lab.evaluate",
     "fit_sensor": "lab.fitting",
     "fit_skin": "lab.town",
     "layout_of": "geometry.layout",
@@ -101,6 +102,7 @@ if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Source as Source
     from lidar_synth.geometry.sensor import Sensor as Sensor
     from lidar_synth.geometry.sensor import load_sensor as load_sensor
+    from lidar_synth.lab.evaluate import evaluate as evaluate
     from lidar_synth.lab.fitting import SensorFit as SensorFit
     from lidar_synth.lab.fitting import fit_sensor as fit_sensor
     from lidar_synth.lab.proof import ProofSettings as ProofSettings

@@ -31,7 +31,7 @@ from lidar_synth.formats.semantic_kitti import SPLITS
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import SYNTHETIC
 from lidar_synth.geometry.sensor import Sensor, presets
-from lidar_synth.lab.evaluate import PROTOCOLS, evaluate
+from lidar_synth.lab.evaluate import PROTOCOLS, Metric, evaluate
 from lidar_synth.lab.evaluate.leakage import measured, overlap, recordings_of, town
 from lidar_synth.lab.importers import lidm
 from lidar_synth.lab.town.export import SETTINGS
@@ -171,7 +171,9 @@ def test_another_sensor_is_refused(
         DataError,
         match=r"scan .* of sensor hdl32e_nuscenes \(32 rows.*expected .*64 rows",
     ):
-        evaluate(*(open_scans(p) for p in call[1:3]), protocol, progress=False)
+        metric = Metric(protocol)
+        metric.update(open_scans(call[1]), real=True)
+        metric.update(open_scans(call[2]), real=False)
 
 
 def test_an_unknown_protocol_is_a_wrong_call(folders: tuple[Path, Path]) -> None:
@@ -569,3 +571,17 @@ def test_each_protocols_reference_is_apart_from_its_training_data(
             protocol == "r2flow"
         )  # whose code compares with all drives
         assert "training" in PROTOCOLS[protocol].unverified or not shared
+
+
+def test_python_refuses_what_the_command_refuses(kitti360: Path, fake: Path) -> None:
+    trained_on(fake, seen_by(TRAINED["own lidm/train"]))
+    sets = open_scans(kitti360, split="r2flow/test"), open_scans(fake)
+    with pytest.raises(ConfigError, match="was trained on .*training_data=True"):
+        evaluate(*sets, "r2flow", anyway=True, progress=False)
+    with pytest.raises(DataError, match="as the r2flow protocol compares.*anyway=True"):
+        evaluate(*sets, "r2flow", training_data=True, progress=False)
+    scores = evaluate(*sets, "r2flow", anyway=True, training_data=True, progress=False)
+    assert [score.table for score in scores[:2]] == ["JSD", "MMD"]
+    (fake / NOTE).write_text(json.dumps({"trained_on": "KITTI raw"}))
+    with pytest.warns(UserWarning, match="does not record its model's training data"):
+        evaluate(*sets, "r2flow", anyway=True, progress=False)

@@ -221,8 +221,8 @@ def test_scans_of_another_sensor_are_refused() -> None:
     with pytest.raises(DataError, match="real scan .* of sensor hdl32e_nuscenes .*"):
         evaluate([REAL[0], other], FAKE, "town", progress=False)
     with pytest.raises(DataError, match="the sensor of the lidm protocol"):
-        evaluate([other], [other], "lidm", progress=False)
-    assert evaluate(REAL, [other], "town", progress=False, any_sensor=True)
+        Metric("lidm").update([other], real=True)
+    assert evaluate(REAL, [other], "town", progress=False, anyway=True)
     assert alike(presets()["hdl64e_kitti"], presets()["hdl64e_semantic_kitti"])
 
 
@@ -334,6 +334,7 @@ def test_published_weights_are_measured_and_kept(
         "weights": tmp_path / "weights",
         "cache": tmp_path / "cache",
         "progress": False,
+        "anyway": True,
     }
     left_out: dict[str, str] = {}
     first = evaluate(REAL[:2], FAKE[:2], "r2flow", left_out=left_out, **options)

@@ -346,7 +346,7 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
 
     real = scans(6, 0)
     fake = scans(4, 1)
-    score = evaluate(Recorded(real), fake, limited, progress=False)[0]
+    score = evaluate(Recorded(real), fake, limited, progress=False, anyway=True)[0]
     assert asked == [4, 2, 1]  # random.Random(0).shuffle of 6 numbers, the first 3
     assert (score.real, score.generated) == (3, 4)
     everything = evaluate(
@@ -355,6 +355,7 @@ def test_r2flow_takes_a_fixed_choice_of_its_limit() -> None:
         limited,
         {"moments": lambda some: np.ones((len(some), 2))},
         progress=False,
+        anyway=True,
     )
     # Features are of all scans, as R2Flow takes them.
     assert everything[0] == score and everything[-1].real == 6
@@ -368,7 +369,7 @@ def test_bad_input() -> None:
     ):
         evaluate(good, good, "jsd")
     with pytest.raises(DataError, match="no generated scans; expected at least one"):
-        evaluate(good, [], "lidm", progress=False)
+        evaluate(good, [], "lidm", progress=False, anyway=True)
     empty = Scan(
         np.zeros((0, 3), np.float32), np.zeros(0, np.float32), SENSOR, id="blank"
     )
@@ -381,7 +382,7 @@ def test_bad_input() -> None:
             DataError,
             match=f"generated scan 'blank': a cloud of 0 points with none .*{area}",
         ):
-            evaluate(good, [good[0], empty], name, progress=False)
+            evaluate(good, [good[0], empty], name, progress=False, anyway=True)
     features = np.ones((3, 4))
     with pytest.raises(
         DataError, match="features of 3 and 1 scans; expected at least two of each"

@@ -34,16 +34,15 @@ from lidar_synth.lab.train.config import (
 from lidar_synth.lab.train.state import Recipe
 
 TOPICS = {
-    "geometry": "Scans and range images",
-    "formats": "Reading",
-    "bank": "Banks",
-    "generate": "Generating",
-    "mixing": "Mixing",
-    "labels": "Labels",
-    "lab.fitting": "Sensors from scans",
-    "lab.train": "Training",
-    "lab.proof": "Proof",
-    "lab.town": "The town",
+    "formats": "Load",
+    "geometry": "Load",
+    "bank": "Load",
+    "datasets": "Load",
+    "mixing": "Mix",
+    "labels": "Mix",
+    "generate": "Generate",
+    "viz": "Look",
+    "lab": "Lab",
     "errors": "Errors",
 }
 """Headings of the API by the package's folder in which a name lies."""
@@ -66,7 +65,6 @@ FURTHER = (
     "lidar_synth.labels.edit.unboxed.remove_unboxed",
     "lidar_synth.datasets.classes.Taxonomy",
     "lidar_synth.lab.evaluate.metric.Metric",
-    "lidar_synth.lab.evaluate.comparison.evaluate",
     "lidar_synth.lab.evaluate.segmentation.load_judge",
     "lidar_synth.lab.train.runs.run",
     "lidar_synth.lab.train.config.load.load_config",
@@ -106,7 +104,8 @@ def api() -> str:
     for name, home in lidar_synth._HOME.items():
         given = getattr(lidar_synth, name)
         topics[topic_of(home)].append(f"{given.__module__}.{given.__qualname__}")
-    topics["Further names"] = list(FURTHER)
+    for name in FURTHER:
+        topics[topic_of(name.removeprefix("lidar_synth."))].append(name)
     return "\n".join(
         f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names)
         for topic, names in topics.items()

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from lidar_synth.datasets.recordings import Recordings
     from lidar_synth.geometry.scan import Source
 
 
@@ -101,13 +100,12 @@ def evaluate(
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
     """
     from lidar_synth.errors import suggest
-    from lidar_synth.formats import layout_of, open_scans
+    from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import PROTOCOLS
     from lidar_synth.lab.evaluate import evaluate as compare
-    from lidar_synth.lab.evaluate.comparison import check_counts
     from lidar_synth.lab.evaluate.features import describe_missing
     from lidar_synth.lab.evaluate.leaderboard import compare_published as published
-    from lidar_synth.lab.evaluate.leakage import measured, seen_by_model_of
+    from lidar_synth.lab.evaluate.leakage import refuse_training_data
     from lidar_synth.lab.evaluate.segmentation import load_judge
 
     if beside and (as_json or judge is not None):
@@ -126,16 +124,12 @@ def evaluate(
         open_scans(real, sensor=sensor, split=split),
         open_scans(fake, sensor=sensor),
     )
-    if not training_data and (seen := seen_by_model_of(fake, sources[1])) is not None:
-        _refuse_training_data(
-            seen, measured(sources[0], layout_of(real), real, split, seen), real, fake
-        )
+    if not training_data and (note := refuse_training_data(*sources, split)):
+        typer.echo(note, err=True)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
         return
     rules = PROTOCOLS[str(protocol)]
-    if not anyway:
-        check_counts(rules, *map(len, sources))
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
     left_out: dict[str, str] = {}
     scores = compare(
@@ -146,7 +140,8 @@ def evaluate(
         weights=weights,
         replicates=intervals,
         extended=extended,
-        any_sensor=anyway,
+        anyway=anyway,
+        training_data=True,  # refused above, with the split
         cache=cache,
         processes=processes,
         left_out=left_out,
@@ -176,30 +171,3 @@ def _recognition(
     )
     figures = compare(real, fake)
     typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
-
-
-def _refuse_training_data(
-    seen: "Recordings", reference: "Recordings", real: Path, fake: Path
-) -> None:
-    """Refuse a reference that contains scans that the model of the generated ones has seen."""
-    from lidar_synth.errors import ConfigError
-    from lidar_synth.lab.evaluate.leakage import overlap, undecided
-
-    if shared := overlap(seen, reference):
-        raise ConfigError(
-            f"{real} as a reference for {fake}, whose model was trained on {shared} of it",
-            "scans that the model was not trained on",
-            "Use another split, or a town with another --seed; --training-data compares anyway.",
-        )
-    if not seen:
-        typer.echo(
-            f"{fake} does not record its model's training data: overlap with {real} was not "
-            "checked",
-            err=True,
-        )
-    elif undecided(seen, reference):
-        typer.echo(
-            "KITTI's object set is a sample of the raw drives; whether the two sets share frames "
-            "is not known",
-            err=True,
-        )

@@ -1,5 +1,6 @@
 """Two sets of scans compared by a named protocol, and by the features of any extractor."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.cache import extract_all
 from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
+from lidar_synth.lab.evaluate.leakage import refuse_training_data
 from lidar_synth.lab.evaluate.metric import Metric, Score, choice
 from lidar_synth.lab.evaluate.protocols import Protocol, find_protocol
 
@@ -25,7 +27,8 @@ def evaluate(
     weights: Path | None = None,
     replicates: int = 0,
     extended: bool = False,
-    any_sensor: bool = False,
+    anyway: bool = False,
+    training_data: bool = False,
     cache: Path | None = None,
     processes: int = 1,
     left_out: dict[str, str] | None = None,
@@ -44,29 +47,36 @@ def evaluate(
             that LIDAR_SYNTH_METRICS names. Measures without weights are left out.
         replicates: resamples for a 95 % interval of each value; 0 = no intervals.
         extended: add unbiased forms, precision, recall, density and coverage of all features.
-        any_sensor: whether to compare scans of sensors that differ.
+        anyway: whether to compare fewer scans than the protocol's paper, and scans of
+            sensors that differ.
+        training_data: whether to compare with scans on which the model of the generated
+            ones was trained.
         cache: folder in which features of published weights are kept, by the hash of scan and
             weights.
         processes: number of processes that extract these features; more than one need a ``cache``.
         left_out: filled with {measure: why it was left out}.
 
     Raises:
-        ConfigError: on an unknown protocol, or several processes without a cache.
-        DataError: on an empty set, a scan without returns in the protocol's area, or sensors that
-            differ.
+        ConfigError: on an unknown protocol, several processes without a cache, or real scans
+            that the model has seen; see ``leakage.refuse_training_data``.
+        DataError: on an empty set, a scan without returns in the protocol's area, or, without
+            ``anyway``, fewer scans than the paper's or sensors that differ.
 
     Example:
-        >>> from lidar_synth import Town
-        >>> from lidar_synth.lab.evaluate import evaluate
+        >>> from lidar_synth import Town, evaluate
         >>> scores = evaluate(Town(1, scans=2), Town(2, scans=2), "town", progress=False)
         >>> [score.metric for score in scores]
         ['BEV Jensen-Shannon distance', 'BEV maximum mean discrepancy']
     """
     rules = find_protocol(protocol)
+    if not anyway:
+        check_counts(rules, len(real), len(generated))
+    if not training_data and (note := refuse_training_data(real, generated)):
+        warnings.warn(note, stacklevel=2)
     if processes > 1:
         _fill(rules, (real, generated), weights, cache, processes, batch)
     metric = Metric(
-        rules, extractors, weights, replicates, extended, any_sensor, batch, cache
+        rules, extractors, weights, replicates, extended, anyway, batch, cache
     )
     indices: Sequence[int] = range(len(real))
     if (
@@ -100,7 +110,7 @@ def check_counts(protocol: Protocol, real: int, generated: int) -> None:
             raise DataError(
                 f"{count} {name} scans",
                 f"{least}, as the {protocol.name} protocol compares them",
-                "--anyway measures them; the figures do not stand beside the paper's.",
+                "anyway=True (--anyway) measures them; the figures do not stand beside the paper's.",
             )
 
 

@@ -26,11 +26,12 @@ from lidar_synth.datasets.recordings import (
     frames_of,
     seen_by,
 )
+from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_facts
-from lidar_synth.formats import BankScans
+from lidar_synth.formats import BankScans, layout_of
 from lidar_synth.formats.models import models_of
 from lidar_synth.formats.source import ScanFiles
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.town.export import SETTINGS
 
 
@@ -100,6 +101,51 @@ def measured(
     )
     hashed = seen is not None and any(dataset == CONTENT for dataset, _ in seen.drives)
     return found | contents(map(content_of, source)) if hashed else found
+
+
+def refuse_training_data(
+    real: Source, generated: Source, split: str | None = None
+) -> str:
+    """Refuse a reference that contains scans that the model of the generated ones has seen. Sets
+    that are not read from files are not checked.
+
+    Args:
+        real: the reference.
+        generated: scans of a model.
+        split: of the reference, if it was opened with one.
+
+    Returns:
+        What could not be checked; "" if nothing.
+
+    Raises:
+        ConfigError: if they share scans.
+        FileError, DataError: if what stands beside the scans is damaged.
+    """
+    if not (isinstance(real, ScanFiles) and isinstance(generated, ScanFiles)):
+        return ""
+    seen = seen_by_model_of(generated.root, generated)
+    if seen is None:
+        return ""
+    reference = measured(real, layout_of(real.root), real.root, split, seen)
+    if shared := overlap(seen, reference):
+        raise ConfigError(
+            f"{real.root} as a reference for {generated.root}, whose model was trained on "
+            f"{shared} of it",
+            "scans that the model was not trained on",
+            "Use another split, or a town with another seed; training_data=True "
+            "(--training-data) compares anyway.",
+        )
+    if not seen:
+        return (
+            f"{generated.root} does not record its model's training data: overlap with "
+            f"{real.root} was not checked"
+        )
+    if undecided(seen, reference):
+        return (
+            "KITTI's object set is a sample of the raw drives; whether the two sets share "
+            "frames is not known"
+        )
+    return ""
 
 
 def content_of(scan: Scan) -> str:
