@@ -12,6 +12,7 @@ an undisturbed run.
 
 import argparse
 import encodings.cp437  # noqa: F401  for zip files, where "nobody" may not read Python's folder
+import json
 import os
 import random
 import resource
@@ -21,14 +22,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import accelerate  # noqa: F401 - not in every child again
 import numba
+import torch.utils.tensorboard  # noqa: F401
 from bench.untrained import write_untrained
+from safetensors import safe_open
 from tqdm import tqdm
 from typer.testing import CliRunner
 
+import lidar_synth.lab.proof
+import lidar_synth.lab.train  # noqa: F401
 from lidar_synth.cli import app
 from lidar_synth.errors import LidarSynthError
 
@@ -48,11 +56,24 @@ COMMANDS = {
     "edit remove": "edit remove KITTI360 OUT --scan 0 --name Car",
     "repair": "repair OUT --model MODEL",
     "label kitti360": "label kitti360 KITTI360 OUT",
+    "train": "train town_tiny --resume output=OUT recipe.iterations=6 recipe.batch=2 data.town=4 "
+    "save_every=2 samples.every=3 samples.count=1",
+    "prove": "prove TOWN --out OUT --places stretch --labelled 2 --iterations 10 --batch 1 "
+    "--seeds 1 --arm pretrain --synthetic 2 --jobs 1",
 }
 """Commands by name. OUT is the output; the other places are made beforehand."""
 
 STARTS = {"repair": "DAMAGED"}
 """Commands that change a folder which exists already: the place that they begin with."""
+
+TIMES = {
+    "train": {"seconds", "checksum"},
+    "prove": {"seconds", "minutes", "date", "checksum"},
+}
+"""Fields of JSON and of the metadata of tensors that differ between two undisturbed runs."""
+
+UNCOMPARED = {"train": {"logs"}, "prove": {"index.html"}}
+"""Files and folders that tell the time: TensorBoard's, and the page, which shows what ``results.json`` holds."""
 
 DONE, FAILED, REFUSED = range(3)
 """How a run ended: well, with an exception, or with one of the package's errors."""
@@ -93,6 +114,8 @@ def start(words: list[str], limit: Callable[[], object] = lambda: None) -> int:
             print(f"{type(error).__name__}: {error}", file=sys.stderr)
             ended = FAILED
         os._exit(ended)
+    with suppress(OSError):  # the child may have done it, or have ended
+        os.setpgid(child, child)
     return child
 
 
@@ -114,13 +137,35 @@ def kill(child: int, seconds: float) -> int | None:
     return None
 
 
-def read_files(root: Path) -> dict[str, bytes]:
-    """All files of a folder by their relative paths."""
-    return {
-        path.relative_to(root).as_posix(): path.read_bytes()
-        for path in root.rglob("*")
-        if path.is_file()
-    }
+def read_files(root: Path, name: str) -> dict[str, Any]:
+    """What is compared of the files that a command wrote, by their relative paths."""
+    times = TIMES.get(name, set())
+    found = {}
+    for path in root.rglob("*"):
+        inside = path.relative_to(root)
+        if path.is_file() and UNCOMPARED.get(name, set()).isdisjoint(inside.parts):
+            found[inside.as_posix()] = read_content(path, times)
+    return found
+
+
+def read_content(path: Path, times: set[str]) -> Any:
+    """The bytes of a file, or its values without the fields ``times``."""
+    if times and path.suffix == ".safetensors":
+        with safe_open(path, "np") as file:
+            tensors = {key: file.get_tensor(key).tobytes() for key in file.keys()}  # noqa: SIM118
+            return tensors, without(file.metadata(), times)
+    if times and path.suffix == ".json":
+        return without(json.loads(path.read_bytes()), times)
+    return path.read_bytes()
+
+
+def without(value: Any, names: set[str]) -> Any:
+    """A value of JSON without the fields of these names, at any depth."""
+    if isinstance(value, dict):
+        return {k: without(v, names) for k, v in value.items() if k not in names}
+    if isinstance(value, list):
+        return [without(part, names) for part in value]
+    return value
 
 
 class Trial:
@@ -139,16 +184,18 @@ class Trial:
         words = COMMANDS[name]
         for place, path in {**places, "OUT": str(out)}.items():
             words = words.replace(place, path)
+        self.name = name
         self.words = words.split()
         self.out = out
         self.begins_with = places.get(STARTS.get(name, ""))
-        self.expected: dict[str, bytes] = {}
+        self.expected: dict[str, Any] = {}
         self.clear()
         begin = time.monotonic()
         if wait(start(self.words)) != DONE:
             raise RuntimeError("an undisturbed run fails")
         self.seconds = time.monotonic() - begin
-        self.expected = read_files(out)
+        self.expected = read_files(out, name)
+        self.largest = max(path.stat().st_size for path in out.rglob("*"))
         self.clear()
         self.complete("an undisturbed run")
 
@@ -166,7 +213,7 @@ class Trial:
         """
         if wait(start(self.words)) != DONE:
             raise RuntimeError(f"fails after {after}")
-        found = read_files(self.out)
+        found = read_files(self.out, self.name)
         names = sorted(self.expected.keys() | found.keys())
         differing = [n for n in names if self.expected.get(n) != found.get(n)]
         if differing:
@@ -190,7 +237,7 @@ def kill_often(trial: Trial, kills: int, rng: random.Random) -> None:
 
 def fill_disk(trial: Trial, times: int, rng: random.Random) -> None:
     """Run a command where no file may be larger than a part of the largest one."""
-    largest = max(map(len, trial.expected.values()))
+    largest = trial.largest
     for _ in range(times):
         size = int(largest * rng.random())
         limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (size, size))
