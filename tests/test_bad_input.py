@@ -1,9 +1,12 @@
 """Bad input: a clear error that names the file and says what to do, never a wrong scan, nothing
 half-written."""
 
+import gzip
+import os
 import re
 import shutil
 import sys
+import tarfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -15,14 +18,21 @@ from layouts import (
     nuscenes_arrays,
     some_scan,
     write_all,
+    write_kitti_raw,
     write_nuscenes,
     write_tars,
 )
+from limits import in_limits, needs_limits
 
+from lidar_synth.bank import ShardReader
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.formats import READERS, WRITERS, NuScenes, SemanticKITTI, open_scans
+from lidar_synth.formats.kitti_raw import KITTIRaw
 from lidar_synth.formats.points import read_points
+from lidar_synth.generate.checkpoint import load_checkpoint
+from lidar_synth.lab.evaluate.extractors.archive import Archive
 
 RAW = ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder"]
 """Layouts that hold KITTI's .bin files."""
@@ -437,3 +447,46 @@ def test_a_cloud_with_two_widths(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"HEIGHT 1\n", b"HEIGHT 1 1\n"))
     with pytest.raises(DataError, match=r"one each for WIDTH, HEIGHT and POINTS"):
         open_scans(path)[0]
+
+
+@pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
+def test_a_packed_archive_with_an_endless_header(tmp_path: Path, kind: bytes) -> None:
+    """1 GB of a name packs into 1 MB; it is refused by its size, before it is unpacked."""
+    path = tmp_path / "judge.tgz"
+    member = tarfile.TarInfo("a")
+    member.type = kind
+    member.size = 1 << 30
+    with gzip.open(path, "wb") as file:
+        file.write(member.tobuf(tarfile.GNU_FORMAT) + bytes(1 << 20))
+    with pytest.raises(DataError, match="a header of 1073741824 bytes"):
+        Archive(path, "a peer").yaml("config.yaml")
+
+
+def read_any(path: Path) -> None:
+    """Read a file by its suffix, as its readers do."""
+    if path.suffix == ".safetensors":
+        load_checkpoint(path)
+    elif path.suffix == ".pth":
+        load_pickle(path, "a peer")
+    elif path.suffix == ".h5":
+        ShardReader(path, path.name)
+    else:
+        open_scans(path.parent)[0]
+
+
+@needs_limits
+@pytest.mark.parametrize(
+    "name",
+    ["a.bin", "a.npz", "a.pcd", "a.ply", "a.tar", "a.h5", "a.pth", "a.safetensors"],
+)
+def test_a_named_pipe_is_refused(tmp_path: Path, name: str) -> None:
+    """Opening it would wait for someone who writes."""
+    os.mkfifo(tmp_path / name)
+    assert "FileError: " in in_limits(read_any, tmp_path / name)
+
+
+def test_a_frame_of_kitti_raw_without_a_number_has_no_boxes(tmp_path: Path) -> None:
+    paths = write_kitti_raw(tmp_path)
+    paths[0].rename(paths[0].with_name("0000000000 (1).bin"))
+    found = {Path(scan.id).name: scan.boxes for scan in KITTIRaw(tmp_path)}
+    assert found["0000000000 (1)"] is None and found["0000000001"] is not None

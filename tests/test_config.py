@@ -1,5 +1,6 @@
 """Configuration: every published file loads, overrides apply, what cannot be is refused."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,8 @@ def test_bases_merge_and_the_recipe_takes_precedence(tmp_path: Path) -> None:
     [
         ("base: nowhere", "base 'nowhere'; expected a file beside it"),
         ("base: [3]", "base 3; expected a file beside it"),
+        ("base: null", "base: None; expected the name of a recipe"),
+        ("base: 3", "base: 3; expected the name of a recipe"),
         ("base: loop", "is its own base"),
         ("base: c.yaml", "base 'c.yaml'; expected a file beside it"),
     ],
@@ -316,3 +319,11 @@ def test_the_codec_recipes_have_the_numbers_of_lidms_public_configuration(
         (0.5, 0.9),
         0.0,
     )
+
+
+@pytest.mark.parametrize("depth", [2**32, 2**64])
+def test_a_network_without_end_is_refused_soon(depth: int) -> None:
+    start = time.process_time()
+    with pytest.raises(ConfigError, match="a network of more than"):
+        load_config(TrainConfig, "town_tiny", [f"network.arguments.depths=[1,{depth}]"])
+    assert time.process_time() - start < 5

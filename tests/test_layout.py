@@ -1,6 +1,7 @@
 """Layouts: their image on a sensor's rays against slow independent casting, their files, and their
 errors."""
 
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -428,3 +429,22 @@ def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:
     assert overlaps(Boxes(rows, ("Car",) * 3)) == []
     rows[1, 1] = 1.2
     assert overlaps(Boxes(rows, ("Car",) * 3)) == [(0, 1)]
+
+
+def test_many_boxes_in_one_place_are_refused_soon() -> None:
+    box = np.array([[12, 0, -0.7, 4.5, 1.8, 1.6, 0.3]], np.float32)
+    start = time.process_time()
+    with pytest.raises(DataError, match="that overlap"):
+        Layout(Boxes(np.repeat(box, 1500, 0), ("Car",) * 1500))
+    assert time.process_time() - start < 3
+
+
+def test_turned_boxes_overlap_as_their_footprints_do() -> None:
+    """Two boxes of 4 m by 2 m at a right angle: their sides meet at 3 m from centre to centre."""
+    for apart, meet in ((2.7, True), (2.9, False)):
+        values = [
+            [12, 0, -0.7, 4, 2, 1.6, 0],
+            [12 + apart, 0, -0.7, 4, 2, 1.6, np.pi / 2],
+        ]
+        boxes = Boxes(np.array(values, np.float32), ("Car", "Car"))
+        assert overlaps(boxes) == ([(0, 1)] if meet else [])

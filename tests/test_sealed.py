@@ -1,5 +1,6 @@
 """What a run keeps to resume is sealed: damage is noticed, said, and that part is made again."""
 
+import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from conftest import random_scan
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from lidar_synth.errors import ConfigError, DataError, LidarSynthError
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
@@ -204,7 +205,7 @@ def test_sealed_values_are_read_back(tmp_path: Path) -> None:
     assert read_sealed(tmp_path / "a.json", "values") == values
 
 
-def tiny(out: Path) -> TrainConfig:
+def tiny(out: Path, *more: str) -> TrainConfig:
     changes = [
         "recipe.iterations=2",
         "recipe.batch=1",
@@ -212,7 +213,7 @@ def tiny(out: Path) -> TrainConfig:
         "samples.every=0",
         "save_every=1",
     ]
-    return load_config(TrainConfig, "town_tiny", [*changes, f"output={out}"])
+    return load_config(TrainConfig, "town_tiny", [*changes, f"output={out}", *more])
 
 
 def test_a_run_with_a_damaged_state_begins_anew_and_says_so(tmp_path: Path) -> None:
@@ -256,3 +257,54 @@ def test_moments_that_the_next_step_could_not_use_are_refused(
     save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
     with pytest.raises(DataError, match="is the state of another network"):
         training().load(path)
+
+
+def test_a_state_with_infinite_weights_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / STATE
+    made = training()
+    with torch.no_grad():
+        next(made.network.parameters()).fill_(float("inf"))
+    made.save(path)
+    with pytest.raises(DataError, match="values that are not finite"):
+        training().load(path)
+
+
+def test_a_cache_without_sums_is_made_again(tmp_path: Path) -> None:
+    cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
+    path = tmp_path / "cache.json"
+    values = json.loads(path.read_bytes())
+    del values["checksum"], values["sums"]
+    path.write_bytes(seal(values))
+    with pytest.warns(UserWarning, match="made again"):
+        cache_scans(SCANS, SENSOR, ["range"], tmp_path, progress=False)
+
+
+def test_a_run_killed_behind_its_state_has_its_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that ends after its last state has nothing left to train, and so to show."""
+
+    def save(self: Training, path: Path) -> None:
+        write_state(self, path)
+        raise KeyboardInterrupt
+
+    write_state = Training.save
+    config = tiny(tmp_path / "run", "samples.every=2", "save_every=2")
+    monkeypatch.setattr(Training, "save", save)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert len(list((tmp_path / "run" / "samples").glob("*.png"))) == 1
+
+
+def test_what_a_killed_run_left_of_a_picture_is_removed(tmp_path: Path) -> None:
+    part = tmp_path / "run" / "samples" / ".0000006.png.12345678.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(b"of a killed run")
+    run(tiny(tmp_path / "run"))
+    assert not part.exists()
+
+
+def test_a_run_where_nothing_may_be_written_says_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(FileError, match=r"run cannot be written"):
+        run(tiny(tmp_path / "file" / "run"))

@@ -232,6 +232,14 @@ def shared_lists() -> bytes:
     return archive(pickle.dumps(value, 2))
 
 
+def overlong() -> bytes:
+    """A pickle of 1 GB by the list of members."""
+    content = bytearray(archive(b"\x80\x02N."))
+    at = content.index(b"PK\x01\x02")
+    content[at + 20 : at + 24] = struct.pack("<I", 1 << 30)
+    return bytes(content)
+
+
 DAMAGED = {
     "beyond the storage": lambda: rebuilt((5,), (1,)),
     "an offset beyond": lambda: rebuilt((1,), (1,), 4),
@@ -248,6 +256,7 @@ DAMAGED = {
     "shared lists": shared_lists,
     "2 GB of text": lambda: archive(b"\x80\x04X\xff\xff\xff\x7fx."),
     "opcodes without end": lambda: archive(b"\x80\x02" + b"N0" * 1_600_000 + b"N."),
+    "a member that is longer than the file": overlong,
     "no pickle": lambda: archive(b""),
     "text": lambda: b"not a weight file",
     "nothing": lambda: b"",

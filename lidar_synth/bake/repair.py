@@ -20,7 +20,7 @@ from lidar_synth.bake.verify import (
 )
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
 from lidar_synth.errors import DataError, FileError, LidarSynthError
-from lidar_synth.files.disk import part_of, sha256
+from lidar_synth.files.disk import part_of, sha256, unwritable
 
 
 def repair(
@@ -47,7 +47,10 @@ def repair(
     """
     done: dict[str, str] = {}
     for part in root.glob(".*.part"):
-        part.unlink(missing_ok=True)
+        try:
+            part.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(part, error) from error
         done[part.name] = "removed: a killed repair left it"
     try:
         index = read_index(root)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from lidar_synth.errors import DataError, FileError, LibraryError
+from lidar_synth.files.disk import refuse_special
 
 SCHEMES = frozenset("http https s3 gs gcs az abfs abfss hf file memory".split())
 """Kinds of URLs that are opened; others of fsspec's lead to further files or run what they name."""
@@ -114,6 +115,7 @@ class LocalFile:
     def _open(self) -> tuple[int, int, int]:
         """Size, time of change and number of the file, which is open then."""
         try:
+            refuse_special(self._path)
             self._descriptor = os.open(self._path, os.O_RDONLY)
             found = os.fstat(self._descriptor)
         except OSError as error:

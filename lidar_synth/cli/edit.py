@@ -1,5 +1,7 @@
 """``lidar-synth edit``: removes objects from scans, sets them into scans and moves them."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -74,16 +76,19 @@ def remove_objects(
     if bool(box) == bool(name):
         raise ConfigError(f"--box {box}, --name {name}", "one of the two")
     scans = open_scans(source)
-    writer = _writer(out, to)
     count = 0
-    writer.carry(scans)
-    for index in range(len(scans)) if scan is None else [_number(scan, len(scans))]:
-        given = scans[index]
-        numbers = list(box or ()) if not name else _named(given, name)
-        edited = remove(given, numbers, model=model, seed=seed) if numbers else given
-        count += len(numbers)
-        writer.write(edited, index, name=given.id, calibration=scans.calibration(index))
-    writer.finish()
+    chosen = range(len(scans)) if scan is None else [_number(scan, len(scans))]
+    with _writing(out, to) as writer:
+        writer.carry(scans)
+        for index in chosen:
+            given = scans[index]
+            numbers = list(box or ()) if not name else _named(given, name)
+            edited = given
+            if numbers:
+                edited = remove(given, numbers, model=model, seed=seed)
+            count += len(numbers)
+            calibration = scans.calibration(index)
+            writer.write(edited, index, name=given.id, calibration=calibration)
     if name and not count:
         raise ConfigError(
             f"--name {', '.join(name)}",
@@ -158,10 +163,10 @@ def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> Non
     scans = open_scans(source)
     given = scans[_number(number, len(scans))]
     edited = change(given)
-    writer = _writer(out, to)
-    writer.carry(scans)
-    writer.write(edited, number, name=given.id, calibration=scans.calibration(number))
-    writer.finish()
+    calibration = scans.calibration(number)
+    with _writing(out, to) as writer:
+        writer.carry(scans)
+        writer.write(edited, number, name=given.id, calibration=calibration)
     box = edited.boxes.values[-1]
     inside = int(edited.boxes.contain(edited.points)[-1].sum())
     print(
@@ -170,11 +175,18 @@ def _edit_one(source: Path, out: Path, number: int, to: str, change: Any) -> Non
     )
 
 
-def _writer(out: Path, to: str) -> Any:
+@contextmanager
+def _writing(out: Path, to: str) -> Iterator[Any]:
+    """The writer of a folder that no other process writes meanwhile, which is finished at the
+    end; several edits may share a folder."""
     from lidar_synth.errors import choose
+    from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
 
-    return choose("--to", to, WRITERS)(out)
+    writer = choose("--to", to, WRITERS)(out)
+    with hold_claim(writer.root / ".edit.json", {"format": to}):
+        yield writer
+        writer.finish()
 
 
 def _number(scan: int, count: int) -> int:

@@ -4,10 +4,12 @@ A file is written under a temporary name and then renamed, so that a reader neve
 file.
 """
 
+import errno
 import hashlib
 import os
 import re
 import secrets
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -97,6 +99,28 @@ def _linked(part: Path, path: Path) -> bool:
     return True
 
 
+def refuse_special(path: str | Path) -> None:
+    """Refuse what is no file before it is opened: opening a named pipe would wait for ever, and a
+    device may never end.
+
+    Raises:
+        OSError: on a pipe, a socket or a device, or if there is nothing.
+    """
+    mode = Path(path).stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file")
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading, unless it is special.
+
+    Raises:
+        OSError: if it cannot be opened, or by ``refuse_special``.
+    """
+    refuse_special(path)
+    return path.open("rb")
+
+
 def read_file(
     path: Path, expected: str = "a file of the dataset", at_most: int | None = None
 ) -> bytes:
@@ -112,7 +136,7 @@ def read_file(
         DataError: if it is longer.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             # read(n) takes n bytes of memory before it reads: no more than the file has.
             size = os.fstat(file.fileno()).st_size
             content = file.read(-1 if at_most is None else min(at_most, size) + 1)
@@ -130,7 +154,7 @@ def read_start(path: Path, size: int) -> str:
         FileError: if it cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(size).decode("latin-1")
     except OSError as error:
         raise unreadable(path, error) from error
@@ -168,7 +192,7 @@ def sha256(path: Path) -> str:
         OSError: if it cannot be read.
     """
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
@@ -368,7 +392,7 @@ def png_size(path: Path) -> tuple[int, int] | None:
     """(width, height) of a PNG, from its header; None if the file is missing or its header
     damaged."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             header = file.read(24)
     except OSError:
         return None

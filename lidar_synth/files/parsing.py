@@ -1,4 +1,4 @@
-"""Safe parsers with limits for untrusted files: JSON, YAML, numpy arrays and images.
+"""Safe parsers with limits for untrusted files: JSON, YAML, numpy arrays, archives and images.
 
 A hostile file may declare huge sizes, depths or nested aliases. What it declares is compared with
 its actual size and with a limit before memory is allocated, and every fault becomes an error of
@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 import struct
+import tarfile
 import warnings
 import zipfile
 import zlib
@@ -47,6 +48,17 @@ MOST_NODES = 20_000
 DEEPEST = 64
 """Maximum number of values in a YAML text, with all aliases expanded, and maximum number of
 levels."""
+
+LONGEST_TAR_HEADER = 1 << 20
+"""Maximum size of the attributes or of the name of a tar member in bytes."""
+
+_TAR_HEADERS = (
+    tarfile.GNUTYPE_LONGNAME,
+    tarfile.GNUTYPE_LONGLINK,
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+    tarfile.SOLARIS_XHDTYPE,
+)
 
 DAMAGED_ZIP = (
     zipfile.BadZipFile,
@@ -251,6 +263,9 @@ def zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
         for info in infos
     ):
         return "is compressed by another method than deflate"
+    # zipfile reads as many bytes as the archive says, and takes the memory before.
+    if sum(info.compress_size for info in infos) > size:
+        return "declares more bytes than it holds"
     deflated = sum(
         info.file_size for info in infos if info.compress_type == zipfile.ZIP_DEFLATED
     )
@@ -261,6 +276,21 @@ def zip_fault(infos: list[zipfile.ZipInfo], size: int, most: int) -> str:
             f"{most} bytes"
         )
     return ""
+
+
+class TarMember(tarfile.TarInfo):
+    """A tar member with checked sizes, for ``tarfile.open``.
+
+    Older versions of tarfile loop for ever on a negative size (CVE-2025-8194), no version can seek
+    beyond 2^63, and a header of a long name or of attributes is read at once, whatever its size.
+    """
+
+    def _block(self, count: int) -> int:
+        if not 0 <= count < 1 << 62:
+            raise tarfile.ReadError(f"a member of {count} bytes")
+        if self.type in _TAR_HEADERS and count > LONGEST_TAR_HEADER:
+            raise tarfile.ReadError(f"a header of {count} bytes")
+        return super()._block(count)  # type: ignore[misc,no-any-return]
 
 
 _DESCRIPTION = re.compile(

@@ -120,8 +120,12 @@ def _merged(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         raise ConfigError(f"{path} is its own base", "bases that end")
     values = read_file(path)
     bases = values.pop("base", [])
+    if isinstance(bases, str):
+        bases = [bases]
+    if not isinstance(bases, list):
+        raise ConfigError(f"{path}: base: {bases!r}", "the name of a recipe, or a list")
     result: dict[str, Any] = {}
-    for base in [bases] if isinstance(bases, str) else bases:
+    for base in bases:
         result = merge(result, _merged(_base(path, base), (*above, path)))
     return merge(result, values)
 

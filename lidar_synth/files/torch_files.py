@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lidar_synth.errors import DataError, FileError
+from lidar_synth.files.disk import open_regular
 from lidar_synth.files.parsing import DAMAGED_ZIP, DEEPEST, zip_fault
 from lidar_synth.files.pickles import (
     PERSISTENT,
@@ -88,7 +89,7 @@ def load_pickle(path: Path, peer: str) -> Any:
         DataError: on a truncated file, or one of another format.
     """
     try:
-        file = path.open("rb")
+        file = open_regular(path)
     except OSError as error:
         kind = path.suffix or "weight"
         raise FileError(

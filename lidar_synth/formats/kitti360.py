@@ -148,7 +148,7 @@ class KITTI360(ScanFiles):
         drive, frame = self.ids[index].split("/")
         path = scans_folder(self.root, drive) / f"{frame}.bin"
         points = read_points(path)
-        pose = self._poses[drive].get(int(frame)) if frame.isdigit() else None
+        pose = self._poses[drive].get(int(frame)) if frame.isdecimal() else None
         image = image_path(self.root, drive, frame)
         return Scan(
             points[:, :3],

@@ -101,13 +101,14 @@ class KITTIRaw(ScanFiles):
             path = drive / "tracklet_labels.xml"
             self._boxes[name] = read_tracklets(path) if path.is_file() else None
         boxes = self._boxes[name]
+        found = None
+        if boxes is not None and frame.isdecimal():
+            found = boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ()))
         return Scan(
             points[:, :3],
             points[:, 3],
             self.sensor,
-            boxes=None
-            if boxes is None
-            else boxes.get(int(frame), Boxes(np.zeros((0, 7), np.float32), ())),
+            boxes=found,
             image_path=image if image.is_file() else None,
             id=self.ids[index],
         )

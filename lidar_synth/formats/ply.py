@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
     SKIP_HINT,
+    open_regular,
     read_file,
     read_start,
     unreadable,
@@ -115,7 +116,7 @@ def map_vertices(path: Path) -> NDArray[np.void]:
     """
     where = str(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(LONGEST_HEADER)
             size = os.fstat(file.fileno()).st_size
     except OSError as error:

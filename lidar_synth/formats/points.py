@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import SKIP_HINT, unreadable, write_file
+from lidar_synth.files.disk import SKIP_HINT, refuse_special, unreadable, write_file
 from lidar_synth.formats.calibration import check_rigid
 from lidar_synth.geometry.scan import FARTHEST, Scan
 
@@ -44,6 +44,7 @@ def read_points(
         DataError: on an empty or truncated file, and on values that cannot be points.
     """
     try:
+        refuse_special(path)
         values = np.fromfile(path, "<f4")
         size = path.stat().st_size
     except OSError as error:

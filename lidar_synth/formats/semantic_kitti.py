@@ -157,7 +157,7 @@ class SemanticKITTI(ScanFiles):
             points[:, 3],
             self.sensor,
             **labels,
-            pose=self._poses[sequence].get(int(frame)) if frame.isdigit() else None,
+            pose=self._poses[sequence].get(int(frame)) if frame.isdecimal() else None,
             image_path=image if image.is_file() else None,
             id=self.ids[index],
         )

@@ -32,8 +32,15 @@ import numpy as np
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, LidarSynthError, shorten
-from lidar_synth.files.disk import SKIP_HINT, list_files, unreadable, write_file
-from lidar_synth.files.parsing import parse_json, parse_npy
+from lidar_synth.files.disk import (
+    SKIP_HINT,
+    list_files,
+    open_regular,
+    refuse_special,
+    unreadable,
+    write_file,
+)
+from lidar_synth.files.parsing import TarMember, parse_json, parse_npy
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
@@ -203,7 +210,7 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
 def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Scan:
     where = f"scan {shorten(key, 100)!r} of {path}"
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             contents = {name: _content(file, *place) for name, place in members.items()}
     except OSError as error:
         raise unreadable(path, error) from error
@@ -326,24 +333,15 @@ class _Bounded(BufferedReader):
         return super().read(length if size is None or size < 0 else min(size, length))
 
 
-class _Member(tarfile.TarInfo):
-    """A tar member with a checked size: older versions of tarfile loop for ever on a negative size
-    (CVE-2025-8194), and no version can seek beyond 2^63."""
-
-    def _block(self, count: int) -> int:
-        if not 0 <= count < 1 << 62:
-            raise tarfile.ReadError(f"a member of {count} bytes")
-        return super()._block(count)  # type: ignore[misc,no-any-return]
-
-
 @contextmanager
 def _open(path: Path) -> Iterator[tarfile.TarFile]:
     """Open a tar file for reading, and convert its errors to those of this package."""
     try:
+        refuse_special(path)
         with (
             path.open("rb", 0) as raw,
             _Bounded(raw) as file,
-            tarfile.open(fileobj=file, mode="r:", tarinfo=_Member) as tar,
+            tarfile.open(fileobj=file, mode="r:", tarinfo=TarMember) as tar,
         ):
             yield tar
     except (

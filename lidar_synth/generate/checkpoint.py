@@ -38,7 +38,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import write_file
+from lidar_synth.files.disk import open_regular, write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import uniform_grid
@@ -351,7 +351,7 @@ class _Content(NamedTuple):
 def _read(path: Path, tensors: bool = True) -> _Content:
     """The content of a checkpoint with a verified header; the tensors are not verified yet."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(2)
     except OSError as error:
         raise FileError(

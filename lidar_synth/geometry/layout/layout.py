@@ -7,6 +7,7 @@ that generates the scan of it, and its boxes are the boxes of that scan.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,29 +208,26 @@ def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
         near = np.hypot(*gap[:, :2].T) < np.hypot(*half[i, :2]) + np.hypot(
             *half[i + 1 :, :2].T
         )
-        for j in (
-            i
-            + 1
-            + np.flatnonzero(near & (np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2]))
-        ):
-            if _footprints_meet(
-                axes[i],
-                half[i, :2],
-                axes[j],
-                half[j, :2],
-                values[j, :2] - values[i, :2],
-            ):
-                found.append((i, int(j)))
+        near &= np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2]
+        others = i + 1 + np.flatnonzero(near)
+        meet = _footprints_meet(
+            axes[i], half[i, :2], axes[others], half[others, :2], gap[near, :2]
+        )
+        found += [(i, int(j)) for j in others[meet]]
     return found
 
 
-def _footprints_meet(axes_a, half_a, axes_b, half_b, gap) -> bool:  # type: ignore[no-untyped-def]
-    """Separating axis theorem for two rectangles with unit axes (2, 2), half sides (2,) and centres
-    ``gap`` apart."""
-    for axis in (*axes_a, *axes_b):
-        if (
-            abs(axis @ gap)
-            >= np.abs(axes_a @ axis) @ half_a + np.abs(axes_b @ axis) @ half_b
-        ):
-            return False
-    return True
+def _footprints_meet(
+    axes_a: NDArray[Any],
+    half_a: NDArray[Any],
+    axes_b: NDArray[Any],
+    half_b: NDArray[Any],
+    gap: NDArray[Any],
+) -> NDArray[np.bool_]:
+    """(K,) separating axis theorem for a rectangle with unit axes (2, 2) and half sides
+    (2,) and K others, (K, 2, 2) and (K, 2), with centres ``gap`` (K, 2) apart."""
+    axes = np.concatenate([np.broadcast_to(axes_a, axes_b.shape), axes_b], 1)
+    distance = np.abs(np.einsum("kax,kx->ka", axes, gap))
+    reach_a = np.abs(axes @ axes_a.T) @ half_a
+    reach_b = np.einsum("kab,kb->ka", np.abs(axes @ axes_b.swapaxes(1, 2)), half_b)
+    return (distance < reach_a + reach_b).all(1)

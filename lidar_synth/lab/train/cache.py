@@ -283,6 +283,8 @@ def _check(folder: Path, facts: dict[str, Any], layout: Layout) -> list[int | No
             "the cache of this configuration",
             "Remove it, or name another folder.",
         )
+    if not isinstance(sums, list):
+        raise DataError(f"{folder / NOTE} is damaged", "the sums of a cache")
     maps = {n: _open_array(folder / f"{n}.npy", "r", *layout[n]) for n in layout}
     intact = [
         s if s is None or s == _sum(maps, block) else None

@@ -15,7 +15,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ import yaml
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, LibraryError
-from lidar_synth.files.disk import write_file
+from lidar_synth.files.disk import unwritable, write_file
 from lidar_synth.files.lock import one_writer
 from lidar_synth.generate.checkpoint import save_checkpoint
 from lidar_synth.generate.codec import Latent
@@ -173,18 +173,23 @@ def _lock(config: Run, main: bool) -> Iterator[None]:
 
     Raises:
         ConfigError: if another run writes there.
+        FileError: if the folder cannot be written.
     """
     if not main:
         yield
         return
-    config.output.mkdir(parents=True, exist_ok=True)
-    with one_writer(config.output / ".lock") as free:
+    with ExitStack() as held:
+        try:
+            config.output.mkdir(parents=True, exist_ok=True)
+            free = held.enter_context(one_writer(config.output / ".lock"))
+        except OSError as error:
+            raise unwritable(config.output, error) from error
         if not free:
             raise ConfigError(
                 f"another run is training in {config.output}",
                 "one at a time, or another output=FOLDER",
             )
-        for part in config.output.glob(".*.part"):
+        for part in config.output.rglob(".*.part"):
             part.unlink(missing_ok=True)
         yield
 
@@ -222,7 +227,8 @@ def _train(
         else None
     )
     if watch is not None and not watch.measured:
-        _save(config, plan, training, data, watch)
+        _save_checkpoint(config, plan, training, data, watch)
+        training.save(config.output / STATE)
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
     for record in steps(training, plan.task, batches, accelerator, plan.loss):
         # All processes stop at the same step, whose clock ever is ahead.
@@ -236,13 +242,16 @@ def _train(
         last = late or record.step == config.recipe.iterations
         if log is not None:
             log.add(record)
-            if last or record.step % config.save_every == 0:
-                _save(config, plan, training, data, watch)
+            saves = last or record.step % config.save_every == 0
+            if saves:
+                _save_checkpoint(config, plan, training, data, watch)
             if config.samples.every and (
                 last or record.step % config.samples.every == 0
             ):
                 with accelerator.autocast():
                     log.picture(plan, training, data)
+            if saves:
+                training.save(config.output / STATE)
         if late:
             break
     if log is not None:
@@ -251,15 +260,15 @@ def _train(
     return checkpoint_path(config)
 
 
-def _save(
+def _save_checkpoint(
     config: Run,
     plan: TrainingPlan,
     training: Training,
     data: Batches,
     watch: Watch | None,
 ) -> None:
-    """Write the checkpoint, if it is the best, and then the state: what is lost in between is
-    trained again."""
+    """Write the checkpoint, if it is the best. The state is written behind it and behind the
+    picture: what is lost in between is trained again."""
     if watch is None or watch.measure(training):
         if isinstance(training.average, Autoencoding):
             training.average.finish(data)
@@ -268,7 +277,6 @@ def _save(
         )
         header = replace(plan.header, provenance=plan.header.provenance | facts)
         save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
-    training.save(config.output / STATE)
 
 
 class _Log:

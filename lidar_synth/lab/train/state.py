@@ -179,6 +179,8 @@ class Training:
         }
         try:
             for name, tensor in tensors.items():
+                if tensor.is_floating_point() and not tensor.isfinite().all():
+                    raise ValueError(f"{name} holds values that are not finite")
                 part, key = name.split(".", 1)
                 parts[part][key] = tensor
             self.network.load_state_dict(parts["network"])

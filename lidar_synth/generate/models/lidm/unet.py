@@ -39,6 +39,9 @@ from lidar_synth.generate.models.convolution import (
 )
 from lidar_synth.generate.models.network import Network
 
+MOST_BLOCKS = 1000
+"""Maximum number of residual blocks of a level."""
+
 TIME_SCALE = 1000.0
 """Factor from times in [0, 1] to the diffusion steps that the time embedding expects."""
 
@@ -319,6 +322,8 @@ class _Stage(nn.Module):
 def _plan(widths: list[int], blocks: int) -> tuple[list[_Row], list[_Row]]:
     """The entries of the downward and of the upward path; each of the latter takes one skip
     connection."""
+    if blocks > MOST_BLOCKS:  # a configuration may ask for 10^9
+        raise ConfigError(f"{blocks} blocks a level", f"at most {MOST_BLOCKS}")
     down = []
     skips = [widths[0]]
     channels = widths[0]

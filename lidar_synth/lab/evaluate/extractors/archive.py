@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from lidar_synth.errors import DataError, FileError, LidarSynthError
 from lidar_synth.files.disk import read_file
-from lidar_synth.files.parsing import LONGEST_YAML, parse_yaml
+from lidar_synth.files.parsing import LONGEST_YAML, TarMember, parse_yaml
 from lidar_synth.files.torch_files import unpickle
 
 MOST_BYTES = 2 << 30
@@ -76,7 +76,7 @@ class Archive:
                 f"an archive of {self.project}, or a folder with its files",
             )
         try:
-            with tarfile.open(self.path) as tar:
+            with tarfile.open(self.path, tarinfo=TarMember) as tar:
                 return self._member(tar, name, at_most)
         except (tarfile.TarError, EOFError, zlib.error, OSError, ValueError) as error:
             if isinstance(error, LidarSynthError):

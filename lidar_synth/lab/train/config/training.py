@@ -8,7 +8,7 @@ from torch import nn
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, NetworkSpec
-from lidar_synth.generate.models import build_network, network_class
+from lidar_synth.generate.models import build_network, limit_modules, network_class
 from lidar_synth.generate.models.network import Autoencoder, Encoder
 from lidar_synth.generate.models.objective import Losses
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
@@ -117,9 +117,13 @@ class TrainConfig(Run):
         return parts | {CODEC if self.autoencodes else VELOCITY: part}
 
 
+MOST_MODULES = 4_000
+"""Maximum number of modules of a network; a recipe may ask for 10^9 blocks."""
+
+
 def _checked(part: NetworkSpec) -> nn.Module:
     """The network without weights: no memory and no time, only whether the values fit together."""
-    with torch.device("meta"):
+    with torch.device("meta"), limit_modules(MOST_MODULES):
         return build_network(*part)
 
 
