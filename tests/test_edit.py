@@ -553,3 +553,15 @@ def test_the_command_line_edits_scans(tmp_path: Path) -> None:
         assert isinstance(result.exception, ConfigError) and message in str(
             result.exception
         )
+
+
+def test_what_a_killed_edit_left_is_removed(tmp_path: Path) -> None:
+    writer = WRITERS["npz"](tmp_path / "in")
+    writer.write(SCAN, 0)
+    writer.finish()
+    part = tmp_path / "out" / ".000000.npz.12345678.part"
+    part.parent.mkdir()
+    part.write_bytes(b"of a killed run")
+    words = ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), "--box", "1"]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert not part.exists()

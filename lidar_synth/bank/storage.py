@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from lidar_synth.errors import DataError, FileError, LibraryError
-from lidar_synth.files.disk import refuse_special
+from lidar_synth.files.disk import refuse_special, unreadable
 
 SCHEMES = frozenset("http https s3 gs gcs az abfs abfss hf file memory".split())
 """Kinds of URLs that are opened; others of fsspec's lead to further files or run what they name."""
@@ -97,7 +97,7 @@ class LocalFile:
         try:
             content = os.pread(self._descriptor, size, offset)
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise unreadable(self._path, error, "a file of a bank") from error
         if len(content) != size:
             raise DataError(
                 f"{self._path} was truncated while it was read", "a complete file"
@@ -119,14 +119,8 @@ class LocalFile:
             self._descriptor = os.open(self._path, os.O_RDONLY)
             found = os.fstat(self._descriptor)
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise unreadable(self._path, error, "a file of a bank") from error
         return found.st_size, found.st_mtime_ns, found.st_ino
-
-    def _unreadable(self, error: OSError) -> FileError:
-        return FileError(
-            f"{self._path} cannot be read ({error.strerror or error})",
-            "a file of a bank",
-        )
 
 
 class RemoteFile:

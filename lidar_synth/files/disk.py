@@ -111,14 +111,25 @@ def refuse_special(path: str | Path) -> None:
         raise OSError(errno.EINVAL, "it is a pipe or a device, not a file")
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading, unless it is special.
+@contextmanager
+def open_file(
+    path: Path, expected: str = "a file of the dataset"
+) -> Iterator[BinaryIO]:
+    """Open a file for reading.
+
+    Args:
+        path: the file.
+        expected: description of the expected file, for the error.
 
     Raises:
-        OSError: if it cannot be opened, or by ``refuse_special``.
+        FileError: if it cannot be opened or read, or is special.
     """
-    refuse_special(path)
-    return path.open("rb")
+    try:
+        refuse_special(path)
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise unreadable(path, error, expected) from error
 
 
 def read_file(
@@ -135,13 +146,10 @@ def read_file(
         FileError: if it cannot be read.
         DataError: if it is longer.
     """
-    try:
-        with open_regular(path) as file:
-            # read(n) takes n bytes of memory before it reads: no more than the file has.
-            size = os.fstat(file.fileno()).st_size
-            content = file.read(-1 if at_most is None else min(at_most, size) + 1)
-    except OSError as error:
-        raise unreadable(path, error, expected) from error
+    with open_file(path, expected) as file:
+        # read(n) takes n bytes of memory before it reads: no more than the file has.
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(-1 if at_most is None else min(at_most, size) + 1)
     if at_most is not None and len(content) > at_most:
         raise DataError(f"{path} is longer than {at_most} bytes", expected)
     return content
@@ -153,11 +161,8 @@ def read_start(path: Path, size: int) -> str:
     Raises:
         FileError: if it cannot be read.
     """
-    try:
-        with open_regular(path) as file:
-            return file.read(size).decode("latin-1")
-    except OSError as error:
-        raise unreadable(path, error) from error
+    with open_file(path) as file:
+        return file.read(size).decode("latin-1")
 
 
 def write_arrays(
@@ -192,7 +197,8 @@ def sha256(path: Path) -> str:
         OSError: if it cannot be read.
     """
     digest = hashlib.sha256()
-    with open_regular(path) as file:
+    refuse_special(path)
+    with path.open("rb") as file:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
@@ -392,7 +398,7 @@ def png_size(path: Path) -> tuple[int, int] | None:
     """(width, height) of a PNG, from its header; None if the file is missing or its header
     damaged."""
     try:
-        with open_regular(path) as file:
+        with open_file(path) as file:
             header = file.read(24)
     except OSError:
         return None

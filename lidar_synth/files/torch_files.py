@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidar_synth.errors import DataError, FileError
-from lidar_synth.files.disk import open_regular
+from lidar_synth.errors import DataError
+from lidar_synth.files.disk import open_file
 from lidar_synth.files.parsing import DAMAGED_ZIP, DEEPEST, zip_fault
 from lidar_synth.files.pickles import (
     PERSISTENT,
@@ -88,15 +88,8 @@ def load_pickle(path: Path, peer: str) -> Any:
         FileError: if the file cannot be read.
         DataError: on a truncated file, or one of another format.
     """
-    try:
-        file = open_regular(path)
-    except OSError as error:
-        kind = path.suffix or "weight"
-        raise FileError(
-            f"{path} cannot be read ({error.strerror or error})",
-            f"a {kind} file of {peer}",
-        ) from error
-    with file:
+    kind = path.suffix or "weight"
+    with open_file(path, f"a {kind} file of {peer}") as file:
         return unpickle(file, path, peer)
 
 

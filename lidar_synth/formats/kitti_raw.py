@@ -33,6 +33,8 @@ from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
+_IN_NAMES = str.maketrans(" ", "_", "()")
+"""The characters of a class of KITTI raw, such as "Person (sitting)", by those of KITTI."""
 """Pattern of the folders with scans, relative to the folder of a date."""
 
 
@@ -165,12 +167,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
     try:
         tracklets = ElementTree.fromstring(read_file(path)).findall("tracklets/item")
         for instance, tracklet in enumerate(tracklets):
-            name = (
-                tracklet.findtext("objectType", "")
-                .replace(" ", "_")
-                .replace("(", "")
-                .replace(")", "")
-            )
+            name = tracklet.findtext("objectType", "").translate(_IN_NAMES)
             height, width, length = (float(tracklet.findtext(tag, "")) for tag in "hwl")
             for k, pose in enumerate(tracklet.findall("poses/item")):
                 x, y, floor, yaw = (

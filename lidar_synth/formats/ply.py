@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import (
     SKIP_HINT,
-    open_regular,
+    open_file,
     read_file,
     read_start,
-    unreadable,
     write_file,
 )
 from lidar_synth.formats.cloud import (
@@ -115,12 +114,9 @@ def map_vertices(path: Path) -> NDArray[np.void]:
         DataError: if its header is invalid or does not match the file.
     """
     where = str(path)
-    try:
-        with open_regular(path) as file:
-            start = file.read(LONGEST_HEADER)
-            size = os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise unreadable(path, error, "a PLY file") from error
+    with open_file(path, "a PLY file") as file:
+        start = file.read(LONGEST_HEADER)
+        size = os.fstat(file.fileno()).st_size
     encoding, elements, offset = _parse(start, where)
     if encoding == "ascii" or len(elements) != 1 or elements[0].lists:
         raise DataError(

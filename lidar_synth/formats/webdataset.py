@@ -35,7 +35,7 @@ from lidar_synth.errors import ConfigError, DataError, LidarSynthError, shorten
 from lidar_synth.files.disk import (
     SKIP_HINT,
     list_files,
-    open_regular,
+    open_file,
     refuse_special,
     unreadable,
     write_file,
@@ -209,11 +209,8 @@ def _encode(key: str, scan: Scan) -> Iterator[tuple[str, bytes]]:
 
 def _decode(path: Path, key: str, members: Members, sensor: Sensor | None) -> Scan:
     where = f"scan {shorten(key, 100)!r} of {path}"
-    try:
-        with open_regular(path) as file:
-            contents = {name: _content(file, *place) for name, place in members.items()}
-    except OSError as error:
-        raise unreadable(path, error) from error
+    with open_file(path) as file:
+        contents = {name: _content(file, *place) for name, place in members.items()}
     facts = parse_json(
         contents.pop("json", b""),
         f"{where}: its json",

@@ -37,8 +37,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import open_regular, write_file
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.disk import open_file, write_file
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned
 from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import uniform_grid
@@ -350,14 +350,8 @@ class _Content(NamedTuple):
 
 def _read(path: Path, tensors: bool = True) -> _Content:
     """The content of a checkpoint with a verified header; the tensors are not verified yet."""
-    try:
-        with open_regular(path) as file:
-            start = file.read(2)
-    except OSError as error:
-        raise FileError(
-            f"checkpoint {path} cannot be read ({error.strerror})",
-            "a .safetensors file",
-        ) from error
+    with open_file(path, "a .safetensors file") as file:
+        start = file.read(2)
     if start in (b"PK", b"\x80\x02"):
         raise DataError(
             f"{path} is a PyTorch pickle",
