@@ -562,6 +562,13 @@ def test_what_a_killed_edit_left_is_removed(tmp_path: Path) -> None:
     part = tmp_path / "out" / ".000000.npz.12345678.part"
     part.parent.mkdir()
     part.write_bytes(b"of a killed run")
-    words = ["edit", "remove", str(tmp_path / "in"), str(tmp_path / "out"), "--box", "1"]
+    words = [
+        "edit",
+        "remove",
+        str(tmp_path / "in"),
+        str(tmp_path / "out"),
+        "--box",
+        "1",
+    ]
     assert CliRunner().invoke(app, words).exit_code == 0
     assert not part.exists()

@@ -379,16 +379,10 @@ def read_picture(path: Path, expected: str = "a PNG or JPEG file") -> "Image":
                 return opened
     # The exceptions of Pillow's readers on damaged files.
     except (
-        OSError,
+        *DAMAGED_ZIP,
+        LookupError,
         SyntaxError,
-        ValueError,
-        EOFError,
-        OverflowError,
-        IndexError,
-        KeyError,
         TypeError,
-        struct.error,
-        zlib.error,
         Image.DecompressionBombError,
     ) as error:
         raise DataError(

@@ -33,9 +33,10 @@ from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
-_IN_NAMES = str.maketrans(" ", "_", "()")
-"""The characters of a class of KITTI raw, such as "Person (sitting)", by those of KITTI."""
 """Pattern of the folders with scans, relative to the folder of a date."""
+
+_IN_NAMES = str.maketrans(" ", "_", "()")
+"""Turns a class of KITTI raw, such as "Person (sitting)", into KITTI's name of it."""
 
 
 class KITTIRaw(ScanFiles):

@@ -22,7 +22,7 @@ import tarfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedReader, BytesIO
+from io import BufferedReader, BytesIO, FileIO
 from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -36,8 +36,6 @@ from lidar_synth.files.disk import (
     SKIP_HINT,
     list_files,
     open_file,
-    refuse_special,
-    unreadable,
     write_file,
 )
 from lidar_synth.files.parsing import TarMember, parse_json, parse_npy
@@ -334,10 +332,9 @@ class _Bounded(BufferedReader):
 def _open(path: Path) -> Iterator[tarfile.TarFile]:
     """Open a tar file for reading, and convert its errors to those of this package."""
     try:
-        refuse_special(path)
         with (
-            path.open("rb", 0) as raw,
-            _Bounded(raw) as file,
+            open_file(path) as opened,
+            _Bounded(FileIO(opened.fileno(), closefd=False)) as file,
             tarfile.open(fileobj=file, mode="r:", tarinfo=TarMember) as tar,
         ):
             yield tar
@@ -351,8 +348,6 @@ def _open(path: Path) -> Iterator[tarfile.TarFile]:
             f"{path} is truncated, damaged or not a tar file ({error})",
             "a file of a WebDataset",
         ) from error
-    except OSError as error:
-        raise unreadable(path, error) from error
 
 
 def _write_tar(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
