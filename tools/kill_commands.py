@@ -34,8 +34,11 @@ from bench.untrained import write_untrained
 from safetensors import safe_open
 from typer.testing import CliRunner
 
+import lidar_synth.bake
+import lidar_synth.lab.kitti360
 import lidar_synth.lab.proof
-import lidar_synth.lab.train  # noqa: F401
+import lidar_synth.lab.train
+import lidar_synth.labels.edit  # noqa: F401
 from lidar_synth.cli import app
 from lidar_synth.errors import LidarSynthError
 

@@ -145,39 +145,27 @@ class Description:
                 f"its format is {shorten(repr(given), 100)}, not {FORMAT!r}"
             )
         sensor = _sensor(values["sensor"]) if "sensor" in values else None
-        if sensor is not None and values.get("grid", list(sensor.shape)) != list(
-            sensor.shape
-        ):
+        shape = None if sensor is None else list(sensor.shape)
+        if sensor is not None and values.get("grid", shape) != shape:
             raise ValueError(
                 f"its grid is {shorten(repr(values['grid']), 100)}, but its sensor has "
                 f"{sensor.shape}"
             )
         origins = values.get("origins", [{"domain": "real"}])
-        if (
-            not isinstance(origins, list)
-            or not origins
-            or not all(isinstance(origin, dict) for origin in origins)
-        ):
+        if not isinstance(origins, list) or not origins:
             raise ValueError("its origins are not a list of mappings")
-        if any(
-            not isinstance(o.get("domain"), str) or o["domain"] not in DOMAINS
-            for o in origins
-        ):
-            raise ValueError(
-                f"the domain of an origin is not one of {', '.join(DOMAINS)}"
-            )
-        facts = [
-            {key: value for key, value in origin.items() if key != "domain"}
-            for origin in origins
-        ]
-        pairs = zip(origins, facts, strict=True)
-        return cls(
-            sensor,
-            tuple(
-                Origin(DOMAINS[o["domain"]], check_provenance(kept))
-                for o, kept in pairs
-            ),
-        )
+        return cls(sensor, tuple(map(_origin, origins)))
+
+
+def _origin(value: Any) -> Origin:
+    """An origin from its values."""
+    if not isinstance(value, dict):
+        raise ValueError("its origins are not a list of mappings")
+    facts = dict(value)
+    domain = facts.pop("domain", None)
+    if not isinstance(domain, str) or domain not in DOMAINS:
+        raise ValueError(f"the domain of an origin is not one of {', '.join(DOMAINS)}")
+    return Origin(DOMAINS[domain], check_provenance(facts))
 
 
 def _sensor(value: Any) -> Sensor:

@@ -24,7 +24,6 @@ from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json, read_arrays
-from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import Description
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -37,7 +36,7 @@ from lidar_synth.formats.ply import read_ply, read_ply_description, write_ply
 from lidar_synth.formats.point_labels import encode_labels, read_labels, write_labels
 from lidar_synth.formats.points import check_scan, read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter, Picture
+from lidar_synth.formats.writer import DETAILS, LABELS, FileWriter
 from lidar_synth.geometry.assign import assign_beams
 from lidar_synth.geometry.scan import POINT_FIELDS, Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -301,13 +300,7 @@ class KITTIWriter(FileWriter):
     suffix = ".bin"
     keeps = LABELS
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         if scan.label is not None:
             write_labels(
                 path.with_suffix(".label"), encode_labels(scan, SEMANTIC_KITTI)
@@ -321,13 +314,7 @@ class NPZWriter(FileWriter):
     suffix = ".npz"
     keeps = frozenset(DETAILS) - {"image_path"}
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         write_scan(path, scan)
 
 
@@ -338,30 +325,17 @@ class PCDWriter(FileWriter):
     suffix = ".pcd"
     keeps = frozenset({*POINT_FIELDS, "boxes"})
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         write_boxes(path, scan.boxes)
         write_pcd(path, scan)
 
 
-class PLYWriter(FileWriter):
+class PLYWriter(PCDWriter):
     """Writes ``NAME.ply`` with the scan's points and fields, and its boxes to ``NAME.boxes.json``,
     without pose."""
 
     suffix = ".ply"
-    keeps = frozenset({*POINT_FIELDS, "boxes"})
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         write_boxes(path, scan.boxes)
         write_ply(path, scan)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError, choose
 from lidar_synth.files.parsing import read_arrays
-from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import (
     check_numbers,
@@ -31,7 +30,7 @@ from lidar_synth.formats.npz import (
 from lidar_synth.formats.nuscenes import INTENSITY_MAX, ahead
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, FileWriter, Picture, project_scan
+from lidar_synth.formats.writer import DETAILS, FileWriter, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -244,11 +243,5 @@ class RangeWriter(FileWriter):
     suffix = ".npz"
     keeps = frozenset(DETAILS) - {"image_path"}
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         write_range_image(path, project_scan(scan), scan)

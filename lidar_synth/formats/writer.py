@@ -210,6 +210,19 @@ class FileWriter(Writer):
     def _place(self, index: int, name: str | None) -> str:
         return f"{name or f'{index:06d}'}{self.suffix}"
 
+    def _put(
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
+    ) -> None:
+        self._write_file(path, scan)
+
+    def _write_file(self, path: Path, scan: Scan) -> None:
+        """Write a scan, without picture and camera."""
+        raise NotImplementedError
+
 
 def check_facts(scan: Scan, where: str) -> None:
     """Refuse a domain, provenance or pose that readers refuse.
