@@ -15,6 +15,10 @@ Example:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lidar_synth.files.compiled import keep_compiled_code
+
+keep_compiled_code()
+
 __version__ = "0.1.0"
 
 _HOME = {

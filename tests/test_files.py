@@ -1,13 +1,16 @@
 """Files of arrays: the same by every version of numpy, and without code in them."""
 
+import os
 import zipfile
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from banks import add_stray, some_image
 
-from lidar_synth.errors import DataError
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.files.compiled import keep_compiled_code
 from lidar_synth.files.disk import write_arrays
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
@@ -38,3 +41,22 @@ def test_files_with_a_stray_array_are_read(tmp_path: Path) -> None:
         add_stray(path)
     assert len(open_scans(tmp_path / "image")[0]) == len(scan)
     assert np.array_equal(open_scans(tmp_path / "scan")[0].points, scan.points)
+
+
+def test_without_a_writable_folder_numba_compiles_into_a_temporary_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    keep_compiled_code()
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.warns(UserWarning, match="every start compiles it again"):
+        keep_compiled_code()
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert folder.is_dir() and folder.parent == tmp_path
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    with pytest.raises(FileError, match="no folder may be written to"):
+        keep_compiled_code()

@@ -28,9 +28,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 from typer.testing import CliRunner
 
-from lidar_synth.errors import DataError, FileError, LidarSynthError
+from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import CODEC, ENCODER, VELOCITY, load_checkpoint
 from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.models.lidm.unet import _plan
 from lidar_synth.lab.importers.lidm import read_lidm
 from lidar_synth.lab.importers.lidm_names import FIRST_STAGE, UNET, UNET_EMA
 
@@ -353,3 +354,8 @@ def test_mutated_configurations_give_no_foreign_error(tmp_path: Path) -> None:
         except LidarSynthError:
             refused += 1
     assert refused > 10
+
+
+def test_a_u_net_without_end_is_refused_before_it_is_planned() -> None:
+    with pytest.raises(ConfigError, match="1000000000 blocks a level"):
+        _plan([16, 32], 10**9)

@@ -167,7 +167,7 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (147_550, 6.0, 141),
+    "plugin": (147_700, 6.0, 141),
     "laboratory": (113_500, 6.0, 172),
     "tools": (48_100, 6.0, 192),
 }

@@ -531,3 +531,15 @@ def test_info_describes_a_bank(root: Path) -> None:
     )
     with pytest.raises(FileError, match="holds no bank"):
         call("info", root / "nowhere")
+
+
+def test_repair_says_where_it_may_not_remove(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    (root / ".shard-00000.h5.1.part").write_bytes(b"half a shard")
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(FileError, match=r"part cannot be written \(Permission denied"):
+        repair(root, progress=False)
