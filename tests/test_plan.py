@@ -380,6 +380,13 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
         )
 
 
+def test_every_real_scan_stays_in_epochs_far_ahead() -> None:
+    """A share that rises after the first hundred epochs decides the length of all of them."""
+    mixed = mixture(10, {0: 0.2, 150: 0.5})
+    assert quotas(mixed, 150) == (10, 10) and mixed.length == 20
+    assert count_before(mixture(10, 0.5), 10**9) == (10**10, 10**10)
+
+
 def test_a_late_epoch_costs_no_more_than_the_first() -> None:
     calls: list[int] = []
 

@@ -91,7 +91,7 @@ class Linear:
             )
 
     @property
-    def settled(self) -> int:
+    def constant_from(self) -> int:
         """The epoch from which on the share is constant."""
         return self.epochs - 1
 
@@ -159,7 +159,7 @@ def to_integer(value: Any, name: str) -> int:
 
 def settled(schedule: Schedule) -> int | None:
     """The epoch from which on a schedule is constant; None if unknown."""
-    return getattr(schedule, "settled", None)
+    return getattr(schedule, "constant_from", None)
 
 
 def _checked(value: Any, epoch: int) -> Fraction:
