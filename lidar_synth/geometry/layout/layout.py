@@ -230,4 +230,5 @@ def _footprints_meet(
     distance = np.abs(np.einsum("kax,kx->ka", axes, gap))
     reach_a = np.abs(axes @ axes_a.T) @ half_a
     reach_b = np.einsum("kab,kb->ka", np.abs(axes @ axes_b.swapaxes(1, 2)), half_b)
-    return (distance < reach_a + reach_b).all(1)
+    meet: NDArray[np.bool_] = (distance < reach_a + reach_b).all(1)
+    return meet
