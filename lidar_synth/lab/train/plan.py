@@ -17,6 +17,7 @@ from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
     VELOCITY,
+    Checkpoint,
     Header,
     join,
     load_checkpoint,
@@ -32,6 +33,7 @@ from lidar_synth.generate.flow.path import (
 )
 from lidar_synth.generate.flow.solvers import mean_velocity, uniform_grid
 from lidar_synth.generate.flow.timesteps import Selection, select_timesteps
+from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
 from lidar_synth.geometry.scan import Scan, Source
@@ -223,11 +225,13 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         time_grid=config.grid or uniform_grid(config.intervals),
         provenance=provenance,
     )
-    student = join(load_checkpoint(config.teacher).networks)
+    start = load_checkpoint(find_model(config.init or config.teacher))
     plan = TrainingPlan(
-        student, teacher_task(), header, frozen=_codec_of(teacher.networks)
+        join(start.networks), teacher_task(), header, frozen=_codec_of(start.networks)
     )
-    if config.grid is None and config.strategy == "adaptive_piecewise":
+    if config.init is not None:
+        header = _continued(config, header, start)
+    elif config.grid is None and config.strategy == "adaptive_piecewise":
         with accelerator.main_process_first():
             found = _selection(config, flow, plan, accelerator)
         provenance |= {
@@ -243,6 +247,32 @@ def plan_student(config: DistillConfig, accelerator: "Accelerator") -> TrainingP
         plan,
         task=student_task(config.strategy, flow, header.time_grid, config.steps),
         header=header,
+    )
+
+
+def _continued(config: DistillConfig, header: Header, start: Checkpoint) -> Header:
+    """The header of a student that is trained further, with its times.
+
+    Raises:
+        ConfigError: if it is the student of another kind of teacher, or of other numbers of
+            steps.
+    """
+    shared = ("sensor", "channels", "normalisation", "conditioning")
+    differs = [k for k in shared if getattr(header, k) != getattr(start.header, k)]
+    intervals = [
+        len(grid) - 1 for grid in (start.header.time_grid, *start.header.other_grids)
+    ]
+    if differs or intervals != [config.intervals, *config.also]:
+        raise ConfigError(
+            f"init {config.init} with {', '.join(differs) or f'{intervals} steps'}",
+            f"a student of {config.teacher} in {[config.intervals, *config.also]} steps",
+        )
+    made = {"init": start.hash, "init_provenance": start.header.provenance}
+    return replace(
+        header,
+        time_grid=start.header.time_grid,
+        other_grids=start.header.other_grids,
+        provenance=header.provenance | made,
     )
 
 

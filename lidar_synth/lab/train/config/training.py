@@ -160,9 +160,12 @@ class DistillConfig(Run):
         also: other numbers of steps that the student learns as well, such as [2, 1]; it is then
             told where a step ends.
         selection: the selection of these times.
+        init: checkpoint of a student of this teacher, or name of a shipped model, to train
+            further; it determines the times. By default the teacher is the start.
     """
 
     teacher: Path
+    init: Path | None = None
     strategy: Literal[
         "adaptive_piecewise",
         "uniform_piecewise",
