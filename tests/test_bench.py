@@ -28,6 +28,7 @@ SMALLEST = {
     "town": "--stretches 1 --jobs 1",
     "trainers": "",
     "transfer": "--rounds 1",
+    "weather": "--rounds 1",
 }
 """{script: arguments}, with the names of ``models``."""
 

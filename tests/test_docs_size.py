@@ -38,6 +38,7 @@ LIMITS = {
     "docs/how-to/bake.md": 320,
     "docs/how-to/look.md": 130,
     "docs/how-to/prove.md": 180,
+    "docs/how-to/weather.md": 230,
     "docs/reference/api.md": 40,
     "docs/reference/command-line.md": 30,
     "docs/reference/recipes.md": 80,

@@ -16,10 +16,11 @@ from project import ROOT
 import lidar_synth
 from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.lab.town import Town, export_town
+from lidar_synth.weather import CORRUPTIONS
 
 FURTHER = {
     "lidar_synth.datasets.classes": ("Taxonomy",),
-    "lidar_synth.lab.evaluate": ("Metric", "evaluate"),
+    "lidar_synth.lab.evaluate": ("Metric",),
     "lidar_synth.lab.evaluate.segmentation": ("load_judge",),
     "lidar_synth.generate.flow.solvers": ("solve",),
     "lidar_synth.geometry.normalize": ("Normalisation",),
@@ -44,6 +45,7 @@ FURTHER = {
         "train_model",
     ),
     "lidar_synth.viz": ("write_view",),
+    "lidar_synth.weather": tuple(kind.__name__ for kind in CORRUPTIONS.values()),
 }
 """What the documents name besides ``lidar_synth.__all__``. Python keeps no docstring of a
 dictionary such as ``NORMALISATIONS``: the example of its values' class shows it."""

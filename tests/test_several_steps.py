@@ -106,3 +106,25 @@ def test_a_damaged_selection_is_made_again(
         for other in path.parent.iterdir():
             if other.is_file():
                 other.unlink()
+
+
+def test_a_student_is_trained_further_from_its_checkpoint(
+    scans: Path, teacher: Path, tmp_path: Path
+) -> None:
+    config = distilling(scans, tmp_path, teacher)
+    call("distill", config, "also=[2, 1]")
+    made = tmp_path / "run" / "run.safetensors"
+    start = load_checkpoint(made)
+    out = tmp_path / "more"
+    further = [f"init={made}", f"output={out}", "also=[2, 1]"]
+    call("distill", config, *further, "recipe.iterations=1", "recipe.rate=1.0e-9")
+    found = load_checkpoint(out / "more.safetensors")
+    assert found.header.other_grids == start.header.other_grids
+    assert found.header.time_grid == start.header.time_grid
+    assert found.header.provenance["init"] == start.hash
+    assert not (out / "selection.npz").exists()  # the times are those of the start
+    before = start.networks["velocity"].state_dict()
+    for name, value in found.networks["velocity"].state_dict().items():
+        assert np.allclose(value, before[name], atol=1e-5), name
+    with pytest.raises(ConfigError, match=r"with \[4, 2, 1\] steps; .*in \[4, 1\]"):
+        call("distill", config, f"init={made}", f"output={tmp_path / 'x'}", "also=[1]")

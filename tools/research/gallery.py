@@ -29,6 +29,7 @@ from lidar_synth import Scan, load_generator, project
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank, make_policy
 from lidar_synth.viz import Orbit, picture, render, write_view
+from lidar_synth.weather import CORRUPTIONS
 
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8."""
@@ -165,6 +166,19 @@ def sensors() -> list[list[tuple[str, Picture]]]:
     ]
 
 
+def weather() -> list[list[tuple[str, Picture]]]:
+    """A scan in clear air, and in weather of two severities."""
+    scan = street(0, sensor="hdl64e_lasers", motion=False)
+    rows = []
+    for name in ("fog", "snow", "wet_ground"):
+        row = [("clear", near(scan))]
+        for severity in ("light", "heavy"):
+            changed = CORRUPTIONS[name].at(severity)(scan, np.random.default_rng(0))
+            row.append((f"{name.replace('_', ' ')}, {severity}", near(changed)))
+        rows.append(row)
+    return rows
+
+
 PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "pairs": pairs,
     "map": from_map,
@@ -172,6 +186,7 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "layout": from_layout,
     "paste": pasted,
     "sensors": sensors,
+    "weather": weather,
 }
 """Rows of titled images."""
 
@@ -204,6 +219,22 @@ def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     figure.canvas.draw()
     pixels: Picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
     return pixels
+
+
+def weather() -> list[list[tuple[str, Picture]]]:
+    """A scan in clear air, and in weather of three severities."""
+    scan = street(0, sensor="hdl64e_lasers", motion=False)
+    rows = []
+    for name in ("fog", "snow", "wet_ground"):
+        corrupted = [
+            (
+                f"{name.replace('_', ' ')}, {severity}",
+                near(CORRUPTIONS[name].at(severity)(scan, np.random.default_rng(0))),
+            )
+            for severity in ("light", "heavy")
+        ]
+        rows.append([("clear", near(scan)), *corrupted])
+    return rows
 
 
 def channels() -> Picture:

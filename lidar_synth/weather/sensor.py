@@ -1,0 +1,232 @@
+"""What goes wrong in the sensor, as the Robo3D benchmark (Kong et al., ICCV 2023)
+defines it; low power is the package's own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar_synth.datasets.classes import TRAIN_ID
+from lidar_synth.errors import DataError
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.weather.corruption import (
+    CROSSTALK,
+    FLOOR,
+    Change,
+    Corruption,
+    kept,
+    ranges_of,
+    require_between,
+    rings_of,
+    signal_of,
+)
+
+VEHICLES = [
+    TRAIN_ID[name]
+    for name in ("car", "bicycle", "motorcycle", "truck", "other-vehicle")
+]
+
+
+@dataclass(frozen=True)
+class MotionBlur(Corruption):
+    """A vibrating vehicle: every point is displaced.
+
+    Args:
+        spread: standard deviation of each coordinate, metres.
+
+    Raises:
+        ConfigError: on a spread outside 0 to 1 m.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import MotionBlur
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> blurred = MotionBlur(spread=0.08)(scan, np.random.default_rng(0))
+        >>> round(float((blurred.points - scan.points).std()), 2)
+        0.08
+    """
+
+    spread: float
+    SEVERE = {"spread": 0.04}, {"spread": 0.08}, {"spread": 0.10}
+
+    def __post_init__(self) -> None:
+        require_between("spread", self.spread, 0, 1)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        same = kept(scan, np.ones(len(scan), bool))
+        noise = rng.standard_normal(scan.points.shape, np.float32)
+        points = same.points + np.float32(self.spread) * noise
+        return Change(same.source, points, same.reflectance, same.cause)
+
+
+@dataclass(frozen=True)
+class MissingBeams(Corruption):
+    """Beams that fail: all returns of some of them are lost.
+
+    Args:
+        share: of the sensor's beams, in [0, 1].
+
+    Raises:
+        ConfigError: on another share.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import MissingBeams
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> half = MissingBeams(share=0.5)(scan, np.random.default_rng(0))
+        >>> len(np.unique(half.ring)) == len(np.unique(scan.ring)) // 2
+        True
+    """
+
+    share: float
+    SEVERE = {"share": 0.25}, {"share": 0.5}, {"share": 0.75}
+
+    def __post_init__(self) -> None:
+        require_between("share", self.share, 0, 1)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        rows = scan.sensor.shape[0]
+        lost = rng.choice(rows, round(self.share * rows), replace=False)
+        return kept(scan, ~np.isin(rings_of(scan), lost))
+
+
+@dataclass(frozen=True)
+class CrossSensor(Corruption):
+    """A sensor with fewer beams: evenly spaced ones stay.
+
+    Args:
+        share: of the beams that stay, in (0, 1].
+
+    Raises:
+        ConfigError: on another share.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import CrossSensor
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> few = CrossSensor(share=0.25)(scan, np.random.default_rng(0))
+        >>> len(np.unique(few.ring)) <= 16
+        True
+    """
+
+    share: float
+    SEVERE = {"share": 0.75}, {"share": 0.5}, {"share": 0.25}
+
+    def __post_init__(self) -> None:
+        require_between("share", self.share, 1e-3, 1)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        rings = rings_of(scan)
+        stay = np.floor((rings + 1) * self.share) > np.floor(rings * self.share)
+        return kept(scan, stay)
+
+
+@dataclass(frozen=True)
+class Crosstalk(Corruption):
+    """Pulses of other beams or sensors: some points are somewhere else.
+
+    Args:
+        share: of the points, in [0, 1].
+        spread: standard deviation of each coordinate, metres.
+
+    Raises:
+        ConfigError: on another share, or a spread outside 0 to 100 m.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import Crosstalk
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> noisy = Crosstalk(share=0.01)(scan, np.random.default_rng(0))
+        >>> 0 < (noisy.label != scan.label).mean() <= 0.01
+        True
+    """
+
+    share: float
+    spread: float = 3.0
+    SEVERE = {"share": 0.006}, {"share": 0.008}, {"share": 0.01}
+
+    def __post_init__(self) -> None:
+        require_between("share", self.share, 0, 1)
+        require_between("spread", self.spread, 0, 100)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        same = kept(scan, np.ones(len(scan), bool))
+        hit = rng.choice(len(scan), round(self.share * len(scan)), replace=False)
+        points = same.points.copy()
+        points[hit] += self.spread * rng.standard_normal((len(hit), 3), np.float32)
+        cause = same.cause.copy()
+        cause[hit] = CROSSTALK
+        return Change(same.source, points, same.reflectance, cause)
+
+
+@dataclass(frozen=True)
+class IncompleteEcho(Corruption):
+    """Dark vehicles: a share of their returns is lost.
+
+    Args:
+        share: of the returns of vehicles, in [0, 1].
+
+    Raises:
+        ConfigError: on another share.
+        DataError: on a scan without labels.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import IncompleteEcho
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> dark = IncompleteEcho(share=0.85)(scan, np.random.default_rng(0))
+        >>> (dark.label == 0).sum() < 0.3 * (scan.label == 0).sum()
+        True
+    """
+
+    share: float
+    SEVERE = {"share": 0.75}, {"share": 0.85}, {"share": 0.95}
+
+    def __post_init__(self) -> None:
+        require_between("share", self.share, 0, 1)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        if scan.label is None:
+            raise DataError(
+                f"scan {scan.id!r} without labels",
+                "labels, which say what is a vehicle",
+            )
+        lost = np.isin(scan.label, VEHICLES) & (rng.random(len(scan)) < self.share)
+        return kept(scan, ~lost)
+
+
+@dataclass(frozen=True)
+class LowPower(Corruption):
+    """A laser that has lost power: weak returns are not detected.
+
+    Args:
+        power: what is left of it, in (0, 1].
+
+    Raises:
+        ConfigError: on another power.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Town
+        >>> from lidar_synth.weather import LowPower
+        >>> scan = Town(seed=0, scans=1)[0]
+        >>> weak = LowPower(power=0.25)(scan, np.random.default_rng(0))
+        >>> len(weak) < len(scan)
+        True
+    """
+
+    power: float
+    SEVERE = {"power": 0.5}, {"power": 0.25}, {"power": 0.1}
+
+    def __post_init__(self) -> None:
+        require_between("power", self.power, 1e-3, 1)
+
+    def change(self, scan: Scan, rng: np.random.Generator) -> Change:
+        seen = self.power * signal_of(scan, ranges_of(scan)) >= FLOOR
+        same = kept(scan, seen)
+        dim = (self.power * same.reflectance).astype(np.float32)
+        return Change(same.source, same.points, dim, same.cause)
