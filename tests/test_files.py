@@ -11,7 +11,7 @@ from banks import add_stray, some_image
 
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.compiled import keep_compiled_code
-from lidar_synth.files.disk import write_arrays
+from lidar_synth.files.disk import remove_file, write_arrays
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import read_arrays, write_range_image, write_scan
 from lidar_synth.geometry.projection import unproject
@@ -60,3 +60,21 @@ def test_without_a_writable_folder_numba_compiles_into_a_temporary_one(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
     with pytest.raises(FileError, match="no folder may be written to"):
         keep_compiled_code()
+
+
+def test_a_file_that_cannot_be_removed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "old.label"
+    remove_file(path)  # nothing is there
+    path.write_bytes(b"old")
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(FileError, match=r"old\.label cannot be written \(Perm"):
+            remove_file(path)
+    remove_file(path)
+    assert not path.exists()

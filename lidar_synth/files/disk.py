@@ -204,6 +204,18 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        FileError: if it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
 def unreadable(
     path: Path, error: OSError, expected: str = "a file of the dataset"
 ) -> FileError:

@@ -39,7 +39,7 @@ OVERLAP = 0.9, 12.0
 metres. Haze with a visibility of hundreds of metres is then not detected."""
 BACKSCATTER = 0.046
 """b times the meteorological optical range (Rasshofer et al. 2011)."""
-COMPENSATED = 0.5
+COMPENSATED = 0.7
 """Share of the logarithm of a loss that a sensor's automatic power and gain make up for
 in the reflectance that it reports (0 = none). Chosen so that a network that learnt in
 clear air loses as much as in the Robo3D benchmark."""

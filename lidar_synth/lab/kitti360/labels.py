@@ -26,7 +26,13 @@ from tqdm import tqdm
 
 from lidar_synth.datasets.classes import KITTI360 as CLASSES
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.disk import list_files, read_text, sha256, write_file
+from lidar_synth.files.disk import (
+    list_files,
+    read_text,
+    remove_file,
+    sha256,
+    write_file,
+)
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats.kitti360 import (
@@ -252,7 +258,7 @@ def _label_window(
         {f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]}
     )
     for frame in job.frames:  # labels of an earlier run with other clouds or poses
-        (folder / f"{frame:010d}.label").unlink(missing_ok=True)
+        remove_file(folder / f"{frame:010d}.label")
     counts = LabelCounts()
     fitting = []
     misfits = []
