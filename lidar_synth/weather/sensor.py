@@ -19,6 +19,7 @@ from lidar_synth.weather.corruption import (
     rings_of,
     signal_of,
 )
+from lidar_synth.weather.fog import moved
 
 VEHICLES = [
     TRAIN_ID[name]
@@ -226,7 +227,7 @@ class LowPower(Corruption):
         require_between("power", self.power, 1e-3, 1)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        seen = self.power * signal_of(scan, ranges_of(scan)) >= FLOOR
-        same = kept(scan, seen)
-        dim = (self.power * same.reflectance).astype(np.float32)
-        return Change(same.source, same.points, dim, same.cause)
+        distance = ranges_of(scan)
+        signal = self.power * signal_of(scan, distance)
+        nowhere = np.zeros(len(scan), bool)
+        return moved(scan, distance, distance, signal, nowhere, signal >= FLOOR)
