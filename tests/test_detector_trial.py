@@ -202,9 +202,7 @@ def test_a_trial_from_scans_to_table(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    options = ["--arm", "gt_sampling", "--seeds", "1", "--iterations", "2"]
-    monkeypatch.setattr(sys, "argv", ["trial", str(tmp_path), *options])
-    trial.main()
+    trial.main(tmp_path, ["gt_sampling"], seeds=1, iterations=2)
     [result] = (tmp_path / "results-2").iterdir()
     assert (
         result.name == "gt_sampling-0.json"
@@ -212,7 +210,7 @@ def test_a_trial_from_scans_to_table(
     )
     assert "| GT sampling |" in capsys.readouterr().out
     monkeypatch.setattr(trial, "run", None)  # a second run trains nothing
-    trial.main()
+    trial.main(tmp_path, ["gt_sampling"], seeds=1, iterations=2)
     assert "| GT sampling |" in capsys.readouterr().out
 
 
@@ -232,12 +230,9 @@ def test_synthetic_scans_come_first_or_in_half_of_each_batch(
     assert found == shares
 
 
-def test_layout_arms_need_a_model(
-    trial: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["trial", str(tmp_path), "--arm", "layout"])
+def test_layout_arms_need_a_model(trial: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="--layout-model"):
-        trial.main()
+        trial.main(tmp_path, ["layout"])
 
 
 def test_the_table_has_means_spreads_and_paired_differences(trial: ModuleType) -> None:

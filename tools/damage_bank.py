@@ -10,15 +10,16 @@ reader returns has to equal the one that was written, and ``verify`` has to find
 end ``repair`` generates the shard again.
 """
 
-import argparse
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.repair import repair
@@ -58,57 +59,60 @@ def attempt(read: Callable[[], list[bytes]], expected: list[bytes]) -> str:
         return "refused"
 
 
-def main() -> None:
-    """Prints what each check found; exits with 1 on a wrong scan or on damage that no check
-    found."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--model", default="town", help="a shipped model or a checkpoint"
-    )
-    parser.add_argument("--flips", type=int, default=1000)
-    parser.add_argument("--cuts", type=int, default=200)
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the flipped bits and the lengths"
-    )
-    given = parser.parse_args()
-    rng = np.random.default_rng(given.seed)
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder) / "bank"
-        index = bake(
-            make_plan(root, BakeJob(model=given.model, count=4, shard_size=2)),
-            progress=False,
-        )
-        assert index is not None
-        path = root / index.shards[1].file
-        facts = index.sources[0]
-        entry = index.shards[1]
-        content = path.read_bytes()
-        whole = by_index(root, 1)
-        arrays = alone(path)
-        bits = rng.choice(8 * len(content), given.flips, replace=False).tolist()
-        lengths = rng.choice(len(content), given.cuts, replace=False).tolist()
-        damaged = [("flip", flipped(content, bit)) for bit in bits] + [
-            ("cut", content[:length]) for length in lengths
-        ]
-        counts: Counter[tuple[str, str, str]] = Counter()
-        for kind, values in tqdm(damaged, unit="damage"):
-            path.write_bytes(values)
-            counts[
-                kind, "reading the bank", attempt(lambda: by_index(root, 1), whole)
-            ] += 1
-            counts[
-                kind, "reading the shard alone", attempt(lambda: alone(path), arrays)
-            ] += 1
-            found = next(check_shard(root, facts, entry), None) is not None
-            counts[kind, "verify", "found" if found else "NOT FOUND"] += 1
-        done = repair(root, given.model, progress=False)
-        same = path.read_bytes() == content
+def damages(
+    content: bytes, flips: int, cuts: int, seed: int
+) -> Iterator[tuple[str, bytes]]:
+    """The kind of each damage, and the bytes of the damaged shard."""
+    rng = np.random.default_rng(seed)
+    for bit in rng.choice(8 * len(content), flips, replace=False).tolist():
+        yield "flip", flipped(content, bit)
+    for length in rng.choice(len(content), cuts, replace=False).tolist():
+        yield "cut", content[:length]
+
+
+def checks(root: Path) -> dict[str, Callable[[], str]]:
+    """What is done with the second shard of a bank, each with its outcome."""
+    index = Bank(root).index
+    entry = index.shards[1]
+    path = root / entry.file
+    facts = index.sources[0]
     print(
-        f"a shard of {len(content):,} bytes, {entry.scans} scans of {facts.sensor.shape}, "
+        f"a shard of {entry.bytes:,} bytes, {entry.scans} scans of {facts.sensor.shape}, "
         f"{facts.fields}"
     )
+    readers = {
+        "reading the bank": partial(by_index, root, 1),
+        "reading the shard alone": partial(alone, path),
+    }
+    found = {who: partial(attempt, read, read()) for who, read in readers.items()}
+
+    def verified() -> str:
+        fault = next(check_shard(root, facts, entry), None)
+        return "NOT FOUND" if fault is None else "found"
+
+    return found | {"verify": verified}
+
+
+def main(
+    model: str = "town", flips: int = 1000, cuts: int = 200, seed: int = 0
+) -> None:
+    """Prints what each check found; exits with 1 on a wrong scan or on damage that no check
+    found."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "bank"
+        job = BakeJob(model=model, count=4, shard_size=2)
+        bake(make_plan(root, job), progress=False)
+        every = checks(root)
+        path = root / Bank(root).index.shards[1].file
+        content = path.read_bytes()
+        damaged = damages(content, flips, cuts, seed)
+        for kind, values in tqdm(damaged, total=flips + cuts, unit="damage"):
+            path.write_bytes(values)
+            for who, check in every.items():
+                counts[kind, who, check()] += 1
+        done = repair(root, model, progress=False)
+        same = path.read_bytes() == content
     for (kind, who, what), count in counts.items():
         print(f"{kind:5} {who:24} {what:12} {count:6}")
     print(f"repair: {done}, {'the same bytes' if same else 'DIFFERENT BYTES'}")
@@ -124,4 +128,4 @@ def flipped(content: bytes, bit: int) -> bytes:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -18,7 +18,6 @@ a page to look at.
 Run it again to resume after a stop.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -27,11 +26,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from comparison import AUGMENTATION, Protocol, Result, compare
 from numpy.typing import NDArray
 from panels import classes_panel, mixture_panel, scores_panel
+from typer import Argument, run
 
 from lidar_synth import KITTI360, Bank, Scan, Source, open_scans
 from lidar_synth.datasets.classes import NAMES
@@ -96,35 +97,22 @@ def spread(
 
 def town(out: Path, scans: int, seed: int) -> Data:
     """Scans of two towns; those of the first one take the place of the user's own."""
-    for name, number, more in (
-        ("town", seed, ()),
-        ("other_town", seed + 1, ("--no-camera",)),
-    ):
-        words = (
-            "--scans",
-            str(scans),
-            "--seed",
-            str(number),
-            "--interval",
-            "1",
-            "--sensor",
-            "hdl64e_lasers",
-            "--layout",
-            "semantic_kitti",
-            *more,
-        )
-        command("town", str(out / name), *words, "--jobs", str(os.cpu_count() or 1))
+    words = (
+        f"--scans {scans} --interval 1 --sensor hdl64e_lasers --layout semantic_kitti"
+    )
+    words += f" --jobs {os.cpu_count() or 1}"
+    command("town", str(out / "town"), *words.split(), "--seed", str(seed))
+    words += f" --seed {seed + 1} --no-camera"
+    command("town", str(out / "other_town"), *words.split())
     notes = (
         "No real sensor measured these scans: no dataset was given, so scans of a procedural town "
         f"take the place of your real ones (seed {seed}). Set SEMANTICKITTI_ROOT to see your own "
         "data. The synthetic scans come from the "
         'model that ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
     )
-    real = list(open_scans(out / "town"))
-    other = list(open_scans(out / "other_town"))
     return Data(
-        real,
-        other,
+        list(open_scans(out / "town")),
+        list(open_scans(out / "other_town")),
         "Scan of the town, in place of a real one",
         "town",
         notes,
@@ -242,31 +230,21 @@ def panels(protocol: Protocol, data: Data, result: Result | None) -> list[str]:
     made = [mixture_panel([scan.domain for scan in epoch], kinds)]
     if result is None:
         return made
-    without, with_synthetic = result.scores()
-    arms = {
-        f"{data.kind} scans only": without,
-        f"{data.kind} and synthetic scans": with_synthetic,
-    }
+    arms = [f"{data.kind} scans only", f"{data.kind} and synthetic scans"]
+    scores = dict(zip(arms, result.scores(), strict=True))
     columns = {
         f"% of points, {kind}": shares([s for s in epoch if s.domain == d])
         for d, kind in enumerate(kinds)
     }
-    ious = dict(
-        zip(
-            (f"IoU %, {data.kind} only", "IoU %, with synthetic"),
-            result.ious(),
-            strict=True,
-        )
-    )
+    without, with_synthetic = result.ious()
+    columns[f"IoU %, {data.kind} only"] = without
+    columns["IoU %, with synthetic"] = with_synthetic
     notes = [
         f"Points: labelled ones of the first epoch. IoU: on {data.place}, mean of the seeds; – : "
         "not there."
     ]
-    return [
-        *made,
-        scores_panel(arms, protocol_notes(protocol, data.place)),
-        classes_panel(columns | ious, notes),
-    ]
+    made.append(scores_panel(scores, protocol_notes(protocol, data.place)))
+    return [*made, classes_panel(columns, notes)]
 
 
 def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
@@ -285,66 +263,38 @@ def write_page(path: Path, data: Data, bank: Bank, made: list[str]) -> None:
     write_file(path, text.encode())
 
 
-def main() -> None:
+def compared(protocol: Protocol) -> Result:
+    """Train both arms and print their scores."""
+    print(
+        f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, "
+        f"{protocol.steps} iterations each"
+    )
+    result = compare(protocol)
+    for name, scores in zip(("without", "with"), result.scores(), strict=True):
+        values = ", ".join(f"{100 * score:.1f} %" for score in scores)
+        print(f"mIoU {name} synthetic scans: {values}")
+    return result
+
+
+def main(
+    out: Annotated[Path, Argument()] = Path("demo_out"), scans: int = 24, seed: int = 0
+) -> None:
     """Runs all steps."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "out", type=Path, nargs="?", default=Path("demo_out"), help="folder to write to"
-    )
-    parser.add_argument(
-        "--scans",
-        type=int,
-        default=24,
-        help="how many scans to train on, and how many to hold out",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the town")
-    given = parser.parse_args()
     start = time.monotonic()
     command("doctor")
-    data = dataset(given.out, given.scans, given.seed)
-    folder = given.out / "bank"
-    command(
-        "bake",
-        str(folder),
-        "--model",
-        "town",
-        "--count",
-        str(given.scans),
-        "--seed",
-        "1",
-        "--shard-size",
-        "16",
-    )
-    command("verify", str(folder), "--deep")
+    data = dataset(out, scans, seed)
+    folder = str(out / "bank")
+    words = f"--model town --count {scans} --seed 1 --shard-size 16"
+    command("bake", folder, *words.split())
+    command("verify", folder, "--deep")
     bank = Bank(folder)
-
-    few = given.scans < 12
-    protocol = Protocol(
-        data.real,
-        list(bank),
-        data.held_out,
-        steps=40 if few else 120,
-        seeds=2 if few else 3,
-    )
-    result = None
-    if data.labelled:
-        print(
-            f"\nTraining without and with synthetic scans: {protocol.seeds} seeds, "
-            f"{protocol.steps} iterations each"
-        )
-        result = compare(protocol)
-    page = given.out / "index.html"
+    steps, seeds = (40, 2) if scans < 12 else (120, 3)
+    protocol = Protocol(data.real, list(bank), data.held_out, steps=steps, seeds=seeds)
+    result = compared(protocol) if data.labelled else None
+    page = out / "index.html"
     write_page(page, data, bank, panels(protocol, data, result))
-    if result is not None:
-        for name, scores in zip(("without", "with"), result.scores(), strict=True):
-            print(
-                f"mIoU {name} synthetic scans: "
-                f"{', '.join(f'{100 * score:.1f} %' for score in scores)}"
-            )
     print(f"\n{time.monotonic() - start:.0f} s. The page is {page.resolve()}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,6 @@ Whenever a bake finishes, its files are compared and the next bank begins. By de
 fast one with random weights, because the test is about writing.
 """
 
-import argparse
 import os
 import random
 import shutil
@@ -16,14 +15,16 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from bench.untrained import write_untrained
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
 from lidar_synth.bake.verify import verify
-from lidar_synth.bank import INDEX
 
 
 def start(plan: BakePlan, engine: str, workers: int) -> int:
@@ -65,58 +66,57 @@ def files(root: Path) -> dict[str, bytes]:
     }
 
 
-def main() -> None:
+def count_kills(
+    plan: BakePlan, again: Callable[[], int], seconds: float, rng: random.Random
+) -> int:
+    """Kill a bake and start it again until it has finished; the number of kills."""
+    kills = 0
+    while killed(again(), rng.uniform(0, seconds)):
+        kills += 1
+    assert verify(plan.out, progress=False) == []
+    return kills
+
+
+def main(
+    model: str | None = None,
+    kills: int = 100,
+    count: int = 40,
+    shard_size: int = 4,
+    engine: str = "local",
+    workers: int = 2,
+    seed: int = 0,
+) -> None:
     """Repeats until the number of kills is reached; exits with 1 if bytes differ."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--model", help="a shipped model or a checkpoint")
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--shard-size", type=int, default=4)
-    parser.add_argument("--engine", default="local")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
-    given = parser.parse_args()
-    rng = random.Random(given.seed)
+    rng = random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
-        model = given.model or str(
-            write_untrained(Path(folder) / "untrained.safetensors")
-        )
-        job = BakeJob(model=model, count=given.count, shard_size=given.shard_size)
-        whole, plan = (
-            make_plan(Path(folder) / name / "bank", job) for name in ("whole", "killed")
-        )
+        model = model or str(write_untrained(Path(folder) / "untrained.safetensors"))
+        job = BakeJob(model=model, count=count, shard_size=shard_size)
+        whole = make_plan(Path(folder) / "whole" / "bank", job)
+        plan = make_plan(Path(folder) / "killed" / "bank", job)
+        again = partial(start, plan, engine, workers)
         assert not killed(start(whole, "local", 1), 1e6)
         begin = time.monotonic()
-        assert not killed(start(plan, given.engine, given.workers), 1e6)
+        assert not killed(again(), 1e6)
         seconds = time.monotonic() - begin
         expected = files(whole.out)
-        out = plan.out
-        assert files(out) == expected, "the engine writes other bytes"
-        shutil.rmtree(out)
-        kills = banks = 0
-        with tqdm(total=given.kills, unit="kill") as bar:
-            while kills < given.kills or out.exists():
-                moment = rng.uniform(0, seconds) if kills < given.kills else 1e6
-                if killed(start(plan, given.engine, given.workers), moment):
-                    kills += 1
-                    bar.update()
-                elif (out / INDEX).exists():
-                    assert verify(out, progress=False) == []
-                    if files(out) != expected:
-                        sys.exit(
-                            f"bank {banks} after {kills} kills has other bytes than one baked "
-                            "without a kill"
-                        )
-                    banks += 1
-                    shutil.rmtree(out)
-        print(
-            f"{kills} kills, {banks} banks of {given.count} scans in {len(plan.shards)} shards by "
-            f"{given.engine}, "
-            f"a whole run takes {seconds:.1f} s: all files have the same bytes as without a kill"
-        )
+        assert files(plan.out) == expected, "the engine writes other bytes"
+        done = banks = 0
+        with tqdm(total=kills, unit="kill") as bar:
+            while done < kills:
+                shutil.rmtree(plan.out)
+                done += count_kills(plan, again, seconds, rng)
+                banks += 1
+                bar.update(done - bar.n)
+                if files(plan.out) != expected:
+                    sys.exit(
+                        f"bank {banks} has other bytes than one baked without a kill"
+                    )
+    print(
+        f"{done} kills, {banks} banks of {count} scans in {len(plan.shards)} shards by "
+        f"{engine}, a whole run takes {seconds:.1f} s: all files have the same bytes as "
+        "without a kill"
+    )
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,6 @@ leaving a process or a segment of shared
 memory behind. Linux only: processes are counted in /proc.
 """
 
-import argparse
 import json
 import os
 import random
@@ -19,13 +18,14 @@ import tempfile
 import time
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from bench.untrained import write_untrained
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
+from typer import Option, run
 
 from lidar_synth.bank.encoding import Encoding
 from lidar_synth.errors import LidarSynthError
@@ -120,113 +120,103 @@ def living(session: int) -> list[int]:
     return found
 
 
-def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> str:
-    """One trainer, one kill; returns what is wrong with the outcome, or ""."""
-    call = [
-        sys.executable,
-        __file__,
-        "--trainer",
-        str(model),
-        "--known",
-        json.dumps(known),
-        "--workers",
-        "2",
-    ]
+def started(model: Path, known: list[int]) -> tuple[subprocess.Popen[str], Any]:
+    """A trainer in a session of its own, and the ids of its generator and workers; none if it did
+    not start."""
+    call = [sys.executable, __file__, "--trainer", model, "--workers", "2"]
     trainer = subprocess.Popen(
-        call,
+        [*call, "--known", json.dumps(known)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
     assert trainer.stdout is not None
-    pids: dict[str, Any] = json.loads(trainer.stdout.readline() or "{}")
+    return trainer, json.loads(trainer.stdout.readline() or "{}")
+
+
+def left_behind(session: int, everyone: list[int]) -> str:
+    """Processes and segments of memory that are left after a while, or ""."""
+    end = time.monotonic() + 15
+    while (left := living(session)) and time.monotonic() < end:
+        time.sleep(0.1)
+    segments = [
+        path.name
+        for path in Path("/dev/shm").glob("*")
+        if any(f"_{pid}_" in path.name for pid in everyone)
+    ]
+    return (
+        f"processes {left} and segments {segments} are left" if left or segments else ""
+    )
+
+
+def expected(victim: str, target: int, code: int, output: str, errors: str) -> bool:
+    """Whether a trainer ended as it should after a kill."""
+    if victim == "trainer":
+        return code == -signal.SIGKILL
+    if victim == "generator":
+        return code == 1 and f"rolling bank died (process {target}" in errors
+    return code == 0 and "continued after" in output and str(target) in output
+
+
+def kill_one(model: Path, known: list[int], victim: str, rng: random.Random) -> str:
+    """One trainer, one kill; returns what is wrong with the outcome, or ""."""
+    trainer, pids = started(model, known)
     if not pids:
         return f"the trainer did not start: {trainer.communicate()[1]}"
     everyone = living(trainer.pid)
     time.sleep(rng.random())
-    target = {
-        "trainer": trainer.pid,
-        "generator": pids["generator"],
-        "worker": rng.choice(pids["worker"]),
-    }[victim]
+    targets = {"trainer": trainer.pid, "worker": rng.choice(pids["worker"])}
+    target = (pids | targets)[victim]
     os.kill(target, signal.SIGKILL)
     try:
         output, errors = trainer.communicate(timeout=LIMIT)
     except subprocess.TimeoutExpired:
         os.killpg(trainer.pid, signal.SIGKILL)
         return f"{victim} killed: still running after {LIMIT:g} s"
-    said = {
-        "trainer": trainer.returncode == -signal.SIGKILL,
-        "generator": trainer.returncode == 1
-        and f"rolling bank died (process {target}" in errors,
-        "worker": trainer.returncode == 0
-        and "went on after" in output
-        and str(target) in output,
-    }[victim]
-    if not said:
+    if not expected(victim, target, trainer.returncode, output, errors):
         return f"{victim} killed: exit code {trainer.returncode}, {output} {errors}"
-    end = time.monotonic() + 15
-    while (left := living(trainer.pid)) and time.monotonic() < end:
-        time.sleep(0.1)
-    segments = [
-        p.name
-        for p in Path("/dev/shm").glob("*")
-        if any(f"_{pid}_" in p.name for pid in everyone)
-    ]
-    return (
-        f"{victim} killed: processes {left} and segments {segments} are left"
-        if left or segments
-        else ""
-    )
+    left = left_behind(trainer.pid, everyone)
+    return left and f"{victim} killed: {left}"
 
 
-def main() -> None:
+def count_torn(model: Path, known: list[int], reads: int, workers: int) -> int:
+    """The number of torn or wrong scans of so many reads."""
+    with RollingBank(model, slots=16, threads=1) as bank:
+        batches = loader(bank, known, reads, workers)
+        torn = sum(tqdm(batches, desc="reads", unit="batch"))
+        print(
+            f"{reads} reads by {workers} workers: {torn} torn or wrong; {bank.counts()}"
+        )
+    return torn
+
+
+def main(
+    kills: int = 50,
+    reads: int = 100_000,
+    workers: int = 4,
+    seed: int = 0,
+    trainer: Annotated[Path | None, Option(hidden=True)] = None,
+    known: Annotated[str, Option(hidden=True)] = "",
+) -> None:
     """Prints the outcome; exits with 1 if anything was wrong."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--reads", type=int, default=100_000)
-    parser.add_argument("--workers", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--trainer", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--known", type=json.loads, help=argparse.SUPPRESS)
-    options = parser.parse_args()
     torch.set_num_threads(1)
-    if options.trainer:
-        train(options.trainer, options.known, options.workers)
+    if trainer:
+        train(trainer, json.loads(known), workers)
         return
-    wrong = []
+    rng = random.Random(seed)
+    victims = [("trainer", "generator", "worker")[n % 3] for n in range(kills)]
     with tempfile.TemporaryDirectory() as folder:
         model = write_untrained(Path(folder) / "untrained.safetensors")
-        known = known_checksums(model)
-        rng = random.Random(options.seed)
-        victims = [
-            ("trainer", "generator", "worker")[n % 3] for n in range(options.kills)
-        ]
-        for victim in tqdm(
-            rng.sample(victims, len(victims)), desc="kills", unit="kill"
-        ):
-            if problem := kill_one(model, known, victim, rng):
-                wrong.append(problem)
-        print(f"{options.kills} kills: {len(wrong)} went wrong")
-        if options.reads:
-            with RollingBank(model, slots=16, threads=1) as bank:
-                batches = tqdm(
-                    loader(bank, known, options.reads, options.workers),
-                    desc="reads",
-                    unit="batch",
-                )
-                torn = sum(batches)
-                print(
-                    f"{options.reads} reads by {options.workers} workers: {torn} torn or wrong; "
-                    f"{bank.counts()}"
-                )
-            wrong += [f"{torn} wrong reads"] if torn else []
+        sums = known_checksums(model)
+        order = tqdm(rng.sample(victims, kills), desc="kills", unit="kill")
+        wrong = list(filter(None, (kill_one(model, sums, who, rng) for who in order)))
+        print(f"{kills} kills: {len(wrong)} went wrong")
+        if reads and (torn := count_torn(model, sums, reads, workers)):
+            wrong.append(f"{torn} wrong reads")
     print(*wrong, sep="\n")
     sys.exit(bool(wrong))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -9,16 +9,18 @@ the script: their lowest versions need gigabytes of CUDA libraries, or have no b
 table at the end lists the versions that were used.
 """
 
-import argparse
 import os
 import re
 import subprocess
 import sys
-import venv
+import venv as environments
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 import tomllib
+from typer import Argument, run
 
 ROOT = Path(__file__).parent.parent
 KEPT = ("torch", "open3d")
@@ -63,7 +65,7 @@ def lowest() -> dict[str, str]:
 def install(folder: Path, wanted: dict[str, str]) -> Path:
     """Make an environment in which these versions take precedence over the current ones; returns
     its Python."""
-    venv.create(folder, with_pip=True, clear=True)
+    environments.create(folder, with_pip=True, clear=True)
     python = folder / "bin" / "python"
     pins = [f"{name}=={text}" for name, text in wanted.items()]
     pip = [
@@ -83,60 +85,40 @@ def install(folder: Path, wanted: dict[str, str]) -> Path:
     return python
 
 
-def main() -> None:
-    """Installs, tests, prints the table; the exit status is that of pytest."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--venv",
-        type=Path,
-        default=ROOT / ".venv-lowest",
-        help="folder of the environment, which is replaced",
-    )
-    parser.add_argument(
-        "tests", nargs="*", help="test files [default: those of files and banks]"
-    )
-    options = parser.parse_args()
-    wanted = {name: text for name, text in lowest().items() if name not in KEPT}
-    python = install(options.venv.absolute(), wanted)
-    tests = options.tests or [
-        f"tests/{name}" for name in TESTS if (ROOT / "tests" / name).exists()
-    ]
-    versions = subprocess.run(
-        [
-            python,
-            "-c",
-            "import sys; from importlib.metadata import version\n"
-            "for name in sys.argv[1:]: print(version(name))",
-            *wanted,
-        ],
-        check=True,
-        capture_output=True,
-        text=True,
+def versions(python: Path, names: Iterable[str]) -> list[str]:
+    """The versions of distributions in an environment."""
+    code = "import sys; from importlib.metadata import version; print(*map(version, sys.argv[1:]))"
+    call = [python, "-c", code, *names]
+    return subprocess.run(
+        call, check=True, capture_output=True, text=True
     ).stdout.split()
-    environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(options.venv.absolute() / "numba")
-    }
-    done = subprocess.run(
-        [python, "-m", "pytest", *tests], cwd=ROOT, env=environment, check=False
-    )
-    print(
-        f"\nPython {sys.version.split()[0]}\n\n| dependency | declared from | tested "
-        "|\n|---|---|---|"
-    )
-    for name, text in zip(wanted, versions, strict=True):
+
+
+def main(
+    venv: Path = ROOT / ".venv-lowest",
+    tests: Annotated[list[str] | None, Argument()] = None,
+) -> None:
+    """Installs, runs the tests, by default those of files and banks, and prints the table; the
+    exit status is that of pytest."""
+    declared = lowest()
+    wanted = {name: text for name, text in declared.items() if name not in KEPT}
+    python = install(venv.absolute(), wanted)
+    files = (f"tests/{name}" for name in TESTS)
+    chosen = tests or [name for name in files if (ROOT / name).exists()]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(venv.absolute() / "numba")}
+    call = [python, "-m", "pytest", *chosen]
+    status = subprocess.run(call, cwd=ROOT, env=environment, check=False).returncode
+    print(f"\nPython {sys.version.split()[0]}\n")
+    print("| dependency | declared from | tested |\n|---|---|---|")
+    for name, text in zip(wanted, versions(python, wanted), strict=True):
         print(f"| {name} | {wanted[name]} | {text} |")
     for name in KEPT:
-        print(
-            f"| {name} | {lowest()[name]} | {version(name)}: not at its lowest version, see above |"
-        )
-    print(
-        f"\n{' '.join(tests)}: "
-        f"{'passed' if done.returncode == 0 else f'failed, status {done.returncode}'}"
-    )
-    sys.exit(done.returncode)
+        used = f"{version(name)}: not at its lowest version, see above"
+        print(f"| {name} | {declared[name]} | {used} |")
+    outcome = f"failed, status {status}" if status else "passed"
+    print(f"\n{' '.join(chosen)}: {outcome}")
+    sys.exit(status)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

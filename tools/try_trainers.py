@@ -1,7 +1,7 @@
 """Run each trainer's own script on a mixture, in a fresh environment, with validation; print a
 Markdown table.
 
-    python tools/try_trainers.py --work FOLDER [--only NAME ...] [--scans 1]
+    python tools/try_trainers.py --work FOLDER [--only NAME] [--scans 1]
 
 ``tools/trainers/`` has one file for each trainer. Public source trees are found by environment
 variables such as OPENPCDET_ROOT and POINTCEPT_ROOT; each file names its own. Real scans are used
@@ -10,7 +10,6 @@ town. Logs are kept in FOLDER/<name>/logs. This shows that a trainer runs on the
 the mixture helps. The exit status is 1 if a trial failed.
 """
 
-import argparse
 import importlib
 import os
 import platform
@@ -18,9 +17,11 @@ import shutil
 import sys
 import traceback
 from pathlib import Path
+from typing import Annotated
 
 from trainers.data import Data
 from trainers.trial import STEPS, Failed, Row, Trial
+from typer import Option, run
 
 FRAME = ("__init__", "data", "trial")
 
@@ -66,39 +67,19 @@ def line(row: Row) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def main() -> None:
-    """Runs the trials and prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--work", type=Path, required=True, help="folder of environments, data and logs"
-    )
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=names(),
-        default=names(),
-        metavar="NAME",
-        help=", ".join(names()),
-    )
-    parser.add_argument(
-        "--scans", type=int, default=1, help="scans of each SemanticKITTI sequence [1]"
-    )
-    parser.add_argument(
-        "--reuse-environments",
-        action="store_true",
-        help="keep those of an earlier run, to develop",
-    )
-    options = parser.parse_args()
-    work = options.work.absolute()
+def main(
+    work: Annotated[Path, Option()],
+    only: list[str] | None = None,
+    scans: int = 1,
+    reuse_environments: bool = False,
+) -> None:
+    """Runs the trials, by default all, and prints the table."""
+    work = work.absolute()
     shutil.rmtree(work / "wheel", ignore_errors=True)  # that of an earlier checkout
-    data = Data(work / f"data-{options.scans}", options.scans)
-    done = [
-        row
-        for name in options.only
-        for row in attempt(name, work, data, options.reuse_environments)
-    ]
+    data = Data(work / f"data-{scans}", scans)
+    done: list[Row] = []
+    for name in only or names():
+        done += attempt(name, work, data, reuse_environments)
     machine = f"Python {platform.python_version()}, {os.cpu_count()} cores, {platform.machine()}"
     print(f"{machine}; scans called real: {data.real}\n")
     print(
@@ -110,4 +91,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,6 @@ because the memory per scan does not depend on the model. Every bake runs in its
 one thread per worker; the machine has to be idle. Compared runs take turns; the table has medians.
 """
 
-import argparse
 import resource
 import tempfile
 import time
@@ -20,6 +19,7 @@ from statistics import median
 from typing import Any
 
 from timing import machine
+from typer import run
 from untrained import write_untrained
 
 from lidar_synth.bake import BakeJob, BakePlan, Resources, bake, make_plan
@@ -69,57 +69,47 @@ def peak_memory(out: Path, model: str, count: int) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-def main() -> None:
+def print_processes(root: Path, model: str, count: int, rounds: int) -> None:
+    """Print the time of a bake by one process and by two."""
+    seconds: dict[int, list[float]] = {1: [], 2: []}
+    for turn in range(rounds):
+        for workers, times in seconds.items():
+            out = root / f"{turn} by {workers}"
+            times.append(alone(by_processes, out, model, count, workers))
+    one = median(seconds[1])
+    two = median(seconds[2])
+    print(f"| {count} scans by one process | {one:.1f} s |")
+    print(f"| by two processes | {two:.1f} s, {one / two:.2f} times as fast |")
+
+
+def print_writing(root: Path, model: str, count: int, rounds: int) -> None:
+    """Print the rate of generating alone and with writing."""
+    turns = alone(generated_and_baked, root, model, count, rounds)
+    plain, whole = (median(times) for times in zip(*turns, strict=True))
+    print(f"| generating only, in one process | {count / plain:.2f} scans/s |")
+    print(
+        f"| generating and writing | {count / whole:.2f} scans/s, {1 - plain / whole:.1%} "
+        "of the time for writing |"
+    )
+
+
+def main(
+    model: str = "town",
+    count: int = 256,
+    lengths: tuple[int, int] = (400, 4000),
+    rounds: int = 3,
+) -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--model", default="town", help="a shipped model or a checkpoint"
-    )
-    parser.add_argument("--count", type=int, default=256, help="scans of a timed bake")
-    parser.add_argument(
-        "--lengths",
-        type=int,
-        nargs=2,
-        default=(400, 4000),
-        help="scans of the bakes whose memory is measured",
-    )
-    parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args()
     print(f"\n### Baking\n\n{machine()}\n\n| what | |\n|---|---:|")
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        seconds: dict[int, list[float]] = {1: [], 2: []}
-        for turn in range(given.rounds):
-            for workers, times in seconds.items():
-                times.append(
-                    alone(
-                        by_processes,
-                        root / f"{turn} by {workers}",
-                        given.model,
-                        given.count,
-                        workers,
-                    )
-                )
-        one, two = (median(times) for times in seconds.values())
-        print(f"| {given.count} scans by one process | {one:.1f} s |")
-        print(f"| by two processes | {two:.1f} s, {one / two:.2f} times as fast |")
-        few = max(1, given.count // 4)
-        turns = alone(
-            generated_and_baked, root / "turns", given.model, few, given.rounds
-        )
-        plain, whole = (median(times) for times in zip(*turns, strict=True))
-        print(f"| generating only, in one process | {few / plain:.2f} scans/s |")
-        print(
-            f"| generating and writing | {few / whole:.2f} scans/s, {1 - plain / whole:.1%} of "
-            "the time for writing |"
-        )
+        print_processes(root, model, count, rounds)
+        print_writing(root / "turns", model, max(1, count // 4), rounds)
         untrained = str(write_untrained(root / "untrained.safetensors"))
-        for count in given.lengths:
-            megabytes = alone(peak_memory, root / f"{count} scans", untrained, count)
-            print(f"| peak memory of a bake of {count} scans | {megabytes:.0f} MB |")
+        for length in lengths:
+            megabytes = alone(peak_memory, root / f"{length} scans", untrained, length)
+            print(f"| peak memory of a bake of {length} scans | {megabytes:.0f} MB |")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -10,40 +10,42 @@ a tree of files of so many shards, each with 1,024 small scans, as a bank of a m
 them; only a read's overhead depends on their number.
 """
 
-import argparse
 import os
 import resource
 import shutil
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import deflate as libdeflate
 import h5py
 import numpy as np
 import torch
-from projection import random_points
+from projection import random_points, read
 from timing import machine, print_table, time_in_turns
 from tqdm import tqdm
+from typer import Argument, run
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bank import Bank, Encoding, Entry, Facts, Index, ShardWriter
 from lidar_synth.bank.chunks import checksum, deflate, fletcher32, inflate
 from lidar_synth.files.disk import sha256
-from lidar_synth.formats.points import read_points
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.projection import project, unproject
-from lidar_synth.geometry.scan import RangeImage, Scan
+from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import Town
 
 SHARD = 64
 LARGE = 1024
 """Scans of a shard: of banks of the town, and of the tree of files."""
+PACK = "shuffle, deflate, Fletcher-32"
+"""The stage with which the others are compared."""
 FIELDS = ("reflectance", "label", "confidence")
 
 
@@ -119,21 +121,10 @@ def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
     """Prints the first table; returns a bank without confidence."""
     count = len(images)
     plain = write(root / "plain", images, FIELDS[:2])
-    rates = {}
-    for turn, fields in enumerate((FIELDS[:2], FIELDS) * 3):
-        name = ", ".join(("range", *fields))
-        took = seconds(partial(write, root / f"turn-{turn}", images, fields))
-        rates[name] = max(rates.get(name, 0.0), count / took)
+    read = partial(read_all, plain, range(count))
     error = max(
         float(np.abs(plain.image(i).range - image.range).max())
         for i, image in enumerate(images)
-    )
-    read = min(
-        seconds(lambda: [plain.image(i) for i in range(count)]) for _ in range(3)
-    )
-    threads = os.cpu_count() or 1
-    clock = max(
-        scans_per_second(root / f"clock-{turn}", images, threads) for turn in range(3)
     )
     print(
         f"\n### Size and rate, 64 x 1024, {count} scans of the town\n\n{machine()}\n\n| what | "
@@ -142,31 +133,39 @@ def size_and_rate(root: Path, images: list[RangeImage]) -> Bank:
     sizes(root / "full", images)
     print(f"| step of the range | {plain.facts.encoding.scale * 1e3:.2f} mm |")
     print(f"| largest error of a range | {error * 1e3:.2f} mm |")
-    print(f"| read in order, as images | {count / read:.0f} scans/s |")
-    for name, rate in rates.items():
+    fastest = min(seconds(read) for _ in range(3))
+    print(f"| read in order, as images | {count / fastest:.0f} scans/s |")
+    print_writing(root, images)
+    return plain
+
+
+def print_writing(root: Path, images: list[RangeImage]) -> None:
+    """Prints the rates of writing."""
+    for fields in (FIELDS[:2], FIELDS):
+        took = [
+            seconds(partial(write, root / f"{len(fields)}-{turn}", images, fields))
+            for turn in range(3)
+        ]
+        name = ", ".join(("range", *fields))
+        rate = len(images) / min(took)
         print(f"| written by one core: {name} | {rate:.0f} scans/s |")
+    threads = os.cpu_count() or 1
+    clock = max(
+        scans_per_second(root / f"clock-{turn}", images, threads) for turn in range(3)
+    )
     print(
         f"| written by one process with {threads} threads, with confidence, wall-clock time | "
         f"{clock:.0f} scans/s |"
     )
-    return plain
 
 
 def reading(path: Path, bank: Bank) -> None:
     """Prints the cost of reading a scan from a bank, and from a point file."""
     turn = iter(np.random.default_rng(0).integers(0, len(bank), 10**6).tolist())
-    sensor = bank.sensor
     shard = bank.shard(0)
-
-    def read_and_project() -> RangeImage:
-        points = read_points(path)
-        return project(Scan(points[:, :3], points[:, 3], sensor))
-
     ours = "random scan of a bank, as image"
-
-    with h5py.File(
-        bank.root / shard.entry.file, "r", rdcc_nbytes=0
-    ) as file:  # no cache: every read decompresses
+    # Without a cache every read decompresses.
+    with h5py.File(bank.root / shard.entry.file, "r", rdcc_nbytes=0) as file:
         datasets = [file[name] for name in bank.facts.encoding.names]
 
         def by_hdf5() -> list[object]:
@@ -178,7 +177,9 @@ def reading(path: Path, bank: Bank) -> None:
             "the same, as points": lambda: bank[next(turn)],
             "its arrays only": lambda: shard.read(next(turn) % shard.entry.scans),
             "its arrays only, by HDF5's own filters (zlib), without CRC": by_hdf5,
-            f"{path.name}, {path.stat().st_size // 16} points, read and projected": read_and_project,
+            f"{path.name}, {path.stat().st_size // 16} points, read and projected": (
+                lambda: project(read(path, bank.sensor))
+            ),
         }
         print_table("Reading", time_in_turns(calls, 200, time.process_time), ours)
 
@@ -187,40 +188,49 @@ def stages(image: RangeImage) -> None:
     """Prints the time of each stage of writing and reading a scan with confidence."""
     encoding = Encoding(image.sensor, FIELDS)
     arrays = encoding.encode(image)
-    kinds = encoding.arrays()
-    packed = {name: deflate(values) for name, values in arrays.items()}
     decoded = encoding.decode(arrays)
+    calls: dict[str, Callable[[], object]] = {
+        "encode": lambda: encoding.encode(image),
+        "CRC-32": lambda: checksum(0, 0, arrays),
+        **packing(arrays),
+        **unpacking(encoding, arrays),
+        "decode": lambda: encoding.decode(arrays),
+        "unproject": lambda: unproject(decoded),
+    }
+    seconds = time_in_turns(calls, 200, time.process_time)
+    print_table("Stages of a scan with confidence", seconds, PACK)
+
+
+def packing(arrays: dict[str, np.ndarray]) -> dict[str, Callable[[], object]]:
+    """The stages of compression."""
     planes = [
         values.view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
         for values in arrays.values()
     ]
-    pack = "shuffle, deflate, Fletcher-32"
-    calls: dict[str, Callable[[], object]] = {
-        "encode": lambda: encoding.encode(image),
-        "CRC-32": lambda: checksum(0, 0, arrays),
-        pack: lambda: [deflate(values) for values in arrays.values()],
-        "deflate alone": lambda: [
-            libdeflate.zlib_compress(plane, 1) for plane in planes
-        ],
+    fast = partial(libdeflate.zlib_compress, compresslevel=1)
+    return {
+        PACK: lambda: [deflate(values) for values in arrays.values()],
+        "deflate alone": lambda: [fast(plane) for plane in planes],
         "deflate by zlib": lambda: [zlib.compress(plane, 1) for plane in planes],
-        "Fletcher-32, inflate, unshuffle": lambda: [
-            inflate(c, *kinds[name]) for name, c in packed.items()
-        ],
-        "inflate alone": lambda: [
-            libdeflate.zlib_decompress(c[:-4], 1 << 17) for c in packed.values()
-        ],
-        "inflate by zlib": lambda: [
-            zlib.decompress(c[:-4], bufsize=1 << 17) for c in packed.values()
-        ],
-        "Fletcher-32 alone": lambda: [fletcher32(chunk) for chunk in packed.values()],
-        "decode": lambda: encoding.decode(arrays),
-        "unproject": lambda: unproject(decoded),
     }
-    print_table(
-        "Stages of a scan with confidence",
-        time_in_turns(calls, 200, time.process_time),
-        pack,
-    )
+
+
+def unpacking(
+    encoding: Encoding, arrays: dict[str, np.ndarray]
+) -> dict[str, Callable[[], object]]:
+    """The stages of decompression."""
+    kinds = encoding.arrays()
+    packed = {name: deflate(values) for name, values in arrays.items()}
+    bare = [chunk[:-4] for chunk in packed.values()]
+    size = 1 << 17
+    return {
+        "Fletcher-32, inflate, unshuffle": lambda: [
+            inflate(chunk, *kinds[name]) for name, chunk in packed.items()
+        ],
+        "inflate alone": lambda: [libdeflate.zlib_decompress(c, size) for c in bare],
+        "inflate by zlib": lambda: [zlib.decompress(c, bufsize=size) for c in bare],
+        "Fletcher-32 alone": lambda: [fletcher32(chunk) for chunk in packed.values()],
+    }
 
 
 def tree(root: Path, shards: int) -> Bank:
@@ -238,29 +248,24 @@ def tree(root: Path, shards: int) -> Bank:
     with ShardWriter(first, facts, Entry(first.name, 0, 0, LARGE)) as writer:
         for _ in range(LARGE):
             writer.append(image)
-    entries = []
-    for number in tqdm(range(shards), "shards", leave=False):
-        path = root / f"shard-{number:05d}.h5"
-        indices = np.arange(number * LARGE, (number + 1) * LARGE, dtype=np.uint64)
-        if number:
-            shutil.copyfile(first, path)
-            with h5py.File(path, "r+", libver="latest") as file:
-                file.attrs.modify("first", indices[0])
-                file["index"][:] = indices
-                file["crc"][:] = [checksum(0, int(index), arrays) for index in indices]
-        entries.append(
-            Entry(
-                path.name,
-                0,
-                int(indices[0]),
-                LARGE,
-                0,
-                path.stat().st_size,
-                sha256(path),
-            )
-        )
+    numbers = tqdm(range(shards), "shards", leave=False)
+    entries = [copied(first, number, arrays) for number in numbers]
     write_bank_files(root, Index((facts,), tuple(entries)))
     return Bank(root)
+
+
+def copied(first: Path, number: int, arrays: dict[str, np.ndarray]) -> Entry:
+    """The entry of a copy of the first shard with the indices of another one."""
+    path = first.with_name(f"shard-{number:05d}.h5")
+    begin = number * LARGE
+    if number:
+        shutil.copyfile(first, path)
+        indices = np.arange(begin, begin + LARGE, dtype=np.uint64)
+        with h5py.File(path, "r+", libver="latest") as file:
+            file.attrs.modify("first", indices[0])
+            file["index"][:] = indices
+            file["crc"][:] = [checksum(0, int(index), arrays) for index in indices]
+    return Entry(path.name, 0, begin, LARGE, 0, path.stat().st_size, sha256(path))
 
 
 def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
@@ -270,19 +275,14 @@ def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
     print(f"\n### Random reads from shards of {LARGE:,} scans\n\n{machine()}\n")
     print(
         "| shards | scans | first read of a shard, ms | later reads, ms | overhead, ms | memory, "
-        "MB |"
+        "MB |\n|---:|---:|---:|---:|---:|---:|"
     )
-    print("|---:|---:|---:|---:|---:|---:|")
     base = 0.0
     for count in sorted({min(count, shards) for count in (1, 64, 128, 512, shards)}):
         bank = Bank(root)
         before = peak_memory()
-        opened = (
-            seconds(
-                partial(read_all, bank, [number * LARGE for number in range(count)])
-            )
-            / count
-        )
+        firsts = range(0, count * LARGE, LARGE)
+        opened = seconds(partial(read_all, bank, firsts)) / count
         order = np.random.default_rng(0).integers(0, count * LARGE, reads).tolist()
         later = seconds(partial(read_all, bank, order)) / reads
         base = base or later
@@ -291,7 +291,7 @@ def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
         print(f"| {count:,} | {count * LARGE:,} | {values} |", flush=True)
 
 
-def read_all(bank: Bank, order: list[int]) -> None:
+def read_all(bank: Bank, order: Sequence[int]) -> None:
     """Reads scans in this order, as images."""
     for number in order:
         bank.image(number)
@@ -302,52 +302,38 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-def main() -> None:
+def print_generated(root: Path, model: str, count: int) -> None:
+    """Prints the sizes of scans of a model."""
+    generator = load_generator(model)
+    title = f"Size of {count} scans of {generator.name}"
+    print(f"\n### {title}\n\n| what | |\n|---|---:|")
+    numbers = tqdm(range(count), "generated", leave=False)
+    sizes(root, [generator.range_images(0, [i])[0] for i in numbers])
+
+
+def main(
+    scan: Annotated[Path | None, Argument()] = None,
+    scans: int = 192,
+    model: str = "town",
+    generated: int = 40,
+    tree: int = 1000,
+) -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
-    parser.add_argument("--scans", type=int, default=192, help="scans of the town")
-    parser.add_argument(
-        "--model", default="town", help="a shipped model or a checkpoint"
-    )
-    parser.add_argument(
-        "--generated",
-        type=int,
-        default=40,
-        help="scans of the model; 0 omits that table",
-    )
-    parser.add_argument(
-        "--tree",
-        type=int,
-        default=1000,
-        help="shards of the tree of files; 0 omits that table",
-    )
-    options = parser.parse_args()
     torch.set_num_threads(1)
-    images = town_images(options.scans)
+    images = town_images(scans)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         plain = size_and_rate(root, images)
-        path = options.scan or root / "random.bin"
-        if options.scan is None:
+        path = scan or root / "random.bin"
+        if scan is None:
             random_points(plain.sensor).tofile(path)
         reading(path, plain)
         stages(images[0])
-        if options.tree:
-            random_reads(root / "tree", options.tree)
-        if options.generated:
-            generator = load_generator(options.model)
-            print(
-                f"\n### Size of {options.generated} scans of {generator.name}\n\n| what | "
-                "|\n|---|---:|"
-            )
-            rounds = tqdm(range(options.generated), "generated", leave=False)
-            sizes(
-                root / "generated", [generator.range_images(0, [i])[0] for i in rounds]
-            )
+        if tree:
+            random_reads(root / "tree", tree)
+        if generated:
+            print_generated(root / "generated", model, generated)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

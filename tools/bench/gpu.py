@@ -1,6 +1,6 @@
 """Scans per second of shipped models, and of a network of R2Flow's size, on a GPU.
 
-    python tools/bench/gpu.py [MODEL ...] [--batch 1 16 64] [--dtype bfloat16] [--rounds N] [--device cuda]
+    python tools/bench/gpu.py [MODEL ...] [--batch 1 --batch 16] [--dtype bfloat16] [--rounds N] [--device cuda]
 
 From noise to the tensors of labelled scans: the flow's steps and the decoder, eager and compiled,
 in turns. The network of R2Flow's size is this package's HDiT with random weights in 4 steps, as
@@ -9,16 +9,17 @@ is left out for models whose operations are not counted. ``--device cpu`` tries 
 GPU, and leaves that network out.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from statistics import median
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from networks import EVALUATION, GRID, full_network
 from timing import machine
 from tqdm import tqdm
+from typer import Argument, run
 
 from lidar_synth.generate.devices import check_device
 from lidar_synth.generate.flow.solvers import solve
@@ -44,34 +45,41 @@ class Row(NamedTuple):
     work: float = 0.0
 
 
+def of_model(
+    model: str, batch: int, device: torch.device, dtype: torch.dtype
+) -> Iterator[Row]:
+    """The rows of a shipped model or a checkpoint."""
+    load = partial(load_generator, model, device=device, dtype=dtype, batch=batch)
+    both = [load(compile=False), load(compile=True)]
+    for steps in (4, 2, 1):
+        pair = (
+            lambda g=g, s=steps: list(g.samples(0, range(batch), steps=s)) for g in both
+        )
+        yield Row(f"{model}, {steps} steps", batch, *pair)
+
+
+def of_full_size(
+    batches: list[int], device: torch.device, dtype: torch.dtype
+) -> Iterator[Row]:
+    """The rows of a network of R2Flow's size."""
+    net = full_network(None).to(device, dtype)
+    both = (net, torch.compile(net))
+    for batch in batches:
+        noise = torch.randn(batch, 2, 64, 1024, device=device)
+        pair = (partial(solve, velocity, noise, GRID) for velocity in both)
+        work = 4 * EVALUATION * batch
+        yield Row("R2Flow's size, pixels, 4 steps", batch, *pair, work)
+
+
 def table(
     models: list[str], batches: list[int], device: torch.device, dtype: torch.dtype
 ) -> Iterator[Row]:
     """The rows of the table."""
     for model in models:
         for batch in batches:
-            both = [
-                load_generator(
-                    model, device=device, dtype=dtype, batch=batch, compile=c
-                )
-                for c in (False, True)
-            ]
-            for steps in (4, 2, 1):
-                pair = (
-                    lambda g=g, n=batch, s=steps: list(g.samples(0, range(n), steps=s))
-                    for g in both
-                )
-                yield Row(f"{model}, {steps} steps", batch, *pair)
-    if device.type == "cpu":
-        return
-    net = full_network(None).to(device, dtype)
-    compiled = torch.compile(net)
-    for batch in batches:
-        noise = torch.randn(batch, 2, 64, 1024, device=device)
-        pair = (lambda v=v, y=noise: solve(v, y, GRID) for v in (net, compiled))
-        yield Row(
-            "R2Flow's size, pixels, 4 steps", batch, *pair, 4 * EVALUATION * batch
-        )
+            yield from of_model(model, batch, device, dtype)
+    if device.type != "cpu":
+        yield from of_full_size(batches, device, dtype)
 
 
 def seconds(call: Call, device: torch.device, rounds: int) -> float:
@@ -86,45 +94,44 @@ def seconds(call: Call, device: torch.device, rounds: int) -> float:
     return median(found)
 
 
-def main() -> None:
+def print_row(row: Row, rate: float, measure: Callable[[Call], float]) -> None:
+    """Measure a row and print it; ``rate`` is that of the product."""
+    times = [measure(row.eager), measure(row.compiled)]
+    share = f"{row.work / min(times) / rate:.0%}" if row.work else ""
+    speed = " | ".join(f"{row.batch / t:.1f}" for t in times)
+    tqdm.write(
+        f"| {row.name} | {row.batch} | {speed} | {1e3 * min(times):.1f} | {share} |"
+    )
+
+
+def main(
+    model: Annotated[list[str] | None, Argument()] = None,
+    batch: list[int] | None = None,
+    dtype: str = "bfloat16",
+    rounds: int = 7,
+    device: str = "cuda",
+) -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("model", nargs="*", default=["town"])
-    parser.add_argument("--batch", type=int, nargs="+", default=[1, 16, 64])
-    parser.add_argument(
-        "--dtype", choices=("bfloat16", "float16", "float32"), default="bfloat16"
-    )
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--device", default="cuda")
-    given = parser.parse_args()
     torch.set_grad_enabled(False)
-    device = check_device(given.device)
-    dtype = getattr(torch, given.dtype)
-    size = 8192 if device.type == "cuda" else 2048
-    a = torch.randn(size, size, device=device, dtype=dtype)
-    rate = 2 * size**3 / seconds(lambda: a @ a, device, given.rounds)
-    card = torch.cuda.get_device_name(device) if device.type == "cuda" else machine()
+    place = check_device(device)
+    kind = getattr(torch, dtype)
+    measure = partial(seconds, device=place, rounds=rounds)
+    size = 8192 if place.type == "cuda" else 2048
+    a = torch.randn(size, size, device=place, dtype=kind)
+    rate = 2 * size**3 / measure(lambda: a @ a)
+    card = torch.cuda.get_device_name(place) if place.type == "cuda" else machine()
     print(
-        f"\n### {card}, {given.dtype}, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n"
+        f"\n### {card}, {dtype}, torch {torch.__version__}, {time.strftime('%Y-%m-%d')}\n"
     )
     print(f"product of {size} x {size}: {rate / 1e12:.2f} TFLOP/s\n")
     print(
         "| model | batch | eager, scans/s | compiled, scans/s | latency, ms | share of the "
-        "product's rate |"
+        "product's rate |\n|---|---:|---:|---:|---:|---:|"
     )
-    print("|---|---:|---:|---:|---:|---:|")
-    for row in tqdm(list(table(given.model, given.batch, device, dtype)), leave=False):
-        times = [
-            seconds(call, device, given.rounds) for call in (row.eager, row.compiled)
-        ]
-        share = f"{row.work / min(times) / rate:.0%}" if row.work else ""
-        speed = " | ".join(f"{row.batch / t:.1f}" for t in times)
-        tqdm.write(
-            f"| {row.name} | {row.batch} | {speed} | {1e3 * min(times):.1f} | {share} |"
-        )
+    rows = table(model or ["town"], batch or [1, 16, 64], place, kind)
+    for row in tqdm(list(rows), leave=False):
+        print_row(row, rate, measure)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -15,12 +15,14 @@ of KITTI-360 have about 10 million points, those of the town 300,000; so a windo
 ``--points`` by copies of its points, moved by a few centimetres, and its scans are labelled again.
 """
 
-import argparse
 import os
 import resource
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
+
+from typer import run
 
 # Set before numpy is imported: one process per core does the work, and numpy's threads would
 # compete for the cores.
@@ -76,22 +78,20 @@ def print_right(report: LabelReport) -> None:
 def print_confidence(town: Path, out: Path) -> None:
     """Print how many labels are right by their confidence."""
     edges = np.array([0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.01])
-    counts = np.zeros((2, len(edges) - 1))
+    labelled = np.zeros(len(edges) - 1)
+    right = np.zeros(len(edges) - 1)
     for known, scan in zip(KITTI360(town), KITTI360(town, labels=out), strict=True):
-        assert (
-            known.label is not None
-            and scan.label is not None
-            and scan.confidence is not None
-        )
+        assert known.label is not None
+        assert scan.label is not None and scan.confidence is not None
         both = (known.label != IGNORE) & (scan.label != IGNORE)
-        for row, mask in zip(
-            counts, (both, both & (known.label == scan.label)), strict=True
-        ):
-            row += np.histogram(scan.confidence[mask], edges)[0]
+        equal = both & (known.label == scan.label)
+        labelled += np.histogram(scan.confidence[both], edges)[0]
+        right += np.histogram(scan.confidence[equal], edges)[0]
+    shares = 100 * labelled / labelled.sum()
+    good = 100 * right / np.maximum(labelled, 1)
     print("\n| confidence | share of the labels | right |\n|---|---:|---:|")
-    for low, high, number, right in zip(edges, edges[1:], *counts, strict=False):
-        shares = f"{100 * number / counts[0].sum():.1f} % | {100 * right / max(number, 1):.1f} %"
-        print(f"| {low:.1f} to {min(high, 1):.1f} | {shares} |")
+    for i, (low, high) in enumerate(pairwise(np.minimum(edges, 1))):
+        print(f"| {low:.1f} to {high:.1f} | {shares[i]:.1f} % | {good[i]:.1f} % |")
 
 
 def fill(root: Path, points: int) -> int:
@@ -116,56 +116,51 @@ def fill(root: Path, points: int) -> int:
     return points
 
 
-def main() -> None:
+def label(town: Path, out: Path) -> tuple[LabelReport, float]:
+    """Recover the labels of a town; seconds of processor time."""
+    start = time.process_time()
+    report = label_scans(town, out, against=town)
+    return report, time.process_time() - start
+
+
+def print_filled(town: Path, out: Path, points: int) -> None:
+    """Print time and memory of a window with so many points, and the shares of right labels."""
+    points = fill(town, points)
+    report, used = label(town, out)
+    scans = sum(report.labelled.values())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(
+        f"\nA window of {points:,} points: {used:.1f} s of processor time for {scans} scans, "
+        f"with reading\nat most {peak:.1f} GiB of memory\n"
+    )
+    print_right(report)
+
+
+def main(
+    scans: int = 200,
+    seed: int = 3,
+    interval: float = 0.4,
+    points: int = 10_000_000,
+) -> None:
     """Prints the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scans", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument(
-        "--interval", type=float, default=0.4, help="seconds between scans"
-    )
-    parser.add_argument(
-        "--points", type=int, default=10_000_000, help="points of the filled window"
-    )
-    arguments = parser.parse_args()
     print(f"{machine()}, load {os.getloadavg()[0]:.1f}\n")
     with tempfile.TemporaryDirectory() as folder:
-        town, out, again = (Path(folder) / name for name in ("town", "labels", "again"))
-        source = Town(
-            arguments.seed, "hdl64e_kitti360", arguments.scans, arguments.interval
-        )
+        root = Path(folder)
+        town = root / "town"
+        source = Town(seed, "hdl64e_kitti360", scans, interval)
         export_town(source, town, "kitti360", camera=False, accumulate=True)
-        used = time.process_time()
         clock = time.perf_counter()
-        report = label_scans(town, out, against=town)
-        used = time.process_time() - used
+        report, used = label(town, root / "labels")
         clock = time.perf_counter() - clock
         print_right(report)
-        print_confidence(town, out)
-        each = used / arguments.scans
+        print_confidence(town, root / "labels")
         print(
-            f"\n{report.counts.points / arguments.scans:,.0f} points and {1e3 * each:.0f} ms of "
-            "processor time per scan"
+            f"\n{report.counts.points / scans:,.0f} points and {1e3 * used / scans:.0f} ms "
+            f"of processor time per scan\n{2 * scans / used:.1f} scans/s on 2 dedicated "
+            f"cores; {scans / clock:.1f} scans/s by one process here"
         )
-        print(
-            f"{2 / each:.1f} scans/s on 2 dedicated cores; {arguments.scans / clock:.1f} scans/s "
-            "by one process here"
-        )
-        points = fill(town, arguments.points)
-        used = time.process_time()
-        report = label_scans(town, again, against=town)
-        used = time.process_time() - used
-        scans = sum(report.labelled.values())
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(
-            f"\nA window of {points:,} points: {used:.1f} s of processor time for {scans} scans, "
-            "with reading"
-        )
-        print(f"at most {peak:.1f} GiB of memory\n")
-        print_right(report)
+        print_filled(town, root / "again", points)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

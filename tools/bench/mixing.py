@@ -9,21 +9,19 @@ bank holds scans of the town. One process, so that workers hide nothing; process
 other programs do not count. The caches of the file system are warm.
 """
 
-import argparse
 import tempfile
 import time
 import tracemalloc
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from bank import write
 from timing import machine, time_in_turns
+from typer import run
 
-from lidar_synth.bake.folder import write_bank_files
-from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.files.disk import sha256
+from lidar_synth.bank import Bank
 from lidar_synth.formats import WRITERS, SemanticKITTI
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan, Source
@@ -47,40 +45,12 @@ class Trainer:
         return dict(to_item(self.scans[index], keyed_rng(0, index)))
 
 
-def write_dataset(root: Path, scans: Sequence[Scan]) -> SemanticKITTI:
-    """The scans as a SemanticKITTI root."""
+def write_dataset(root: Path, scans: Sequence[Scan]) -> None:
+    """Write the scans as a SemanticKITTI root."""
     writer = WRITERS["semantic_kitti"](root)
     for index, scan in enumerate(scans):
         writer.write(scan, index)
     writer.finish()
-    return SemanticKITTI(root)
-
-
-def write_bank(root: Path, scans: Sequence[Scan]) -> Bank:
-    """The scans as a bank of one shard."""
-    facts = Facts(
-        scans[0].sensor,
-        ("reflectance", "label"),
-        "town",
-        "",
-        {"seed": 0},
-        "generated",
-        "MIT",
-        "none",
-    )
-    entry = Entry("shard-00000.h5", 0, 0, len(scans))
-    root.mkdir()
-    with ShardWriter(root / entry.file, facts, entry) as writer:
-        for scan in scans:
-            writer.append(project(scan))
-    path = root / entry.file
-    write_bank_files(
-        root,
-        Index(
-            (facts,), (replace(entry, bytes=path.stat().st_size, sha256=sha256(path)),)
-        ),
-    )
-    return Bank(root)
 
 
 def epoch(
@@ -125,67 +95,60 @@ def print_long_plan(bank: Bank, samples: int = 10**8) -> None:
     )
 
 
-def main() -> None:
+def print_overhead(real: SemanticKITTI, rounds: int) -> None:
+    """Print the cost of a mixture without synthetic scans."""
+    scans = MixedScans(real, None, 0)
+    wrapped = MixedScans.wrap(Trainer(real), None, 0, to_sample=to_item)
+    alone = "a trainer's dataset alone"
+    order = range(len(real))
+    calls = {
+        alone: epoch(Trainer(real), scans.plan().index.tolist()),
+        "wrapped, ratio 0": epoch(wrapped, order),
+        "MixedScans of the scans, ratio 0": epoch(scans, order),
+    }
+    seconds = time_in_turns(calls, rounds, time.process_time)
+    print_rates("Overhead at ratio 0", len(real), seconds, alone)
+    numbers = MixedScans.wrap(range(1000), None, 0, to_sample=to_item)
+    through = {"": lambda: [numbers[i] for i in range(1000)]}
+    bare = time_in_turns(through, rounds, time.process_time)[""]
+    print(
+        f"\nWrapping alone, around a dataset of numbers: {1e3 * bare:.1f} µs a sample"
+    )
+
+
+def print_bank(real: SemanticKITTI, bank: Bank, form: Any, rounds: int) -> None:
+    """Print the cost of batches of a form of which half are from a bank."""
+    only = MixedScans(real, None, 0, collate=form)
+    half = MixedScans(
+        real, bank, 0.5, epoch_size="replace", balanced=True, collate=form
+    )
+    calls = {
+        "real scans only": epoch(only, range(len(only)), only.collate),
+        "half from a bank": epoch(half, range(len(half)), half.collate),
+    }
+    seconds = time_in_turns(calls, rounds, time.process_time)
+    title = f"A bank at ratio 0.5, batches of {BATCH}, collate={form!r}"
+    print_rates(title, len(real), seconds, "real scans only")
+
+
+def main(real: Path | None = None, scans: int = 32, rounds: int = 100) -> None:
     """Times everything in turns and prints the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--real", type=Path, help="root of SemanticKITTI")
-    parser.add_argument(
-        "--scans", type=int, default=32, help="scans, real and synthetic each"
-    )
-    parser.add_argument("--rounds", type=int, default=100)
-    arguments = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        town = Town(0, scans=2 * arguments.scans)
-        made = [town[i] for i in range(len(town))]
-        if arguments.real:
-            real: SemanticKITTI = SemanticKITTI(arguments.real)
-        else:
-            real = write_dataset(Path(folder) / "real", made[: arguments.scans])
-        bank = write_bank(Path(folder) / "bank", made[arguments.scans :])
+        town = list(Town(0, scans=2 * scans))
+        root = real or Path(folder) / "real"
+        if real is None:
+            write_dataset(root, town[:scans])
+        own = SemanticKITTI(root)
+        images = [project(scan) for scan in town[scans:]]
+        bank = write(Path(folder) / "bank", images, ("reflectance", "label"))
         print_long_plan(bank)
-        points = sum(len(scan) for scan in real) / len(real)
-        print(f"{len(real)} real scans of {points:,.0f} points each")
-
-        scans = MixedScans(real, None, 0)
-        wrapped = MixedScans.wrap(Trainer(real), None, 0, to_sample=to_item)
-        calls = {
-            "a trainer's dataset alone": epoch(
-                Trainer(real), scans.plan().index.tolist()
-            ),
-            "wrapped, ratio 0": epoch(wrapped, range(len(real))),
-            "MixedScans of the scans, ratio 0": epoch(scans, range(len(real))),
-        }
-        seconds = time_in_turns(calls, arguments.rounds, time.process_time)
-        print_rates("Overhead at ratio 0", len(real), seconds, next(iter(calls)))
-        numbers = MixedScans.wrap(range(1000), None, 0, to_sample=to_item)
-        bare = time_in_turns(
-            {"": lambda: [numbers[i] for i in range(1000)]},
-            arguments.rounds,
-            time.process_time,
-        )
-        print(
-            f"\nWrapping alone, around a dataset of numbers: {1e3 * bare['']:.1f} µs a sample"
-        )
-        for form, title in (("offsets", "points"), ("range", "range images")):
-            only = MixedScans(real, None, 0, collate=form)  # type: ignore[arg-type]
-            half = MixedScans(
-                real, bank, 0.5, epoch_size="replace", balanced=True, collate=form
-            )  # type: ignore[arg-type]
-            calls = {
-                "real scans only": epoch(only, range(len(only)), only.collate),
-                "half from a bank": epoch(half, range(len(half)), half.collate),
-            }
-            seconds = time_in_turns(calls, arguments.rounds, time.process_time)
-            print_rates(
-                f"A bank at ratio 0.5, batches of {BATCH} as {title}",
-                len(real),
-                seconds,
-                next(iter(calls)),
-            )
+        points = sum(len(scan) for scan in own) / len(own)
+        print(f"{len(own)} real scans of {points:,.0f} points each")
+        print_overhead(own, rounds)
+        print_bank(own, bank, "offsets", rounds)
+        print_bank(own, bank, "range", rounds)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -5,14 +5,15 @@
 SCAN.bin is any KITTI or KITTI-360 scan; the default is a random scan of 120,000 points.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from timing import print_table, time_in_turns
+from typer import Argument, run
 
 from lidar_synth.formats.points import read_points
 from lidar_synth.geometry.projection import (
@@ -47,87 +48,76 @@ def sort_and_scatter(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The plain numpy formula: every angle by numpy, all points sorted by range, far ones
     overwritten."""
-    (height, width), up, down = (
-        sensor.shape,
-        np.radians(np.float32(sensor.up)),
-        np.radians(np.float32(sensor.down)),
-    )
+    height, width = sensor.shape
+    down = np.radians(np.float32(sensor.down))
+    field = np.radians(np.float32(sensor.up)) - down
     distance = np.linalg.norm(points[:, :3], axis=1)
     kept = (distance >= sensor.range_min) & (distance <= sensor.range_max)
     points = points[kept]
     distance = distance[kept]
-    row = (1 - (np.arcsin(points[:, 2] / distance) - down) / (up - down)) * height
+    row = (1 - (np.arcsin(points[:, 2] / distance) - down) / field) * height
     column = (-np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) / 2 % 1 * width
     row = np.clip(row, 0, height - 1).astype(np.int32)
     column = np.clip(column, 0, width - 1).astype(np.int32)
     order = np.argsort(-distance)
     image = np.zeros((2, height, width), np.float32)
-    image[0, row[order], column[order]] = distance[order]
-    image[1, row[order], column[order]] = points[order, 3]
+    image[:, row[order], column[order]] = distance[order], points[order, 3]
     return image[0], image[1]
 
 
-def main() -> None:
+def print_projection(scan: Scan, points: np.ndarray, rounds: int) -> None:
+    """Print the first table."""
+    sensor = scan.sensor
+    image = project(scan)
+    assert np.array_equal(sort_and_scatter(points, sensor)[0] > 0, image.mask)
+    tensor = torch.from_numpy(points)
+    offsets = torch.tensor([0, len(points)])
+    ours = "points -> range image with reflectance"
+    calls = {
+        ours: lambda: project(scan),
+        "the same, numpy sort-and-scatter": lambda: sort_and_scatter(points, sensor),
+        "the same, torch on the CPU": lambda: project_batch(tensor, offsets, sensor),
+        "index map of points and cells": lambda: locate(scan.points, sensor),
+        "scan unfolding": lambda: unfold(scan),
+        "range image -> points with reflectance": lambda: unproject(image),
+    }
+    seconds = time_in_turns(calls, rounds, time.process_time)
+    print_table(f"{len(points):,} points, 64 x 1024, one core", seconds, ours)
+
+
+def print_reading(path: Path, sensor: Sensor, rounds: int) -> None:
+    """Print the second table."""
+    scan = read(path, sensor)
+    plain = "bare read (numpy.fromfile)"
+    both = "read, check, project"
+    calls = {
+        plain: lambda: np.fromfile(path, np.float32),
+        "project": lambda: project(scan),
+        both: lambda: project(read(path, sensor)),
+    }
+    seconds = time_in_turns(calls, rounds, time.process_time)
+    print_table("From the file to the range image", seconds, both)
+    ratio = seconds[both] / (seconds[plain] + seconds["project"])
+    print(f"\nread, check, project = {ratio:.2f} x (read + project)")
+
+
+def read(path: Path, sensor: Sensor) -> Scan:
+    """The scan of a file."""
+    points = read_points(path)
+    return Scan(points[:, :3], points[:, 3], sensor)
+
+
+def main(scan: Annotated[Path | None, Argument()] = None, rounds: int = 60) -> None:
     """Times everything in turns and prints two tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scan", nargs="?", type=Path, help="a .bin file")
-    parser.add_argument("--rounds", type=int, default=60)
-    given = parser.parse_args()
-    path: Path | None = given.scan
     torch.set_num_threads(1)
     sensor = load_sensor("hdl64e_kitti360")
     with tempfile.TemporaryDirectory() as folder:
-        if path is None:
-            path = Path(folder) / "random.bin"
+        path = scan or Path(folder) / "random.bin"
+        if scan is None:
             random_points(sensor).tofile(path)
-        points = read_points(path)
-        scan = Scan(points[:, :3], points[:, 3], sensor)
-        image = project(scan)
-        assert np.array_equal(sort_and_scatter(points, sensor)[0] > 0, image.mask)
-        tensor = torch.from_numpy(points)
-        offsets = torch.tensor([0, len(points)])
-        ours = "points -> range image with reflectance"
-        calls = {
-            ours: lambda: project(scan),
-            "the same, numpy sort-and-scatter": lambda: sort_and_scatter(
-                points, sensor
-            ),
-            "the same, torch on the CPU": lambda: project_batch(
-                tensor, offsets, sensor
-            ),
-            "index map of points and cells": lambda: locate(scan.points, sensor),
-            "scan unfolding": lambda: unfold(scan),
-            "range image -> points with reflectance": lambda: unproject(image),
-        }
-        print_table(
-            f"{len(points):,} points, 64 x 1024, one core",
-            time_in_turns(calls, given.rounds, time.process_time),
-            ours,
-        )
-
-        def read() -> Scan:
-            values = read_points(path)
-            return Scan(values[:, :3], values[:, 3], sensor)
-
-        plain = "bare read (numpy.fromfile)"
-        both = "read, check, project"
-        seconds = time_in_turns(
-            {
-                plain: lambda: np.fromfile(path, np.float32),
-                "project": lambda: project(scan),
-                both: lambda: project(read()),
-            },
-            given.rounds,
-            time.process_time,
-        )
-        print_table("From the file to the range image", seconds, both)
-        print(
-            "\nread, check, project = "
-            f"{seconds[both] / (seconds[plain] + seconds['project']):.2f} x (read + project)"
-        )
+        print_projection(read(path, sensor), read_points(path), rounds)
+        print_reading(path, sensor, rounds)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

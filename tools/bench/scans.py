@@ -1,6 +1,6 @@
 """Time and memory of a labelled scan by model, steps and columns, against a large matrix product.
 
-    python tools/bench/scans.py [MODEL ...] [--steps 4 2 1] [--rounds N] [--threads N] [--busy]
+    python tools/bench/scans.py [MODEL ...] [--steps 4 --steps 2] [--rounds N] [--threads N] [--busy]
 
 MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise
 to points with labels. All measurements of the first table take turns. With --busy, processor time
@@ -9,20 +9,22 @@ of a process that generates scans one by one, and how many scans one process of 
 core generate together, as those of ``bake --engine processes`` do.
 """
 
-import argparse
 import os
 import time
+from collections.abc import Callable
 from itertools import count
 from multiprocessing import get_context
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
-from timing import print_table, time_in_turns
+from timing import CLOCKS, print_table, time_in_turns
+from typer import Argument, run
 
 from lidar_synth import Generator, Scan, Town, load_generator
 
+PRODUCT = "product of 4096 x 4096 (137 GFLOP)"
 TOGETHER = 6
 """Scans of each process in the second table."""
 
@@ -94,50 +96,52 @@ def together(kind: Kind) -> tuple[float, float]:
     return sum(rate for rate, _ in found), max(memory for _, memory in found)
 
 
-def main() -> None:
-    """Prints the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("model", nargs="*", default=["town"])
-    parser.add_argument("--steps", type=int, nargs="+", default=[4, 2, 1])
-    parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--busy", action="store_true", help="measure processor time")
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
+def calls_of(every: list[Kind]) -> dict[str, Callable[[], object]]:
+    """What the first table measures, the product first."""
     a = torch.randn(4096, 4096)
     index = count()
-    calls = {"product of 4096 x 4096 (137 GFLOP)": lambda: a @ a}
-    for kind in kinds(given.model, given.steps):
+    calls: dict[str, Callable[[], object]] = {PRODUCT: lambda: a @ a}
+    for kind in every:
         generator = kind.generator()
         streets = conditions(generator)
         calls[str(kind)] = lambda g=generator, k=kind, c=streets: g.scans(
             0, [next(index)], c, steps=k.steps
         )
-    seconds = time_in_turns(
-        calls, given.rounds, time.process_time if given.busy else time.perf_counter
-    )
-    what = "processor time" if given.busy else "wall time"
-    title = (
-        f"A labelled scan on the CPU, {given.threads} threads, float32, {what}; torch "
-        f"{torch.__version__}"
-    )
-    base = next(iter(calls))
-    print_table(title, seconds, base)
-    cores = os.cpu_count()
+    return calls
+
+
+def print_together(every: list[Kind], product: float) -> None:
+    """Print the second table; ``product`` is the time of a product in seconds."""
     print(
-        f"\n| {cores} processes of one thread | scans/s | scans in the time of a product | MB of "
-        "each |"
+        f"\n| {os.cpu_count()} processes of one thread | scans/s | scans in the time of a "
+        "product | MB of each |\n|---|---:|---:|---:|"
     )
-    print("|---|---:|---:|---:|")
-    for kind in kinds(given.model, given.steps):
+    for kind in every:
         rate, memory = together(kind)
         print(
-            f"| {kind} | {rate:.2f} | {rate * seconds[base]:.1f} | {memory:.0f} |",
-            flush=True,
+            f"| {kind} | {rate:.2f} | {rate * product:.1f} | {memory:.0f} |", flush=True
         )
 
 
+def main(
+    model: Annotated[list[str] | None, Argument()] = None,
+    steps: list[int] | None = None,
+    rounds: int = 10,
+    threads: int = torch.get_num_threads(),
+    busy: bool = False,
+) -> None:
+    """Prints the tables."""
+    torch.set_num_threads(threads)
+    every = kinds(model or ["town"], steps or [4, 2, 1])
+    what, clock = CLOCKS[busy]
+    seconds = time_in_turns(calls_of(every), rounds, clock)
+    title = (
+        f"A labelled scan on the CPU, {threads} threads, float32, {what}; torch "
+        f"{torch.__version__}"
+    )
+    print_table(title, seconds, PRODUCT)
+    print_together(every, seconds[PRODUCT])
+
+
 if __name__ == "__main__":
-    main()
+    run(main)

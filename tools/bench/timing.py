@@ -9,6 +9,12 @@ from statistics import median
 import numpy as np
 from tqdm import tqdm
 
+CLOCKS = {
+    False: ("wall time", time.perf_counter),
+    True: ("processor time", time.process_time),
+}
+"""What is measured, and its clock, by whether the machine does other work."""
+
 
 def time_in_turns(
     calls: Mapping[str, Callable[[], object]],

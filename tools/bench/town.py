@@ -6,9 +6,10 @@ The town's target is 25 scans per second on 2 cores with 2,175 firings, with lab
 without images.
 """
 
-import argparse
 import os
 import time
+
+from typer import run
 
 # Set before numpy is imported: one process per core does the work, and numpy's threads would
 # compete for the cores.
@@ -42,8 +43,9 @@ PARTS = (
     "sample and build the stretch",
     "its Embree BVH",
     "ray casting, returns, boxes",
-    "image",
 )
+"""The parts of a scan without image."""
+IMAGE = "image"
 SKIN = "a skin on its returns, if there is one"
 
 
@@ -51,28 +53,11 @@ def parts(stretches: int) -> dict[str, float]:
     """Seconds of processor time of each part, per scan."""
     town = Town(0, scans=10**6)
     town[10**6 - 1]
-    used = dict.fromkeys(PARTS, 0.0)
-    for k in range(stretches):
-        start = time.process_time()
-        world = build_world(0, k, town.interval)
-        built = time.process_time()
-        Solid(world.triangles).first(world.triangles[:1, 0], world.triangles[:1, 1])
-        ready = time.process_time()
-        town[STRETCH_FRAMES * k]
-        begin = time.process_time()
-        for i in range(1, 6):
-            town[STRETCH_FRAMES * k + i]
-        cast = time.process_time()
-        spent = (
-            (built - start) / STRETCH_FRAMES,
-            (ready - built) / STRETCH_FRAMES,
-            (cast - begin) / 5,
-        )
-        for part, seconds in zip(PARTS, spent, strict=False):
-            used[part] += seconds / stretches
+    spent = np.mean([stretch_parts(town, k) for k in range(stretches)], axis=0)
+    used = dict(zip(PARTS, spent.tolist(), strict=True))
     start = time.process_time()
     town.image(0)
-    used["image"] = time.process_time() - start
+    used[IMAGE] = time.process_time() - start
     used[SKIN] = skin()
     return used
 
@@ -93,45 +78,48 @@ def skin() -> float:
     return (time.process_time() - start) / 10
 
 
-def main() -> None:
+def stretch_parts(town: Town, number: int) -> tuple[float, float, float]:
+    """Seconds of processor time of ``PARTS``, per scan of a stretch."""
+    start = time.process_time()
+    world = build_world(0, number, town.interval)
+    built = time.process_time()
+    Solid(world.triangles).first(world.triangles[:1, 0], world.triangles[:1, 1])
+    ready = time.process_time()
+    first = STRETCH_FRAMES * number
+    town[first]
+    begin = time.process_time()
+    for i in range(1, 6):
+        town[first + i]
+    cast = time.process_time() - begin
+    return (built - start) / STRETCH_FRAMES, (ready - built) / STRETCH_FRAMES, cast / 5
+
+
+def print_together(stretches: int, jobs: int) -> None:
+    """Print the rate of complete scans by several processes."""
+    shares = [list(range(j, stretches, jobs)) for j in range(jobs)]
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        results = pool.map(make, shares, chunksize=1)
+    count = STRETCH_FRAMES * stretches
+    used, clocks = zip(*results, strict=True)
+    each = sum(used) / count
+    print(
+        f"\n{count} scans by {jobs} processes: {1e3 * each:.1f} ms of processor time "
+        f"each\n{jobs / each:.1f} scans/s on {jobs} dedicated cores; "
+        f"{count / max(clocks):.1f} scans/s of wall-clock time here"
+    )
+
+
+def main(stretches: int = 10, jobs: int = 2) -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--stretches",
-        type=int,
-        default=10,
-        help=f"stretches of {STRETCH_FRAMES} scans each",
-    )
-    parser.add_argument("--jobs", type=int, default=2)
-    arguments = parser.parse_args()
     print(f"64 x 1024, {machine()}, load {os.getloadavg()[0]:.1f}\n")
     print("| part | ms of processor time per scan |\n| --- | ---: |")
-    used = parts(arguments.stretches)
+    used = parts(stretches)
     for name, seconds in used.items():
         print(f"| {name} | {1e3 * seconds:.1f} |")
-    whole = sum(used.values()) - used["image"] - used[SKIN]
+    whole = sum(used[name] for name in PARTS)
     print(f"| **a scan without image** | **{1e3 * whole:.1f}** |")
-    shares = [
-        list(range(j, arguments.stretches, arguments.jobs))
-        for j in range(arguments.jobs)
-    ]
-    with multiprocessing.get_context("spawn").Pool(arguments.jobs) as pool:
-        results = pool.map(make, shares, chunksize=1)
-    count = STRETCH_FRAMES * arguments.stretches
-    seconds = sum(r[0] for r in results)
-    rate = arguments.jobs * count / seconds
-    clock = count / max(r[1] for r in results)
-    print(
-        f"\n{count} scans by {arguments.jobs} processes: {1e3 * seconds / count:.1f} ms of "
-        "processor time each"
-    )
-    print(
-        f"{rate:.1f} scans/s on {arguments.jobs} dedicated cores; {clock:.1f} scans/s of "
-        "wall-clock time here"
-    )
+    print_together(stretches, jobs)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -10,13 +10,11 @@ and decoded to the mode of the predicted distributions. A flow on these latents 
 accurate than this.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 import torch
-from model_card import open_codec, town
+from model_card import Asked, head, open_codec, row, town
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.files.markdown import escape_markdown
@@ -29,17 +27,17 @@ SEED = 7
 CLASSES = ("road", "building", "fence", "vegetation", "car", "pole")
 
 
-def there_and_back(model: str, images: list[RangeImage]) -> list[RangeImage]:
+def there_and_back(asked: Asked, images: list[RangeImage]) -> list[RangeImage]:
     """Range images, encoded and decoded by the autoencoder of a checkpoint."""
-    codec = open_codec(model)
+    codec = open_codec(asked.model)
     made = []
-    for image in tqdm(images, desc=Path(model).stem, unit="scan"):
+    for image in tqdm(images, desc=asked.name, unit="scan"):
         made += reconstruct(codec, codec.tensors.from_images([image]), image.sensor)
     return made
 
 
-def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
-    """A line of the table, in per cent."""
+def figures(real: list[RangeImage], made: list[RangeImage]) -> list[float]:
+    """The figures of a line, in [0, 1]."""
     a, b = (np.stack([image.range for image in images]) for images in (real, made))
     labels, decoded = (
         np.stack([image.channels["label"] for image in images])
@@ -52,34 +50,25 @@ def row(name: str, real: list[RangeImage], made: list[RangeImage]) -> str:
         (labels == decoded)[both & (labels != IGNORE)].mean(),
     ]
     medians = [np.median(off[both & (labels == TRAIN_ID[one])]) for one in CLASSES]
-    return f"| {escape_markdown(name)} | {' | '.join(f'{100 * v:.1f}' for v in (*right, *medians))} |"
+    return [*right, *medians]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("models", nargs="+", metavar="NAME=MODEL")
-    parser.add_argument("--count", type=int, default=24, help="scans")
-    given = parser.parse_args()
-
-    images = [
-        project(scan, channels=["reflectance", "label"])
-        for scan in town(SEED, given.count)
-    ]
-    lines = []
-    for text in given.models:
-        name, model = text.split("=", 1)
+def main(models: list[str], count: int = 24) -> None:
+    """Prints the table."""
+    channels = ["reflectance", "label"]
+    images = [project(scan, channels=channels) for scan in town(SEED, count)]
+    lines = head("autoencoder", ("returns right", "labels right", *CLASSES))
+    for asked in map(Asked.parse, models):
         with torch.inference_mode():
-            lines.append(row(name, images, there_and_back(model, images)))
+            found = figures(images, there_and_back(asked, images))
+        shares = [f"{100 * share:.1f}" for share in found]
+        lines.append(row(escape_markdown(asked.name), shares))
     print(
-        f"{given.count} scans of town {SEED}; per cent: cells, labels; medians of |range / true "
+        f"{count} scans of town {SEED}; per cent: cells, labels; medians of |range / true "
         "range - 1|\n"
     )
-    columns = ("returns right", "labels right", *CLASSES)
-    print(f"| autoencoder | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
     print("\n".join(lines))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -17,21 +17,21 @@ set away:
                up to 40 m away; a cell is occupied if it has a return above the ground
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import gallery
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from gallery import save
 from model_card import (
     REFERENCE,
     SEED,
+    Asked,
     Comparison,
     Measured,
+    apart,
     needs_images,
-    shrink,
     table,
     town,
     with_images,
@@ -39,6 +39,7 @@ from model_card import (
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth import Scan, Town, load_generator, open_scans
 from lidar_synth.files.markdown import escape_markdown
@@ -63,16 +64,14 @@ def verdict(
     return f"| {escape_markdown(name)} | {measure} | {' | '.join(values)} |"
 
 
-def generate(
-    model: str, steps: int | None, real: Sequence[Scan]
-) -> tuple[str, list[Scan]]:
+def generate(asked: Asked, real: Sequence[Scan]) -> tuple[str, list[Scan]]:
     """The kind of condition, and one generated scan for the condition of each real scan."""
-    generator = load_generator(model)
+    generator = load_generator(asked.model)
     if generator.condition is None:
-        raise SystemExit(f"{model} is unconditional: see tools/research/model_card.py")
+        raise SystemExit(f"{asked.model} is unconditional: see model_card.py")
     made = (
-        generator.scans(SEED, [i], condition=scan, steps=steps)[0]
-        for i, scan in enumerate(tqdm(real, desc=Path(model).stem, unit="scan"))
+        generator.scans(SEED, [i], condition=scan, steps=asked.steps)[0]
+        for i, scan in enumerate(tqdm(real, desc=asked.name, unit="scan"))
     )
     return generator.condition, list(made)
 
@@ -88,98 +87,61 @@ def seen(kind: str, scan: Scan, sensor: Sensor) -> NDArray[np.uint8]:
 
 def draw(path: Path, kind: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
     """Write conditions, generated scans and the scans of the conditions side by side."""
-    figure = Figure(
-        figsize=(15, 3.05 * len(made)), facecolor="#1e1014", layout="constrained"
-    )
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(made), 3, squeeze=False, width_ratios=[1.25, 1, 1])
-    for axes, a, b in zip(grid, made, real, strict=True):
+    rows = []
+    for a, b in zip(apart(made, SHOWN), apart(real, SHOWN), strict=True):
         assert a.sensor is not None
-        images = (
-            seen(kind, b, a.sensor),
-            render(a, "label", size=(900, 540)),
-            render(b, "label", size=(900, 540)),
+        rows.append(
+            [
+                ("condition", seen(kind, b, a.sensor)),
+                ("generated", render(a, "label", size=(900, 540))),
+                ("scan of the condition", render(b, "label", size=(900, 540))),
+            ]
         )
-        for axis, image, title in zip(
-            axes,
-            images,
-            ("condition", "generated", "scan of the condition"),
-            strict=True,
-        ):
-            axis.imshow(
-                image,
-                aspect="equal" if kind == "camera" or title != "condition" else "auto",
-            )
-            axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
-            axis.set_axis_off()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    shrink(path)
+    save(path, gallery.draw(rows), 1500, 256)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
-    parser.add_argument(
-        "--root", help="a dataset with labels or images [default: a town]"
-    )
-    parser.add_argument("--split", help="split of ROOT")
-    parser.add_argument("--count", type=int, default=64, help="scans in each row")
-    parser.add_argument(
-        "--intervals",
-        type=int,
-        default=200,
-        help="resamples for 95 %% intervals; 0 = none",
-    )
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        help="PNG of the first model's scans; do not publish it for real data",
-    )
-    given = parser.parse_args()
-    with TemporaryDirectory() as folder:
-        report(given, Path(folder))
+def conditions(
+    root: str | None, split: str | None, count: int, images: Path | None
+) -> list[Scan]:
+    """The scans of which the conditions are taken; images of the town go to a folder."""
+    if root:
+        return apart(open_scans(root, split=split), count)
+    real = town(REFERENCE, count)
+    source = Town(REFERENCE, scans=count * STRETCH_FRAMES, interval=1.0)
+    return real if images is None else with_images(real, source, images)
 
 
-def report(given: argparse.Namespace, folder: Path) -> None:
-    """Print the tables; images of the town go to a folder."""
+def main(
+    models: list[str],
+    root: str | None = None,
+    split: str | None = None,
+    count: int = 64,
+    intervals: int = 200,
+    picture: Path | None = None,
+) -> None:
+    """Prints the tables; writes the picture, which is not to be published for real data."""
     judge = load_judge()
-    if given.root:
-        source = open_scans(given.root, split=given.split)
-        chosen = np.unique(np.linspace(0, len(source) - 1, given.count).astype(int))
-        real = [source[int(i)] for i in tqdm(chosen, desc=given.root, unit="scan")]
-    else:
-        real = town(REFERENCE, given.count)
-        if needs_images(given.models):
-            real = with_images(
-                real,
-                Town(REFERENCE, scans=given.count * STRETCH_FRAMES, interval=1.0),
-                folder,
-            )
-    comparison = Comparison(real, judge, given.intervals)
-    sets: list[Measured] = []
-    verdicts = []
-    for i, text in enumerate(given.models):
-        name, model = text.split("=", 1)
-        model, _, steps = model.partition(":")
-        kind, scans = generate(model, int(steps) if steps else None, real)
-        sets.append(comparison.measure(name, scans))
-        if i == 0:
-            verdicts.append(verdict("the real scans", kind, real, real, judge))
-        verdicts.append(verdict(name, kind, scans, real, judge))
-        if i == 0 and given.picture:
-            apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
-            draw(
-                given.picture, kind, [scans[k] for k in apart], [real[k] for k in apart]
-            )
+    every = [Asked.parse(text) for text in models]
+    with TemporaryDirectory() as folder:
+        images = Path(folder) if needs_images(every) else None
+        real = conditions(root, split, count, images)
+        comparison = Comparison(real, judge, intervals)
+        sets: list[Measured] = []
+        verdicts = []
+        for asked in every:
+            kind, scans = generate(asked, real)
+            sets.append(comparison.measure(asked.name, scans))
+            if len(sets) == 1:
+                verdicts.append(verdict("the real scans", kind, real, real, judge))
+            verdicts.append(verdict(asked.name, kind, scans, real, judge))
+            if picture and len(sets) == 1:
+                draw(picture, kind, scans, real)
     print(f"{len(real)} scans in each set\n\n{table(sets)}")
     print(
-        "\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|\n"
-        + "\n".join(verdicts)
+        "\n| scans | % | with its own condition | with another's |\n|---|---|---:|---:|"
     )
+    print("\n".join(verdicts))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

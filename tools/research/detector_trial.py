@@ -10,7 +10,6 @@ has its own 30 scans of the town, the same in every arm. Scans and finished trai
 WORK: the same command resumes. docs/research/detectors.md has the protocol.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import typer
 from detector import pools
 from detector.bev import view
 from detector.classes import CLASSES
@@ -53,6 +53,9 @@ PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects that GT sampling pastes into a scan."""
 BASE = "gt_sampling"
 """The arm with which the others are compared."""
+
+
+Test = Callable[[Detector], list[float]]
 
 
 @dataclass(frozen=True)
@@ -200,17 +203,11 @@ def mixture(
     """The training set of an arm, of ``count`` samples, as a user of the package makes it."""
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
-    options: dict[str, Any] = {
-        "bank": objects,
-        "count": there,
-        "turn": 180.0,
-        "clear": False,
-    }
+    options = {"bank": objects, "count": there, "turn": 180.0, "clear": False}
     steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
     if arm.pasted:
-        steps.insert(
-            0, make_policy("paste", fields=frozenset({"label", "boxes"}), **options)
-        )
+        fields = frozenset({"label", "boxes"})
+        steps.insert(0, make_policy("paste", fields=fields, **options))
     share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
         labelled,
@@ -229,9 +226,7 @@ def mixture(
     )
 
 
-def run(
-    work: Work, name: str, seed: int, test: Callable[[Detector], list[float]]
-) -> dict[str, Any]:
+def run(work: Work, name: str, seed: int, test: Test) -> dict[str, Any]:
     """Train and test one detector."""
     arm = ARMS[name]
     labelled = work.labelled(seed)
@@ -240,22 +235,17 @@ def run(
     torch.manual_seed(seed)
     network = Detector()
     mixed = mixture(arm, labelled, pool, seed, work.iterations * BATCH)
-    losses = train(
-        network, endless_batches(mixed, BATCH), work.iterations, RATE, f"{name} {seed}"
-    )
+    batches = endless_batches(mixed, BATCH)
+    losses = train(network, batches, work.iterations, RATE, f"{name} {seed}")
     seconds = time.process_time() - start
     base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
     found = test(settled(network, _one_epoch(base)))
-    parts = [
-        round(float(np.mean(part)), 3)
-        for part in np.array_split(losses, 10)
-        if len(part)
-    ]
+    tenths = [part for part in np.array_split(losses, 10) if len(part)]
     return {
         "arm": name,
         "seed": seed,
         "ap": found,
-        "losses": parts,
+        "losses": [round(float(part.mean()), 3) for part in tenths],
         "seconds": round(seconds, 1),
     }
 
@@ -265,7 +255,7 @@ def _one_epoch(mixed: MixedScans) -> Iterator[Sample]:
     return (next(batches) for _ in range(SETTLING))
 
 
-def make_test(work: Work) -> Callable[[Detector], list[float]]:
+def make_test(work: Work) -> Test:
     """The test of a network: average precision of every class on all tested scans."""
     scans = [source[i] for source in work.tested() for i in range(len(source))]
     truths = [Truth.of(scan) for scan in tqdm(scans, "tested boxes", unit="scan")]
@@ -296,26 +286,23 @@ def report(results: Mapping[str, Mapping[int, list[float]]]) -> str:
     names = [*CLASSES, "mean"]
     lines = [
         f"| half of each batch, besides the 30 scans | {' | '.join(names)} | mean - GT sampling | "
-        "seeds |"
+        "seeds |",
+        "|---|" + "---:|" * (len(names) + 2),
     ]
-    lines.append("|---|" + "---:|" * (len(names) + 2))
-    base = {seed: np.mean(ap) for seed, ap in results.get(BASE, {}).items()}
+    base = results.get(BASE, {})
     for name, found in results.items():
         table = 100 * np.array([[*ap, np.mean(ap)] for ap in found.values()])
-        paired = [
-            100 * (np.mean(ap) - base[seed])
-            for seed, ap in found.items()
-            if seed in base
-        ]
         cells = [_spread(column) for column in table.T]
-        difference = _spread(paired, "+") if name != BASE and paired else "-"
-        lines.append(
-            f"| {ARMS[name].title} | {' | '.join(cells)} | {difference} | {len(found)} |"
-        )
+        paired = [
+            100 * (np.mean(ap) - np.mean(base[seed]))
+            for seed, ap in found.items()
+            if seed in base and name != BASE
+        ]
+        cells += [_spread(paired, "+") if paired else "-", str(len(found))]
+        lines.append(f"| {ARMS[name].title} | {' | '.join(cells)} |")
     lines += ["", "| | labels used besides those of the 30 scans |", "|---|---|"]
-    return "\n".join(
-        [*lines, *(f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results)]
-    )
+    lines += [f"| {ARMS[name].title} | {ARMS[name].budget} |" for name in results]
+    return "\n".join(lines)
 
 
 def _spread(values: Any, sign: str = "") -> str:
@@ -324,73 +311,57 @@ def _spread(values: Any, sign: str = "") -> str:
     return f"{np.mean(values):{sign}.1f}{spread}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("work", type=Path, help="folder for scans and results")
-    parser.add_argument(
-        "--arm",
-        action="append",
-        choices=ARMS,
-        help="by default all; layout arms only with a model",
-    )
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=1600)
-    parser.add_argument(
-        "--pool", type=int, default=200, help="synthetic scans of each kind"
-    )
-    parser.add_argument("--layout-model", metavar="CHECKPOINT")
-    parser.add_argument(
-        "--minutes",
-        type=float,
-        default=float("inf"),
-        help="no training begins after these",
-    )
-    parser.add_argument("--out", type=Path, help="file for the table")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    start = time.monotonic()
-    work = Work(given.work, given.iterations, given.pool, given.layout_model)
-    arms = [
-        n
-        for n in ARMS
-        if (
-            n in given.arm
-            if given.arm
-            else given.layout_model or ARMS[n].pool != "layout"
-        )
-    ]
-    test: Callable[[Detector], list[float]] | None = None
-    for seed, name in ((seed, name) for seed in range(given.seeds) for name in arms):
-        if (
-            path := work.result(name, seed)
-        ).exists() or time.monotonic() - start > 60 * given.minutes:
-            continue
-        test = test or make_test(work)
-        found = run(work, name, seed, test)
-        write_file(path, json.dumps(found).encode())
-        print(
-            f"{name}, seed {seed}: AP {np.round(100 * np.array(found['ap']), 1)}",
-            flush=True,
-        )
-    results = {}
+def finished(work: Work, arms: list[str], seeds: int) -> dict[str, dict[int, Any]]:
+    """{arm: {seed: AP of every class}} of the trainings that have ended."""
+    results: dict[str, dict[int, Any]] = {}
     for name in arms:
-        paths = {seed: work.result(name, seed) for seed in range(given.seeds)}
-        kept = {
-            seed: json.loads(path.read_text())["ap"]
-            for seed, path in paths.items()
-            if path.exists()
-        }
-        results |= {name: kept} if kept else {}
+        for seed in range(seeds):
+            path = work.result(name, seed)
+            if path.exists():
+                found = json.loads(path.read_text())["ap"]
+                results.setdefault(name, {})[seed] = found
+    return results
+
+
+def train_arms(work: Work, arms: list[str], seeds: int, minutes: float) -> None:
+    """Run the trainings that have not ended; none begins after so many minutes."""
+    start = time.monotonic()
+    test = cache(partial(make_test, work))
+    for seed in range(seeds):
+        for name in arms:
+            path = work.result(name, seed)
+            if path.exists() or time.monotonic() - start > 60 * minutes:
+                continue
+            found = run(work, name, seed, test())
+            write_file(path, json.dumps(found).encode())
+            shares = np.round(100 * np.array(found["ap"]), 1)
+            print(f"{name}, seed {seed}: AP {shares}", flush=True)
+
+
+def main(
+    work: Path,
+    arm: list[str] | None = None,
+    seeds: int = 3,
+    iterations: int = 1600,
+    pool: int = 200,
+    layout_model: str | None = None,
+    minutes: float = float("inf"),
+    out: Path | None = None,
+) -> None:
+    """Trains the arms, by default all; those with layout scans need a model."""
+    torch.set_num_threads(1)
+    folder = Work(work, iterations, pool, layout_model)
+    possible = [n for n in ARMS if layout_model or ARMS[n].pool != "layout"]
+    arms = arm or possible
+    train_arms(folder, arms, seeds, minutes)
     text = (
-        f"{report(results)}\n\n{given.iterations} iterations of {BATCH}; {machine()}; "
-        f"{time.strftime('%Y-%m-%d')}"
+        f"{report(finished(folder, arms, seeds))}\n\n{iterations} iterations of {BATCH}; "
+        f"{machine()}; {time.strftime('%Y-%m-%d')}"
     )
     print(text)
-    if given.out:
-        given.out.write_text(text + "\n", encoding="utf-8")
+    if out:
+        out.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

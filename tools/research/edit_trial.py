@@ -7,12 +7,12 @@ those of other sensors.
     python tools/research/edit_trial.py --inserts 500 --scans 8
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from typer import run
 
 from lidar_synth import Boxes, Scan, Source, Town, load_sensor, open_scans
 from lidar_synth.datasets.classes import TRAIN_ID
@@ -108,31 +108,20 @@ def tried(
     return all_of, done, why
 
 
-def main() -> None:
+def main(
+    inserts: int = 500,
+    scans: int = 8,
+    folder: list[str] | None = None,
+) -> None:
     """Print the figures of each sensor."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--inserts", type=int, default=500, help="inserts of all sensors together"
-    )
-    parser.add_argument("--scans", type=int, default=8, help="scans of each sensor")
-    parser.add_argument(
-        "--folder",
-        nargs="*",
-        default=[],
-        help="folders of scans with boxes, in place of the town",
-    )
-    arguments = parser.parse_args()
-    sources: dict[str, Source] = {root: open_scans(root) for root in arguments.folder}
+    sources: dict[str, Source] = {root: open_scans(root) for root in folder}
     if not sources:
         sources = {
-            n: Town(seed=40, scans=arguments.scans, sensor=load_sensor(n))
-            for n in SENSORS
+            n: Town(seed=40, scans=scans, sensor=load_sensor(n)) for n in SENSORS
         }
     for name, source in sources.items():
-        scans = [source[i] for i in range(min(len(source), arguments.scans))]
-        growth = grown_by(scans, -(-arguments.inserts // len(sources)))
+        scans = [source[i] for i in range(min(len(source), scans))]
+        growth = grown_by(scans, -(-inserts // len(sources)))
         worst = np.abs(growth).max(1, initial=0)
         shares = [(worst > limit).mean() for limit in (0.2, 0.5, 2.0)]
         print(
@@ -154,4 +143,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -14,16 +14,17 @@ All scans are the first ones of their seed: none is selected. Each picture takes
 on one core.
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
+from typer import Argument, BadParameter, run
 
 from lidar_synth import Scan, load_generator, project
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
@@ -194,24 +195,16 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
 def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Rows of images with their titles, all rows of the same width."""
     title = 0.36  # inches
-    heights = [
-        12 / sum(image.shape[1] / image.shape[0] for _, image in row) + title
-        for row in rows
-    ]
+    heights = [12 / sum(map(shape, row)) + title for row in rows]
     figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
     FigureCanvasAgg(figure)
     parts = np.atleast_1d(figure.subfigures(len(rows), 1, height_ratios=heights))
     for part, row, height in zip(parts, rows, heights, strict=True):
         part.set_facecolor("#101218")
-        grid = part.subplots(
-            1,
-            len(row),
-            squeeze=False,
-            width_ratios=[i.shape[1] / i.shape[0] for _, i in row],
-        )
-        part.subplots_adjust(
-            left=0.003, right=0.997, bottom=0, top=1 - title / height, wspace=0.01
-        )
+        widths = [shape(one) for one in row]
+        grid = part.subplots(1, len(row), squeeze=False, width_ratios=widths)
+        top = 1 - title / height
+        part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=top, wspace=0.01)
         for axes, (name, image) in zip(grid[0], row, strict=True):
             axes.imshow(image, interpolation="lanczos")
             axes.set_title(name, color="#9aa0ad", fontsize=14, loc="left", pad=4)
@@ -238,51 +231,51 @@ def weather() -> list[list[tuple[str, Picture]]]:
 
 
 def channels() -> Picture:
-    """The sheet that ``lidar-synth view`` writes of a generated scan."""
+    """The sheet of a generated scan."""
+    return sheet(load_generator("town").scans(0, [0]))
+
+
+def shape(one: tuple[str, Picture]) -> float:
+    """Width over height of a titled image."""
+    height, width, _ = one[1].shape
+    return width / height
+
+
+def sheet(scans: Sequence[Scan], title: str = "") -> Picture:
+    """What ``lidar-synth view`` shows of scans."""
     with TemporaryDirectory() as folder:
-        sheet = Path(folder) / "scan.png"
-        write_view(sheet, load_generator("town").scans(0, [0]))
-        return np.asarray(Image.open(sheet).convert("RGB"))
+        path = Path(folder) / "scans.png"
+        write_view(path, list(scans), title=title)
+        return np.asarray(Image.open(path).convert("RGB"))
 
 
-def save(path: Path, pixels: Picture) -> None:
+def save(path: Path, pixels: Picture, width: int = WIDTH, colours: int = 96) -> None:
     """Write a PNG with few colours, small enough for a repository."""
     image = Image.fromarray(pixels)
-    image = image.resize(
-        (WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS
-    )
-    # Few pixels are cars or poles: a palette by number of pixels would lose their colours.
+    size = (width, round(image.height * width / image.width))
+    image = image.resize(size, Image.Resampling.LANCZOS)
+    # Few pixels are cars or poles: a palette by number of pixels would lose their colours, one by
+    # coverage alone those of the background.
     image = image.quantize(
-        96, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
+        colours, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     image.save(path, optimize=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    names = ["channels", *PICTURES]
-    parser.add_argument(
-        "names",
-        nargs="*",
-        metavar="NAME",
-        help=f"pictures to make: {', '.join(names)} [all]",
-    )
-    parser.add_argument("--out", type=Path, default=Path("docs/gallery"))
-    given = parser.parse_args()
-    if unknown := set(given.names) - set(names):
-        parser.error(
-            f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(names)}"
-        )
-    for name in given.names or names:
-        save(
-            given.out / f"{name}.png",
-            channels() if name == "channels" else draw(PICTURES[name]()),
-        )
-        print(given.out / f"{name}.png")
+def main(
+    names: Annotated[list[str] | None, Argument()] = None,
+    out: Path = Path("docs/gallery"),
+) -> None:
+    """Draws the pictures with these names, by default all."""
+    known = ["channels", *PICTURES]
+    if unknown := set(names or ()) - set(known):
+        raise BadParameter(f"{', '.join(unknown)}; expected: {', '.join(known)}")
+    for name in names or known:
+        pixels = channels() if name == "channels" else draw(PICTURES[name]())
+        save(out / f"{name}.png", pixels)
+        print(out / f"{name}.png")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,12 +6,12 @@ docs/research/measures.md.
 Each trial draws two sets whose true distance is known, or is measured once on large sets.
 """
 
-import argparse
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from typer import Argument, run
 
 from lidar_synth.lab.evaluate.distances import (
     frechet_of_moments,
@@ -123,19 +123,16 @@ def coverage(
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("names", nargs="*", help="simulations [default: all]")
-    parser.add_argument("--trials", type=int, default=400)
-    parser.add_argument("--replicates", type=int, default=200)
-    given = parser.parse_args()
+def main(
+    names: Annotated[list[str] | None, Argument()] = None,
+    trials: int = 400,
+    replicates: int = 200,
+) -> None:
     print("| simulation | covered, % | mean width |\n|---|---:|---:|")
-    for name in given.names or SIMULATIONS:
-        share, width = coverage(SIMULATIONS[name], given.trials, given.replicates)
+    for name in names or SIMULATIONS:
+        share, width = coverage(SIMULATIONS[name], trials, replicates)
         print(f"| {name} | {100 * share:.1f} | {width:.4g} |", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,9 +6,8 @@ Differences of places are normal with one standard deviation, those of seeds wit
 another. The table is that of docs/research/proof.md.
 """
 
-import argparse
-
 import numpy as np
+from typer import run
 
 from lidar_synth.lab.proof.scores import interval
 
@@ -28,13 +27,10 @@ def coverage(
     return held / trials
 
 
-def main() -> None:
+def main(
+    trials: int = 600,
+) -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--trials", type=int, default=600)
-    trials = parser.parse_args().trials
     spreads = {
         "places and seeds alike": (1, 1),
         "mostly places": (1, 0.2),
@@ -53,4 +49,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

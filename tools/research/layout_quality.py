@@ -10,25 +10,25 @@ rays return from behind. Other models are compared by the distances alone, with 
 of the same scans as conditions.
 """
 
-import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+import gallery
+from gallery import save
 from model_card import (
     SEED,
+    Asked,
     Comparison,
     Measured,
+    apart,
     needs_images,
-    shrink,
     table,
     with_images,
 )
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth import Scan, Town, layout_of, load_generator
 from lidar_synth.files.markdown import escape_markdown
@@ -38,20 +38,22 @@ from lidar_synth.lab.evaluate.segmentation import load_judge
 from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.viz import render
 
+SIZE = (1100, 660)
+"""Width and height of one of them, in pixels."""
 SHOWN = 6
 """Examples in the picture."""
 
 
 def generate(
-    model: str, steps: int | None, guidance: float, real: list[Scan]
+    asked: Asked, guidance: float, real: list[Scan]
 ) -> tuple[str | None, list[Scan]]:
     """The model's condition, and one scan of it for each real scan."""
-    generator = load_generator(model)
+    generator = load_generator(asked.model)
+    strength = guidance if generator.condition == "layout" else 1.0
     made = []
-    for i, scan in enumerate(tqdm(real, desc=Path(model).stem, unit="scan")):
+    for i, scan in enumerate(tqdm(real, desc=asked.name, unit="scan")):
         given = scan if generator.condition else None
-        strength = guidance if generator.condition == "layout" else 1.0
-        made += generator.scans(SEED, [i], given, steps=steps, guidance=strength)
+        made += generator.scans(SEED, [i], given, steps=asked.steps, guidance=strength)
     return generator.condition, made
 
 
@@ -68,109 +70,78 @@ def line(name: str, found: LayoutAgreement | None) -> str:
 
 def draw(path: Path, made: list[Scan], real: list[Scan], layouts: list[Layout]) -> None:
     """Write generated scans with the boxes of their layouts beside the scans of the layouts."""
-    figure = Figure(
-        figsize=(15, 4.6 * len(made)), facecolor="#1e1014", layout="constrained"
-    )
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(made), 2, squeeze=False)
-    for axes, scan, own, layout in zip(grid, made, real, layouts, strict=True):
-        scan.boxes = own.boxes = layout.boxes
-        for axis, one, title in zip(
-            axes, (scan, own), ("generated", "scan of the layout"), strict=True
-        ):
-            axis.imshow(render(one, "label", size=(1100, 660)))
-            axis.set_title(title, color="#9aa0ad", fontsize=9, loc="left")
-            axis.set_axis_off()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    shrink(path)
+    rows = []
+    for scan, own, layout in zip(
+        *(apart(some, SHOWN) for some in (made, real, layouts)), strict=True
+    ):
+        titled = {"generated": scan, "scan of the layout": own}
+        rows.append(
+            [
+                (title, render(replace(one, boxes=layout.boxes), "label", size=SIZE))
+                for title, one in titled.items()
+            ]
+        )
+    save(path, gallery.draw(rows), 1500, 256)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def print_agreement(counts: dict[str, LayoutAgreement | None]) -> None:
+    """Print the second table."""
+    print(
+        "| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, % "
+        "| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |\n"
+        "|---|---:|---:|---:|---:|---:|---:|"
     )
-    parser.add_argument("models", nargs="+", metavar="NAME=MODEL[:STEPS]")
-    parser.add_argument("--count", type=int, default=64, help="number of layouts")
-    parser.add_argument("--seed", type=int, default=1, help="of the unseen town")
-    parser.add_argument("--guidance", type=float, default=1.0, help="of layout models")
-    parser.add_argument(
-        "--distances", action="store_true", help="compare the sets of scans, too (slow)"
-    )
-    parser.add_argument("--picture", type=Path, help="PNG of the first model's scans")
-    parser.add_argument(
-        "--intervals",
-        type=int,
-        default=200,
-        help="resamples for 95 %% intervals; 0 = none",
-    )
-    parser.add_argument("--dump", type=Path, help="JSON of the counts")
-    given = parser.parse_args()
-    with TemporaryDirectory() as folder:
-        report(given, Path(folder))
+    for name, found in counts.items():
+        print(line(name, found))
 
 
-def report(given: argparse.Namespace, folder: Path) -> None:
-    """Print the tables; images of the town go to a folder."""
-    town = Town(
-        given.seed,
-        "hdl64e_lasers",
-        given.count * STRETCH_FRAMES,
-        interval=2.0,
-        motion=False,
-    )
-    real = [
-        town[i * STRETCH_FRAMES]
-        for i in tqdm(range(given.count), desc="town", unit="scan")
-    ]
+def streets(seed: int, count: int) -> Town:
+    """A town without motion, of as many streets."""
+    scans = count * STRETCH_FRAMES
+    return Town(seed, "hdl64e_lasers", scans, interval=2.0, motion=False)
+
+
+def main(
+    models: list[str],
+    count: int = 64,
+    seed: int = 1,
+    guidance: float = 1.0,
+    distances: bool = False,
+    picture: Path | None = None,
+    intervals: int = 200,
+    dump: Path | None = None,
+) -> None:
+    """Prints the tables; writes the picture and the counts."""
+    town = streets(seed, count)
+    real = [town[i * STRETCH_FRAMES] for i in tqdm(range(count), desc="town")]
     layouts = [layout_of(scan) for scan in real]
-    real = with_images(real, town, folder) if needs_images(given.models) else real
-    comparison = (
-        Comparison(real, load_judge(), given.intervals) if given.distances else None
-    )
-    counts: dict[str, Any] = {
+    every = [Asked.parse(text) for text in models]
+    sets: list[Measured] = []
+    counts: dict[str, LayoutAgreement | None] = {
         "the town's own scans": layout_agreement(real, layouts, real)
     }
-    distances: list[Measured] = []
-    for i, text in enumerate(given.models):
-        name, model = text.split("=", 1)
-        model, _, steps = model.partition(":")
-        kind, scans = generate(
-            model, int(steps) if steps else None, given.guidance, real
-        )
-        counts[name] = (
-            layout_agreement(scans, layouts, real) if kind == "layout" else None
-        )
-        if comparison is not None:
-            distances.append(comparison.measure(name, scans))
-        if i == 0 and given.picture:
-            apart = np.unique(np.linspace(0, len(real) - 1, SHOWN).astype(int))
-            draw(
-                given.picture,
-                *([some[k] for k in apart] for some in (scans, real, layouts)),
+    with TemporaryDirectory() as folder:
+        if needs_images(every):
+            real = with_images(real, town, Path(folder))
+        if distances:
+            comparison = Comparison(real, load_judge(), intervals)
+        for asked in every:
+            kind, scans = generate(asked, guidance, real)
+            counts[asked.name] = (
+                layout_agreement(scans, layouts, real) if kind == "layout" else None
             )
-    print(f"{given.count} layouts of the town of seed {given.seed}\n")
-    print(
-        "| scans | points of boxed classes in a box, % | boxes that 20 rays meet with 10 points, %",
-        end=" ",
-    )
-    print(
-        "| boxes with 20 points in the town's scan with 10 points, % | points | boxes | boxes |"
-    )
-    print(
-        "|---|---:|---:|---:|---:|---:|---:|\n"
-        + "\n".join(line(name, found) for name, found in counts.items())
-    )
-    if comparison is not None:
-        print(f"\n{table(distances)}")
-    if given.dump:
-        given.dump.write_text(
-            json.dumps(
-                {name: found and found._asdict() for name, found in counts.items()},
-                indent=1,
-            )
-        )
+            if distances:
+                sets.append(comparison.measure(asked.name, scans))
+            if picture and asked is every[0]:
+                draw(picture, scans, real, layouts)
+    print(f"{count} layouts of the town of seed {seed}\n")
+    print_agreement(counts)
+    if distances:
+        print(f"\n{table(sets)}")
+    if dump:
+        values = {name: found and found._asdict() for name, found in counts.items()}
+        dump.write_text(json.dumps(values, indent=1))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

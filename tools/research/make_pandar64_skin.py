@@ -7,10 +7,10 @@ the sensor's frame. The skin is learnt from frames 00 to 30; ``--measure`` compa
 frames 60 and later instead of writing it.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
+from typer import run
 
 from lidar_synth.files.parsing import read_arrays
 from lidar_synth.geometry.scan import Scan
@@ -119,25 +119,20 @@ def measure(folder: Path, sensor: Sensor, streets: int, seed: int) -> None:
         print(f"| {name} | {a:.3f} | {b:.3f} | {c:.1f} | {points:,.0f} |")
 
 
-def main() -> None:
+def main(
+    frames: Path,
+    measure: bool = False,
+    streets: int = 12,
+) -> None:
     """Writes the skin, or prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("frames", type=Path)
-    parser.add_argument("--measure", action="store_true")
-    parser.add_argument(
-        "--streets", type=int, default=12, help="of the town that is measured"
-    )
-    given = parser.parse_args()
     sensor = load_sensor("pandar64")
-    if given.measure:
-        measure(given.frames, sensor, given.streets, seed=7)
+    if measure:
+        measure(frames, sensor, streets, seed=7)
         return
     fit_skin(
-        frames(given.frames, sensor, 0, LAST_LEARNT), licence=LICENCE, source=SOURCE
+        frames(frames, sensor, 0, LAST_LEARNT), licence=LICENCE, source=SOURCE
     ).save(OUT)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -21,19 +21,18 @@ Fréchet distance gets one from 256 scans on.
 tools/research/condition_card.py is for conditional models.
 """
 
-import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gallery import save, sheet
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
@@ -57,7 +56,6 @@ from lidar_synth.lab.evaluate.segmentation import (
 from lidar_synth.lab.evaluate.statistics import Counts, Statistic
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.noise import uniform
-from lidar_synth.viz import write_view
 
 REFERENCE = 1
 OTHER = 2
@@ -103,21 +101,43 @@ class Autoguided(nn.Module):
         return autoguide(self.network, self.weaker, *self.how)(y, t, cond)
 
 
-def generate(
-    model: str, steps: int | None, count: int, weaker: str = "", *how: str
-) -> list[Scan]:
+class Asked(NamedTuple):
+    """A model of the command line.
+
+    Args:
+        name: the head of its column.
+        model: a shipped model or a checkpoint.
+        steps: of the flow; None = the model's own.
+        guidance: WEAKER, SCALE, LOW and HIGH, if given.
+    """
+
+    name: str
+    model: str
+    steps: int | None
+    guidance: list[str]
+
+    @classmethod
+    def parse(cls, text: str) -> "Asked":
+        """NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]."""
+        name, _, rest = text.partition("=")
+        model, *more = rest.split(":")
+        steps = int(more[0]) if any(more[:1]) else None
+        return cls(name, model, steps, more[1:])
+
+
+def generate(asked: Asked, count: int) -> list[Scan]:
     """Scans of one model, measured on the town's grid; all models get the same noise."""
-    generator = load_generator(model)
-    if weaker:
+    generator = load_generator(asked.model)
+    if asked.guidance:
+        weaker, *how = asked.guidance
         guided = Autoguided(
             generator.network, load_generator(weaker).network, *map(float, how)
         )
         generator = replace(generator, network=guided)
-    indices = tqdm(range(count), desc=Path(model).stem, unit="scan")
-    return [
-        replace(generator.scans(SEED, [i], steps=steps)[0], sensor=load_sensor("town"))
-        for i in indices
-    ]
+    sensor = load_sensor("town")
+    indices = tqdm(range(count), desc=Path(asked.model).stem, unit="scan")
+    made = (generator.scans(SEED, [i], steps=asked.steps)[0] for i in indices)
+    return [replace(scan, sensor=sensor) for scan in made]
 
 
 def open_codec(model: str) -> Latent:
@@ -164,12 +184,9 @@ def town(seed: int, count: int) -> list[Scan]:
     ]
 
 
-def needs_images(models: Sequence[str]) -> bool:
-    """Whether one of the models NAME=MODEL[:STEPS] is conditioned on camera images."""
-    return any(
-        load_generator(text.split("=", 1)[1].partition(":")[0]).condition == "camera"
-        for text in models
-    )
+def needs_images(models: Sequence[Asked]) -> bool:
+    """Whether one of the models is conditioned on camera images."""
+    return any(load_generator(one.model).condition == "camera" for one in models)
 
 
 def with_images(scans: Sequence[Scan], source: Town, folder: Path) -> list[Scan]:
@@ -200,14 +217,16 @@ class Measured(NamedTuple):
     isolated: NDArray[np.float64]
 
 
+def apart(scans: Sequence[Any], count: int) -> list[Any]:
+    """At most ``count`` of the scans, spread evenly."""
+    indices = np.unique(np.linspace(0, len(scans) - 1, count).astype(int))
+    return [scans[int(i)] for i in tqdm(indices, unit="scan", leave=False)]
+
+
 def opened(root: Path, count: int) -> list[Scan]:
     """At most ``count`` scans of a folder, spread over it, on the town's grid."""
-    source = open_scans(root)
-    indices = np.unique(np.linspace(0, len(source) - 1, count).astype(int))
-    return [
-        replace(source[int(i)], sensor=load_sensor("town"))
-        for i in tqdm(indices, desc=root.name, unit="scan")
-    ]
+    sensor = load_sensor("town")
+    return [replace(scan, sensor=sensor) for scan in apart(open_scans(root), count)]
 
 
 class Comparison:
@@ -293,41 +312,19 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
 def table(sets: Sequence[Measured]) -> str:
     """Figures as rows, sets as columns; then IoU between the labels and the segmenter's prediction
     by class, and the bend of walls; then isolated returns by class."""
-    titles = list(
-        dict.fromkeys(f"{s.metric} ({s.protocol})" for one in sets for s in one.scores)
-    )
-    lines = [
-        f"| figure | {' | '.join(escape_markdown(one.name) for one in sets)} |",
-        f"|---|{'---:|' * len(sets)}",
-    ]
-    for title in titles:
-        found = [
-            next((s for s in one.scores if f"{s.metric} ({s.protocol})" == title), None)
-            for one in sets
-        ]
-        lines.append(
-            f"| {title} | {' | '.join(_shown(score) if score else '' for score in found)} |"
-        )
-    columns = (*CLASSES, BEND)
-    lines += [
-        "",
-        f"| IoU with the segmenter, % | {' | '.join(columns)} |",
-        f"|---|{'---:|' * len(columns)}",
-    ]
-    for one in sets:
-        values = [
-            f"{one.classes[c]:.1f}" if c == BEND else f"{one.classes[c]:.0f}"
-            for c in columns
-        ]
-        lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
-    lines += [
-        "",
-        f"| isolated returns, % | {' | '.join(CLASSES)} |",
-        f"|---|{'---:|' * len(CLASSES)}",
-    ]
-    for one in sets:
-        values = [f"{one.isolated[TRAIN_ID[c]]:.1f}" for c in CLASSES]
-        lines.append(f"| {escape_markdown(one.name)} | {' | '.join(values)} |")
+    names = [escape_markdown(one.name) for one in sets]
+    scores = [{f"{s.metric} ({s.protocol})": s for s in one.scores} for one in sets]
+    lines = head("figure", names)
+    for title in dict.fromkeys(title for own in scores for title in own):
+        lines.append(row(title, [_shown(own.get(title)) for own in scores]))
+    lines += ["", *head("IoU with the segmenter, %", (*CLASSES, BEND))]
+    for name, one in zip(names, sets, strict=True):
+        values = [f"{one.classes[kind]:.0f}" for kind in CLASSES]
+        lines.append(row(name, [*values, f"{one.classes[BEND]:.1f}"]))
+    lines += ["", *head("isolated returns, %", CLASSES)]
+    for name, one in zip(names, sets, strict=True):
+        shares = [f"{one.isolated[TRAIN_ID[kind]]:.1f}" for kind in CLASSES]
+        lines.append(row(name, shares))
     return "\n".join(lines)
 
 
@@ -340,112 +337,66 @@ def bend(scans: Sequence[Scan]) -> float:
         image = project(scan, scan.sensor, ["label"])
         wall = image.mask & (image.channels["label"] == TRAIN_ID["building"])
         near = np.divide(1, image.range, where=wall, out=np.zeros_like(image.range))
-        inside = np.logical_and.reduce(
-            [np.roll(wall, k, 1) for k in range(-SPAN, SPAN + 1)]
-        )
+        shifted = [np.roll(wall, k, 1) for k in range(-SPAN, SPAN + 1)]
+        inside = np.logical_and.reduce(shifted)
         second = np.roll(near, SPAN, 1) - 2 * near + np.roll(near, -SPAN, 1)
         found.append(np.abs(second[inside]) / near[inside])
     return float(np.median(np.concatenate(found)))
 
 
-def _shown(score: Score) -> str:
+def head(name: str, columns: Sequence[str]) -> list[str]:
+    """The first two lines of a table in Markdown."""
+    return [row(name, columns), f"|---|{'---:|' * len(columns)}"]
+
+
+def row(name: str, cells: Sequence[str]) -> str:
+    """A row of a table in Markdown."""
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def _shown(score: Score | None) -> str:
     """The value with its interval, where it has one."""
-    return f"{score.value:.4g}" + (
-        "" if score.low is None else f" [{score.low:.4g}, {score.high:.4g}]"
-    )
+    if score is None:
+        return ""
+    if score.low is None:
+        return f"{score.value:.4g}"
+    return f"{score.value:.4g} [{score.low:.4g}, {score.high:.4g}]"
 
 
-def picture(path: Path, scans: Sequence[Scan], title: str) -> None:
-    """Write a sheet of scans as a PNG with few colours, small enough for a repository."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_view(path, list(scans), title=title)
-    shrink(path)
+def draw(folder: Path, name: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:
+    """Write sheets of generated scans and of the town."""
+    sheets = {
+        "generated": sheet(made[:TILES], f"{name}: {TILES} scans, not selected"),
+        "town": sheet(apart(real, TILES), f"{TILES} scans of the town"),
+    }
+    for stem, pixels in sheets.items():
+        save(folder / f"{stem}.png", pixels, 1500, 256)
 
 
-def shrink(path: Path) -> None:
-    """Reduce the pixels and colours of a PNG."""
-    image = Image.open(path).convert("RGB")
-    width = 1500
-    image = image.resize(
-        (width, round(image.height * width / image.width)), Image.Resampling.LANCZOS
-    )
-    # Few cells are cars or poles: a palette by number of pixels would lose their colours, a palette
-    # by coverage alone those of the background.
-    image.quantize(
-        256, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
-    ).save(path, optimize=True)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "models", nargs="+", metavar="NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]]"
-    )
-    parser.add_argument("--count", type=int, default=512, help="scans in each row")
-    parser.add_argument(
-        "--real",
-        type=Path,
-        nargs=2,
-        metavar=("A", "B"),
-        help="folders of scans instead of two towns",
-    )
-    parser.add_argument(
-        "--intervals",
-        type=int,
-        default=200,
-        help="resamples for 95 %% intervals; 0 = none",
-    )
-    parser.add_argument(
-        "--pictures",
-        type=Path,
-        help="folder for sheets of the first model and of the town",
-    )
-    given = parser.parse_args()
-
-    @cache
-    def real(which: int) -> list[Scan]:
-        if given.real:
-            return opened(given.real[which], given.count)
-        return town((REFERENCE, OTHER)[which], given.count)
-
-    def add(name: str, scans: Sequence[Scan]) -> None:
-        sets.append(comparison.measure(name, scans))
-        print(
-            "\n".join([name, *map(str, sets[-1].scores)]), file=sys.stderr, flush=True
-        )
-
-    comparison = Comparison(real(0), load_judge(), given.intervals)
+def main(
+    models: list[str],
+    count: int = 512,
+    real: tuple[Path, Path] | None = None,
+    intervals: int = 200,
+    pictures: Path | None = None,
+) -> None:
+    """Prints the tables; writes the pictures."""
+    if real:
+        reference, other = (opened(root, count) for root in real)
+    else:
+        reference, other = (town(seed, count) for seed in (REFERENCE, OTHER))
+    comparison = Comparison(reference, load_judge(), intervals)
     sets: list[Measured] = []
-    for i, text in enumerate(given.models):
-        name, spec = text.split("=", 1)
-        model, steps, *guidance = spec.split(":") if ":" in spec else (spec, "")
-        if steps == "0":
-            scans = resampled(model, real(1))
-        else:
-            scans = generate(
-                model, int(steps) if steps else None, given.count, *guidance
-            )
-        add(name, scans)
-        if i == 0 and given.pictures:
-            apart = np.linspace(0, len(real(0)) - 1, TILES).astype(int)
-            picture(
-                given.pictures / "generated.png",
-                scans[:TILES],
-                f"{name}: {TILES} scans, not selected",
-            )
-            picture(
-                given.pictures / "town.png",
-                [real(0)[k] for k in apart],
-                f"{TILES} scans of the town",
-            )
-    add("real against real (lower bound)", real(1))
-    print(
-        f"{given.count} scans in each set, {len(real(0))} of the "
-        f"reference\n\n{table([sets[-1], *sets[:-1]])}"
-    )
+    for asked in map(Asked.parse, models):
+        encoded = asked.steps == 0
+        scans = resampled(asked.model, other) if encoded else generate(asked, count)
+        if pictures and not sets:
+            draw(pictures, asked.name, scans, reference)
+        sets.append(comparison.measure(asked.name, scans))
+    bound = comparison.measure("real against real (lower bound)", other)
+    print(f"{count} scans in each set, {len(reference)} of the reference\n")
+    print(table([bound, *sets]))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -12,13 +12,13 @@ generator must not know more labels than the trainer: use the town, or a model t
 the same labelled scans.
 """
 
-import argparse
 import json
 from pathlib import Path
 
 from lidar_synth.integrations.mmdet3d_infos import write_infos
-from lidar_synth.integrations.mmdet3d_lists import ORDERS, semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.errors import ConfigError
 
@@ -50,47 +50,30 @@ def write(
     return [real, mixed]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("root", type=Path)
-    parser.add_argument("bank")
-    parser.add_argument("out", type=Path)
-    parser.add_argument(
-        "--share",
-        type=float,
-        nargs="+",
-        default=[1, 10, 20],
-        help="per cent of the scans",
-    )
-    parser.add_argument("--order", nargs="+", choices=ORDERS, default=list(ORDERS))
-    parser.add_argument(
-        "--ratio",
-        type=float,
-        default=0.5,
-        help="share of synthetic scans: 1/2, 2/3 or 3/4",
-    )
-    given = parser.parse_args()
+def main(
+    root: Path,
+    bank: str,
+    out: Path,
+    share: list[float] | None = None,
+    order: list[str] | None = None,
+    ratio: float = 0.5,
+) -> None:
 
-    if (
-        not 0 < given.ratio < 1
-        or abs(1 / (1 - given.ratio) - round(1 / (1 - given.ratio))) > 0.03
-    ):
+    if not 0 < ratio < 1 or abs(1 / (1 - ratio) - round(1 / (1 - ratio))) > 0.03:
         raise ConfigError(
-            f"ratio {given.ratio}",
+            f"ratio {ratio}",
             "0.5, 0.667 or 0.75, with which real scans occur a whole number of times",
         )
-    tasks = [(share, order) for order in given.order for share in given.share]
+    tasks = [(share, order) for order in order for share in share]
     lines = []
     for share, order in tqdm(tasks, desc="lists"):
         for path in write(
-            given.root,
-            given.bank,
-            given.out / f"{order}-{share:g}",
+            root,
+            bank,
+            out / f"{order}-{share:g}",
             share / 100,
             order,
-            given.ratio,
+            ratio,
         ):
             name = f"{order}-{share:g}-{path.parent.name}"
             lines += [
@@ -103,4 +86,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -9,13 +9,13 @@ the casting sensor for the town; for two disjoint halves of the frames, it is th
 both fits.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from typer import run
 
 from lidar_synth import Scan, Town, fit_sensor, load_sensor, open_scans
 from lidar_synth.formats.points import read_points
@@ -87,16 +87,13 @@ def row(
     return fit
 
 
-def main() -> None:
+def main(
+    real: Path,
+    labelled: Path,
+) -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("real", type=Path)
-    parser.add_argument("labelled", type=Path)
-    given = parser.parse_args()
-    real = given.real
-    labelled = given.labelled
+    real = real
+    labelled = labelled
     hesai = np.loadtxt(
         labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1
     )[:, 1].tolist()
@@ -154,4 +151,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

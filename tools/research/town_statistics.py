@@ -8,7 +8,6 @@ town only. Every figure is a mean over scans; both sides are projected onto the 
 image. docs/research/town.md has the table.
 """
 
-import argparse
 import os
 from collections.abc import Iterable
 from itertools import pairwise
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.projection import project, ring_numbers
@@ -121,25 +121,17 @@ def number(value: float) -> str:
     )
 
 
-def main() -> None:
+def main(
+    scans: int = 120,
+    seed: int = 0,
+) -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--scans",
-        type=int,
-        default=120,
-        help="scans of the town, spread over stretches",
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
     # Three scans of each stretch: neighbouring scans are similar, and building a stretch takes
     # time.
-    stretches = -(-arguments.scans // 3)
-    town = Town(arguments.seed, scans=STRETCH_FRAMES * stretches)
+    stretches = -(-scans // 3)
+    town = Town(seed, scans=STRETCH_FRAMES * stretches)
     picked = [STRETCH_FRAMES * k + f for k in range(stretches) for f in (2, 9, 16)][
-        : arguments.scans
+        :scans
     ]
     sides = {"town": gather((town[i] for i in picked), len(picked), "town")}
     folder = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
@@ -168,4 +160,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,13 +8,14 @@ ROOT is any dataset with labels per scan, SemanticKITTI for instance. The traini
 lidar_synth/lab/train/segmentation.py.
 """
 
-import argparse
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch.utils.data import DataLoader
 from tqdm import tqdm
+from typer import Argument, run
 
 from lidar_synth import MixedScans, Scan, Source, Town, load_generator, open_scans
 from lidar_synth.datasets.classes import NAMES
@@ -51,63 +52,52 @@ def fit(
     return Judge(network, sensor, {}), table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "root", nargs="?", help="a labelled dataset [default: the town]"
-    )
-    parser.add_argument("--split", default="train")
-    parser.add_argument("--val-split", default="val")
-    parser.add_argument("--scans", type=int, default=400, help="scans of the town")
-    parser.add_argument(
-        "--held-out", type=int, default=200, help="held-out scans, of another town"
-    )
-    parser.add_argument(
-        "--ratio", type=float, default=0.0, help="share of synthetic scans"
-    )
-    parser.add_argument("--model", default="town", help="model of the synthetic scans")
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--batch", type=int, default=4)
-    parser.add_argument("--workers", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--save", type=Path)
-    given = parser.parse_args()
+def main(
+    root: Annotated[str | None, Argument()] = None,
+    split: str = "train",
+    val_split: str = "val",
+    scans: int = 400,
+    held_out: int = 200,
+    ratio: float = 0.0,
+    model: str = "town",
+    steps: int = 400,
+    batch: int = 4,
+    workers: int = 0,
+    seed: int = 0,
+    save: Path | None = None,
+) -> None:
 
-    if given.root:
-        real = open_scans(given.root, split=given.split)
-        validation = open_scans(given.root, split=given.val_split)
+    if root:
+        real = open_scans(root, split=split)
+        validation = open_scans(root, split=val_split)
     else:
-        real = town(0, given.scans)
-        validation = town(1, given.held_out)
-    synthetic = load_generator(given.model) if given.ratio else None
+        real = town(0, scans)
+        validation = town(1, held_out)
+    synthetic = load_generator(model) if ratio else None
     train = MixedScans(
         real,
         synthetic,
-        given.ratio,
-        seed=given.seed,
+        ratio,
+        seed=seed,
         epoch_size="replace",
         balanced=True,
         collate="range",
     )
-    judge, table = fit(
-        train, validation, given.steps, given.batch, given.workers, given.seed
-    )
+    judge, table = fit(train, validation, steps, batch, workers, seed)
     for name, iou in zip(NAMES, class_ious(table), strict=True):
         print(f"{name:>16} {100 * iou:6.1f}")
     print(f"{'mIoU':>16} {100 * mean_iou(table):6.1f}")
-    if given.save:
-        data = given.root or f"{given.scans} scans of town 0, a second apart"
+    if save:
+        data = root or f"{scans} scans of town 0, a second apart"
         provenance = {
             "data": data,
-            "ratio": given.ratio,
-            "steps": given.steps,
-            "batch": given.batch,
+            "ratio": ratio,
+            "steps": steps,
+            "batch": batch,
             "mIoU": mean_iou(table),
         }
-        Judge(judge.network, judge.sensor, provenance).save(given.save)
+        Judge(judge.network, judge.sensor, provenance).save(save)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

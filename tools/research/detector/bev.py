@@ -109,13 +109,11 @@ def targets(
         square = (rows - int(centre[0]))[:, None] ** 2 + (columns - int(centre[1])) ** 2
         bump = np.exp(-square / (2 * spread**2)).astype(np.float32)
         heat[each][at] = np.maximum(heat[each][at], bump)
-        nearest = (bump > weight[at]) & (
-            square <= 2
-        )  # the pixel of the centre and its neighbours
-        for channel, value in enumerate(
-            (*_offsets(centre, rows, columns), *_shape(box))
-        ):
-            values[channel][at] = np.where(nearest, value, values[channel][at])
+        # The pixel of the centre and its neighbours.
+        nearest = (bump > weight[at]) & (square <= 2)
+        own = (*_offsets(centre, rows, columns), *_shape(box))
+        for channel, value in zip(values, own, strict=True):
+            channel[at] = np.where(nearest, value, channel[at])
         weight[at] = np.where(nearest, bump, weight[at])
     return Target(*map(torch.from_numpy, (heat, values, weight)))
 
@@ -148,26 +146,17 @@ def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) ->
     Returns:
         Boxes of each class by falling score, at least ``APART``.
     """
-    pixel = 2 * REACH / heat.shape[-1]
     peaks = heat * (F.max_pool2d(heat[None], 3, 1, 1)[0] == heat)
     boxes = []
     scores = []
-    classes = []
-    for each, peak in enumerate(peaks):
+    for distance, peak in zip(APART, peaks, strict=True):
         top = peak.flatten().topk(most)
-        index = top.indices[top.values > least]
-        found = values.flatten(1)[:, index].double().numpy()
-        pixels = np.stack(np.divmod(index.numpy(), heat.shape[-1])) + 0.5
-        x, y = (pixels + found[:2]) * pixel - REACH
-        yaw = np.arctan2(found[7], found[6]) / 2
-        candidates = np.stack(
-            [x, y, found[2], *np.exp(found[3:6].clip(-3, 4)), yaw], 1
-        ).astype(np.float32)
-        kept = _apart(candidates[:, :2], APART[each])
+        candidates = boxes_at(top.indices[top.values > least], values)
+        kept = _apart(candidates[:, :2], distance)
         boxes.append(candidates[kept])
-        scores.append(top.values.numpy()[: len(index)][kept])
-        classes.append(np.full(len(kept), each))
-    return Found(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+        scores.append(top.values.numpy()[kept])
+    classes = np.repeat(np.arange(len(boxes)), list(map(len, boxes)))
+    return Found(np.concatenate(boxes), np.concatenate(scores), classes)
 
 
 def _apart(places: NDArray[np.float32], distance: float) -> list[int]:
@@ -177,3 +166,14 @@ def _apart(places: NDArray[np.float32], distance: float) -> list[int]:
         if not kept or np.hypot(*(places[kept] - place).T).min() >= distance:
             kept.append(i)
     return kept
+
+
+def boxes_at(index: Tensor, values: Tensor) -> NDArray[np.float32]:
+    """(D, 7) boxes that the pixels with these flat indices hold."""
+    count = values.shape[-1]
+    found = values.flatten(1)[:, index].double().numpy()
+    pixels = np.stack(np.divmod(index.numpy(), count)) + 0.5
+    x, y = (pixels + found[:2]) * 2 * REACH / count - REACH
+    sizes = np.exp(found[3:6].clip(-3, 4))
+    yaw = np.arctan2(found[7], found[6]) / 2
+    return np.stack([x, y, found[2], *sizes, yaw], 1).astype(np.float32)

@@ -10,7 +10,6 @@ with scans of the town. ``--frame`` names a folder of one real nuScenes key fram
 ``info.json``.
 """
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -25,6 +24,7 @@ from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list
 from lidar_synth.integrations.mmdet3d_nuscenes import nuscenes_list
 from mmengine.config import Config
+from typer import run
 
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import convert
@@ -203,39 +203,28 @@ def few_objects(sampler: Any) -> None:
     }
 
 
-def main() -> None:
+def main(
+    out: Path,
+    kitti: Path | None = None,
+    nuscenes: Path | None = None,
+    frame: Path | None = None,
+    scans: int = 4,
+    configs: list[str] | None = None,
+) -> None:
     """See the module."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--kitti", type=Path)
-    parser.add_argument("--nuscenes", type=Path)
-    parser.add_argument(
-        "--frame",
-        type=Path,
-        help="a real nuScenes key frame: info.json and samples/LIDAR_TOP",
-    )
-    parser.add_argument(
-        "--scans", type=int, default=4, help="number of synthetic scans"
-    )
-    parser.add_argument(
-        "--configs", nargs="*", default=[], help="configurations to shorten"
-    )
-    options = parser.parse_args()
-    out = options.out.resolve()
-    given = {"kitti": options.kitti, "nuscenes": options.nuscenes}
+    out = out.resolve()
+    given = {"kitti": kitti, "nuscenes": nuscenes}
     for name, root in given.items():
         if root is not None:
             shutil.copytree(root, out / "data" / name)
-    if options.kitti:
-        kitti(out, options.scans)
-    if options.nuscenes:
-        nuscenes(out, options.scans, options.frame)
-    for name in options.configs:
+    if kitti:
+        kitti(out, scans)
+    if nuscenes:
+        nuscenes(out, scans, frame)
+    for name in configs:
         extra = ("spconv_on_cpu",) if name in SPCONV_ON_CPU else ()
         shorten(name, out, extra=("mmdet3d_report", *extra))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,12 +8,13 @@ planes are fitted where they are missing. OpenPCDet's sampler needs objects of e
 few scans lack: the database of GT sampling is that of a bank of objects.
 """
 
-import argparse
 import json
 import pickle
 import sys
 from pathlib import Path
 from typing import Any
+
+from typer import run
 
 sys.path.insert(0, str(Path(__file__).parent))
 from openpcdet_cpu import prepare
@@ -22,17 +23,14 @@ VERSION = "v1.0-mini"
 TABLES = ("sensor", "calibrated_sensor", "sample_data")
 
 
-def main() -> None:
+def main(
+    tree: Path,
+    kind: str,
+    folder: Path,
+    objects: Path,
+) -> None:
     """Write the files beside the dataset."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("tree", type=Path)
-    parser.add_argument("kind", choices=["kitti", "nuscenes"])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("objects", type=Path)
-    options = parser.parse_args()
-    prepare(options.tree)
+    prepare(tree)
     import torch
     import yaml
     from easydict import EasyDict
@@ -40,16 +38,10 @@ def main() -> None:
     from lidar_synth.labels import ObjectBank
 
     torch.Tensor.cuda = lambda self, *args, **kwargs: self  # type: ignore[method-assign]
-    stock = (
-        options.tree
-        / "tools"
-        / "cfgs"
-        / "dataset_configs"
-        / f"{options.kind}_dataset.yaml"
-    )
+    stock = tree / "tools" / "cfgs" / "dataset_configs" / f"{kind}_dataset.yaml"
     config = EasyDict(yaml.safe_load(stock.read_text()))
-    {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[options.kind](
-        config, options.folder, ObjectBank.load(options.objects)
+    {"kitti": prepare_kitti, "nuscenes": prepare_nuscenes}[kind](
+        config, folder, ObjectBank.load(objects)
     )
 
 
@@ -144,4 +136,4 @@ def complete(file: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
