@@ -26,8 +26,8 @@ from lidar_synth.weather import (
     fog,
     precipitation,
 )
-from lidar_synth.weather.corruption import FLOOR, OUT_OF_SIGHT, SURFACE
-from lidar_synth.weather.wet_ground import find_ground, mirrored
+from lidar_synth.weather.corruption import COMPENSATED, FLOOR, OUT_OF_SIGHT, SURFACE
+from lidar_synth.weather.wet_ground import find_ground, reflect_from_water
 
 WEATHER = ("fog", "rain", "snow")
 MOVED = {"motion_blur", "crosstalk"}
@@ -112,14 +112,14 @@ def test_reflectance_falls_by_beer_and_lambert(visibility: float) -> None:
     hard = change.cause == SURFACE
     distance = change.points[hard, 0]
     slope = np.polyfit(distance, np.log(change.reflectance[hard]), 1)[0]
-    wanted = -2 * np.log(20) / visibility * (1 - fog.COMPENSATED)
+    wanted = -2 * np.log(20) / visibility * (1 - COMPENSATED)
     assert slope == pytest.approx(wanted, rel=0.02)
 
 
 def test_the_fogs_own_return_peaks_where_it_should() -> None:
     """Against a direct sum of the same integral on another grid, one target at a time."""
     extinction, backscatter = 0.06, 0.046 / 50
-    place, strength = fog.soft_return(extinction, backscatter)
+    place, strength = fog.find_soft_return(extinction, backscatter)
     ranges = np.arange(0.005, 60, 0.01)
     path = np.arange(0.9, 60, 0.01)
     seen = np.clip((path - 0.9) / 11.1, 0, 1)
@@ -140,7 +140,7 @@ def test_energy_never_grows() -> None:
             change = CORRUPTIONS[name].at(severity).change(scan, keyed_rng(0))
             hard = change.cause == SURFACE
             assert (change.reflectance[hard] <= np.float32(0.4)).all()
-    assert (fog.soft_return(0.2, 0.003)[1] < 1).all()
+    assert (fog.find_soft_return(0.2, 0.003)[1] < 1).all()
 
 
 @pytest.mark.parametrize(
@@ -160,8 +160,10 @@ def test_extinction_of_precipitation(
 
 
 def test_wet_ground_is_lost_far_away_first(clear: Scan) -> None:
-    assert mirrored(np.array([1.0]))[0] == pytest.approx(((1.33 - 1) / 2.33) ** 2)
-    assert mirrored(np.array([0.0]))[0] == pytest.approx(1)
+    assert reflect_from_water(np.array([1.0]))[0] == pytest.approx(
+        ((1.33 - 1) / 2.33) ** 2
+    )
+    assert reflect_from_water(np.array([0.0]))[0] == pytest.approx(1)
     new = WetGround(1.2)(clear, keyed_rng(0))
     ground = GROUND[clear.label]
     far = np.linalg.norm(clear.points, axis=1) > 20

@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.weather.corruption import (
     FLOOR,
-    SCATTERED,
-    SURFACE,
     Change,
     Corruption,
+    move_returns,
     ranges_of,
     require_between,
     signal_of,
@@ -39,17 +38,13 @@ OVERLAP = 0.9, 12.0
 metres. Haze with a visibility of hundreds of metres is then not detected."""
 BACKSCATTER = 0.046
 """b times the meteorological optical range (Rasshofer et al. 2011)."""
-COMPENSATED = 0.7
-"""Share of the logarithm of a loss that a sensor's automatic power and gain make up for
-in the reflectance that it reports (0 = none). Chosen so that a network that learnt in
-clear air loses as much as in the Robo3D benchmark."""
 UNEVEN = 0.5
 """Standard deviation of the logarithm of the fog's density from ray to ray."""
 STEP = 0.1
 """Metres between the ranges for which the soft return is computed."""
 
 
-def extinction_of(visibility: float) -> float:
+def extinction_at(visibility: float) -> float:
     """The extinction (1 / m) at a meteorological optical range (m), over which light
     loses 95 %."""
     return float(np.log(20) / visibility)
@@ -83,9 +78,9 @@ class Fog(Corruption):
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
         distance = ranges_of(scan)
-        extinction = extinction_of(self.visibility)
+        extinction = extinction_at(self.visibility)
         hard = signal_of(scan, distance) * np.exp(-2 * extinction * distance)
-        peak, strength = soft_return(extinction, BACKSCATTER / self.visibility)
+        peak, strength = find_soft_return(extinction, BACKSCATTER / self.visibility)
         index = np.minimum(distance / STEP, len(peak) - 1).astype(int)
         soft = strength[index] * np.exp(
             UNEVEN * rng.standard_normal(len(scan), np.float32)
@@ -96,39 +91,11 @@ class Fog(Corruption):
         place = np.clip(peak[index] + np.abs(spread), STEP, np.maximum(distance, STEP))
         where = np.where(scattered, place, distance)
         signal = np.where(scattered, soft, hard)
-        return moved(scan, distance, where, signal, scattered, seen)
-
-
-def moved(
-    scan: Scan,
-    distance: NDArray[np.float64],
-    where: NDArray[np.float64],
-    signal: NDArray[np.float64],
-    scattered: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
-) -> Change:
-    """Returns at other places along their rays.
-
-    Args:
-        scan: N points.
-        distance, where: (N,) metres from the sensor, before and after.
-        signal: (N,) reflectance / range^2.
-        scattered: (N,) whether particles return the pulse.
-        seen: (N,) whether there is a return.
-    """
-    source = np.flatnonzero(seen)
-    factor = where / np.maximum(distance, 1e-6)
-    points = (scan.points * factor[:, None]).astype(np.float32)
-    loss = np.minimum(signal / signal_of(scan, distance), 1)
-    surface = scan.reflectance * loss ** (1 - COMPENSATED)
-    particle = np.minimum(signal * np.maximum(where, 0.1) ** 2, 1)
-    values = np.where(scattered, particle, surface).astype(np.float32)
-    cause = np.where(scattered, SCATTERED, SURFACE).astype(np.uint8)
-    return Change(source, points[source], values[source], cause[source])
+        return move_returns(scan, distance, where, signal, scattered, seen)
 
 
 @lru_cache(maxsize=16)
-def soft_return(
+def find_soft_return(
     extinction: float, backscatter: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The place (m) and the strength of the fog's own return in front of a target, by

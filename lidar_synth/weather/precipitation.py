@@ -23,11 +23,11 @@ from lidar_synth.weather.corruption import (
     FLOOR,
     Change,
     Corruption,
+    move_returns,
     ranges_of,
     require_between,
     signal_of,
 )
-from lidar_synth.weather.fog import moved
 
 EFFICIENCY = 2.0
 """Mie's extinction efficiency of particles much larger than the wavelength."""
@@ -83,7 +83,7 @@ class _Particles(Corruption):
         scattered = (soft > hard) & (place < distance)
         signal = np.where(scattered, soft, hard)
         where = np.where(scattered, place, distance)
-        return moved(scan, distance, where, signal, scattered, signal > FLOOR)
+        return move_returns(scan, distance, where, signal, scattered, signal > FLOOR)
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from lidar_synth.weather.corruption import (
     FLOOR,
     Change,
     Corruption,
-    kept,
+    keep_points,
+    move_returns,
     ranges_of,
     require_between,
     rings_of,
     signal_of,
 )
-from lidar_synth.weather.fog import moved
 
 VEHICLES = [
     TRAIN_ID[name]
@@ -54,7 +54,7 @@ class MotionBlur(Corruption):
         require_between("spread", self.spread, 0, 1)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        same = kept(scan, np.ones(len(scan), bool))
+        same = keep_points(scan, np.ones(len(scan), bool))
         noise = rng.standard_normal(scan.points.shape, np.float32)
         points = same.points + np.float32(self.spread) * noise
         return Change(same.source, points, same.reflectance, same.cause)
@@ -89,7 +89,7 @@ class MissingBeams(Corruption):
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
         rows = scan.sensor.shape[0]
         lost = rng.choice(rows, round(self.share * rows), replace=False)
-        return kept(scan, ~np.isin(rings_of(scan), lost))
+        return keep_points(scan, ~np.isin(rings_of(scan), lost))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class CrossSensor(Corruption):
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
         rings = rings_of(scan)
         stay = np.floor((rings + 1) * self.share) > np.floor(rings * self.share)
-        return kept(scan, stay)
+        return keep_points(scan, stay)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Crosstalk(Corruption):
         require_between("spread", self.spread, 0, 100)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        same = kept(scan, np.ones(len(scan), bool))
+        same = keep_points(scan, np.ones(len(scan), bool))
         hit = rng.choice(len(scan), round(self.share * len(scan)), replace=False)
         points = same.points.copy()
         points[hit] += self.spread * rng.standard_normal((len(hit), 3), np.float32)
@@ -197,7 +197,7 @@ class IncompleteEcho(Corruption):
                 "labels, which say what is a vehicle",
             )
         lost = np.isin(scan.label, VEHICLES) & (rng.random(len(scan)) < self.share)
-        return kept(scan, ~lost)
+        return keep_points(scan, ~lost)
 
 
 @dataclass(frozen=True)
@@ -230,4 +230,4 @@ class LowPower(Corruption):
         distance = ranges_of(scan)
         signal = self.power * signal_of(scan, distance)
         nowhere = np.zeros(len(scan), bool)
-        return moved(scan, distance, distance, signal, nowhere, signal >= FLOOR)
+        return move_returns(scan, distance, distance, signal, nowhere, signal >= FLOOR)

@@ -17,11 +17,11 @@ from lidar_synth.weather.corruption import (
     FLOOR,
     Change,
     Corruption,
+    move_returns,
     ranges_of,
     require_between,
     signal_of,
 )
-from lidar_synth.weather.fog import moved
 
 WATER = 1.33
 """Refractive index."""
@@ -63,15 +63,15 @@ class WetGround(Corruption):
         distance = ranges_of(scan)
         ground = find_ground(scan)
         incidence = np.abs(scan.points[:, 2]) / np.maximum(distance, 1e-6)
-        passed = (1 - mirrored(np.clip(incidence, 0, 1))) ** 2
+        passed = (1 - reflect_from_water(np.clip(incidence, 0, 1))) ** 2
         flat = min(self.depth / TEXTURE, 1.0)
         factor = np.where(ground, 1 - flat + flat * passed, 1)
         signal = signal_of(scan, distance) * factor
         nowhere = np.zeros(len(scan), bool)
-        return moved(scan, distance, distance, signal, nowhere, signal >= FLOOR)
+        return move_returns(scan, distance, distance, signal, nowhere, signal >= FLOOR)
 
 
-def mirrored(cosine: NDArray[np.floating]) -> NDArray[np.float64]:
+def reflect_from_water(cosine: NDArray[np.floating]) -> NDArray[np.float64]:
     """Fresnel's reflection of unpolarised light by water, for cosines of the angle of
     incidence."""
     inside = np.sqrt(1 - (1 - cosine**2) / WATER**2)
