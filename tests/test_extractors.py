@@ -7,16 +7,18 @@ import json
 import shutil
 import sys
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+import random_inputs as inputs
 import torch
 import yaml
 from conftest import Golden, random_scan
 from numpy.typing import NDArray
+from random_archives import write
 from safetensors.numpy import load_file
 from typer.testing import CliRunner
 
@@ -44,7 +46,6 @@ from lidar_synth.lab.evaluate.extractors.liploc import picture
 from lidar_synth.lab.evaluate.extractors.rangevit import build
 from lidar_synth.lab.evaluate.street_judge import load_archive
 
-ROOT = Path(__file__).parents[1]
 Of = Callable[[torch.Tensor], NDArray[np.floating]]
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -53,9 +54,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def archives(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """An extractor's archive with random weights, written once."""
     folder = tmp_path_factory.mktemp("weights")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
-        from random_archives import write
 
     def made(name: str) -> Path:
         path = folder / name / EXTRACTORS[name].archives[0]
@@ -85,14 +83,6 @@ def _scan(points: NDArray[np.float32]) -> Scan:
     )
 
 
-@pytest.fixture(scope="module")
-def inputs() -> Iterator[ModuleType]:
-    """The random inputs that the peers' code was given."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
-        yield importlib.import_module("random_inputs")
-
-
 def difference(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> float:
     """Largest difference relative to the largest feature."""
     assert ours.shape == theirs.shape
@@ -115,7 +105,6 @@ def test_features_and_distances_of_points_are_the_peers(
     archives: Callable[[str], Path],
     peer: dict[str, NDArray[np.float32]],
     scan: Scan,
-    inputs: ModuleType,
 ) -> None:
     name, _, preparation = case.partition(" as ")
     if name == "liploc":
@@ -128,9 +117,7 @@ def test_features_and_distances_of_points_are_the_peers(
         extract([_scan(inputs.random_points(1000, *one))])[0]
         for one in inputs.two_sets()
     ]
-    assert distance(both, inputs) == pytest.approx(
-        float(peer[f"{case} distance"][0]), rel=1e-4
-    )
+    assert distance(both) == pytest.approx(float(peer[f"{case} distance"][0]), rel=1e-4)
 
 
 def _timm() -> ModuleType:
@@ -197,7 +184,6 @@ def test_features_and_distances_of_images_are_the_peers(
     name: str,
     features_of: Callable[[str], Of],
     peer: dict[str, NDArray[np.float32]],
-    inputs: ModuleType,
 ) -> None:
     of = features_of(name)
     with torch.inference_mode():
@@ -206,12 +192,10 @@ def test_features_and_distances_of_images_are_the_peers(
             of(inputs.random_image(channels(name), *one)[0])
             for one in inputs.two_sets()
         ]
-    assert distance(both, inputs) == pytest.approx(
-        float(peer[f"{name} distance"][0]), rel=1e-4
-    )
+    assert distance(both) == pytest.approx(float(peer[f"{name} distance"][0]), rel=1e-4)
 
 
-def distance(features: list[NDArray[np.floating]], inputs: ModuleType) -> float:
+def distance(features: list[NDArray[np.floating]]) -> float:
     """Our Fréchet distance between two sets of inputs, of as many numbers as the peers' covariances
     allow."""
     few = inputs.reduced(np.stack(features))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch.distributed
 from conftest import random_scan
-from project import ROOT
+from random_archives import write
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan, scan_hash
@@ -326,9 +326,6 @@ def test_processes_extract_the_features_of_one(tmp_path: Path) -> None:
 def test_published_weights_are_measured_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools" / "research" / "extractors"))
-    from random_archives import write
-
     write("sparenet_pointnet", tmp_path / "weights")
     options = {
         "weights": tmp_path / "weights",

@@ -17,10 +17,8 @@ from typer import run
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS, load_extractor
 from lidar_synth.lab.town import Town
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "research" / "extractors"))
-from random_archives import (
-    write,
-)  # the folder of tools/extractors is on the path from here on
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
+from random_archives import write
 
 
 def main(rounds: int = 3, busy: bool = False, only: list[str] | None = None) -> None:

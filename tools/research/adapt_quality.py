@@ -20,14 +20,15 @@ label) in the sensor's frame; the first command writes frames 00 to 30 to OUT/ad
     those among real scans
 """
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
+from typer import Option, Typer
 
 from lidar_synth import load_generator, load_sensor, open_scans
 from lidar_synth.datasets.classes import IGNORE, NAMES, PANDASET
@@ -38,7 +39,7 @@ from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.regrid import regrid
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.distances import frechet_distance
 from lidar_synth.lab.evaluate.neighbours import nearest_training
@@ -54,41 +55,8 @@ SEED = 1
 Features = Callable[[Sequence[Scan]], NDArray[np.floating]]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    commands = parser.add_subparsers(dest="command", required=True)
-    write = commands.add_parser(
-        "pandaset", help="write the frames to adapt to and those to test on"
-    )
-    write.add_argument("frames", type=Path)
-    write.add_argument("out", type=Path)
-    of = commands.add_parser("measure", help="the figures of an adapted checkpoint")
-    of.add_argument("checkpoint", type=Path)
-    of.add_argument(
-        "--train", type=Path, required=True, help="the scans that it was adapted to"
-    )
-    of.add_argument(
-        "--test", type=Path, required=True, help="scans that it has not seen"
-    )
-    of.add_argument(
-        "--before", default="town", help="the model that it was adapted from"
-    )
-    of.add_argument("--judge", type=Path, help="an archive of lidar-bonnetal")
-    of.add_argument(
-        "--columns", type=int, help="width at which the judge looks [the archive's own]"
-    )
-    of.add_argument("--count", type=int, default=60, help="scans to generate")
-    given = parser.parse_args()
-    if given.command == "pandaset":
-        prepare(given.frames, given.out)
-    else:
-        measure(given)
-
-
-def prepare(frames: Path, out: Path) -> None:
-    """Write the frames of PandaSet as the package's own scans."""
+def pandaset(frames: Path, out: Path) -> None:
+    """Write the frames of PandaSet to adapt to, and those to test on, as the package's own scans."""
     sensor = load_sensor("pandar64")
     writers = {part: WRITERS["npz"](out / part) for part in ("adapt", "test")}
     for path in sorted(frames.glob("[0-9][0-9].npz")):
@@ -106,80 +74,26 @@ def prepare(frames: Path, out: Path) -> None:
         writers["adapt" if number <= LAST_LEARNT else "test"].write(scan, number)
 
 
-def measure(given: argparse.Namespace) -> None:
-    """Print the tables."""
-    train = list(open_scans(given.train))
-    test = list(open_scans(given.test))
-    sensor = load_checkpoint(given.checkpoint).header.sensor
-    print(
-        "| model | returns right, % | labels right, % | range within 5 cm, % | mean error of the "
-        "range, m |"
-    )
-    print("|---|---:|---:|---:|---:|")
-    models = {"before": given.before, "adapted": given.checkpoint}
-    tables = {
-        name: autoencoder_row(name, str(model), sensor, test)
-        for name, model in models.items()
-    }
-    there = np.flatnonzero(~np.isnan(tables["adapted"]))
-    print("\n| IoU of decoded labels, % |", " | ".join(NAMES[i] for i in there), "|")
-    print("|---|" + "---:|" * len(there))
-    for name, ious in tables.items():
-        print(f"| {name} |", " | ".join(f"{100 * ious[i]:.0f}" for i in there), "|")
-    generated = {
-        name: generate(str(model), given.count) for name, model in models.items()
-    }
+def measure(
+    checkpoint: Path,
+    train: Annotated[Path, Option()],
+    test: Annotated[Path, Option()],
+    before: str = "town",
+    judge: Path | None = None,
+    columns: int | None = None,
+    count: int = 60,
+) -> None:
+    """Print the figures of an adapted checkpoint; columns are those at which the judge looks."""
+    learnt = list(open_scans(train))
+    unseen = list(open_scans(test))
+    models = {"before": before, "adapted": str(checkpoint)}
+    print_autoencoders(models, load_checkpoint(checkpoint).header.sensor, unseen)
+    generated = {name: generate(model, count) for name, model in models.items()}
     extractors: dict[str, Features] = {"the shipped segmenter": load_judge().features}
-    if given.judge is not None:
-        extractors["the archive"] = load_archive(given.judge, given.columns).features
+    if judge is not None:
+        extractors["the archive"] = load_archive(judge, columns).features
     for name, extractor in extractors.items():
-        features_table(name, extractor, train, test, generated)
-
-
-def autoencoder_row(
-    name: str, model: str, sensor: Sensor, scans: Sequence[Scan]
-) -> NDArray[np.float64]:
-    """Print a model's figures on encoded and decoded scans; return the IoU of each class, (19,),
-    NaN without a label.
-
-    A model of another sensor is moved to the grid first; cells are sampled, as they are when scans
-    are generated.
-    """
-    checkpoint = load_checkpoint(find_model(model))
-    networks = (
-        checkpoint.networks
-        if checkpoint.header.sensor == sensor
-        else regrid(checkpoint, sensor)[1]
-    )
-    tensors = checkpoint.header.tensors
-    codec = Latent(networks[CODEC], tensors)  # type: ignore[arg-type]
-    sums = np.zeros(5)
-    table = np.zeros((len(NAMES), len(NAMES)), np.int64)
-    for i, scan in enumerate(tqdm(scans, desc=f"{name}, autoencoder", unit="scan")):
-        image = project(scan, sensor, ["reflectance", "label"])
-        noise = uniform(SEED, [i], (codec.draws, *sensor.shape), "cpu")
-        [made] = tensors.to_images(
-            codec.decode(codec.encode(tensors.from_images([image])), noise), sensor
-        )
-        both = image.mask & made.mask
-        real = image.channels["label"]
-        label = made.channels["label"]
-        known = both & (real != IGNORE)
-        error = np.abs(image.range - made.range)
-        sums += [
-            (image.mask == made.mask).mean(),
-            (real == label)[known].mean(),
-            (both & (error < 0.05)).sum() / image.mask.sum(),
-            error[both].mean(),
-            1,
-        ]
-        decoded = known & (label != IGNORE)
-        np.add.at(table, (real[decoded], label[decoded]), 1)
-    returns, labels, near, error = sums[:4] / sums[4]
-    print(
-        f"| {name} | {100 * returns:.1f} | {100 * labels:.1f} | {100 * near:.1f} | {error:.2f} |"
-    )
-    return np.where(table.sum(1) > 0, class_ious(table), np.nan)
+        features_table(name, extractor, learnt, unseen, generated)
 
 
 def generate(model: str, count: int) -> list[Scan]:
@@ -188,6 +102,73 @@ def generate(model: str, count: int) -> list[Scan]:
     return [
         generator.scans(SEED, [i])[0]
         for i in tqdm(range(count), desc=Path(model).stem, unit="scan")
+    ]
+
+
+def print_autoencoders(
+    models: dict[str, str], sensor: Sensor, scans: Sequence[Scan]
+) -> None:
+    """Print the tables of encoded and decoded scans."""
+    print(
+        "| model | returns right, % | labels right, % | range within 5 cm, % | mean error of the "
+        "range, m |\n|---|---:|---:|---:|---:|"
+    )
+    tables = {}
+    for name, model in models.items():
+        right, tables[name] = autoencoder_figures(model, sensor, scans)
+        shares = " | ".join(f"{100 * share:.1f}" for share in right[:3])
+        print(f"| {name} | {shares} | {right[3]:.2f} |")
+    there = np.flatnonzero(~np.isnan(tables["adapted"]))
+    print("\n| IoU of decoded labels, % |", " | ".join(NAMES[i] for i in there), "|")
+    print("|---|" + "---:|" * len(there))
+    for name, ious in tables.items():
+        print(f"| {name} |", " | ".join(f"{100 * ious[i]:.0f}" for i in there), "|")
+
+
+def autoencoder_figures(
+    model: str, sensor: Sensor, scans: Sequence[Scan]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(4,) means of ``figures_of``, and (19,) the IoU of each class, NaN without a label.
+
+    A model of another sensor is moved to the grid first; cells are sampled, as they are when scans
+    are generated.
+    """
+    checkpoint = load_checkpoint(find_model(model))
+    networks = checkpoint.networks
+    if checkpoint.header.sensor != sensor:
+        networks = regrid(checkpoint, sensor)[1]
+    codec = Latent(networks[CODEC], checkpoint.header.tensors)  # type: ignore[arg-type]
+    figures = []
+    table = np.zeros((len(NAMES), len(NAMES)), np.int64)
+    for i, scan in enumerate(tqdm(scans, desc="autoencoder", unit="scan")):
+        image = project(scan, sensor, ["reflectance", "label"])
+        noise = uniform(SEED, [i], (codec.draws, *sensor.shape), "cpu")
+        x = codec.encode(codec.tensors.from_images([image]))
+        [made] = codec.tensors.to_images(codec.decode(x, noise), sensor)
+        figures.append(figures_of(image, made))
+        label = made.channels["label"]
+        decoded = labelled(image, made) & (label != IGNORE)
+        np.add.at(table, (image.channels["label"][decoded], label[decoded]), 1)
+    ious = np.where(table.sum(1) > 0, class_ious(table), np.nan)
+    return np.mean(figures, axis=0), ious
+
+
+def labelled(image: RangeImage, made: RangeImage) -> NDArray[np.bool_]:
+    """The cells of returns in both images whose label is known."""
+    return image.mask & made.mask & (image.channels["label"] != IGNORE)
+
+
+def figures_of(image: RangeImage, made: RangeImage) -> list[float]:
+    """The shares of right returns, of right labels, and of ranges within 5 cm; the mean error of
+    ranges in metres."""
+    both = image.mask & made.mask
+    error = np.abs(image.range - made.range)
+    equal = image.channels["label"] == made.channels["label"]
+    return [
+        (image.mask == made.mask).mean(),
+        equal[labelled(image, made)].mean(),
+        (both & (error < 0.05)).sum() / image.mask.sum(),
+        error[both].mean(),
     ]
 
 
@@ -208,14 +189,13 @@ def features_table(
     reference = of(test)
     apart = np.linalg.norm(known[:, None] - known[None], axis=2)
     np.fill_diagonal(apart, np.inf)
+    near = np.median(apart.min(1))
     print(
         f"\n| features of {name} | Frechet distance | nearest training scan | nearer than the "
-        "tests, % |"
+        "tests, % |\n|---|---:|---:|---:|"
     )
-    print("|---|---:|---:|---:|")
     print(
-        f"| training scans | {frechet_distance(reference, known):.2f} | "
-        f"{np.median(apart.min(1)):.2f} | |"
+        f"| training scans | {frechet_distance(reference, known):.2f} | {near:.2f} | |"
     )
     for model, scans in generated.items():
         fake = of(scans)
@@ -229,4 +209,7 @@ def features_table(
 
 
 if __name__ == "__main__":
-    main()
+    app = Typer()
+    app.command()(pandaset)
+    app.command()(measure)
+    app()

@@ -44,21 +44,19 @@ def grown_by(scans: Sequence[Scan], count: int) -> NDArray[np.float64]:
         for number, item in objects_of(scan, LEAST).items()
     ]
     growth: list[NDArray[np.float64]] = []
-    if not items:
-        return np.zeros((0, 3))
-    for _ in range(40 * count):
+    tries = 40 * count if items else 0
+    while tries and len(growth) < count:
+        tries -= 1
         item, box = items[rng.integers(len(items))]
         distance = np.hypot(*box[:2]) * rng.uniform(0.6, 1.8)
         angle = rng.uniform(-np.pi, np.pi)
+        pose = distance * np.cos(angle), distance * np.sin(angle)
         try:
-            pose = distance * np.cos(angle), distance * np.sin(angle)
             result = edit.insert(scans[rng.integers(len(scans))], item, pose)
         except DataError:
             continue
         assert result.boxes is not None
         growth.append(result.boxes.values[-1, 3:6] - box[3:6])
-        if len(growth) == count:
-            break
     return np.array(growth).reshape(-1, 3)
 
 
@@ -108,38 +106,35 @@ def tried(
     return all_of, done, why
 
 
-def main(
-    inserts: int = 500,
-    scans: int = 8,
-    folder: list[str] | None = None,
-) -> None:
-    """Print the figures of each sensor."""
-    sources: dict[str, Source] = {root: open_scans(root) for root in folder}
-    if not sources:
-        sources = {
-            n: Town(seed=40, scans=scans, sensor=load_sensor(n)) for n in SENSORS
-        }
-    for name, source in sources.items():
-        scans = [source[i] for i in range(min(len(source), scans))]
-        growth = grown_by(scans, -(-inserts // len(sources)))
-        worst = np.abs(growth).max(1, initial=0)
-        shares = [(worst > limit).mean() for limit in (0.2, 0.5, 2.0)]
+def print_figures(name: str, scans: Sequence[Scan], inserts: int) -> None:
+    """Print the figures of a sensor."""
+    growth = grown_by(scans, inserts)
+    worst = np.abs(growth).max(1, initial=0)
+    shares = ", ".join(f"{(worst > limit).mean():.1%}" for limit in (0.2, 0.5, 2.0))
+    print(
+        f"{name}: {len(growth)} inserts; a side changed by over 0.2, 0.5, 2 m: {shares}; at "
+        f"most {worst.max(initial=0):.2f} m"
+    )
+    if all(scan.label is not None for scan in scans):
+        share = outside_share(scans, SENSORS)
+        print(f"  vehicles' points over 2 m from a box after a transfer: {share:.2%}")
+    for text, factor in (("moved", AWAY), ("put back", 1.0)):
+        all_of, done, why = tried(scans, factor)
         print(
-            f"{name}: {len(growth)} inserts; a side changed by over 0.2, 0.5, 2 m: "
-            + "{:.1%}, {:.1%}, {:.1%}".format(*shares)
-            + f"; at most {worst.max(initial=0):.2f} m"
+            f"  {text}: {done.total()} of {all_of.total()}; people "
+            f"{done['Pedestrian']} of {all_of['Pedestrian']}; else {dict(why.most_common(5))}"
         )
-        if all(scan.label is not None for scan in scans):
-            print(
-                "  vehicles' points over 2 m from a box after a transfer: "
-                f"{outside_share(scans, SENSORS):.2%}"
-            )
-        for text, factor in (("moved", AWAY), ("put back", 1.0)):
-            all_of, done, why = tried(scans, factor)
-            print(
-                f"  {text}: {done.total()} of {all_of.total()}; people "
-                f"{done['Pedestrian']} of {all_of['Pedestrian']}; else {dict(why.most_common(5))}"
-            )
+
+
+def main(inserts: int = 500, scans: int = 8, folder: list[str] | None = None) -> None:
+    """Prints the figures of each sensor, or of each folder of scans with boxes."""
+    sources: dict[str, Source] = {root: open_scans(root) for root in folder or ()}
+    if not sources:
+        towns = (Town(seed=40, scans=scans, sensor=load_sensor(n)) for n in SENSORS)
+        sources = dict(zip(SENSORS, towns, strict=True))
+    for name, source in sources.items():
+        chosen = [source[i] for i in range(min(len(source), scans))]
+        print_figures(name, chosen, -(-inserts // len(sources)))
 
 
 if __name__ == "__main__":

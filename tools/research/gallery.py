@@ -21,7 +21,7 @@ from typing import Annotated
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 from PIL import Image
 from typer import Argument, BadParameter, run
@@ -43,6 +43,8 @@ NEAR = Orbit(
 """A camera from which cars and poles are distinguishable."""
 SIZE = (760, 400)
 """Width and height of one scan, in pixels."""
+TITLE = 0.36
+"""Height of a title, in inches."""
 WIDTH = 1200
 """Width of a picture, in pixels."""
 
@@ -194,40 +196,15 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
 
 def draw(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Rows of images with their titles, all rows of the same width."""
-    title = 0.36  # inches
-    heights = [12 / sum(map(shape, row)) + title for row in rows]
+    heights = [12 / sum(map(shape, row)) + TITLE for row in rows]
     figure = Figure(figsize=(12, sum(heights)), facecolor="#101218", dpi=150)
     FigureCanvasAgg(figure)
     parts = np.atleast_1d(figure.subfigures(len(rows), 1, height_ratios=heights))
     for part, row, height in zip(parts, rows, heights, strict=True):
-        part.set_facecolor("#101218")
-        widths = [shape(one) for one in row]
-        grid = part.subplots(1, len(row), squeeze=False, width_ratios=widths)
-        top = 1 - title / height
-        part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=top, wspace=0.01)
-        for axes, (name, image) in zip(grid[0], row, strict=True):
-            axes.imshow(image, interpolation="lanczos")
-            axes.set_title(name, color="#9aa0ad", fontsize=14, loc="left", pad=4)
-            axes.set_axis_off()
+        draw_row(part, row, 1 - TITLE / height)
     figure.canvas.draw()
     pixels: Picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
     return pixels
-
-
-def weather() -> list[list[tuple[str, Picture]]]:
-    """A scan in clear air, and in weather of three severities."""
-    scan = street(0, sensor="hdl64e_lasers", motion=False)
-    rows = []
-    for name in ("fog", "snow", "wet_ground"):
-        corrupted = [
-            (
-                f"{name.replace('_', ' ')}, {severity}",
-                near(CORRUPTIONS[name].at(severity)(scan, np.random.default_rng(0))),
-            )
-            for severity in ("light", "heavy")
-        ]
-        rows.append([("clear", near(scan)), *corrupted])
-    return rows
 
 
 def channels() -> Picture:
@@ -261,6 +238,18 @@ def save(path: Path, pixels: Picture, width: int = WIDTH, colours: int = 96) -> 
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     image.save(path, optimize=True)
+
+
+def draw_row(part: SubFigure, row: Sequence[tuple[str, Picture]], top: float) -> None:
+    """Draw titled images side by side, up to a share of the height."""
+    part.set_facecolor("#101218")
+    widths = [shape(one) for one in row]
+    grid = part.subplots(1, len(row), squeeze=False, width_ratios=widths)
+    part.subplots_adjust(left=0.003, right=0.997, bottom=0, top=top, wspace=0.01)
+    for axes, (name, image) in zip(grid[0], row, strict=True):
+        axes.imshow(image, interpolation="lanczos")
+        axes.set_title(name, color="#9aa0ad", fontsize=14, loc="left", pad=4)
+        axes.set_axis_off()
 
 
 def main(

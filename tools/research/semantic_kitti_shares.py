@@ -1,7 +1,7 @@
 """Lists of SemanticKITTI at 1, 10 and 20 % of its labels, real and mixed, for MMDetection3D's
 configurations.
 
-    python tools/research/semantic_kitti_shares.py SEMANTIC_KITTI BANK OUT [--share 10 ...] [--order uniform ...]
+    python tools/research/semantic_kitti_shares.py SEMANTIC_KITTI BANK OUT [--share 10] [--order uniform]
         [--ratio 0.5]
 
 BANK is a bank, a folder of labelled scans or a model's name. For each share and order, OUT gets a
@@ -13,10 +13,11 @@ the same labelled scans.
 """
 
 import json
+from itertools import product
 from pathlib import Path
 
 from lidar_synth.integrations.mmdet3d_infos import write_infos
-from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
+from lidar_synth.integrations.mmdet3d_lists import ORDERS, semantic_kitti_list
 from tqdm import tqdm
 from typer import run
 
@@ -31,23 +32,13 @@ def write(
 ) -> list[Path]:
     """Write the real and the mixed list; returns their paths."""
     listed = semantic_kitti_list(root, out / "labelled.json", share=share, order=order)
-    mixed = write_infos(
-        out / "mixed",
-        listed,
-        {"synthetic": bank, "ratio": ratio, "seed": 0},
-        data_root=root,
-    )
     values = json.loads(listed.read_text())
     values["data_list"] *= round(1 / (1 - ratio))
     repeated = out / "repeated.json"
     repeated.write_text(json.dumps(values))
-    real = write_infos(
-        out / "real",
-        repeated,
-        {"synthetic": bank, "ratio": 0.0, "seed": 0},
-        data_root=root,
-    )
-    return [real, mixed]
+    mix = {"synthetic": bank, "ratio": ratio, "seed": 0}
+    real = write_infos(out / "real", repeated, mix | {"ratio": 0.0}, data_root=root)
+    return [real, write_infos(out / "mixed", listed, mix, data_root=root)]
 
 
 def main(
@@ -58,31 +49,21 @@ def main(
     order: list[str] | None = None,
     ratio: float = 0.5,
 ) -> None:
-
+    """Writes the lists for shares in per cent and orders, and prints the commands."""
     if not 0 < ratio < 1 or abs(1 / (1 - ratio) - round(1 / (1 - ratio))) > 0.03:
         raise ConfigError(
             f"ratio {ratio}",
             "0.5, 0.667 or 0.75, with which real scans occur a whole number of times",
         )
-    tasks = [(share, order) for order in order for share in share]
-    lines = []
-    for share, order in tqdm(tasks, desc="lists"):
-        for path in write(
-            root,
-            bank,
-            out / f"{order}-{share:g}",
-            share / 100,
-            order,
-            ratio,
-        ):
-            name = f"{order}-{share:g}-{path.parent.name}"
-            lines += [
-                f"python tools/train.py configs/mmdet3d/{config} --work-dir "
-                f"work_dirs/{config.split('_')[0]}-{name} "
-                f"--cfg-options train_dataloader.dataset.ann_file={path.resolve()}"
-                for config in CONFIGS
-            ]
-    print("\n".join(lines))
+    for way, percent in tqdm(list(product(order or ORDERS, share or [1, 10, 20]))):
+        folder = out / f"{way}-{percent:g}"
+        for path in write(root, bank, folder, percent / 100, way, ratio):
+            for config in CONFIGS:
+                name = f"{config.split('_')[0]}-{folder.name}-{path.parent.name}"
+                tqdm.write(
+                    f"python tools/train.py configs/mmdet3d/{config} --work-dir work_dirs/{name} "
+                    f"--cfg-options train_dataloader.dataset.ann_file={path.resolve()}"
+                )
 
 
 if __name__ == "__main__":

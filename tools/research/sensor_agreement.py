@@ -17,8 +17,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.formats import KITTI360, KITTIObject, KITTIRaw, NuScenes, SemanticKITTI
+from lidar_synth.formats import open_scans
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, Agreement, agreement
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town import Town
 
@@ -49,42 +50,24 @@ SHARES = ("outside", "gaps", "unused", "between")
 
 def scans() -> Iterator[tuple[str, NDArray[np.float32], Sensor]]:
     """What was recorded, its points, and its sensor."""
-    for source in (
-        KITTI360(REAL / "kitti360"),
-        KITTIObject(REAL / "kitti_object"),
-        KITTIRaw(REAL / "kitti_raw"),
-    ):
-        yield from (
-            ("KITTI, KITTI-360 (HDL-64E)", scan.points, scan.sensor) for scan in source
-        )
-    for root in (REAL, LABELLED):
-        for scan in SemanticKITTI(root / "semantic_kitti"):
-            yield "SemanticKITTI (HDL-64E, compensated)", scan.points, scan.sensor
-    yield from (
-        ("nuScenes (HDL-32E)", scan.points, scan.sensor)
-        for scan in NuScenes(REAL / "nuscenes")
-    )
+    sources = {
+        REAL / "kitti360": "KITTI, KITTI-360 (HDL-64E)",
+        REAL / "kitti_object": "KITTI, KITTI-360 (HDL-64E)",
+        REAL / "kitti_raw": "KITTI, KITTI-360 (HDL-64E)",
+        REAL / "semantic_kitti": "SemanticKITTI (HDL-64E, compensated)",
+        LABELLED / "semantic_kitti": "SemanticKITTI (HDL-64E, compensated)",
+        REAL / "nuscenes": "nuScenes (HDL-32E)",
+    }
+    for root, name in sources.items():
+        for scan in open_scans(root):
+            yield name, scan.points, scan.sensor
     for path in sorted((LABELLED / "pandaset" / "sensor_frame").glob("*.npz")):
-        yield (
-            "PandaSet (Pandar64)",
-            np.load(path)["points"].astype(np.float32),
-            SENSORS["Pandar64"],
-        )
-    yield from (
-        ("town (OS1-128)", scan.points, scan.sensor) for scan in Town(0, "os1_128", 4)
-    )
-    for scan in KITTI360(REAL / "kitti360"):
-        beams = np.sort(scan.sensor.laser_elevations)
-        elevation = np.arctan2(
-            scan.points[:, 2], np.hypot(scan.points[:, 0], scan.points[:, 1])
-        )
-        number = np.searchsorted((beams[1:] + beams[:-1]) / 2, elevation)
-        yield "every 4th beam of an HDL-64E", scan.points[number % 4 == 0], scan.sensor
-        yield (
-            "16 neighbouring beams of an HDL-64E",
-            scan.points[(number >= 40) & (number < 56)],
-            scan.sensor,
-        )
+        points = np.load(path)["points"].astype(np.float32)
+        yield "PandaSet (Pandar64)", points, SENSORS["Pandar64"]
+    for scan in Town(0, "os1_128", 4):
+        yield "town (OS1-128)", scan.points, scan.sensor
+    for scan in open_scans(REAL / "kitti360"):
+        yield from some_beams(scan)
 
 
 def verdicts(found: list[tuple[Agreement, Sensor]]) -> str:
@@ -100,6 +83,20 @@ def verdicts(found: list[tuple[Agreement, Sensor]]) -> str:
     return ", ".join(
         f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(sorted(kinds))
     )
+
+
+def some_beams(scan: Scan) -> Iterator[tuple[str, NDArray[np.float32], Sensor]]:
+    """A scan of the HDL-64E with a part of its beams."""
+    x, y, z = scan.points.T
+    beams = np.sort(scan.sensor.laser_elevations)
+    between = (beams[1:] + beams[:-1]) / 2
+    number = np.searchsorted(between, np.arctan2(z, np.hypot(x, y)))
+    kept = {
+        "every 4th beam of an HDL-64E": number % 4 == 0,
+        "16 neighbouring beams of an HDL-64E": (number >= 40) & (number < 56),
+    }
+    for name, mask in kept.items():
+        yield name, scan.points[mask], scan.sensor
 
 
 def main() -> None:

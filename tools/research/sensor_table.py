@@ -10,7 +10,7 @@ both fits.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,11 +69,35 @@ def largest_error(fit: SensorFit, table: Sequence[float]) -> float:
     return float(np.abs(found - np.asarray(table)).max())
 
 
-def row(
-    name: str, make: Callable[[], list[Scan]], table: Sequence[float] | None
-) -> SensorFit:
+def print_pandar(labelled: Path) -> None:
+    """The lines of the Pandar64."""
+    table = labelled / "pandaset/pandar64_elevations.csv"
+    hesai = np.loadtxt(table, delimiter=",", skiprows=1)[:, 1].tolist()
+    scans = pandar(labelled)
+    row("Pandar64 (PandaSet), sensor frame", scans, hesai)
+    row("the same without times", [replace(s, time=None) for s in scans], hesai)
+    forward = [s[s.points[:, 0] > abs(s.points[:, 1])] for s in scans]
+    row("the same, forward quarter", forward, hesai)
+    row("the same, every fourth beam", pandar(labelled, rings=4), hesai[::4])
+
+
+def print_hdl64(real: Path, labelled: Path) -> None:
+    """The lines of the HDL-64E."""
+    roots = {
+        "KITTI": real / "kitti_object" / "training" / "velodyne",
+        "SemanticKITTI": labelled / "semantic_kitti",
+        "KITTI-360": real / "kitti360",
+    }
+    for name, root in roots.items():
+        files = sorted(root.rglob("*.bin"))
+        fit = row(f"HDL-64E ({name}), even frames", raw(files[::2]), None)
+        table = fit.sensor.elevations or ()
+        row(f"HDL-64E ({name}), odd frames", raw(files[1::2]), table)
+    row("HDL-64E (KITTI-360), points shuffled", without_rings(raw(files[:5])), table)
+
+
+def row(name: str, scans: list[Scan], table: Sequence[float] | None) -> SensorFit:
     """Fit, and print a line of the table."""
-    scans = make()
     start = time.process_time()
     fit = fit_sensor(scans)
     seconds = time.process_time() - start
@@ -87,67 +111,20 @@ def row(
     return fit
 
 
-def main(
-    real: Path,
-    labelled: Path,
-) -> None:
+def main(real: Path, labelled: Path) -> None:
     """Prints the table."""
-    real = real
-    labelled = labelled
-    hesai = np.loadtxt(
-        labelled / "pandaset/pandar64_elevations.csv", delimiter=",", skiprows=1
-    )[:, 1].tolist()
     print(
         "| scans | frames | beams | error (degrees) | within 0.05 | firings | offsets by | range "
-        "step | seconds |"
+        "step | seconds |\n|---|---:|---:|---:|---:|---:|---|---:|---:|"
     )
-    print("|---|---:|---:|---:|---:|---:|---|---:|---:|")
-    row("Pandar64 (PandaSet), sensor frame", lambda: pandar(labelled), hesai)
-    row(
-        "the same without times",
-        lambda: [replace(s, time=None) for s in pandar(labelled)],
-        hesai,
-    )
-    row(
-        "the same, forward quarter",
-        lambda: [s[s.points[:, 0] > abs(s.points[:, 1])] for s in pandar(labelled)],
-        hesai,
-    )
-    row("the same, every fourth beam", lambda: pandar(labelled, rings=4), hesai[::4])
-    tables: dict[str, Sequence[float]] = {}
-    for name, files in {
-        "KITTI-360": sorted((real / "kitti360").rglob("*.bin")),
-        "KITTI": sorted(
-            (real / "kitti_object" / "training" / "velodyne").glob("*.bin")
-        ),
-        "SemanticKITTI": sorted((labelled / "semantic_kitti").rglob("*.bin")),
-    }.items():
-        first = row(
-            f"HDL-64E ({name}), even frames", lambda files=files: raw(files[::2]), None
-        )  # type: ignore[misc]
-        table = first.sensor.elevations or ()
-        tables[name] = table
-        row(
-            f"HDL-64E ({name}), odd frames", lambda files=files: raw(files[1::2]), table
-        )  # type: ignore[misc]
-    row(
-        "HDL-64E (KITTI-360), points shuffled",
-        lambda: without_rings(raw(sorted((real / "kitti360").rglob("*.bin"))[:5])),
-        tables["KITTI-360"],
-    )
-    row(
-        "HDL-32E (nuScenes)",
-        lambda: list(open_scans(real / "nuscenes")),
-        np.linspace(10.67, -30.67, 32).tolist(),
-    )
+    print_pandar(labelled)
+    print_hdl64(real, labelled)
+    nominal = np.linspace(10.67, -30.67, 32).tolist()
+    row("HDL-32E (nuScenes)", list(open_scans(real / "nuscenes")), nominal)
     for preset in ("town", "os1_128", "hdl32e_nuscenes"):
-        sensor = load_sensor(preset)
-        elevations = np.degrees(sensor.optics()[0]).tolist()
-        row(
-            f"town, `{preset}`",
-            lambda p=preset: [Town(0, p, motion=False)[i] for i in range(3)],
-            elevations,
-        )  # type: ignore[misc]
+        town = Town(0, preset, motion=False)
+        elevations = np.degrees(town.sensor.optics()[0]).tolist()
+        row(f"town, `{preset}`", [town[i] for i in range(3)], elevations)
 
 
 if __name__ == "__main__":

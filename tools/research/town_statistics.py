@@ -9,7 +9,7 @@ image. docs/research/town.md has the table.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from typer import run
 
 from lidar_synth.formats import open_scans
 from lidar_synth.geometry.projection import project, ring_numbers
-from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 
@@ -48,60 +48,16 @@ def is_ground(points: np.ndarray) -> np.ndarray:
 
 def statistics(scan: Scan) -> dict[str, float]:
     """All figures of one scan by name."""
-    sensor = load_sensor("town")
-    image = project(scan, sensor)
-    filled = image.mask
-    ranges = image.range
-    assert image.reflectance is not None
-    distance = np.linalg.norm(scan.points, axis=1)
-    assert sensor.firings is not None
-    rings = (
-        np.bincount(
-            ring_numbers(scan.points) if scan.ring is None else scan.ring, minlength=64
-        )[:64]
-        / sensor.firings
-    )
-    figures = {"points": float(len(scan)), "cells filled of 65,536": filled.sum()}
-    for a, b in GROUPS:
-        figures[f"empty cells, rows {a} to {b - 1}"] = 1 - filled[a:b].mean()
-    # A row that no beam reaches is empty, but not because returns were lost.
-    lost = ~filled[:, 1:-1] & filled[:, :-2] & filled[:, 2:]
-    figures["single lost cells (both neighbours filled)"] = lost.mean()
-    elevation = np.degrees(np.arcsin(scan.points[:, 2] / distance))
-    for share in (0.5, 5, 25, 50, 75, 95, 99.5):
-        figures[f"elevation, {share:g} % lower than (degrees)"] = float(
-            np.percentile(elevation, share)
-        )
-    azimuth = np.degrees(-np.arctan2(scan.points[:, 1], scan.points[:, 0]))
-    for a in range(-180, 180, 45):
-        inside = (azimuth >= a) & (azimuth < a + 45)
-        figures[f"share of returns at azimuth {a} to {a + 45} degrees"] = inside.mean()
-    for a, b in ((0, 16), (16, 32), (32, 48), (48, 64)):
-        figures[f"returns per firing, rings {a} to {b - 1}"] = rings[a:b].mean()
-    for a, b in GROUPS:
-        seen = ranges[a:b][filled[a:b]]
-        for share in (10, 50, 90):
-            figures[f"range in rows {a} to {b - 1}, {share} % nearer than (m)"] = float(
-                np.percentile(seen, share)
-            )
-    for a, b in pairwise(RANGES):
-        figures[f"cells at {a} to {b} m"] = (
-            (ranges >= a) & (ranges < b) & filled
-        ).sum() / filled.sum()
-    for a, b in pairwise(REFLECTANCE):
-        value = image.reflectance[filled]
-        name = "reflectance 0" if a == 0 else f"reflectance {a:.1f} to {b:.1f}"
-        figures[name] = ((value >= a) & (value < b)).mean()
-    for a, b in ((0, 10), (10, 25), (25, 40), (40, 80)):
-        near = (distance >= a) & (distance < b)
-        figures[f"mean reflectance at {a} to {b} m"] = scan.reflectance[near].mean()
-    ground = is_ground(scan.points)
-    figures["share of ground"] = ground.mean()
-    figures["share of ground beyond 20 m"] = ground[distance > 20].mean()
-    figures["mean reflectance of ground within 20 m"] = scan.reflectance[
-        ground & (distance < 20)
-    ].mean()
-    return figures
+    image = project(scan, load_sensor("town"))
+    return {
+        "points": float(len(scan)),
+        "cells filled of 65,536": image.mask.sum(),
+        **of_gaps(image),
+        **of_directions(scan),
+        **of_ranges(image),
+        **of_reflectance(scan, image),
+        **of_ground(scan),
+    }
 
 
 def gather(scans: Iterable[Scan], count: int, name: str) -> dict[str, np.ndarray]:
@@ -121,41 +77,110 @@ def number(value: float) -> str:
     )
 
 
-def main(
-    scans: int = 120,
-    seed: int = 0,
-) -> None:
+def of_gaps(image: RangeImage) -> dict[str, float]:
+    """Figures of missing returns."""
+    filled = image.mask
+    figures = {
+        f"empty cells, rows {a} to {b - 1}": 1 - filled[a:b].mean() for a, b in GROUPS
+    }
+    # A row that no beam reaches is empty, but not because returns were lost.
+    lost = ~filled[:, 1:-1] & filled[:, :-2] & filled[:, 2:]
+    figures["single lost cells (both neighbours filled)"] = lost.mean()
+    return figures
+
+
+def of_directions(scan: Scan) -> dict[str, float]:
+    """Figures of angles and rings."""
+    x, y, z = scan.points.T
+    figures = {}
+    elevation = np.degrees(np.arcsin(z / np.linalg.norm(scan.points, axis=1)))
+    for share in (0.5, 5, 25, 50, 75, 95, 99.5):
+        name = f"elevation, {share:g} % lower than (degrees)"
+        figures[name] = float(np.percentile(elevation, share))
+    azimuth = np.degrees(-np.arctan2(y, x))
+    for a in range(-180, 180, 45):
+        inside = (azimuth >= a) & (azimuth < a + 45)
+        figures[f"share of returns at azimuth {a} to {a + 45} degrees"] = inside.mean()
+    ring = ring_numbers(scan.points) if scan.ring is None else scan.ring
+    counts = np.bincount(ring, minlength=64) / (load_sensor("town").firings or 1)
+    for a in range(0, 64, 16):
+        name = f"returns per firing, rings {a} to {a + 15}"
+        figures[name] = counts[a : a + 16].mean()
+    return figures
+
+
+def of_ranges(image: RangeImage) -> dict[str, float]:
+    """Figures of ranges."""
+    figures = {}
+    for a, b in GROUPS:
+        seen = image.range[a:b][image.mask[a:b]]
+        for share in (10, 50, 90):
+            name = f"range in rows {a} to {b - 1}, {share} % nearer than (m)"
+            figures[name] = float(np.percentile(seen, share))
+    ranges = image.range[image.mask]
+    for a, b in pairwise(RANGES):
+        figures[f"cells at {a} to {b} m"] = ((ranges >= a) & (ranges < b)).mean()
+    return figures
+
+
+def of_reflectance(scan: Scan, image: RangeImage) -> dict[str, float]:
+    """Figures of reflectance."""
+    assert image.reflectance is not None
+    values = image.reflectance[image.mask]
+    figures = {}
+    for a, b in pairwise(REFLECTANCE):
+        name = "reflectance 0" if a == 0 else f"reflectance {a:.1f} to {b:.1f}"
+        figures[name] = ((values >= a) & (values < b)).mean()
+    distance = np.linalg.norm(scan.points, axis=1)
+    for a, b in pairwise((0, 10, 25, 40, 80)):
+        near = (distance >= a) & (distance < b)
+        figures[f"mean reflectance at {a} to {b} m"] = scan.reflectance[near].mean()
+    return figures
+
+
+def of_ground(scan: Scan) -> dict[str, float]:
+    """Figures of the ground."""
+    ground = is_ground(scan.points)
+    distance = np.linalg.norm(scan.points, axis=1)
+    near = scan.reflectance[ground & (distance < 20)]
+    return {
+        "share of ground": ground.mean(),
+        "share of ground beyond 20 m": ground[distance > 20].mean(),
+        "mean reflectance of ground within 20 m": near.mean(),
+    }
+
+
+def beside(town: np.ndarray, real: np.ndarray) -> list[str]:
+    """The cells of a figure of real scans beside the town's."""
+    ratio = town.mean() / real.mean() if real.mean() else float("nan")
+    lowest_to_highest = f"{number(real.min())} to {number(real.max())}"
+    return [number(real.mean()), lowest_to_highest, f"{ratio:.2f}"]
+
+
+def town_scans(seed: int, count: int) -> Iterator[Scan]:
+    """Three scans of each stretch: neighbouring scans are similar, and building a stretch takes
+    time."""
+    town = Town(seed, scans=STRETCH_FRAMES * -(-count // 3))
+    for number in range(count):
+        yield town[STRETCH_FRAMES * (number // 3) + (2, 9, 16)[number % 3]]
+
+
+def main(scans: int = 120, seed: int = 0) -> None:
     """Prints the table."""
-    # Three scans of each stretch: neighbouring scans are similar, and building a stretch takes
-    # time.
-    stretches = -(-scans // 3)
-    town = Town(seed, scans=STRETCH_FRAMES * stretches)
-    picked = [STRETCH_FRAMES * k + f for k in range(stretches) for f in (2, 9, 16)][
-        :scans
-    ]
-    sides = {"town": gather((town[i] for i in picked), len(picked), "town")}
+    town = gather(town_scans(seed, scans), scans, "town")
+    heads = ["figure", f"town ({scans} scans)"]
+    real = {}
     folder = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
     if folder:
-        scans = open_scans(Path(folder) / "kitti360")
-        sides["real"] = gather(scans, len(scans), "KITTI-360")  # type: ignore[arg-type]
-    print(
-        "| figure | "
-        + " | ".join(
-            f"{name} ({len(next(iter(s.values())))} scans)" for name, s in sides.items()
-        )
-        + (" | real, lowest to highest | town / real |" if folder else " |")
-    )
-    print("| --- |" + " ---: |" * (len(sides) + 2 * bool(folder)))
-    for key, values in sides["town"].items():
+        source = open_scans(Path(folder) / "kitti360")
+        real = gather(source, len(source), "KITTI-360")  # type: ignore[arg-type]
+        heads += [f"real ({len(source)} scans)", "real, lowest to highest"]
+        heads.append("town / real")
+    print("| " + " | ".join(heads) + " |\n| --- |" + " ---: |" * (len(heads) - 1))
+    for key, values in town.items():
         cells = [key, number(values.mean())]
-        if folder:
-            real = sides["real"][key]
-            ratio = values.mean() / real.mean() if real.mean() else float("nan")
-            cells += [
-                number(real.mean()),
-                f"{number(real.min())} to {number(real.max())}",
-                f"{ratio:.2f}",
-            ]
+        if real:
+            cells += beside(values, real[key])
         print("| " + " | ".join(cells) + " |")
 
 

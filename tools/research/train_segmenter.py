@@ -31,15 +31,9 @@ def town(seed: int, count: int) -> list[Scan]:
 
 
 def fit(
-    train: MixedScans,
-    validation: Source,
-    steps: int,
-    batch: int,
-    workers: int,
-    seed: int,
+    train: MixedScans, validation: Source, steps: int, batch: int, workers: int
 ) -> tuple[Judge, np.ndarray]:
     """A trained segmenter and its confusion matrix on held-out scans."""
-    torch.manual_seed(seed)
     sensor = train.collate.sensor
     height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
     network = RangeSegmenter()
@@ -49,7 +43,14 @@ def fit(
         held_out, batch, collate_fn=held_out.collate, num_workers=workers
     )
     table = confusion(network, tqdm(loader, desc="held out"), height)
-    return Judge(network, sensor, {}), table
+    return Judge(network, sensor, {"steps": steps, "batch": batch}), table
+
+
+def print_ious(table: np.ndarray) -> None:
+    """Print the IoU of each class and their mean, %."""
+    for name, iou in zip(NAMES, class_ious(table), strict=True):
+        print(f"{name:>16} {100 * iou:6.1f}")
+    print(f"{'mIoU':>16} {100 * mean_iou(table):6.1f}")
 
 
 def main(
@@ -66,37 +67,22 @@ def main(
     seed: int = 0,
     save: Path | None = None,
 ) -> None:
-
+    """Trains, prints the IoU of each class and saves the segmenter."""
+    sources: tuple[Source, Source]
     if root:
-        real = open_scans(root, split=split)
-        validation = open_scans(root, split=val_split)
+        sources = open_scans(root, split=split), open_scans(root, split=val_split)
     else:
-        real = town(0, scans)
-        validation = town(1, held_out)
+        sources = town(0, scans), town(1, held_out)
     synthetic = load_generator(model) if ratio else None
-    train = MixedScans(
-        real,
-        synthetic,
-        ratio,
-        seed=seed,
-        epoch_size="replace",
-        balanced=True,
-        collate="range",
-    )
-    judge, table = fit(train, validation, steps, batch, workers, seed)
-    for name, iou in zip(NAMES, class_ious(table), strict=True):
-        print(f"{name:>16} {100 * iou:6.1f}")
-    print(f"{'mIoU':>16} {100 * mean_iou(table):6.1f}")
+    options = {"epoch_size": "replace", "balanced": True, "collate": "range"}
+    train = MixedScans(sources[0], synthetic, ratio, seed=seed, **options)  # type: ignore[arg-type]
+    torch.manual_seed(seed)
+    judge, table = fit(train, sources[1], steps, batch, workers)
+    print_ious(table)
     if save:
-        data = root or f"{scans} scans of town 0, a second apart"
-        provenance = {
-            "data": data,
-            "ratio": ratio,
-            "steps": steps,
-            "batch": batch,
-            "mIoU": mean_iou(table),
-        }
-        Judge(judge.network, judge.sensor, provenance).save(save)
+        facts = {"data": root or f"{scans} scans of town 0, a second apart"}
+        facts |= {"ratio": ratio, "mIoU": mean_iou(table)}
+        Judge(judge.network, judge.sensor, judge.provenance | facts).save(save)
 
 
 if __name__ == "__main__":

@@ -76,9 +76,8 @@ def prepare(
         python,
         SCRIPTS / "mmdet3d_prepare.py",
         trial.folder,
-        *data,
-        "--configs",
         *configs,
+        *data,
     ]
     trial.run("prepare", command, env=env)
     shutil.copytree(trial.data.semantic_kitti, trial.folder / "data" / "semantickitti")

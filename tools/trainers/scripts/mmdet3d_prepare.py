@@ -1,7 +1,7 @@
 """Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short
 configurations.
 
-    python tools/trainers/scripts/mmdet3d_prepare.py OUT --kitti KITTI --nuscenes NUSCENES
+    python tools/trainers/scripts/mmdet3d_prepare.py OUT [CONFIG ...] --kitti KITTI --nuscenes NUSCENES
         [--frame NUSCENES_FRAME]
 
 Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in
@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.folders import write_planes
@@ -24,7 +24,7 @@ from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list
 from lidar_synth.integrations.mmdet3d_nuscenes import nuscenes_list
 from mmengine.config import Config
-from typer import run
+from typer import Argument, run
 
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.formats.convert import convert
@@ -37,7 +37,7 @@ SPCONV_ON_CPU = ("centerpoint_voxel_nuscenes.py",)
 """Configurations whose sparse convolutions need ``spconv_on_cpu``."""
 
 
-def kitti(out: Path, scans: int) -> None:
+def prepare_kitti(out: Path, scans: int) -> None:
     """The lists of ``data/kitti``, the mixed one, and the database of objects."""
     root = out / "data" / "kitti"
     write_planes(root, "trainval")
@@ -61,7 +61,7 @@ def kitti(out: Path, scans: int) -> None:
     )
 
 
-def nuscenes(out: Path, scans: int, frame: Path | None) -> None:
+def prepare_nuscenes(out: Path, scans: int, frame: Path | None) -> None:
     """The lists of ``data/nuscenes`` with one more real key frame, the mixed one, and the database
     of objects."""
     root = out / "data" / "nuscenes"
@@ -156,32 +156,13 @@ def shorten(
     config = Config.fromfile(str(CONFIGS / name))
     loader = config.train_dataloader
     loader.update(batch_size=batch_size, num_workers=1)
-    dataset = (
-        loader.dataset.dataset
-        if loader.dataset.type == "RepeatDataset"
-        else loader.dataset
-    )
+    dataset = loader.dataset
+    if dataset.type == "RepeatDataset":
+        dataset = dataset.dataset
     for step in dataset.pipeline:
         if step.type == "ObjectSample":
             few_objects(step.db_sampler)
-    config.train_cfg = {
-        "type": "IterBasedTrainLoop",
-        "max_iters": iterations,
-        "val_interval": iterations,
-    }
-    config.param_scheduler = []
-    if config.optim_wrapper.type == "AmpOptimWrapper":  # mixed precision is a GPU's
-        config.optim_wrapper = {
-            "type": "OptimWrapper",
-            "optimizer": config.optim_wrapper.optimizer,
-        }
-    config.default_hooks.logger = {"type": "LoggerHook", "interval": 1}
-    config.default_hooks.checkpoint = {
-        "type": "CheckpointHook",
-        "interval": iterations // 2,
-        "by_epoch": False,
-    }
-    config.log_processor = {"type": "LogProcessor", "window_size": 1, "by_epoch": False}
+    few_iterations(config, iterations)
     if "mmdet3d_report" in extra:
         config.custom_hooks = [*config.custom_hooks, {"type": "Report"}]
     config.custom_imports.imports = [*extra, *config.custom_imports.imports]
@@ -203,25 +184,41 @@ def few_objects(sampler: Any) -> None:
     }
 
 
+def few_iterations(config: Any, count: int) -> None:
+    """Restrict a configuration to a number of iterations, each with a line in the log."""
+    loop = {"max_iters": count, "val_interval": count}
+    config.train_cfg = {"type": "IterBasedTrainLoop"} | loop
+    config.param_scheduler = []
+    wrapper = config.optim_wrapper
+    if wrapper.type == "AmpOptimWrapper":  # mixed precision is a GPU's
+        wrapper = {"type": "OptimWrapper", "optimizer": wrapper.optimizer}
+        config.optim_wrapper = wrapper
+    hooks = config.default_hooks
+    hooks.logger = {"type": "LoggerHook", "interval": 1}
+    saving = {"interval": count // 2, "by_epoch": False}
+    hooks.checkpoint = {"type": "CheckpointHook"} | saving
+    config.log_processor = {"type": "LogProcessor", "window_size": 1, "by_epoch": False}
+
+
 def main(
     out: Path,
+    configs: Annotated[list[str] | None, Argument()] = None,
     kitti: Path | None = None,
     nuscenes: Path | None = None,
     frame: Path | None = None,
     scans: int = 4,
-    configs: list[str] | None = None,
 ) -> None:
-    """See the module."""
+    """Writes the lists of so many synthetic scans, and shortens configurations."""
     out = out.resolve()
     given = {"kitti": kitti, "nuscenes": nuscenes}
     for name, root in given.items():
         if root is not None:
             shutil.copytree(root, out / "data" / name)
     if kitti:
-        kitti(out, scans)
+        prepare_kitti(out, scans)
     if nuscenes:
-        nuscenes(out, scans, frame)
-    for name in configs:
+        prepare_nuscenes(out, scans, frame)
+    for name in configs or ():
         extra = ("spconv_on_cpu",) if name in SPCONV_ON_CPU else ()
         shorten(name, out, extra=("mmdet3d_report", *extra))
 

@@ -8,15 +8,16 @@ two key frames,
 as the LiDAR alone sees it: no cameras, and an empty map.
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.nuscenes import NAMES, as_nuscenes, five_values
+from numpy.typing import NDArray
 from PIL import Image
 from pyquaternion import Quaternion
+from typer import run
 
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.town import Town
@@ -69,41 +70,49 @@ class Tables:
             (folder / f"{name}.json").write_text(json.dumps(rows))
 
 
-def write_dataset(out: Path, seed: int) -> None:
-    """Write scans and tables to ``out``."""
-    tables = Tables()
-    tables.add("visibility", "4", level="v80-100", description="")
-    tables.add("sensor", "lidar", channel="LIDAR_TOP", modality="lidar")
-    mount = {
-        "translation": [0, 0, HEIGHT],
-        "rotation": Quaternion(matrix=AHEAD).elements.tolist(),
+def placed(box: NDArray[np.float64], pose: NDArray[np.float64]) -> dict[str, Any]:
+    """Place, size and rotation of a box in the world."""
+    length, width, height, yaw = box[3:]
+    turn = Quaternion(matrix=pose[:3, :3]) * Quaternion(axis=(0, 0, 1), radians=yaw)
+    return {
+        "translation": (pose[:3, :3] @ box[:3] + pose[:3, 3]).tolist(),
+        "size": [width, length, height],
+        "rotation": turn.elements.tolist(),
     }
-    tables.add(
-        "calibrated_sensor", "mount", sensor_token="lidar", camera_intrinsic=[], **mount
-    )
+
+
+def write_dataset(out: Path, seed: int = 0) -> None:
+    """Writes scans and tables."""
+    tables = Tables()
+    add_sensor(tables)
     for category, attribute in CATEGORIES.values():
         tables.add("category", category, name=category, description="")
         tables.add("attribute", attribute, name=attribute, description="")
-    town = Town(
-        seed=seed,
-        sensor="hdl32e_nuscenes",
-        scans=STRETCH_FRAMES * len(SCENES),
-        interval=INTERVAL,
-    )
     # The devkit asks for a map of each log.
     tables.add("log", "log", logfile="", vehicle="", date_captured="", location="")
-    tables.add(
-        "map",
-        "map",
-        category="semantic_prior",
-        filename="maps/empty.png",
-        log_tokens=["log"],
-    )
+    plan = {"category": "semantic_prior", "filename": "maps/empty.png"}
+    tables.add("map", "map", **plan, log_tokens=["log"])
     (out / "maps").mkdir(parents=True, exist_ok=True)
     Image.new("L", (8, 8)).save(out / "maps" / "empty.png")
+    scans = STRETCH_FRAMES * len(SCENES)
+    town = Town(seed, "hdl32e_nuscenes", scans, interval=INTERVAL)
     for number, name in enumerate(SCENES):
         write_scene(out, tables, town, number, name)
     tables.write(out / VERSION)
+
+
+def add_sensor(tables: Tables) -> None:
+    """Add the LiDAR and its mount."""
+    tables.add("visibility", "4", level="v80-100", description="")
+    tables.add("sensor", "lidar", channel="LIDAR_TOP", modality="lidar")
+    tables.add(
+        "calibrated_sensor",
+        "mount",
+        sensor_token="lidar",
+        camera_intrinsic=[],
+        translation=[0, 0, HEIGHT],
+        rotation=Quaternion(matrix=AHEAD).elements.tolist(),
+    )
 
 
 def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -> None:
@@ -114,69 +123,67 @@ def write_scene(out: Path, tables: Tables, town: Town, number: int, name: str) -
     for frame in range(STRETCH_FRAMES):
         scan = town[number * STRETCH_FRAMES + frame]
         stamp = int(1e6 * (START + 100 * number + INTERVAL * frame))
-        key = frame in KEYS
         sample = f"{name}-{KEYS[0] if frame <= KEYS[0] else KEYS[1]}"
-        if key:
-            samples.append(
-                tables.add("sample", sample, timestamp=stamp, scene_token=name)
-            )
+        if frame in KEYS:
+            row = tables.add("sample", sample, timestamp=stamp, scene_token=name)
+            samples.append(row)
             annotate(tables, scan, sample, tracks, name)
-        token = f"{name}-{frame:02d}"
-        file = f"{'samples' if key else 'sweeps'}/LIDAR_TOP/{name}__LIDAR_TOP__{stamp}.pcd.bin"
-        frames.append(
-            tables.add(
-                "sample_data",
-                token,
-                sample_token=sample,
-                ego_pose_token=token,
-                calibrated_sensor_token="mount",
-                timestamp=stamp,
-                fileformat="pcd",
-                is_key_frame=key,
-                height=0,
-                width=0,
-                filename=file,
-            )
-        )
-        vehicle = in_world(scan)
-        vehicle[:3, 3] -= HEIGHT * vehicle[:3, 2]
-        rotation = Quaternion(matrix=vehicle[:3, :3]).elements.tolist()
-        tables.add(
-            "ego_pose",
-            token,
-            timestamp=stamp,
-            rotation=rotation,
-            translation=vehicle[:3, 3].tolist(),
-        )
-        (out / file).parent.mkdir(parents=True, exist_ok=True)
-        (out / file).write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
+        row = add_sweep(tables, scan, f"{name}-{frame:02d}", sample, stamp)
+        row["is_key_frame"] = frame in KEYS
+        file = f"LIDAR_TOP/{name}__LIDAR_TOP__{stamp}.pcd.bin"
+        row["filename"] = f"{'samples' if frame in KEYS else 'sweeps'}/{file}"
+        frames.append(row)
+        path = out / row["filename"]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(five_values(as_nuscenes(scan)).astype("<f4").tobytes())
     for rows in (frames, samples, *tracks.values()):
         tables.link(rows)
-    for instance, rows in tracks.items():
-        ends = {
-            "first_annotation_token": rows[0]["token"],
-            "last_annotation_token": rows[-1]["token"],
-        }
-        tables.add(
-            "instance",
-            f"{name}-{instance}",
-            category_token=CATEGORIES[rows[0].pop("class")][0],
-            nbr_annotations=len(rows),
-            **ends,
-        )
-    ends = {
-        "first_sample_token": samples[0]["token"],
-        "last_sample_token": samples[-1]["token"],
-    }
-    tables.add(
-        "scene",
-        name,
-        name=name,
-        description="",
-        log_token="log",
-        nbr_samples=len(samples),
-        **ends,
+    add_instances(tables, tracks, name)
+    facts = {"name": name, "description": "", "log_token": "log"}
+    facts |= {"nbr_samples": len(samples)}
+    tables.add("scene", name, **facts, **ends("sample", samples))
+
+
+def add_sweep(
+    tables: Tables, scan: Scan, token: str, sample: str, stamp: int
+) -> dict[str, Any]:
+    """Add the pose of a sweep, and its row, without what says whether it is a key frame."""
+    vehicle = in_world(scan)
+    vehicle[:3, 3] -= HEIGHT * vehicle[:3, 2]
+    rotation = Quaternion(matrix=vehicle[:3, :3]).elements.tolist()
+    place = vehicle[:3, 3].tolist()
+    row = tables.add(
+        "sample_data",
+        token,
+        sample_token=sample,
+        ego_pose_token=token,
+        calibrated_sensor_token="mount",
+        timestamp=stamp,
+        fileformat="pcd",
+        height=0,
+        width=0,
     )
+    tables.add("ego_pose", token, timestamp=stamp, rotation=rotation, translation=place)
+    return row
+
+
+def add_instances(
+    tables: Tables, tracks: dict[int, list[dict[str, Any]]], scene: str
+) -> None:
+    """Add the objects of a scene."""
+    for instance, rows in tracks.items():
+        category = CATEGORIES[rows[0].pop("class")][0]
+        facts = {"category_token": category, "nbr_annotations": len(rows)}
+        token = f"{scene}-{instance}"
+        tables.add("instance", token, **facts, **ends("annotation", rows))
+
+
+def ends(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
+    """The tokens of the first and the last of some rows."""
+    return {
+        f"first_{kind}_token": rows[0]["token"],
+        f"last_{kind}_token": rows[-1]["token"],
+    }
 
 
 def annotate(
@@ -188,14 +195,11 @@ def annotate(
 ) -> None:
     """Add the boxes of a key frame to the tables, and to the tracks of their instances."""
     assert scan.boxes is not None
-    pose = in_world(scan)
     counts = scan.boxes.contain(scan.points).sum(1)
     for i, kind in enumerate(scan.boxes.names):
         if NAMES[kind] not in CATEGORIES or not counts[i]:
             continue
-        x, y, z, length, width, height, yaw = scan.boxes.values[i].astype(float)
         instance = int(scan.boxes.instance[i])
-        turn = Quaternion(matrix=pose[:3, :3]) * Quaternion(axis=(0, 0, 1), radians=yaw)
         row = tables.add(
             "sample_annotation",
             f"{sample}-{instance}",
@@ -204,10 +208,8 @@ def annotate(
             visibility_token="4",
             attribute_tokens=[CATEGORIES[NAMES[kind]][1]],
             num_radar_pts=0,
-            translation=(pose[:3, :3] @ (x, y, z) + pose[:3, 3]).tolist(),
-            size=[width, length, height],
-            rotation=turn.elements.tolist(),
             num_lidar_pts=int(counts[i]),
+            **placed(scan.boxes.values[i].astype(float), in_world(scan)),
         )
         tracks.setdefault(instance, []).append(row)
         if len(tracks[instance]) == 1:
@@ -221,10 +223,4 @@ def in_world(scan: Scan) -> Any:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    write_dataset(options.out, options.seed)
+    run(write_dataset)
