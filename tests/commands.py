@@ -203,35 +203,36 @@ def _script(path: Path, words: list[str], folder: Path | None) -> None:
     """A script of the repository, by the parser in it; without one, that it compiles."""
     parse = argparse.ArgumentParser.parse_args
 
-    def parse_only(parser: argparse.ArgumentParser, *args: Any, **options: Any) -> None:
-        parse(parser, *args, **options)
+    def parsed(parser: argparse.ArgumentParser) -> None:
+        parse(parser)
         raise _Parsed
 
-    def run_parser_only(function: Callable[..., Any]) -> None:
-        app = typer.Typer(add_completion=False)
-        app.command()(function)
-        typer.main.get_command(app).make_context(path.name, list(words))
-        raise _Parsed
+    def called(program: typer.Typer) -> None:
+        command = typer.main.get_command(program)
+        _record(command, "", {})
+        command.main(list(words), path.name)
 
     text = path.read_text()
     compile(text, str(path), "exec")
     if "from lidar_synth.cli import main" in text:
         lidar_synth([path.stem, *words], folder)
-    elif "parse_args" in text or "from typer import" in text:
+    elif "parse_args" in text or "typer" in text:
         with (
-            mock.patch.object(argparse.ArgumentParser, "parse_args", parse_only),
-            mock.patch.object(typer, "run", run_parser_only),
+            mock.patch.object(argparse.ArgumentParser, "parse_args", parsed),
+            mock.patch.object(typer.Typer, "__call__", called),
             mock.patch.object(sys, "argv", [str(path), *words]),
             mock.patch.object(sys, "path", [str(path.parent), *sys.path]),
         ):
             try:
                 runpy.run_path(str(path), run_name="__main__")
+            except SystemExit as stop:
+                if stop.code:
+                    raise WrongCommand(
+                        f"{path.name} {shlex.join(words)}: wrong arguments"
+                    ) from stop
+                return
             except _Parsed:
                 return
-            except (SystemExit, Exception) as stop:
-                raise WrongCommand(
-                    f"{path.name} {shlex.join(words)}: wrong arguments"
-                ) from stop
             raise WrongCommand(f"{path.name} has not parsed its arguments")
 
 

@@ -81,12 +81,11 @@ def print_confidence(town: Path, out: Path) -> None:
     labelled = np.zeros(len(edges) - 1)
     right = np.zeros(len(edges) - 1)
     for known, scan in zip(KITTI360(town), KITTI360(town, labels=out), strict=True):
-        assert known.label is not None
-        assert scan.label is not None and scan.confidence is not None
         both = (known.label != IGNORE) & (scan.label != IGNORE)
-        equal = both & (known.label == scan.label)
-        labelled += np.histogram(scan.confidence[both], edges)[0]
-        right += np.histogram(scan.confidence[equal], edges)[0]
+        confidence = scan.confidence[both]
+        equal = (known.label == scan.label)[both]
+        labelled += np.histogram(confidence, edges)[0]
+        right += np.histogram(confidence[equal], edges)[0]
     shares = 100 * labelled / labelled.sum()
     good = 100 * right / np.maximum(labelled, 1)
     print("\n| confidence | share of the labels | right |\n|---|---:|---:|")

@@ -21,7 +21,6 @@ from model_card import (
     SEED,
     Asked,
     Comparison,
-    Measured,
     apart,
     needs_images,
     table,
@@ -116,27 +115,25 @@ def main(
     real = [town[i * STRETCH_FRAMES] for i in tqdm(range(count), desc="town")]
     layouts = [layout_of(scan) for scan in real]
     every = [Asked.parse(text) for text in models]
-    sets: list[Measured] = []
-    counts: dict[str, LayoutAgreement | None] = {
-        "the town's own scans": layout_agreement(real, layouts, real)
-    }
+    own = layout_agreement(real, layouts, real)
+    counts: dict[str, LayoutAgreement | None] = {"the town's own scans": own}
+    made = {}
     with TemporaryDirectory() as folder:
         if needs_images(every):
             real = with_images(real, town, Path(folder))
-        if distances:
-            comparison = Comparison(real, load_judge(), intervals)
         for asked in every:
             kind, scans = generate(asked, guidance, real)
-            counts[asked.name] = (
-                layout_agreement(scans, layouts, real) if kind == "layout" else None
-            )
-            if distances:
-                sets.append(comparison.measure(asked.name, scans))
-            if picture and asked is every[0]:
-                draw(picture, scans, real, layouts)
+            made[asked.name] = scans
+            follows = kind == "layout"
+            found = layout_agreement(scans, layouts, real) if follows else None
+            counts[asked.name] = found
     print(f"{count} layouts of the town of seed {seed}\n")
     print_agreement(counts)
+    if picture:
+        draw(picture, next(iter(made.values())), real, layouts)
     if distances:
+        comparison = Comparison(real, load_judge(), intervals)
+        sets = [comparison.measure(name, scans) for name, scans in made.items()]
         print(f"\n{table(sets)}")
     if dump:
         values = {name: found and found._asdict() for name, found in counts.items()}

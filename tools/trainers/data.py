@@ -18,6 +18,8 @@ from lidar_synth.labels import ObjectBank
 
 TRAINING = tuple(f"{number:02d}" for number in (0, 1, 2, 3, 4, 5, 6, 7, 9, 10))
 VALIDATION = "08"
+KITTI = ("velodyne", "label_2", "calib", "image_2")
+"""Folders of KITTI's object set."""
 REAL_VALIDATION = "09"
 """The recorded sequence that serves as sequence 08, which every trainer validates on."""
 
@@ -82,55 +84,46 @@ class Data:
         if out.is_dir():
             return out
         made = self.folder / "kitti.part"
-        export_town(
-            Town(seed=1, scans=self.scans + 1),
-            made,
-            "kitti",
-            camera=True,
-            progress=False,
-        )
-        town = sorted(
-            path.stem for path in (made / "training" / "velodyne").glob("*.bin")
-        )
-        for path in sorted(
-            made.glob("training/*/*")
-        ):  # KITTI's own numbers end below 007481
-            path.rename(path.with_name(f"{int(path.stem) + 7500:06d}{path.suffix}"))
-        town = [f"{int(frame) + 7500:06d}" for frame in town]
-        real: list[str] = []
-        recorded = (
-            Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", ""))
-            / "kitti_object"
-            / "training"
-        )
-        if os.environ.get("LIDAR_SYNTH_REAL_SCANS") and recorded.is_dir():
-            kinds = {
-                "velodyne": ".bin",
-                "label_2": ".txt",
-                "calib": ".txt",
-                "image_2": ".png",
-            }
-            for path in sorted((recorded / "velodyne").glob("*.bin")):
-                files = {
-                    kind: recorded / kind / f"{path.stem}{ending}"
-                    for kind, ending in kinds.items()
-                }
-                if all(file.is_file() for file in files.values()):
-                    real.append(path.stem)
-                    for kind, file in files.items():
-                        shutil.copyfile(file, made / "training" / kind / file.name)
+        town = self._town_frames(made)
+        real = self._real_frames(made)
         validation = [frames[-1] for frames in (real, town) if frames]
-        training = [frame for frame in real + town if frame not in validation]
-        for split, frames in {
-            "train": training,
-            "val": validation,
-            "trainval": sorted(training + validation),
-        }.items():
-            (made / "ImageSets" / f"{split}.txt").write_text(
-                "".join(f"{frame}\n" for frame in sorted(frames))
-            )
+        every = sorted(real + town)
+        splits = {
+            "train": [frame for frame in every if frame not in validation],
+            "val": sorted(validation),
+            "trainval": every,
+        }
+        for split, frames in splits.items():
+            lines = "".join(f"{frame}\n" for frame in frames)
+            (made / "ImageSets" / f"{split}.txt").write_text(lines)
         made.rename(out)
         return out
+
+    def _town_frames(self, made: Path) -> list[str]:
+        """Write frames of the town; their names."""
+        town = Town(seed=1, scans=self.scans + 1)
+        export_town(town, made, "kitti", camera=True, progress=False)
+        for path in sorted(made.glob("training/*/*")):
+            # KITTI's own numbers end below 007481.
+            path.rename(path.with_name(f"{int(path.stem) + 7500:06d}{path.suffix}"))
+        return sorted(path.stem for path in made.glob("training/velodyne/*.bin"))
+
+    def _real_frames(self, made: Path) -> list[str]:
+        """Copy the real frames that have an image; their names."""
+        root = os.environ.get("LIDAR_SYNTH_REAL_SCANS")
+        if not root:
+            return []
+        frames = []
+        for image in sorted(Path(root).glob("kitti_object/training/image_2/*.png")):
+            folders = [image.parents[1] / kind for kind in KITTI]
+            files = [f for each in folders for f in each.glob(f"{image.stem}.*")]
+            if len(files) == len(KITTI):
+                frames.append(image.stem)
+                for file in files:
+                    shutil.copyfile(
+                        file, made / "training" / file.parent.name / file.name
+                    )
+        return frames
 
     @cached_property
     def bank(self) -> Path:

@@ -42,64 +42,8 @@ def rows(trial: Trial) -> Iterator[Row]:
     root = trial.folder / "semantic_kitti"
     root.mkdir()
     (root / "dataset").symlink_to(trial.data.semantic_kitti)
-    mix = mixture(trial)
-
-    stock = "configs/semantic_kitti/semseg-spunet-v1m1-0-base.py"
-    base = trial.folder / "base.py"
-    base.write_text(SEGMENTATION.format(stock=str(tree / stock), root=str(root)))
-    names = common(tree) | {"semseg-spunet-v1m1-0-base.py": base, "/data/mix.yaml": mix}
-    names['dict(type="CheckpointSaver")'] = 'dict(type="CheckpointSaver", save_freq=1)'
-
-    def train(name: str, more: str = "") -> str:
-        own = names | {"exp/mixed": f"{trial.folder / name} {more}"}
-        expect = [r"loss: \d", r"Val result: mIoU"]
-        return trial.type_page(
-            name, python, PAGE, own, skip=PIP, expect=expect, minutes=120
-        )
-
-    whole = train("segmentation")
-    saved = trial.folder / "segmentation" / "model" / "epoch_1.pth"
-    if not saved.is_file():
-        raise Failed("no checkpoint after the first epoch")
-    rest = train("resumed", f"resume=True weight={saved}")
-    if samples(rest) != {1: samples(whole)[1]}:
-        raise Failed(
-            f"the resumed run saw {samples(rest)} instead of {samples(whole)[1]}"
-        )
-    yield trial.row(
-        f"tools/train.py, {stock}",
-        ["training", "validation", "checkpoint", "resume"],
-        LEFT_OUT,
-    )
-
-    sonata = ROOT / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
-    config = trial.folder / "sonata.py"
-    unlabelled = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "none"}
-    config.write_text(
-        PRETRAINING.format(stock=str(sonata), root=str(root), mix=unlabelled)
-    )
-    names = common(tree) | {
-        "configs/semantic_kitti/mixed.py": config,
-        "exp/mixed": trial.folder / "sonata",
-    }
-    trial.type_page(
-        "pretraining",
-        python,
-        PAGE,
-        names,
-        skip=f"{PIP}|^cat",
-        expect=[r"loss: \d"],
-        minutes=120,
-    )
-    if not (trial.folder / "sonata" / "model" / "model_last.pth").is_file():
-        raise Failed("no checkpoint")
-    left_out = (
-        f"{LEFT_OUT}; flash attention; the stock width: 24 GB of memory; Pointcept has no "
-        "validation in pretraining"
-    )
-    yield trial.row(
-        f"tools/train.py, {sonata.name}", ["training", "checkpoint"], left_out
-    )
+    yield segmentation(trial, python, tree, root)
+    yield pretraining(trial, python, tree, root)
 
 
 def common(tree: Path) -> dict[str, object]:
@@ -117,3 +61,55 @@ def samples(output: str) -> dict[int, list[str]]:
     for epoch, name in re.findall(r"epoch (\d+) sample (\S+)", output):
         found.setdefault(int(epoch), []).append(name)
     return {epoch: sorted(names) for epoch, names in found.items()}
+
+
+def segmentation(trial: Trial, python: Path, tree: Path, root: Path) -> Row:
+    """Two epochs, and the second one once more in a resumed run."""
+    stock = "configs/semantic_kitti/semseg-spunet-v1m1-0-base.py"
+    base = trial.folder / "base.py"
+    base.write_text(SEGMENTATION.format(stock=str(tree / stock), root=str(root)))
+    names = common(tree) | {"semseg-spunet-v1m1-0-base.py": base}
+    names["/data/mix.yaml"] = mixture(trial)
+    names['dict(type="CheckpointSaver")'] = 'dict(type="CheckpointSaver", save_freq=1)'
+    expect = [r"loss: \d", r"Val result: mIoU"]
+
+    def train(name: str, more: str = "") -> dict[int, list[str]]:
+        own = names | {"exp/mixed": f"{trial.folder / name} {more}"}
+        said = trial.type_page(
+            name, python, PAGE, own, skip=PIP, expect=expect, minutes=120
+        )
+        return samples(said)
+
+    whole = train("segmentation")
+    saved = trial.folder / "segmentation" / "model" / "epoch_1.pth"
+    if not saved.is_file():
+        raise Failed("no checkpoint after the first epoch")
+    rest = train("resumed", f"resume=True weight={saved}")
+    if rest != {1: whole[1]}:
+        raise Failed(f"the resumed run saw {rest} instead of {whole[1]}")
+    ran = ["training", "validation", "checkpoint", "resume"]
+    return trial.row(f"tools/train.py --config-file {stock}", ran, LEFT_OUT)
+
+
+def pretraining(trial: Trial, python: Path, tree: Path, root: Path) -> Row:
+    """One epoch of Sonata."""
+    sonata = ROOT / "configs" / "pointcept" / "pretrain_sonata_semantickitti.py"
+    config = trial.folder / "sonata.py"
+    mix = {"synthetic": str(trial.data.bank), "ratio": 0.5, "labels": "none"}
+    own = PRETRAINING.format(stock=str(sonata), root=str(root), mix=mix)
+    config.write_text(own)
+    names = common(tree) | {"exp/mixed": trial.folder / "sonata"}
+    names["configs/semantic_kitti/mixed.py"] = config
+    skip = f"{PIP}|^cat"
+    expect = [r"loss: \d"]
+    trial.type_page(
+        "pretraining", python, PAGE, names, skip=skip, expect=expect, minutes=120
+    )
+    if not (trial.folder / "sonata" / "model" / "model_last.pth").is_file():
+        raise Failed("no checkpoint")
+    left_out = (
+        f"{LEFT_OUT}; flash attention; the stock width: 24 GB of memory; Pointcept has no "
+        "validation in pretraining"
+    )
+    script = f"tools/train.py --config-file {sonata.name}"
+    return trial.row(script, ["training", "checkpoint"], left_out)
