@@ -141,7 +141,7 @@ class Crosstalk(Corruption):
         >>> from lidar_synth.weather import Crosstalk
         >>> scan = Town(seed=0, scans=1)[0]
         >>> noisy = Crosstalk(share=0.01)(scan, np.random.default_rng(0))
-        >>> 0 < (noisy.label != scan.label).mean() <= 0.01
+        >>> bool(0 < (noisy.label != scan.label).mean() <= 0.01)
         True
     """
 
@@ -180,7 +180,7 @@ class IncompleteEcho(Corruption):
         >>> from lidar_synth.weather import IncompleteEcho
         >>> scan = Town(seed=0, scans=1)[0]
         >>> dark = IncompleteEcho(share=0.85)(scan, np.random.default_rng(0))
-        >>> (dark.label == 0).sum() < 0.3 * (scan.label == 0).sum()
+        >>> int((dark.label == 0).sum()) < 0.3 * int((scan.label == 0).sum())
         True
     """
 
