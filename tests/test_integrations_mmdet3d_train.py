@@ -71,7 +71,6 @@ def test_pointpillars_trains_validates_and_resumes(tmp_path: Path) -> None:
         tmp_path,
         "--kitti",
         root,
-        "--configs",
         "pointpillars_kitti.py",
     )
     whole = typed(tmp_path, TRAIN, "pointpillars_kitti.py", "--work-dir", "whole")

@@ -29,7 +29,7 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.segmentation import class_ious
 from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
 from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings
-from lidar_synth.lab.proof.arms import rows
+from lidar_synth.lab.proof.arms import options_of, policy_of, rows
 from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
@@ -50,8 +50,10 @@ from lidar_synth.lab.proof.trial import (
     reference,
     turn_scan,
 )
+from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
+from lidar_synth.noise import keyed_rng
 
 
 def test_wrapped_padding_is_circular_padding() -> None:
@@ -492,3 +494,14 @@ def test_a_job_is_plain_values(name: str, tmp_path: Path) -> None:
     assert [stage["iterations"] for stage in values["stages"]] == [
         count for _, count in task.stages()
     ]
+
+
+def test_real_scans_without_instances_exchange_no_objects() -> None:
+    """PolarMix turns whole objects, which SemanticKITTI's labels without instances lack."""
+    scan = Town(1, scans=1)[0]
+    bare = [replace(scan, instance=None, boxes=None)]
+    [stage] = ARMS["exchange"].stages(0.5)
+    assert options_of(stage, bare, None) == {"objects": 0}
+    policy = policy_of(stage, bare, None, frozenset({"label"}))
+    assert len(policy(bare[0], keyed_rng(0))) > 0
+    assert options_of(stage, [scan], None) == {}

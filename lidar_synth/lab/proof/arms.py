@@ -248,6 +248,6 @@ def options_of(
             "bank": objects,
             "count": {name: most for name, most in RARE.items() if name in there},
         }
-    elif options.get("kind") == "exchange" and real[0].instance is None:
+    elif stage.labels == "polarmix_or_lasermix" and real[0].instance is None:
         options["objects"] = 0  # PolarMix turns whole objects, which needs instances
     return options
