@@ -62,7 +62,8 @@ def narrow(image: RangeImage) -> None:
 
 def sprayed(image: RangeImage) -> None:
     shown = image.range[image.mask]
-    image.range[image.mask] = np.where(np.arange(len(shown)) % 3, shown, 1.5 * shown)
+    behind = np.random.default_rng(0).uniform(45, 75, len(shown))
+    image.range[image.mask] = np.where(np.arange(len(shown)) % 3, shown, behind)
 
 
 PLANTED: dict[str, Callable[[RangeImage], object]] = {
