@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -37,51 +38,49 @@ VARIABLES = {
 }
 
 
-def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
-    """The stock dataset and the mixed one, with the same real scans."""
-    import mmcv_ext
-
-    mmcv_ext.install()
+def write_lists(root: Path) -> tuple[Path, Path]:
+    """The trainer's own list of scans of the town, and the mixed one."""
     from lidar_synth.integrations.mmdet3d_infos import write_infos
     from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
-    from mmdet3d.registry import DATASETS
-    from mmengine.config import Config
-    from mmengine.registry import init_default_scope
 
     from lidar_synth.formats import WRITERS
     from lidar_synth.formats.convert import convert
     from lidar_synth.lab.town import Town, export_town
 
-    export_town(
-        Town(seed=1, scans=SCANS),
-        root / "real",
-        "semantic_kitti",
-        camera=False,
-        progress=False,
-    )
-    convert(
-        Town(seed=2, scans=SCANS), WRITERS["npz"](root / "synthetic"), progress=False
-    )
-    listed = semantic_kitti_list(root / "real", root / "real" / "train.json")
-    settings = {"synthetic": root / "synthetic", "ratio": 0.5}
-    mixed = write_infos(root / "mixed", listed, settings, data_root=root / "real")
+    real = root / "real"
+    quiet = {"camera": False, "progress": False}
+    export_town(Town(seed=1, scans=SCANS), real, "semantic_kitti", **quiet)
+    synthetic = root / "synthetic"
+    convert(Town(seed=2, scans=SCANS), WRITERS["npz"](synthetic), progress=False)
+    listed = semantic_kitti_list(real, real / "train.json")
+    settings = {"synthetic": synthetic, "ratio": 0.5}
+    return listed, write_infos(root / "mixed", listed, settings, data_root=real)
+
+
+def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
+    """The stock dataset and the mixed one, with the same real scans."""
+    import mmcv_ext
+
+    mmcv_ext.install()
+    from mmdet3d.registry import DATASETS
+    from mmengine.config import Config
+    from mmengine.registry import init_default_scope
+
+    listed, mixed = write_lists(root)
     init_default_scope("mmdet3d")
-    config = Config.fromfile(
-        str(Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py")
-    )
+    file = Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py"
+    config = Config.fromfile(str(file))
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
-    ours["pipeline"] = [
-        *ours["pipeline"][:3],
-        *ours["pipeline"][-2:],
-    ]  # without random partners
+    first, last = ours["pipeline"][:3], ours["pipeline"][-2:]
+    ours["pipeline"] = [*first, *last]  # without random partners
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
     stock = DATASETS.build(theirs)
     dataset = DATASETS.build(ours)
-    slots = iter(range(10**9))
+    slots = cycle(range(SCANS, 2 * SCANS))
     return {
         OWN: lambda: stock[0],
         MIXED: lambda: dataset[0],
-        SYNTHETIC: lambda: dataset[SCANS + next(slots) % SCANS],
+        SYNTHETIC: lambda: dataset[next(slots)],
     }
 
 
