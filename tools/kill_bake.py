@@ -15,7 +15,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -77,6 +77,21 @@ def count_kills(
     return kills
 
 
+def repeat(
+    again: Callable[[], int], plan: BakePlan, kills: int, seconds: float, seed: int
+) -> Iterator[int]:
+    """Bake banks under kills until there were enough of them; the number of kills of each."""
+    rng = random.Random(seed)
+    done = 0
+    with tqdm(total=kills, unit="kill") as bar:
+        while done < kills:
+            shutil.rmtree(plan.out)
+            found = count_kills(plan, again, seconds, rng)
+            done += found
+            bar.update(found)
+            yield found
+
+
 def main(
     model: str | None = None,
     kills: int = 100,
@@ -87,32 +102,27 @@ def main(
     seed: int = 0,
 ) -> None:
     """Repeats until the number of kills is reached; exits with 1 if bytes differ."""
-    rng = random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
         model = model or str(write_untrained(Path(folder) / "untrained.safetensors"))
         job = BakeJob(model=model, count=count, shard_size=shard_size)
-        whole = make_plan(Path(folder) / "whole" / "bank", job)
-        plan = make_plan(Path(folder) / "killed" / "bank", job)
+        plan = make_plan(Path(folder) / "bank", job)
         again = partial(start, plan, engine, workers)
-        assert not killed(start(whole, "local", 1), 1e6)
+        assert not killed(start(plan, "local", 1), 1e6)
+        expected = files(plan.out)
+        shutil.rmtree(plan.out)
         begin = time.monotonic()
         assert not killed(again(), 1e6)
         seconds = time.monotonic() - begin
-        expected = files(whole.out)
         assert files(plan.out) == expected, "the engine writes other bytes"
-        done = banks = 0
-        with tqdm(total=kills, unit="kill") as bar:
-            while done < kills:
-                shutil.rmtree(plan.out)
-                done += count_kills(plan, again, seconds, rng)
-                banks += 1
-                bar.update(done - bar.n)
-                if files(plan.out) != expected:
-                    sys.exit(
-                        f"bank {banks} has other bytes than one baked without a kill"
-                    )
+        done = []
+        for found in repeat(again, plan, kills, seconds, seed):
+            done.append(found)
+            if files(plan.out) != expected:
+                sys.exit(
+                    f"bank {len(done)} has other bytes than one baked without a kill"
+                )
     print(
-        f"{done} kills, {banks} banks of {count} scans in {len(plan.shards)} shards by "
+        f"{sum(done)} kills, {len(done)} banks of {count} scans in {len(plan.shards)} shards by "
         f"{engine}, a whole run takes {seconds:.1f} s: all files have the same bytes as "
         "without a kill"
     )
