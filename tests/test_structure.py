@@ -170,7 +170,7 @@ def test_every_module_is_imported_by_something() -> None:
 LIMITS = {
     "plugin": (150_500, 6.0, 141),
     "laboratory": (113_600, 6.0, 172),
-    "tools": (39_600, 6.0, 128),
+    "tools": (39_550, 6.0, 128),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -6,12 +6,12 @@ JUDGE is a folder of lidar-bonnetal's archive, LABELLED a root of SemanticKITTI.
 published shares are those of SqueezeSeg in the Robo3D benchmark.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
+from typer import run
 
 from lidar_synth import SemanticKITTI
 from lidar_synth.geometry.scan import Scan
@@ -37,19 +37,12 @@ def score(judge: StreetJudge, scans: Sequence[Scan]) -> float:
     return 100 * mean_iou(judge.confusion(scans))
 
 
-def main() -> None:
-    """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("judge", type=Path)
-    parser.add_argument("labelled", type=Path)
-    parser.add_argument("--every", type=int, default=1, help="use every Nth scan")
-    given = parser.parse_args()
-    judge = load_archive(given.judge, 2048)
-    source = SemanticKITTI(given.labelled)
-    scans = [source[i] for i in range(0, len(source), given.every)]
-    clean = score(judge, scans)
+def main(judge: Path, labelled: Path, every: int = 1) -> None:
+    """Prints the table of every Nth scan."""
+    archive = load_archive(judge, 2048)
+    source = SemanticKITTI(labelled)
+    scans = [source[i] for i in range(0, len(source), every)]
+    clean = score(archive, scans)
     print(f"{len(scans)} scans, clean mIoU {clean:.1f} %\n")
     print(
         f"| % of it | published | mean | {' | '.join(SEVERITIES)} |\n|---|{'---:|' * 5}"
@@ -60,11 +53,11 @@ def main() -> None:
             change = kind.at(severity)
             rngs = map(np.random.default_rng, range(len(scans)))
             changed = [change(s, r) for s, r in zip(scans, rngs, strict=True)]
-            shares.append(100 * score(judge, changed) / clean)
+            shares.append(100 * score(archive, changed) / clean)
         cells = [PUBLISHED.get(name, ""), f"{np.mean(shares):.1f}"]
         cells += [f"{share:.0f}" for share in shares]
         tqdm.write(f"| {name} | {' | '.join(map(str, cells))} |")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
