@@ -54,7 +54,7 @@ def register() -> Any:
             "cd Cylinder3D",
         ) from error
 
-    class Mixed(SemKITTI_sk):  # type: ignore[misc]
+    class MixedPointCloud(SemKITTI_sk):  # type: ignore[misc]
         """``SemKITTI_sk`` with synthetic scans in its training set: (xyz, label (N, 1) uint8,
         strength)."""
 
@@ -92,8 +92,8 @@ def register() -> Any:
                 else (points[:, :3], label)
             )
 
-    Mixed.__name__ = NAME
-    return register_dataset(Mixed)
+    MixedPointCloud.__name__ = NAME
+    return register_dataset(MixedPointCloud)
 
 
 def main() -> None:

@@ -146,7 +146,7 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
             self._resume = None
         dataset: Any = OnDevice(self.train) if self.on_device else self.train
         collate = Unfinished if self.on_device else self.train.collate
-        return _Loader(
+        return _StatefulLoader(
             dataset, batch_sampler=self._batches, collate_fn=collate, **self._workers()
         )
 
@@ -306,7 +306,7 @@ class _Epochs:
         )
 
 
-class _Loader(DataLoader[Any]):
+class _StatefulLoader(DataLoader[Any]):
     """A ``DataLoader`` with the state of its batch sampler, which Lightning saves."""
 
     batch_sampler: Any

@@ -23,6 +23,8 @@ from lidar_synth.datasets.classes import (
 )
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
+from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing.settings import (
     OPTIONS,
     VARIABLE,
@@ -110,10 +112,11 @@ def refuse_unlabelled(settings: Mapping[str, Any], trainer: str) -> None:
     Raises:
         ConfigError: on the policies ``none`` and ``ignore``.
     """
-    if settings.get("labels", "generated") in ("none", "ignore"):
+    policy = read_policy(settings.get("labels", "generated"))
+    if isinstance(policy, RemoveLabels | IgnoreLabels):
         raise ConfigError(
             f"labels={settings['labels']!r} for {trainer}",
-            "labels for every synthetic scan: 'generated', 'condition', 'pseudo' or 'mix'",
+            "labels for every synthetic scan, such as 'generated', 'condition' or 'polarmix'",
             "The trainer makes its own batches; a batch of only synthetic scans would have no "
             "valid label, and its loss, a mean over no label, is NaN.",
         )

@@ -48,7 +48,7 @@ FORMATS = ("lidar-synth-mmdet3d/1", "lidar-synth-mmdet3d/2")
 _CACHED = 4
 
 
-class Layout(NamedTuple):
+class SampleForm(NamedTuple):
     """The form of a dataset's points and boxes.
 
     Args:
@@ -65,8 +65,8 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "kitti": Layout(CLASSES, 4, lambda scan: scan, points_of),
-    "nuscenes": Layout(NUSCENES_CLASSES, 5, as_nuscenes, five_values),
+    "kitti": SampleForm(CLASSES, 4, lambda scan: scan, points_of),
+    "nuscenes": SampleForm(NUSCENES_CLASSES, 5, as_nuscenes, five_values),
 }
 
 

@@ -47,7 +47,7 @@ def dataset_class() -> Any:
     ml3d = _library()
     stock = sys.modules[ml3d.datasets.SemanticKITTI.__module__]
     pipeline = sys.modules[ml3d.pipelines.SemanticSegmentation.__module__]
-    pipeline.DataLoader = _Loader  # type: ignore[attr-defined]
+    pipeline.DataLoader = _PipelineLoader  # type: ignore[attr-defined]
     mixed_split = _split_class(stock)
 
     class MixedSemanticKITTI(stock.SemanticKITTI):  # type: ignore[misc, name-defined]
@@ -140,7 +140,7 @@ def _split_class(stock: Any) -> Any:
     return MixedSplit
 
 
-class _Loader(EpochLoader):
+class _PipelineLoader(EpochLoader):
     """``EpochLoader`` with the pipeline's arguments; its ``worker_init_fn`` overflows 32 bits with
     numpy 2."""
 

@@ -7,7 +7,7 @@ import numpy as np
 from lidar_synth.integrations.detection import ground_plane, in_view, plane_in_camera
 from lidar_synth.integrations.mixture import points_of
 from lidar_synth.integrations.mmdet3d_lists import CLASSES
-from lidar_synth.integrations.openpcdet_mixture import Mixed
+from lidar_synth.integrations.openpcdet_mixture import MixedDetection
 from pcdet.datasets.kitti.kitti_dataset import KittiDataset
 
 from lidar_synth.errors import ConfigError
@@ -15,8 +15,8 @@ from lidar_synth.formats.calibration import Calibration, homogeneous
 from lidar_synth.geometry.scan import Scan
 
 
-class MixedKitti(Mixed, KittiDataset):  # type: ignore[misc]
-    """KITTI mixed with synthetic scans at the ratio of its settings, see ``Mixed``.
+class MixedKitti(MixedDetection, KittiDataset):  # type: ignore[misc]
+    """KITTI mixed with synthetic scans at the ratio of its settings, see ``MixedDetection``.
 
     A synthetic scan gets the calibration of the first real scan and a fitted ground plane.
     """

@@ -14,11 +14,12 @@ LOOKED_AT = 16
 """Number of synthetic scans among which one has to have a box, if GT sampling adds none."""
 
 
-class Mixed:
+class MixedDetection:
     """A dataset of OpenPCDet mixed with synthetic scans; evaluation uses only real ones.
 
-    Combine it with a dataset class of OpenPCDet, ``class MixedKitti(Mixed, KittiDataset)``, that
-    calls ``_start`` at the end of its ``__init__`` and defines ``_synthetic``.
+    Combine it with a dataset class of OpenPCDet, ``class MixedKitti(MixedDetection,
+    KittiDataset)``, that calls ``_start`` at the end of its ``__init__`` and defines
+    ``_synthetic``.
 
     OpenPCDet replaces a scan without boxes after augmentation by another random scan. To keep the
     ratio, a real scan is replaced by a real one here, and a synthetic one raises an error:

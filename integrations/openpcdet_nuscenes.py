@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.nuscenes import NAMES, as_nuscenes, five_values
-from lidar_synth.integrations.openpcdet_mixture import Mixed
+from lidar_synth.integrations.openpcdet_mixture import MixedDetection
 from pcdet.datasets.nuscenes.nuscenes_dataset import NuScenesDataset
 
 from lidar_synth.errors import ConfigError
@@ -15,8 +15,8 @@ SRC = ["x", "y", "z", "intensity", "timestamp"]
 """The features that a sample has, in OpenPCDet's order."""
 
 
-class MixedNuScenes(Mixed, NuScenesDataset):  # type: ignore[misc]
-    """nuScenes mixed with synthetic scans at the ratio of its settings, see ``Mixed``.
+class MixedNuScenes(MixedDetection, NuScenesDataset):  # type: ignore[misc]
+    """nuScenes mixed with synthetic scans at the ratio of its settings, see ``MixedDetection``.
 
     A synthetic scan becomes what OpenPCDet makes of the first key frame of a scene, which has no
         earlier sweeps: the

@@ -23,10 +23,16 @@ from lidar_synth.integrations.reader import PLAN_FORMAT
 from lidar_synth.bank import is_bank
 from lidar_synth.errors import ConfigError, LidarSynthError
 from lidar_synth.files.disk import write_arrays
-from lidar_synth.labels.policies import read_labels
+from lidar_synth.labels.own import KeepBoxes, KeepCondition, KeepLabels, RemoveLabels
+from lidar_synth.labels.policies import read_policy
 from lidar_synth.mixing.plan import VERSION
 
-POLICIES = ("generated", "condition", "boxes", "none")
+POLICIES = {
+    KeepLabels: "generated",
+    KeepCondition: "condition",
+    KeepBoxes: "boxes",
+    RemoveLabels: "none",
+}
 """Label policies that need no other scan than the bank's own."""
 
 
@@ -51,11 +57,12 @@ def write_plan(
             refuses.
         FileError: if the file cannot be written.
     """
-    labels, options = read_labels(settings.get("labels", "generated"))
-    if labels not in POLICIES or set(options) - {"threshold"}:
+    policy = read_policy(settings.get("labels", "generated"))
+    labels = POLICIES.get(type(policy))
+    if labels is None:
         raise ConfigError(
-            f"labels={labels!r} with arguments {sorted(options)} for a plan file",
-            f"{', '.join(POLICIES)}, and no argument but threshold",
+            f"labels={settings['labels']!r} for a plan file",
+            f"one of {', '.join(POLICIES.values())}",
             "The reader takes a bank's own labels; other policies need the package in the "
             "trainer's environment.",
         )
@@ -101,7 +108,7 @@ def write_plan(
         "real": real,
         "bank": mixed.synthetic[0].identity,
         "labels": labels,
-        "threshold": float(options.get("threshold", 0)),
+        "threshold": float(getattr(policy, "threshold", 0)),
         "lengths": [len(plan) for plan in plans],
         "hashes": hashes,
     }

@@ -74,7 +74,7 @@ def dataset_class(stock: Any) -> Any:
         stock: the module of the trainer's parser.
     """
 
-    class Mixed(stock.SemanticKitti):  # type: ignore[misc]
+    class MixedRangeImages(stock.SemanticKitti):  # type: ignore[misc]
         """The trainer's dataset, mixed with synthetic scans."""
 
         scan_files: Any
@@ -138,7 +138,7 @@ def dataset_class(stock: Any) -> Any:
             mask: NDArray[Any] = scan.proj_range >= 0
             return mask
 
-    return Mixed
+    return MixedRangeImages
 
 
 def check_stripes(dataset: Any) -> None:

@@ -45,7 +45,7 @@ def dataset_class(stock: Any) -> Any:
     """Make a subclass of WaffleIron's ``SemanticKITTI`` (``stock``) that mixes real and synthetic
     scans."""
 
-    class Mixed(stock):  # type: ignore[misc]
+    class MixedWaffleIron(stock):  # type: ignore[misc]
         """WaffleIron's ``SemanticKITTI`` with synthetic scans in its training set."""
 
         mixed: Any = (
@@ -95,7 +95,7 @@ def dataset_class(stock: Any) -> Any:
                 name = f"synthetic/{number}" if synthetic else self.real.im_idx[number]
             return points, labels, name
 
-    return Mixed
+    return MixedWaffleIron
 
 
 @cache

@@ -26,11 +26,14 @@ _HOME = {
     "BatchMixer": "mixing.service",
     "Boxes": "geometry.scan",
     "Generator": "generate.generator",
+    "IgnoreLabels": "labels.own",
     "KITTI360": "formats",
     "KITTIObject": "formats",
     "KITTIRaw": "formats",
-    "KeepLabels": "labels",
-    "LaserMix": "labels",
+    "KeepBoxes": "labels.own",
+    "KeepCondition": "labels.own",
+    "KeepLabels": "labels.own",
+    "LaserMix": "labels.mix",
     "Layout": "geometry.layout",
     "LidarSynthError": "errors",
     "Linear": "mixing",
@@ -39,12 +42,13 @@ _HOME = {
     "NuScenes": "formats",
     "ObjectBank": "labels",
     "PandaSet": "formats",
-    "PasteObjects": "labels",
-    "PolarMix": "labels",
-    "PolarMixOrLaserMix": "labels",
-    "PredictLabels": "labels",
+    "PasteObjects": "labels.mix",
+    "PolarMix": "labels.mix",
+    "PolarMixOrLaserMix": "labels.mix",
+    "PredictLabels": "labels.pseudo",
     "ProofSettings": "lab.proof",
     "RangeImage": "geometry.scan",
+    "RemoveLabels": "labels.own",
     "RollingBank": "mixing.service",
     "Scan": "geometry.scan",
     "SemanticKITTI": "formats",
@@ -116,14 +120,18 @@ if TYPE_CHECKING:
     from lidar_synth.lab.town import fit_skin as fit_skin
     from lidar_synth.lab.town import load_skin as load_skin
     from lidar_synth.lab.train.adaptation import adapt as adapt
-    from lidar_synth.labels import KeepLabels as KeepLabels
-    from lidar_synth.labels import LaserMix as LaserMix
     from lidar_synth.labels import ObjectBank as ObjectBank
-    from lidar_synth.labels import PasteObjects as PasteObjects
-    from lidar_synth.labels import PolarMix as PolarMix
-    from lidar_synth.labels import PolarMixOrLaserMix as PolarMixOrLaserMix
-    from lidar_synth.labels import PredictLabels as PredictLabels
     from lidar_synth.labels import make_policy as make_policy
+    from lidar_synth.labels.mix import LaserMix as LaserMix
+    from lidar_synth.labels.mix import PasteObjects as PasteObjects
+    from lidar_synth.labels.mix import PolarMix as PolarMix
+    from lidar_synth.labels.mix import PolarMixOrLaserMix as PolarMixOrLaserMix
+    from lidar_synth.labels.own import IgnoreLabels as IgnoreLabels
+    from lidar_synth.labels.own import KeepBoxes as KeepBoxes
+    from lidar_synth.labels.own import KeepCondition as KeepCondition
+    from lidar_synth.labels.own import KeepLabels as KeepLabels
+    from lidar_synth.labels.own import RemoveLabels as RemoveLabels
+    from lidar_synth.labels.pseudo import PredictLabels as PredictLabels
     from lidar_synth.mixing import Linear as Linear
     from lidar_synth.mixing import MixedScans as MixedScans
     from lidar_synth.mixing import MixedStream as MixedStream

@@ -48,6 +48,7 @@ from lidar_synth.datasets.classes import IGNORE, SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError, FileError, LibraryError
 from lidar_synth.formats import KITTIObject, open_scans
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.labels.own import IgnoreLabels, RemoveLabels
 from lidar_synth.mixing import MixedScans
 
 
@@ -121,7 +122,7 @@ def test_a_batch_without_a_label_is_prevented() -> None:
     for bare in (nothing, replace(scan, label=None)):
         with pytest.raises(DataError, match="no valid label"):
             class_ids(bare, table)
-    for labels in ("none", "ignore"):
+    for labels in ("none", "ignore", {"None": {}}, RemoveLabels(), IgnoreLabels()):
         with pytest.raises(ConfigError, match="is NaN"):
             refuse_unlabelled({"labels": labels}, "a trainer")
     refuse_unlabelled({}, "a trainer")

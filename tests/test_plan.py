@@ -17,10 +17,15 @@ from lidar_synth.mixing import (
     Mixture,
     PlannedSource,
     make_schedule,
-    plan,
 )
 from lidar_synth.mixing.batches import cut_steps, rank_share
-from lidar_synth.mixing.quotas import count_before, deal, exact_synthetic, quotas, split
+from lidar_synth.mixing.quotas import (
+    count_before,
+    count_samples,
+    deal,
+    exact_synthetic,
+    split,
+)
 from lidar_synth.mixing.schedules import Schedule, share_of
 
 ENDLESS = PlannedSource(None, identity="model")
@@ -48,16 +53,16 @@ def rows(made: MixingPlan) -> list[str]:
 
 def test_the_order_is_the_same_in_all_versions() -> None:
     """Literally: a run that is resumed with a later version has to find the rest of its epoch."""
-    assert [rows(plan(mixture(), epoch)) for epoch in range(3)] == [
+    assert [rows(MixingPlan(mixture(), epoch)) for epoch in range(3)] == [
         ["r1", "r5", "r2", "r3", "s0", "s1", "r4", "r0"],
         ["r2", "r4", "r0", "s3", "r1", "r5", "r3", "s2"],
         ["r0", "r4", "r3", "r5", "r2", "s4", "r1", "s5"],
     ]
     assert (
-        plan(mixture(), 2).hash
+        MixingPlan(mixture(), 2).hash
         == "da107b92653538fe9b6b1d5962019e9f6b0890443e66a738e8a9f71af8485751"
     )
-    assert rows(plan(mixture(balanced=True), 0)) == [
+    assert rows(MixingPlan(mixture(balanced=True), 0)) == [
         "s1",
         "r5",
         "r3",
@@ -74,7 +79,7 @@ def test_the_order_is_the_same_in_all_versions() -> None:
         seed=7,
         epoch_size="replace",
     )
-    made = plan(two, 1)
+    made = MixingPlan(two, 1)
     assert list(zip(made.source.tolist(), made.index.tolist(), strict=True)) == [
         (2, 2),
         (1, 1),
@@ -101,7 +106,7 @@ def test_counts_are_exact_over_epochs(
     mixed = mixture(
         real, hundredths / 100, seed=seed, epoch_size=size, balanced=balanced
     )
-    made = plan(mixed, epoch)
+    made = MixingPlan(mixed, epoch)
     assert (int(made.domain.sum()), len(made)) == (made.synthetics, sum(made.counts))
     if size == "add":
         assert sorted(made.index[~made.domain]) == list(range(real))
@@ -140,7 +145,7 @@ def test_every_source_gets_its_share_over_epochs(
     given_so_far = np.zeros(len(real + synthetic), int)
     exact = Fraction(0)
     for epoch in range(12):
-        made = plan(mixed, epoch)
+        made = MixingPlan(mixed, epoch)
         assert np.bincount(made.source, minlength=len(given_so_far)).tolist() == list(
             made.counts
         )
@@ -163,7 +168,10 @@ def test_rare_sources_and_small_ratios_get_their_turn() -> None:
         make_schedule(0.5),
     )
     assert count_before(mixed, 50) == (200, 180, 20)
-    turns = [quotas(mixture(4, 0.1, epoch_size="replace"), epoch) for epoch in range(5)]
+    turns = [
+        count_samples(mixture(4, 0.1, epoch_size="replace"), epoch)
+        for epoch in range(5)
+    ]
     assert turns == [(3, 1), (4, 0), (3, 1), (4, 0), (4, 0)]
     assert count_before(mixture(4, 0.1, epoch_size="replace"), 900) == (3240, 360)
 
@@ -178,7 +186,7 @@ def test_all_epochs_have_one_length(ratio: object, size: str | int) -> None:
     for real in range(1, 30):
         mixed = mixture(real, ratio, epoch_size=size)
         for epoch in range(8):
-            counts = quotas(mixed, epoch)
+            counts = count_samples(mixed, epoch)
             share = share_of(mixed.ratio, epoch)
             assert sum(counts) == mixed.length
             assert abs(counts[1] - mixed.length * share) < 1
@@ -219,7 +227,7 @@ def test_running_indices(real: int, ratio: float, size: str | int) -> None:
     given_reals: Counter[int] = Counter(dict.fromkeys(range(real), 0))
     synthetic: list[int] = []
     for epoch in range(6):
-        made = plan(mixed, epoch)
+        made = MixingPlan(mixed, epoch)
         given_reals.update(made.index[~made.domain].tolist())
         fresh = sorted(made.index[made.domain].tolist())
         assert fresh == list(range(len(synthetic), len(synthetic) + len(fresh)))
@@ -253,7 +261,7 @@ def test_reuse_is_spread_over_epochs(
     )
     counts: Counter[tuple[int, int]] = Counter()
     for epoch in range(4 * reuse):
-        made = plan(mixed, epoch)
+        made = MixingPlan(mixed, epoch)
         here = list(
             zip(
                 made.source[made.domain].tolist(),
@@ -272,12 +280,14 @@ def test_reuse_is_spread_over_epochs(
 def test_a_bank_begins_again() -> None:
     bank = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.4))
     indices = [
-        sorted(plan(bank, e).index[plan(bank, e).domain].tolist()) for e in range(3)
+        sorted(MixingPlan(bank, e).index[MixingPlan(bank, e).domain].tolist())
+        for e in range(3)
     ]
     assert indices == [[0, 1, 2, 3]] * 3
     few = Mixture((PlannedSource(6),), (PlannedSource(4),), make_schedule(0.5), reuse=2)
     indices = [
-        sorted(plan(few, e).index[plan(few, e).domain].tolist()) for e in range(3)
+        sorted(MixingPlan(few, e).index[MixingPlan(few, e).domain].tolist())
+        for e in range(3)
     ]
     assert indices == [[0, 0, 1, 1, 2, 3], [0, 0, 1, 1, 2, 3], [0, 1, 2, 2, 3, 3]]
 
@@ -314,7 +324,7 @@ def test_a_balanced_plan_is_exact_in_every_batch(
 ) -> None:
     assume(share < 1 or size != "add")
     length = total if size == "number" else size
-    domain = plan(
+    domain = MixingPlan(
         mixture(total, float(share), epoch_size=length, balanced=True), epoch
     ).domain
     for start in range(len(domain) - batch + 1):
@@ -336,7 +346,7 @@ def test_a_balanced_plan_spreads_several_synthetic_sources(
     mixed = Mixture(
         (PlannedSource(9),), sources, make_schedule(0.5), epoch_size=120, balanced=True
     )
-    source = plan(mixed, epoch).source
+    source = MixingPlan(mixed, epoch).source
     for start in range(120 - batch + 1):
         for number, weight in enumerate(weights, 1):
             given_here = int((source[start : start + batch] == number).sum())
@@ -349,7 +359,7 @@ def test_equal_synthetic_sources_alternate_in_every_batch() -> None:
     mixed = Mixture(
         (PlannedSource(40),), (ENDLESS, ENDLESS), make_schedule(0.5), balanced=True
     )
-    batches = plan(mixed, 1).source.reshape(-1, 4)
+    batches = MixingPlan(mixed, 1).source.reshape(-1, 4)
     assert [np.bincount(batch, minlength=3).tolist() for batch in batches] == [
         [2, 1, 1]
     ] * 20
@@ -374,7 +384,7 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
     before = (0, 0)
     for epoch in range(5):
         assert count_before(mixed, epoch) == before
-        before = tuple(np.add(before, quotas(mixed, epoch)).tolist())  # type: ignore[assignment]
+        before = tuple(np.add(before, count_samples(mixed, epoch)).tolist())  # type: ignore[assignment]
         assert before[1] == ceil(
             sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1))
         )
@@ -383,7 +393,7 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
 def test_every_real_scan_stays_in_epochs_far_ahead() -> None:
     """A share that rises after the first hundred epochs decides the length of all of them."""
     mixed = mixture(10, {0: 0.2, 150: 0.5})
-    assert quotas(mixed, 150) == (10, 10) and mixed.length == 20
+    assert count_samples(mixed, 150) == (10, 10) and mixed.length == 20
     assert count_before(mixture(10, 0.5), 10**9) == (10**10, 10**10)
 
 
@@ -407,20 +417,20 @@ def test_a_tenth_is_a_tenth() -> None:
 
 
 def test_the_hash_tells_plans_apart() -> None:
-    one = plan(mixture(), 0).hash
+    one = MixingPlan(mixture(), 0).hash
     others = [
-        plan(mixture(), 1),
-        plan(mixture(seed=1), 0),
-        plan(mixture(ratio=0.5), 0),
-        plan(mixture(balanced=True), 0),
-        plan(
+        MixingPlan(mixture(), 1),
+        MixingPlan(mixture(seed=1), 0),
+        MixingPlan(mixture(ratio=0.5), 0),
+        MixingPlan(mixture(balanced=True), 0),
+        MixingPlan(
             Mixture(
                 (PlannedSource(6, identity="real"),), (OTHER,), make_schedule(0.25)
             ),
             0,
         ),
     ]
-    assert one == plan(mixture(), 0).hash
+    assert one == MixingPlan(mixture(), 0).hash
     assert len({one, *(other.hash for other in others)}) == 6
 
 
@@ -468,16 +478,16 @@ def test_the_remaining_samples_do_not_depend_on_the_number_of_ranks() -> None:
             r"over 1 epochs; expected at least 2",
         ),
         (
-            lambda: plan(mixture(ratio=[0.5, 0.4]), 2),
+            lambda: MixingPlan(mixture(ratio=[0.5, 0.4]), 2),
             ConfigError,
             r"epoch 2 of a ratio schedule for 2 epochs.*longer",
         ),
         (
-            lambda: plan(mixture(ratio=lambda e: e * 0.6), 2),
+            lambda: MixingPlan(mixture(ratio=lambda e: e * 0.6), 2),
             ConfigError,
             r"ratio 1.2 in epoch 2",
         ),
-        (lambda: plan(mixture(), -1), ConfigError, r"epoch -1"),
+        (lambda: MixingPlan(mixture(), -1), ConfigError, r"epoch -1"),
         (
             lambda: mixture(ratio=1.0),
             ConfigError,
@@ -528,9 +538,11 @@ def test_invalid_plans_are_refused(
 
 def test_synthetic_only_and_real_only() -> None:
     only = Mixture((), (ENDLESS,), make_schedule(1), epoch_size=5)
-    assert sorted(plan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
+    assert sorted(MixingPlan(only, 1).index.tolist()) == [5, 6, 7, 8, 9]
     assert (
-        plan(Mixture((PlannedSource(4),), (), make_schedule(0)), 0).domain.tolist()
+        MixingPlan(
+            Mixture((PlannedSource(4),), (), make_schedule(0)), 0
+        ).domain.tolist()
         == [False] * 4
     )
 
@@ -548,7 +560,7 @@ def test_a_plan_of_any_length_takes_the_same_memory() -> None:
                 epoch_size=10**8,
                 balanced=balanced,
             )
-            made = plan(mixed, 3)
+            made = MixingPlan(mixed, 3)
             asked = np.random.default_rng(0).integers(0, len(made), 200)
             found = [made[int(position)] for position in asked]
             assert found == list(

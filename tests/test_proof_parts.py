@@ -431,6 +431,18 @@ def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
     assert ObjectBank.load(pasting["bank"]).boxes.names == task.objects.boxes.names
 
 
+def test_scans_without_instances_exchange_parts_without_whole_objects(
+    tmp_path: Path,
+) -> None:
+    task = job("exchange", tmp_path)
+    bare = [replace(scan, instance=None, boxes=None) for scan in task.real]
+    task = replace(task, real=bare)
+    [stage] = describe(task)["stages"]
+    assert stage["labels"] == {"polarmix_or_lasermix": {"objects": 0}}
+    [(mixed, _)] = task.mixtures()
+    assert len(mixed[0]["points"]) > 0
+
+
 @pytest.mark.parametrize("classes", GROUPS)
 def test_returns_without_a_prediction_are_errors_in_every_pool(
     classes: str, tmp_path: Path

@@ -415,7 +415,7 @@ def test_an_epoch_after_the_last_is_refused(cases: Path) -> None:
     ("settings", "message"),
     [
         ({"labels": "paste"}, "labels='paste'.*generated, condition, boxes, none"),
-        ({"labels": {"generated": {"kind": 1}}}, "no argument but threshold"),
+        ({"labels": {"generated": {"kind": 1}}}, "argument 'kind'; expected arguments"),
         ({"as_sensor": "vlp16"}, "as_sensor: vlp16 for a plan file; expected none"),
         ({"labels": "pseudo"}, "labels='pseudo'"),
         (

@@ -29,7 +29,7 @@ WRONG: dict[str, tuple[str, str]] = {
     ),
     "arguments without names": (
         "labels: {generated: 0.3}",
-        "labels=.*expected a policy, its name, or",
+        "labels='generated': 0.3; expected arguments by name, such as .threshold",
     ),
     "text for a threshold": (
         "labels: {generated: {threshold: high}}",

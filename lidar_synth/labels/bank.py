@@ -41,7 +41,7 @@ MOST_PACKED = 64 << 20, 20
 """How much a bank may unpack into: these bytes, and so many times the size of its file."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class ObjectBank:
     """Objects cut out of many scans; the module's docstring describes the arrays.
 
@@ -217,20 +217,24 @@ class ObjectBank:
         Raises:
             FileError: if it cannot be written.
         """
-        arrays = {
-            f.name: getattr(self, f.name)
-            for f in fields(self)
-            if f.name not in ("sensor", "boxes")
-        }
-        arrays |= {
-            f"box_{f.name}": np.asarray(getattr(self.boxes, f.name))
-            for f in fields(Boxes)
-        }
-        arrays |= {
-            "format": np.array(FORMAT),
-            "sensor": np.array(json.dumps(self.sensor.to_dict())),
-        }
-        write_arrays(Path(path), arrays, compressed=True)
+        write_arrays(Path(path), self._arrays(), compressed=True)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of its file by name."""
+        names = [f.name for f in fields(self) if f.name not in ("sensor", "boxes")]
+        arrays = {name: getattr(self, name) for name in names}
+        for f in fields(Boxes):
+            arrays[f"box_{f.name}"] = np.asarray(getattr(self.boxes, f.name))
+        arrays["format"] = np.array(FORMAT)
+        arrays["sensor"] = np.array(json.dumps(self.sensor.to_dict()))
+        return arrays
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ObjectBank):
+            return NotImplemented
+        theirs = other._arrays()
+        ours = self._arrays().items()
+        return all(np.array_equal(values, theirs[name]) for name, values in ours)
 
     def __len__(self) -> int:
         return len(self.boxes)

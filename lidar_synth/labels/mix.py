@@ -1,16 +1,18 @@
 """Policies that insert labelled parts of real (or town) scans into the synthetic scan.
 
-A mixed scan keeps the position, the id and the ``domain`` (``SYNTHETIC``) of its synthetic scan.
-Inserted points are not marked; they have confidence 1. The remaining synthetic points keep the
-labels of their model; if it gives none, they are ignored.
+A mixed scan keeps the position, the id and the ``domain`` (``SYNTHETIC``) of its synthetic
+scan. Inserted points are not marked; they have confidence 1. The remaining synthetic points
+keep the labels of their model; if it gives none, they are ignored.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from lidar_synth.datasets.classes import BOXED
 from lidar_synth.errors import ConfigError, DataError
@@ -20,9 +22,8 @@ from lidar_synth.labels.edit.redraw import open_model
 from lidar_synth.labels.edit.unboxed import remove_unboxed
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thin_scan
 from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
-from lidar_synth.labels.own import IgnoreLabels, KeepLabels, keep_own
+from lidar_synth.labels.own import check_count, check_own, check_share, keep_own
 from lidar_synth.labels.pasting import paste
-from lidar_synth.labels.policies import LabelPolicy
 
 TRIES = 5
 """Number of candidates that are tried for each object to be placed."""
@@ -33,16 +34,19 @@ class PasteObjects:
     """``paste``: pastes objects of a bank with their boxes, for training detectors.
 
     Args:
-        bank: the objects, or their file; None collects those of the real scans, all of which are
-            read.
-        count: maximum number of objects to place in a scan, in total or as ``{name of the boxes:
-            number}``.
+        bank: the objects, or their file; None collects the objects in the boxes of
+            the mixture's real scans, all of which are read.
+        count: maximum number of objects to place in a scan, in total or as ``{name of the
+            boxes: number}``; they are sampled at random.
         least: minimum number of visible points of an object.
-        turn: maximum angle, degrees to either side, by which an object is turned about the sensor.
-        clear: whether to remove the scan's own objects that have no box, and to fill the holes; a
-            detector would learn that they are background.
-        model: draws the holes; None fills them by geometry, see ``edit.remove``.
-        threshold: minimum confidence of the scan's own labels; those below it are ignored.
+        turn: maximum angle, 0 to 180 degrees to either side, by which an object is turned
+            about the sensor.
+        clear: whether to remove the scan's own objects that have no box, and to fill the
+            holes; a detector would learn that they are background.
+        model: draws the holes, a generator, its name or file; None fills them by geometry,
+            see ``edit.remove``.
+        threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
+            become 255 = ignore.
 
     Raises:
         ConfigError: on invalid values.
@@ -50,10 +54,10 @@ class PasteObjects:
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, ObjectBank, PasteObjects, Town
-        >>> objects = ObjectBank.from_scans(Town(0, "hdl64e_lasers", scans=2))
-        >>> bank = Bank("demo_out/bank")
-        >>> policy = PasteObjects(objects, count=2).bind(None, bank.fields)
-        >>> len(policy(bank[0], np.random.default_rng(0)).boxes) <= 2
+        >>> objects = ObjectBank.from_scans(Town(seed=0, scans=2))
+        >>> policy = PasteObjects(objects, count=8)  # as labels= of a mixture
+        >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> 0 < len(scan.boxes) <= 8
         True
     """
 
@@ -66,24 +70,26 @@ class PasteObjects:
     threshold: float = 0.0
 
     def __post_init__(self) -> None:
-        enough = min(self._limits().values(), default=0) >= 1 and self.least >= 1
-        if not (enough and 0 <= self.turn <= 180):
-            raise ConfigError(
-                f"count={self.count}, least={self.least}, turn={self.turn}",
-                "at least one object, one point, 0..180 degrees",
-            )
+        for name, number in self._limits.items():
+            check_count(f"count {name}".strip(), number, 1)
+        check_count("least", self.least, 1)
+        check_share("turn", self.turn, 180)
+        check_share("threshold", self.threshold)
 
-    def bind(self, real: Source | None, fields: frozenset[str]) -> LabelPolicy:
-        """Open or collect the objects.
-
-        Args:
-            real: scans with boxes, from which objects are collected if no bank is given.
-            fields: the fields of the synthetic scans.
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "PasteObjects":
+        """The policy with the objects of real scans, if it has no others.
 
         Raises:
-            ConfigError: if there are no boxes, or none of a given name; if the synthetic scans have
-                neither labels nor boxes, so that their own objects cannot be found.
+            ConfigError: if there are no boxes, or none of a given name; if the synthetic
+                scans have neither labels nor boxes, so that their own objects cannot be
+                found.
+            FileError, DataError: if a file of objects cannot be read.
         """
+        check_own(self.threshold, fields)
+        bound = self
+        if self.bank is None:
+            bound = replace(self, bank=_collect_objects(real, self.least))
+        bound._groups  # noqa: B018 - raises where there is nothing to paste
         if self.clear and not {"label", "boxes"} & fields:
             raise ConfigError(
                 "labels='paste' for synthetic scans with neither labels nor boxes",
@@ -91,281 +97,248 @@ class PasteObjects:
                 "background for a detector",
                 "clear=False, if the scans hold no such objects.",
             )
-        bank = self._open(real)
-        groups = tuple(self._groups(bank))
-        return _Pasting(keep_own(fields, self.threshold), self, bank, groups)
+        return bound
 
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if self.clear:  # before labels of low confidence are ignored
+            model = open_model(self.model)
+            seed = int(rng.integers(1 << 32))
+            scan = remove_unboxed(scan, model, seed, self._cleared)
+        scan = keep_own(scan, rng, self.threshold)
+        for indices, count in self._groups:
+            picks = rng.choice(indices, min(TRIES * count, len(indices)), replace=False)
+            angles = np.radians(rng.uniform(-self.turn, self.turn, len(picks)))
+            candidates = map(self._object, picks.tolist(), angles.tolist())
+            scan = paste(scan, candidates, count=count, least=self.least)
+        return scan
+
+    @property
     def _limits(self) -> Mapping[str, int]:
+        """Number of objects to place by the name of their boxes; "" = any."""
         return self.count if isinstance(self.count, Mapping) else {"": self.count}
 
-    def _open(self, real: Source | None) -> ObjectBank:
+    @cached_property
+    def _objects(self) -> ObjectBank:
         if isinstance(self.bank, ObjectBank):
             return self.bank
-        if self.bank is not None:
-            return ObjectBank.load(self.bank)
-        try:
-            scans = [] if real is None else real
-            return ObjectBank.from_scans(scans, least=self.least)
-        except DataError as error:
-            raise ConfigError(
-                f"labels='paste': {error}",
-                "real scans with boxes, or bank=",
-                "ObjectBank.from_scans(source).save(path) makes a bank of objects; KITTI and the "
-                "town have boxes.",
-            ) from error
+        if self.bank is None:
+            return _collect_objects(None, self.least)
+        return ObjectBank.load(self.bank)
 
-    def _groups(self, bank: ObjectBank) -> "list[tuple[NDArray[np.intp], int]]":
+    @cached_property
+    def _cleared(self) -> set[int]:
+        """Classes of the scan's own objects that are removed."""
+        labels = np.unique(self._objects.label)
+        return {*BOXED, *labels[labels < THINGS].tolist()}
+
+    @cached_property
+    def _groups(self) -> list[tuple[NDArray[np.intp], int]]:
         """(indices of objects in the bank, number to place) pairs."""
+        bank = self._objects
         names = np.array(bank.boxes.names)
         groups = []
-        for name, number in self._limits().items():
-            named = (names == name) | (name == "")
-            indices = np.flatnonzero((bank.counts >= self.least) & named)
-            if not len(indices):
+        for name, number in self._limits.items():
+            fits = (bank.counts >= self.least) & ((names == name) | (name == ""))
+            if not fits.any():
                 raise ConfigError(
                     f"count={self.count}, least={self.least}",
                     f"names and points of {bank} ({sorted(set(names))})",
                 )
-            groups.append((indices, number))
+            groups.append((np.flatnonzero(fits), number))
         return groups
 
-
-@dataclass(frozen=True)
-class _Pasting:
-    """``PasteObjects`` with its bank.
-
-    Args:
-        own: the policy for the scan's own labels.
-        how: the settings.
-        bank: the objects.
-        groups: (indices of objects in the bank, number to place) pairs; objects are sampled from
-            each group.
-    """
-
-    own: KeepLabels | IgnoreLabels
-    how: PasteObjects
-    bank: ObjectBank
-    groups: tuple[tuple[NDArray[np.intp], int], ...]
-
-    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        if self.how.clear:  # before labels of low confidence are ignored
-            things = {label for label in np.unique(self.bank.label) if label < THINGS}
-            model = open_model(self.how.model)
-            seed = int(rng.integers(1 << 32))
-            scan = remove_unboxed(scan, model, seed, {*BOXED, *map(int, things)})
-        scan = self.own(scan, rng)
-        turn = self.how.turn
-        for indices, count in self.groups:
-            picks = rng.choice(indices, min(TRIES * count, len(indices)), replace=False)
-            angles = np.radians(rng.uniform(-turn, turn, len(picks)))
-            pairs = zip(picks.tolist(), angles.tolist(), strict=True)
-            candidates = (self._object(*pair) for pair in pairs)
-            scan = paste(scan, candidates, count=count, least=self.how.least)
-        return scan
-
     def _object(self, index: int, angle: float) -> Object:
-        return self.bank[index].turned(angle) if angle else self.bank[index]
+        return self._objects[index].turned(angle) if angle else self._objects[index]
 
 
 @dataclass(frozen=True)
 class PolarMix:
-    """``polarmix``: inserts a sector of a real scan, and its objects turned about the sensor
-    (PolarMix, NeurIPS 2022).
+    """``polarmix``: inserts a sector of a random real scan, and objects of it turned about the
+    sensor (Xiao et al., "PolarMix", NeurIPS 2022).
 
     Args:
-        width: width of the sector in degrees.
+        width: width of the sector, 0 to 360 degrees.
         objects: number of objects to place; at most all that the real scan has.
-        threshold: minimum confidence of the scan's own labels; those below it are ignored.
+        threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
+            become 255 = ignore.
+        real: labelled scans; None takes the mixture's real scans.
 
     Raises:
         ConfigError: on invalid values.
 
     Example:
         >>> import numpy as np
-        >>> from lidar_synth import Bank, PolarMix, open_scans
-        >>> bank = Bank("demo_out/bank")
-        >>> policy = PolarMix(width=90).bind(open_scans("demo_out/town"), bank.fields)
-        >>> policy(bank[0], np.random.default_rng(0)).domain == bank[0].domain
-        True
+        >>> from lidar_synth import Bank, PolarMix, Town
+        >>> policy = PolarMix(width=90, objects=0, real=Town(seed=0, scans=2))
+        >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> scan.domain, scan.label.shape == (len(scan),)
+        (1, True)
     """
 
     width: float = 180.0
     objects: int = 10
     threshold: float = 0.0
+    real: Source | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.width <= 360 or self.objects < 0:
-            raise ConfigError(
-                f"width={self.width}, objects={self.objects}",
-                "0..360 degrees, and a number of objects",
-            )
+        check_share("width", self.width, 360)
+        check_count("objects", self.objects, 0)
+        check_share("threshold", self.threshold)
 
-    def bind(self, real: Source | None, fields: frozenset[str]) -> "_SectorOf":
-        """Draw from real scans.
+    def bind(self, real: Source | None, fields: frozenset[str]) -> Self:
+        """The policy with real scans, if it has no others.
 
         Raises:
             ConfigError: if they have no labels, or neither boxes nor instances for objects.
         """
-        real, first = _labelled(real, "polarmix")
+        check_own(self.threshold, fields)
+        bound = replace(self, real=real if self.real is None else self.real)
+        first = _first_labelled(bound.real, type(self).__name__)
         if self.objects and first.boxes is None and first.instance is None:
             raise ConfigError(
-                "labels='polarmix' with real scans that have neither boxes nor instances",
+                f"{type(self).__name__} with real scans that have neither boxes nor "
+                "instances",
                 "objects=0",
             )
-        return _SectorOf(keep_own(fields, self.threshold), self, real)
-
-
-@dataclass(frozen=True)
-class _SectorOf:
-    """``PolarMix`` with its real scans."""
-
-    own: KeepLabels | IgnoreLabels
-    how: PolarMix
-    real: Source
+        return bound
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        other = _partner(self.real, scan, rng)
+        other = _draw_real(self.real, type(self).__name__, scan, rng)
         columns = scan.sensor.columns
-        width = round(columns * self.how.width / 360)
-        first = int(rng.integers(columns))
-        mixed = swap_sector(self.own(scan, rng), other, first, width)
-        has_boxes = other.boxes is not None
-        if self.how.objects:
-            objects = instances_of(other)
-            if has_boxes:
-                objects = list(objects_of(other).values())
-            angles = rng.uniform(-np.pi, np.pi, len(objects))
-            pairs = zip(rng.permutation(len(objects)), angles, strict=True)
-            turned = (objects[i].turned(angle) for i, angle in pairs)
-            mixed = paste(mixed, turned, count=self.how.objects)
-        known = has_boxes and (scan.label is not None or scan.boxes is not None)
+        width = round(columns * self.width / 360)
+        own = keep_own(scan, rng, self.threshold)
+        mixed = swap_sector(own, other, int(rng.integers(columns)), width)
+        if self.objects:
+            mixed = self._add_objects(mixed, other, rng)
+        known = scan.label is not None or scan.boxes is not None
+        if other.boxes is not None and known:
+            return mixed
         # With boxes, all other objects would be negatives.
-        return mixed if known else replace(mixed, boxes=None)
+        return replace(mixed, boxes=None)
+
+    def _add_objects(self, mixed: Scan, other: Scan, rng: np.random.Generator) -> Scan:
+        objects = instances_of(other)
+        if other.boxes is not None:
+            objects = list(objects_of(other).values())
+        angles = rng.uniform(-np.pi, np.pi, len(objects))
+        order = rng.permutation(len(objects))
+        turned = (objects[i].turned(a) for i, a in zip(order, angles, strict=True))
+        return paste(mixed, turned, count=self.objects)
 
 
 @dataclass(frozen=True)
 class LaserMix:
-    """``lasermix``: bands of elevation, alternately from the synthetic and from a real scan
-    (LaserMix, CVPR 2023).
+    """``lasermix``: bands of elevation, alternately from the synthetic and from a random real
+    scan (Kong et al., "LaserMix", CVPR 2023).
 
     Args:
-        bands: numbers of bands, of which one is sampled for each scan.
-        threshold: minimum confidence of the scan's own labels; those below it are ignored.
+        bands: numbers of bands, 2 or more each, of which one is sampled for each scan.
+        threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
+            become 255 = ignore.
+        real: labelled scans; None takes the mixture's real scans.
 
     Raises:
-        ConfigError: on fewer than two bands.
+        ConfigError: on invalid values.
 
     Example:
         >>> import numpy as np
-        >>> from lidar_synth import Bank, LaserMix, open_scans
-        >>> bank = Bank("demo_out/bank")
-        >>> policy = LaserMix(bands=[4]).bind(open_scans("demo_out/town"), bank.fields)
-        >>> policy(bank[0], np.random.default_rng(0)).domain == bank[0].domain
+        >>> from lidar_synth import Bank, LaserMix, Town
+        >>> policy = LaserMix(bands=(4,), real=Town(seed=0, scans=2))
+        >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> scan.boxes is None  # few objects fit into a band
         True
     """
 
     bands: Sequence[int] = (3, 4, 5, 6)
     threshold: float = 0.0
+    real: Source | None = None
 
     def __post_init__(self) -> None:
-        if not len(self.bands) or min(self.bands) < 2:
-            raise ConfigError(f"bands={self.bands}", "numbers of bands, 2 or more each")
+        if not isinstance(self.bands, Sequence) or not self.bands:
+            raise ConfigError(
+                f"bands {self.bands!r}", "numbers of bands, such as [3, 4]"
+            )
+        for number in self.bands:
+            check_count("bands", number, 2)
+        check_share("threshold", self.threshold)
 
-    def bind(self, real: Source | None, fields: frozenset[str]) -> "_BandsOf":
-        """Draw from real scans.
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "LaserMix":
+        """The policy with real scans, if it has no others.
 
         Raises:
             ConfigError: if they have no labels.
         """
-        real, _ = _labelled(real, "lasermix")
-        return _BandsOf(keep_own(fields, self.threshold), self, real)
-
-
-@dataclass(frozen=True)
-class _BandsOf:
-    """``LaserMix`` with its real scans."""
-
-    own: KeepLabels | IgnoreLabels
-    how: LaserMix
-    real: Source
+        check_own(self.threshold, fields)
+        bound = replace(self, real=real if self.real is None else self.real)
+        _first_labelled(bound.real, "LaserMix")
+        return bound
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        other = _partner(self.real, scan, rng)
-        own = self.own(scan, rng)
-        bands = int(rng.choice(self.how.bands))
-        return swap_bands(own, other, bands, bool(rng.integers(2)))
+        other = _draw_real(self.real, "LaserMix", scan, rng)
+        bands = int(rng.choice(self.bands))
+        odd = bool(rng.integers(2))
+        return swap_bands(keep_own(scan, rng, self.threshold), other, bands, odd)
 
 
 @dataclass(frozen=True)
-class PolarMixOrLaserMix:
-    """``polarmix_or_lasermix``: each for half of the scans at random.
-
-    Args:
-        width, objects: as for ``PolarMix``.
-        bands: as for ``LaserMix``.
-        threshold: minimum confidence of the scan's own labels; those below it are ignored.
-
-    Raises:
-        ConfigError: as both.
+class PolarMixOrLaserMix(PolarMix):
+    """``polarmix_or_lasermix``: PolarMix or LaserMix, each for half of the scans at random; the
+    arguments are those of ``PolarMix``.
 
     Example:
         >>> import numpy as np
-        >>> from lidar_synth import Bank, PolarMixOrLaserMix, open_scans
-        >>> bank = Bank("demo_out/bank")
-        >>> policy = PolarMixOrLaserMix().bind(open_scans("demo_out/town"), bank.fields)
-        >>> policy(bank[0], np.random.default_rng(0)).domain == bank[0].domain
+        >>> from lidar_synth import Bank, PolarMixOrLaserMix, Town
+        >>> policy = PolarMixOrLaserMix(real=Town(seed=0, scans=2))
+        >>> scans = [policy(Bank("demo_out/bank")[0], np.random.default_rng(n)) for n in range(4)]
+        >>> {scan.boxes is None for scan in scans} == {True, False}
         True
     """
 
-    width: float = 180.0
-    objects: int = 10
-    bands: Sequence[int] = (3, 4, 5, 6)
-    threshold: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._both()
-
-    def bind(self, real: Source | None, fields: frozenset[str]) -> "_EitherOf":
-        """Draw from real scans.
-
-        Raises:
-            ConfigError: as both.
-        """
-        polar, laser = self._both()
-        return _EitherOf(polar.bind(real, fields), laser.bind(real, fields))
-
-    def _both(self) -> tuple[PolarMix, LaserMix]:
-        polar = PolarMix(self.width, self.objects, self.threshold)
-        return polar, LaserMix(self.bands, self.threshold)
-
-
-@dataclass(frozen=True)
-class _EitherOf:
-    polar: _SectorOf
-    laser: _BandsOf
-
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return (self.polar if rng.random() < 0.5 else self.laser)(scan, rng)
+        if rng.random() < 0.5:
+            return super().__call__(scan, rng)
+        return LaserMix(threshold=self.threshold, real=self.real)(scan, rng)
 
 
-def _partner(real: Source, scan: Scan, rng: np.random.Generator) -> Scan:
+def _draw_real(
+    real: Source | None, policy: str, scan: Scan, rng: np.random.Generator
+) -> Scan:
     """A random real scan, thinned to the grid of a synthetic one."""
+    if real is None:
+        raise _no_labels("no real scans", policy)
     other = real[int(rng.integers(len(real)))]
     if other.label is None:
-        raise DataError(
-            f"scan {other.id!r} has no labels", "real scans with labels, all of them"
-        )
+        given = f"scan {other.id!r} has no labels"
+        raise DataError(given, "real scans with labels, all of them")
     return thin_scan(other, scan.sensor)
 
 
-def _labelled(real: Source | None, name: str) -> tuple[Source, Scan]:
-    """Check that the real scans have labels, and return the scans and the first of them."""
-    if real is None or not len(real) or (first := real[0]).label is None:
-        given = "none" if real is None or not len(real) else "scans without labels"
+def _first_labelled(real: Source | None, policy: str) -> Scan:
+    """The first of the real scans, which has labels."""
+    if real is None or not len(real):
+        raise _no_labels("no real scans", policy)
+    first = real[0]
+    if first.label is None:
+        raise _no_labels("real scans without labels", policy)
+    return first
+
+
+def _no_labels(given: str, policy: str) -> ConfigError:
+    return ConfigError(
+        f"{policy} with {given}",
+        "real scans with labels, such as SemanticKITTI or a town",
+        f"Give {policy}(real=scans). KITTI-360 and KITTI have no labels: use labels='paste' "
+        "with boxes, or labels='generated'.",
+    )
+
+
+def _collect_objects(real: Source | None, least: int) -> ObjectBank:
+    try:
+        return ObjectBank.from_scans([] if real is None else real, least=least)
+    except DataError as error:
         raise ConfigError(
-            f"labels={name!r}, with {given}",
-            "real scans with labels, such as SemanticKITTI or a town",
-            "KITTI-360 and KITTI have no labels: use labels='paste' with boxes, or "
-            "labels='generated'.",
-        )
-    return real, first
+            f"labels='paste': {error}",
+            "real scans with boxes, or bank=",
+            "ObjectBank.from_scans(source).save(path) makes a bank of objects; KITTI and the "
+            "town have boxes.",
+        ) from error

@@ -142,11 +142,8 @@ def find_returns(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 
 def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) True for points of a box's instance that lie within it or within ``NOISE`` of it."""
-    wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
-    return np.asarray(
-        Boxes(wide, box.names).contain(scan.points)[0]
-        & (scan.instance == box.instance[0])
-    )
+    near = box.enlarged(NOISE).contain(scan.points)[0]
+    return np.asarray(near & (scan.instance == box.instance[0]))
 
 
 def _cut(scan: Scan, box: Boxes) -> Object | None:

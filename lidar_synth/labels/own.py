@@ -1,11 +1,12 @@
-"""Policies that need no other scans: they keep the labels of the synthetic scan, or remove them.
+"""Policies that need no other scans: they keep the labels of the synthetic scan, or
+remove them.
 
-They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_label``, which would
-contradict the labels that they set.
+They return a new ``Scan`` that shares its unchanged arrays. They remove ``raw_label``,
+which would contradict the labels that they set.
 """
 
 from dataclasses import dataclass, replace
-from numbers import Real
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,16 @@ from lidar_synth.geometry.scan import Scan, Source
 
 @dataclass(frozen=True)
 class RemoveLabels:
-    """``none``: an unlabelled pool; labels, instances, confidence and boxes are removed."""
+    """``none``: an unlabelled pool; labels, instances, confidence and boxes are
+    removed.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, RemoveLabels
+        >>> scan = RemoveLabels()(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> scan.label is None
+        True
+    """
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         return replace(
@@ -27,11 +37,18 @@ class RemoveLabels:
 
 @dataclass(frozen=True)
 class IgnoreLabels:
-    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan; the sample
-    keeps its keys.
+    """``ignore``: every label is 255 with confidence 0, so that a loss skips the scan;
+    the sample keeps its keys.
 
     Args:
         boxed: whether the scan keeps its boxes.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, IgnoreLabels
+        >>> scan = IgnoreLabels()(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> np.unique(scan.label)
+        array([255], dtype=uint8)
     """
 
     boxed: bool = False
@@ -79,7 +96,7 @@ class KeepLabels:
         Raises:
             ConfigError: if they do not.
         """
-        _require_label("generated", fields)
+        require_label("generated", fields)
         if self.threshold and "confidence" not in fields:
             raise ConfigError(
                 f"threshold {self.threshold} for synthetic scans without confidence",
@@ -88,13 +105,21 @@ class KeepLabels:
         return self
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return trust_labels(scan, _label_of(scan), scan.confidence, self.threshold)
+        return trust_labels(scan, label_of(scan), scan.confidence, self.threshold)
 
 
 @dataclass(frozen=True)
 class KeepCondition:
-    """``condition``: the labels of the semantic map that conditioned the scan, with confidence
-    1."""
+    """``condition``: the labels of the semantic map that conditioned the scan, with
+    confidence 1.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import Bank, KeepCondition
+        >>> scan = KeepCondition()(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> bool((scan.confidence[scan.label < 255] == 1).all())
+        True
+    """
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepCondition":
         """Check that the scans have labels.
@@ -102,16 +127,25 @@ class KeepCondition:
         Raises:
             ConfigError: if they do not.
         """
-        _require_label("condition", fields)
+        require_label("condition", fields)
         return self
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
-        return trust_labels(scan, _label_of(scan), None)
+        return trust_labels(scan, label_of(scan), None)
 
 
 @dataclass(frozen=True)
 class KeepBoxes:
-    """``boxes``: for detectors; the scan keeps its own boxes, and its labels if it has any."""
+    """``boxes``: for detectors; the scan keeps its own boxes, and its labels if it has
+    any.
+
+    Example:
+        >>> import numpy as np
+        >>> from lidar_synth import KeepBoxes, Town
+        >>> scan = KeepBoxes()(Town(seed=0, scans=1)[0], np.random.default_rng(0))
+        >>> len(scan.boxes) > 0
+        True
+    """
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> "KeepBoxes":
         """Check that the scans have boxes.
@@ -138,17 +172,37 @@ class KeepBoxes:
         return scan
 
 
-def keep_own(fields: frozenset[str], threshold: float) -> KeepLabels | IgnoreLabels:
-    """The policy for the synthetic scan's own part of a mixed scan: its labels, or 255 if it has
-    none.
+def keep_own(scan: Scan, rng: np.random.Generator, threshold: float) -> Scan:
+    """The scan with its own labels, see ``KeepLabels``; all are ignored if it has none."""
+    if scan.label is None:
+        return IgnoreLabels(boxed=True)(scan, rng)
+    return KeepLabels(threshold)(scan, rng)
+
+
+def check_own(threshold: float, fields: frozenset[str]) -> None:
+    """Check a threshold for scans that may have labels of their own.
 
     Raises:
-        ConfigError: as ``KeepLabels``.
+        ConfigError: on a threshold that is not from 0 to 1, or for labels without confidence.
     """
     own = KeepLabels(threshold)
     if "label" in fields:
-        return own.bind(None, fields)
-    return IgnoreLabels(boxed="boxes" in fields)
+        own.bind(None, fields)
+
+
+def label_of(scan: Scan) -> NDArray[np.uint8]:
+    """The labels of a scan.
+
+    Raises:
+        DataError: if it has none.
+    """
+    if scan.label is None:
+        raise DataError(
+            f"scan {scan.id!r} has no labels",
+            "a label for each point",
+            "Use labels='ignore'.",
+        )
+    return scan.label
 
 
 def trust_labels(
@@ -172,28 +226,35 @@ def trust_labels(
     return replace(scan, label=label, raw_label=None, confidence=confidence)
 
 
-def check_share(name: str, value: float) -> float:
-    """Check that ``value`` is a number from 0 to 1, and return it.
+def check_share(name: str, value: float, most: float = 1) -> float:
+    """Check that ``value`` is a number from 0 to ``most``, and return it.
 
     Raises:
         ConfigError: on any other value.
     """
-    if not (isinstance(value, Real) and 0 <= value <= 1):
-        raise ConfigError(f"{name} {shorten(repr(value), 40)}", "a number from 0 to 1")
+    if not (isinstance(value, Real) and 0 <= value <= most):
+        given = f"{name} {shorten(repr(value), 40)}"
+        raise ConfigError(given, f"a number from 0 to {most:g}")
     return value
 
 
-def _label_of(scan: Scan) -> NDArray[np.uint8]:
-    if scan.label is None:
-        raise DataError(
-            f"scan {scan.id!r} has no labels",
-            "a label for each point",
-            "Use labels='ignore'.",
-        )
-    return scan.label
+def check_count(name: str, value: int, least: int) -> None:
+    """Check that ``value`` is a whole number of at least ``least``.
+
+    Raises:
+        ConfigError: on any other value.
+    """
+    if not (isinstance(value, Integral) and value >= least):
+        given = f"{name} {shorten(repr(value), 40)}"
+        raise ConfigError(given, f"a whole number, {least} or more")
 
 
-def _require_label(policy: str, fields: frozenset[str]) -> None:
+def require_label(policy: str, fields: frozenset[str]) -> None:
+    """Check that synthetic scans have labels.
+
+    Raises:
+        ConfigError: if they do not.
+    """
     if "label" not in fields:
         raise ConfigError(
             f"labels={policy!r}, but besides points the synthetic scans only have "

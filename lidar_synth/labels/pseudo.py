@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError, DataError
@@ -18,34 +19,38 @@ labels."""
 
 @dataclass(frozen=True)
 class PredictLabels:
-    """``pseudo``: labels that a teacher predicts for the finished scan.
+    """``pseudo``: labels predicted by a teacher, such as your own network.
 
     Args:
-        teacher: any callable; it must be picklable if DataLoader workers are spawned.
+        teacher: ``scan -> (labels (N,) train ids, confidence (N,) in [0, 1])`` or
+            ``scan -> scan`` with labels; it must be picklable if DataLoader workers are
+            spawned.
         threshold: minimum confidence, 0 to 1; labels below it become 255 = ignore.
 
     Raises:
-        ConfigError: without a teacher, or on a threshold outside [0, 1].
+        ConfigError: on a teacher that is no function, or another threshold.
 
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, PredictLabels
-        >>> def teacher(scan):  # your network
-        ...     return scan.label, scan.confidence
-        >>> PredictLabels(teacher)(Bank("demo_out/bank")[0], np.random.default_rng(0)).label.dtype
-        dtype('uint8')
+        >>> def predict(scan):  # your network: here, low returns are road
+        ...     return np.where(scan.points[:, 2] < -1.5, 8, 255), np.ones(len(scan))
+        >>> policy = PredictLabels(predict)
+        >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
+        >>> np.unique(scan.label)
+        array([  8, 255], dtype=uint8)
     """
 
-    teacher: Teacher | None = None
+    teacher: Teacher
     threshold: float = 0.9
 
     def __post_init__(self) -> None:
-        check_share("threshold", self.threshold)
         if not callable(self.teacher):
             raise ConfigError(
                 f"labels='pseudo' with teacher={self.teacher!r}",
                 "a function scan -> (labels, confidence), or scan -> scan",
             )
+        check_share("threshold", self.threshold)
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         """The scan with the teacher's labels.
@@ -53,7 +58,6 @@ class PredictLabels:
         Raises:
             DataError: on an answer that is not one label and one confidence per point.
         """
-        assert self.teacher is not None
         answer = self.teacher(scan)
         if isinstance(answer, Scan):
             answer = (answer.label, answer.confidence)
@@ -62,24 +66,26 @@ class PredictLabels:
                 f"the teacher's answer {type(answer).__name__} for scan {scan.id!r}",
                 "(labels, confidence), (N,) each, or a scan with labels",
             )
-        label, confidence = (
-            None if values is None else np.asarray(values) for values in answer
-        )
-        assert label is not None
-        bad = (
-            label.shape != (len(scan),)
-            or ((label != IGNORE) & ((label < 0) | (label >= len(NAMES)))).any()
-        )
-        if confidence is not None:
-            bad = (
-                bad
-                or confidence.shape != label.shape
-                or not ((confidence >= 0) & (confidence <= 1)).all()
-            )
-            confidence = confidence.astype(np.float32)
-        if bad:
+        label = np.asarray(answer[0])
+        confidence = None if answer[1] is None else np.asarray(answer[1])
+        if not (_are_labels(label, len(scan)) and _are_shares(confidence, len(scan))):
             raise DataError(
-                f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} points",
+                f"the teacher's labels of scan {scan.id!r}, {label.shape} for {len(scan)} "
+                "points",
                 "train ids 0..18 or 255 and confidences in [0, 1], one of each per point",
             )
+        if confidence is not None:
+            confidence = confidence.astype(np.float32)
         return trust_labels(scan, label.astype(np.uint8), confidence, self.threshold)
+
+
+def _are_labels(label: NDArray[Any], count: int) -> bool:
+    known = (label >= 0) & (label < len(NAMES))
+    return label.shape == (count,) and bool((known | (label == IGNORE)).all())
+
+
+def _are_shares(confidence: NDArray[Any] | None, count: int) -> bool:
+    if confidence is None:
+        return True
+    within = (confidence >= 0) & (confidence <= 1)
+    return confidence.shape == (count,) and bool(within.all())

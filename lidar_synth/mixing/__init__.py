@@ -7,7 +7,7 @@ stream follow it.
 from lidar_synth.mixing.batches import MixedBatches
 from lidar_synth.mixing.collate import Collate
 from lidar_synth.mixing.items import Item, to_item
-from lidar_synth.mixing.plan import MixingPlan, plan
+from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture, PlannedSource
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.schedules import Linear, make_schedule
@@ -30,6 +30,5 @@ __all__ = [
     "Synthetic",
     "make_schedule",
     "make_synthetic",
-    "plan",
     "to_item",
 ]

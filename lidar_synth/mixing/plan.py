@@ -28,8 +28,8 @@ from lidar_synth.mixing.quotas import (
     Mixture,
     PlannedSource,
     count_before,
+    count_samples,
     deal,
-    quotas,
     synthetic_before,
 )
 from lidar_synth.mixing.schedules import share_of
@@ -68,7 +68,7 @@ class MixingPlan:
     @cached_property
     def counts(self) -> tuple[int, ...]:
         """Number of samples from each source."""
-        return quotas(self.mixture, self.epoch)
+        return count_samples(self.mixture, self.epoch)
 
     @cached_property
     def before(self) -> tuple[int, ...]:
@@ -237,11 +237,6 @@ class MixingPlan:
             lap = mixture.laps[source - self.reals]
             number = number // (mixture.reuse * lap) * lap + number % lap
         return number if planned.length is None else number % planned.length
-
-
-def plan(mixture: Mixture, epoch: int) -> MixingPlan:
-    """Make the plan of an epoch; see ``MixingPlan``."""
-    return MixingPlan(mixture, epoch)
 
 
 def _facts_of(source: PlannedSource) -> dict[str, Any]:

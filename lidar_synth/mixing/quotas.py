@@ -113,7 +113,7 @@ class Mixture:
                 "no weights, or another epoch_size",
                 "Use epoch_size='replace' or a number of samples.",
             )
-        quotas(self, 0)
+        count_samples(self, 0)
 
     @property
     def real_length(self) -> int:
@@ -241,7 +241,7 @@ def count_before(mixture: Mixture, epoch: int) -> tuple[int, ...]:
     return reals + split(mixture.synthetic_weights, synthetic)
 
 
-def quotas(mixture: Mixture, epoch: int) -> tuple[int, ...]:
+def count_samples(mixture: Mixture, epoch: int) -> tuple[int, ...]:
     """The number of samples from each source in an epoch, real sources first; their sum is the
     epoch's length.
 

@@ -14,8 +14,8 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.labels import LabelPolicy, make_policy
-from lidar_synth.labels.policies import read_labels
+from lidar_synth.labels.own import RemoveLabels
+from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
@@ -121,7 +121,7 @@ class MixedScans(Dataset[Any]):
         real: Any,
         synth: Any = None,
         ratio: Ratio = 0.25,
-        labels: Any = "generated",
+        labels: Labels = "generated",
         seed: int = 0,
         *,
         epoch_size: EpochSize = "add",
@@ -189,11 +189,10 @@ class MixedScans(Dataset[Any]):
         self._to_sample = to_sample
         self._real_as_is = real_as_is
         if isinstance(collate, str):
-            collate = Collate(
-                collate,
-                sensors[0] if sensors else None,
-                "allow" if read_labels(labels)[0] == "none" else unlabelled,
-            )
+            if any(isinstance(policy, RemoveLabels) for policy in self._policies):
+                unlabelled = "allow"
+            sensor = sensors[0] if sensors else None
+            collate = Collate(collate, sensor, unlabelled)
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
         self._untold = (
@@ -235,7 +234,7 @@ class MixedScans(Dataset[Any]):
                 samples.
             collate: the trainer's own collate function.
             options: other arguments of ``MixedScans``. A label policy that draws from real scans
-                has to be made beforehand, by ``make_policy(..., real=scans)``.
+                needs them itself: ``labels=PolarMix(real=scans)``.
 
         Raises:
             ConfigError, DataError: as above; also where a synthetic sample does not have the form

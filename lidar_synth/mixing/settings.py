@@ -16,6 +16,7 @@ from lidar_synth.formats.as_sensor import read_transfer
 from lidar_synth.formats.description import same_grid
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.scans import MixedScans, Ratio
 from lidar_synth.mixing.sources import each, sensor_of
 
@@ -91,7 +92,7 @@ def mix(
     real: Any,
     synth: Any,
     ratio: Ratio = 0.25,
-    labels: Any = "generated",
+    labels: Labels = "generated",
     *,
     as_sensor: Any = "auto",
     **options: Any,

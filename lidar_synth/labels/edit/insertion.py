@@ -125,9 +125,7 @@ def _set(
     """Set an object into a scan at its place; it replaces (N,) estimated returns, whatever their
     distance."""
     rays = rays_of_scan(scan)
-    window = np.flatnonzero(
-        rays.through(placed.box + np.array([0, 0, 0, 0.6, 0.6, 0.6, 0], np.float32))
-    )
+    window = np.flatnonzero(rays.through(placed.box, margin=0.3))
     rho, hits, at = _hits(item, placed, rays, window)
     guess = (rays.point[window] >= 0) & estimated[rays.point[window]]
     seen = np.isfinite(rho) & (guess | (rho < rays.rho[window] - GRAZE))

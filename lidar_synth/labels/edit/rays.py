@@ -45,9 +45,12 @@ class ScanRays(NamedTuple):
             np.float32
         )
 
-    def through(self, box: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(E,) whether each ray passes through a box (7,)."""
-        return np.asarray(self.leaving(box) > 0)
+    def through(self, box: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
+        """(E,) whether each ray passes through a box (7,) with a margin in metres on all six
+        sides."""
+        sides = 3 * [2 * margin]
+        wide = box + np.array([0, 0, 0, *sides, 0], np.float32)
+        return np.asarray(self.leaving(wide) > 0)
 
     def leaving(self, box: NDArray[np.float32]) -> NDArray[np.float64]:
         """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not

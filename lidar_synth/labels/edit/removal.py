@@ -139,8 +139,7 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
     """(N,) the returns of the object in one box, with those of its mirrors and aerials just
     outside."""
     mine = find_returns(scan, box)
-    wide = box.values + np.array([0, 0, 0, *3 * [2 * NOISE], 0], np.float32)
-    around = Boxes(wide, box.names).contain(scan.points)[0] & ~mine
+    around = box.enlarged(NOISE).contain(scan.points)[0] & ~mine
     ground = ground_under(scan, box.values[0])
     if ground is not None:
         around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
@@ -191,9 +190,7 @@ def remove_returns(
     near[hole] = rays.rho[hole]
     for mine, box in parts:
         if mine.any():
-            absorbed = ~there & rays.through(
-                box + np.array([0, 0, 0, *3 * [2 * MARGIN], 0], np.float32)
-            )
+            absorbed = ~there & rays.through(box, MARGIN)
             near[absorbed] = np.minimum(
                 near[absorbed], np.hypot(*scan.points[mine, :2].T).min()
             )

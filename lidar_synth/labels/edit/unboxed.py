@@ -187,12 +187,8 @@ def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:
         return np.zeros(len(scan), bool)
     outside: NDArray[np.bool_] = np.isin(scan.label, list(classes))
     if scan.boxes is not None and len(scan.boxes) and outside.any():
-        wide = scan.boxes.values + np.array(
-            [0, 0, 0, *3 * [2 * TOLERANCE], 0], np.float32
-        )
-        outside[outside] = ~Boxes(wide, scan.boxes.names).contain(
-            scan.points[outside]
-        ).any(0)
+        inside = scan.boxes.enlarged(TOLERANCE).contain(scan.points[outside])
+        outside[outside] = ~inside.any(0)
         if scan.instance is not None:
             outside &= ~(
                 (scan.instance > 0) & np.isin(scan.instance, scan.boxes.instance)
