@@ -54,7 +54,7 @@ class PasteObjects:
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, ObjectBank, PasteObjects, Town
-        >>> objects = ObjectBank.from_scans(Town(seed=0, scans=2))
+        >>> objects = ObjectBank.from_scans(Town(0, "hdl64e_lasers", 2))
         >>> policy = PasteObjects(objects, count=8)  # as labels= of a mixture
         >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
         >>> 0 < len(scan.boxes) <= 8
@@ -169,7 +169,7 @@ class PolarMix:
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, PolarMix, Town
-        >>> policy = PolarMix(width=90, objects=0, real=Town(seed=0, scans=2))
+        >>> policy = PolarMix(width=90, objects=0, real=Town(0, "hdl64e_lasers", 2))
         >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
         >>> scan.domain, scan.label.shape == (len(scan),)
         (1, True)
@@ -243,7 +243,7 @@ class LaserMix:
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, LaserMix, Town
-        >>> policy = LaserMix(bands=(4,), real=Town(seed=0, scans=2))
+        >>> policy = LaserMix(bands=(4,), real=Town(0, "hdl64e_lasers", 2))
         >>> scan = policy(Bank("demo_out/bank")[0], np.random.default_rng(0))
         >>> scan.boxes is None  # few objects fit into a band
         True
@@ -288,7 +288,7 @@ class PolarMixOrLaserMix(PolarMix):
     Example:
         >>> import numpy as np
         >>> from lidar_synth import Bank, PolarMixOrLaserMix, Town
-        >>> policy = PolarMixOrLaserMix(real=Town(seed=0, scans=2))
+        >>> policy = PolarMixOrLaserMix(real=Town(0, "hdl64e_lasers", 2))
         >>> scans = [policy(Bank("demo_out/bank")[0], np.random.default_rng(n)) for n in range(4)]
         >>> {scan.boxes is None for scan in scans} == {True, False}
         True
