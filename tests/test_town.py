@@ -22,7 +22,7 @@ from lidar_synth.lab.town.cast import Snapshot, trace
 from lidar_synth.lab.town.ego import free_rays
 from lidar_synth.lab.town.materials import MATERIALS
 from lidar_synth.lab.town.movers import ego_place
-from lidar_synth.lab.town.prototype import Prototype
+from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.returns import LEVELS
 from lidar_synth.lab.town.scene import PlacedObject
 from lidar_synth.lab.town.shading import camera_hits

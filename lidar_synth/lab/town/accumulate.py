@@ -85,7 +85,12 @@ Cloud = dict[str, NDArray[Any]]
 """{property: (N,)}, as ``write_cloud`` takes it, and ``range``."""
 
 
-def write_window(town: Town, root: Path, drive: str, window: tuple[int, int]) -> None:
+def write_window(
+    town: Town,
+    root: Path,
+    drive: str,
+    window: tuple[int, int],
+) -> None:
     """Write both files of a window, the static one last.
 
     Raises:

@@ -57,7 +57,14 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
     ]
     names = tuple(o.prototype.name for o in objects)
     instance = np.array([o.instance for o in objects], np.int32)
-    return Boxes(values, names, truncation, occlusion, image_box, instance=instance)
+    return Boxes(
+        values,
+        names,
+        truncation,
+        occlusion,
+        image_box,
+        instance=instance,
+    )
 
 
 def _box_values(placed: PlacedObject, in_sensor: Pose) -> NDArray[np.float64]:

@@ -1,9 +1,11 @@
-"""Meshes of buildings (four walls, a roof, rooms behind the windows, balconies) and of garages."""
+"""Buildings (four walls, a roof, rooms behind the windows, balconies) and garages."""
 
 import numpy as np
 
+from lidar_synth.lab.town.catalogue import Rng, pick_colour
 from lidar_synth.lab.town.facades import (
     DOOR,
+    FRONT,
     GLASS,
     PLINTH,
     RAIL,
@@ -14,192 +16,186 @@ from lidar_synth.lab.town.facades import (
     BuildingPlan,
     Frame,
     facade,
-    panels,
     reveals,
+    sheets,
     wall_around,
 )
-from lidar_synth.lab.town.meshes import Mesh, boxes, merge, quads, tube
+from lidar_synth.lab.town.materials import Finish
+from lidar_synth.lab.town.meshes import Array, Mesh, boxes, merge, quads, tube
+from lidar_synth.lab.town.objects import StaticObject, make_object
 
 
-def _balconies(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
+def _balconies(plan: BuildingPlan, rng: Rng) -> Mesh:
     """Balconies along parts of the front: slabs with railings of bars or of solid panels."""
     parts = []
     x = rng.uniform(0.5, 1.5)
-    solid = rng.random() < 0.5
+    railing = _solid_railing if rng.random() < 0.5 else _barred_railing
     while x + 3.0 < plan.width:
         for level in range(1, plan.floors):
             z = plan.plinth + level * plan.storey
             parts.append(boxes([(x, -1.3, z - 0.15)], [(x + 2.8, 0.0, z)], SLAB))
-            if solid:
-                low = [(x, -1.3, z), (x, -1.3, z), (x + 2.75, -1.3, z)]
-                parts.append(
-                    boxes(
-                        low,
-                        [
-                            (x + 2.8, -1.25, z + 1),
-                            (x + 0.05, 0, z + 1),
-                            (x + 2.8, 0, z + 1),
-                        ],
-                        SLAB,
-                    )
-                )
-            else:
-                bars = np.arange(x, x + 2.8, 0.14)
-                grid = np.c_[bars, bars + 0.025, 0 * bars + z, 0 * bars + z + 1]
-                parts.append(
-                    quads(
-                        panels(grid, -1.28, (np.zeros(3), np.eye(3)[0], np.eye(3)[1])),
-                        RAIL,
-                    )
-                )
-                parts.append(
-                    boxes([(x, -1.31, z + 0.98)], [(x + 2.8, -1.26, z + 1.03)], RAIL)
-                )
+            parts += railing(x, z)
         x += rng.uniform(4.5, 6.5)
     return merge(parts)
 
 
-def _roof(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
-    """The roof with chimney and skylights, or a flat roof."""
+def _solid_railing(x: float, z: float) -> list[Mesh]:
+    end = x + 2.8
+    low = [(x, -1.3, z), (x, -1.3, z), (x + 2.75, -1.3, z)]
+    high = [(end, -1.25, z + 1), (x + 0.05, 0, z + 1), (end, 0, z + 1)]
+    return [boxes(low, high, SLAB)]
+
+
+def _barred_railing(x: float, z: float) -> list[Mesh]:
+    bars = np.arange(x, x + 2.8, 0.14)
+    grid = np.c_[bars, bars + 0.025, 0 * bars + z, 0 * bars + z + 1]
+    rail = boxes([(x, -1.31, z + 0.98)], [(x + 2.8, -1.26, z + 1.03)], RAIL)
+    return [sheets(grid, -1.28, FRONT, RAIL), rail]
+
+
+def _flat_roof(plan: BuildingPlan) -> Mesh:
+    """A roof with an edge and a structure for the lift."""
     w = plan.width
     d = plan.depth
     z = plan.eaves
-    over = 0.45
-    if plan.roof == "flat":
-        edge = boxes([(-0.1, -0.1, z - 0.2)], [(w + 0.1, d + 0.1, z + 0.25)], SLAB)
-        return merge(
-            [
-                edge,
-                boxes(
-                    [(0.3 * w, 0.3 * d, z)],
-                    [(0.3 * w + 1.6, 0.3 * d + 1.6, z + 1.4)],
-                    SLAB,
-                ),
-            ]
-        )
-    cross = plan.roof == "cross"
+    x = 0.3 * w
+    y = 0.3 * d
+    return boxes(
+        [(-0.1, -0.1, z - 0.2), (x, y, z)],
+        [(w + 0.1, d + 0.1, z + 0.25), (x + 1.6, y + 1.6, z + 1.4)],
+        SLAB,
+    )
+
+
+def _roof(plan: BuildingPlan, rng: Rng) -> Mesh:
+    """A pitched roof with chimney and skylights."""
     # Built with the ridge along x; a cross gable is the same roof with x and y swapped.
-    along, deep = (d, w) if cross else (w, d)
-    top = z + rng.uniform(0.32, 0.5) * deep
-    low = z - 2 * over * (top - z) / deep
-    inset = 0.35 * deep if plan.roof == "hip" else 0.0
-    x0 = -over
-    x1 = along + over
-    y0 = -over
-    y1 = deep + over
-    a = (x0 + inset, deep / 2, top)
-    b = (x1 - inset, deep / 2, top)
-    slopes = [
-        [(x0, y0, low), (x1, y0, low), b, a],
-        [(x0, y1, low), a, b, (x1, y1, low)],
-    ]
-    ends = [[(x0, y0, low), a, a, (x0, y1, low)], [(x1, y0, low), (x1, y1, low), b, b]]
-    gables = [
-        [(x, 0, z), (x, deep, z), (x, deep / 2, top), (x, deep / 2, top)]
+    cross = plan.roof == "cross"
+    along, deep = (plan.depth, plan.width) if cross else (plan.width, plan.depth)
+    top = plan.eaves + rng.uniform(0.32, 0.5) * deep
+    slopes, sides = _roof_faces(along, deep, plan.eaves, top, plan.roof == "hip")
+    side = ROOF if plan.roof == "hip" else WALL
+    roof = quads([*slopes, *sides], np.array([ROOF, ROOF, side, side]))
+    if cross:
+        roof = Mesh(roof.triangles[..., [1, 0, 2]], roof.slot)
+    x = rng.uniform(0.2, 0.8) * plan.width
+    y = 0.5 * plan.depth
+    low = (x - 0.3, y - 0.3, top - 1.0)
+    parts = [roof, boxes(low, (x + 0.3, y + 0.3, top + 0.9), PLINTH)]
+    if plan.roof == "gable" and plan.detail:
+        parts.append(_skylights(np.array(slopes[0]), int(rng.integers(0, 4)), rng))
+    return merge(parts)
+
+
+Corners = list[tuple[float, float, float]]
+
+
+def _roof_faces(
+    along: float,
+    deep: float,
+    eaves: float,
+    top: float,
+    hip: bool,
+) -> tuple[list[Corners], list[Corners]]:
+    """Corners of the two slopes of a roof and of its two ends, which slope if it is a ``hip``."""
+    over = 0.45
+    low = eaves - 2 * over * (top - eaves) / deep
+    end = along + over
+    back = deep + over
+    ridge = deep / 2
+    inset = 0.35 * deep if hip else 0.0
+    a = (inset - over, ridge, top)
+    b = (end - inset, ridge, top)
+    front_left = (-over, -over, low)
+    front_right = (end, -over, low)
+    back_left = (-over, back, low)
+    back_right = (end, back, low)
+    slopes = [[front_left, front_right, b, a], [back_left, a, b, back_right]]
+    if hip:
+        return slopes, [[front_left, a, a, back_left], [front_right, back_right, b, b]]
+    return slopes, [
+        [(x, 0, eaves), (x, deep, eaves), (x, ridge, top), (x, ridge, top)]
         for x in (0, along)
     ]
-    sheets = quads(
-        [*slopes, *(ends if inset else gables)],
-        np.array([ROOF, ROOF] + [ROOF if inset else WALL] * 2),
-    )
-    turned = Mesh(sheets.triangles[..., [1, 0, 2]], sheets.slot) if cross else sheets
-    chimney = np.array([rng.uniform(0.2, 0.8) * w, 0.5 * d, top])
-    stack = boxes(
-        [chimney - np.array((0.3, 0.3, 1.0))],
-        [chimney + np.array((0.3, 0.3, 0.9))],
-        PLINTH,
-    )
-    lights = (
-        [_skylights(slopes[0], int(rng.integers(0, 4)), rng)]
-        if plan.roof == "gable" and plan.detail
-        else []
-    )
-    return merge([turned, stack, *lights])
 
 
-def _skylights(
-    slope: list[tuple[float, float, float]], count: int, rng: np.random.Generator
-) -> Mesh:
-    """``count`` windows at random positions on a slope, given by its corners."""
-    a, b, c, d = np.array(slope, float)
+def _skylights(slope: Array, count: int, rng: Rng) -> Mesh:
+    """``count`` windows at random positions on a slope, given by its corners (4, 3)."""
+    a, b, c, d = slope
     up = np.cross(b - a, d - a)
     up = 0.04 * up / np.linalg.norm(up)
     width = 0.8 / float(np.linalg.norm(b - a))
     height = 1.2 / float(np.linalg.norm(d - a))
-    corners = []
-    for u in map(float, rng.uniform(0.1, 0.85, count)):
-        edges = [
-            (u, 0.4),
-            (u + width, 0.4),
-            (u + width, 0.4 + height),
-            (u, 0.4 + height),
-        ]
-        corners.append(
-            [
-                (1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up
-                for s, v in edges
-            ]
-        )
-    return quads(np.array(corners).reshape(-1, 4, 3), GLASS)
+    left = rng.uniform(0.1, 0.85, (count, 1, 1))
+    s = left + np.array([0, width, width, 0])[:, None]
+    v = np.array([0.4, 0.4, 0.4 + height, 0.4 + height])[:, None]
+    corners = (1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up
+    return quads(corners, GLASS)
 
 
-def make_building(plan: BuildingPlan, rng: np.random.Generator) -> Mesh:
-    """The mesh of a building; the slots are those of ``facades.finishes``."""
+def make_building(plan: BuildingPlan, rng: Rng) -> Mesh:
+    """The mesh of a building; its slots are those of ``finish_building``."""
     w = plan.width
     d = plan.depth
-    axes = np.eye(3)
+    x, y, _ = np.eye(3)
     sides: list[tuple[float, Frame]] = [
-        (w, (np.zeros(3), axes[0], axes[1])),
-        (d, (np.zeros(3), axes[1], axes[0])),
-        (d, (w * axes[0], axes[1], -axes[0])),
-        (w, (d * axes[1], axes[0], -axes[1])),
+        (w, FRONT),
+        (d, (np.zeros(3), y, x)),
+        (d, (w * x, y, -x)),
+        (w, (d * y, x, -y)),
     ]
     parts = [
         facade(plan, length, frame, i, rng) for i, (length, frame) in enumerate(sides)
     ]
-    parts.append(_roof(plan, rng))
+    parts.append(_flat_roof(plan) if plan.roof == "flat" else _roof(plan, rng))
     if plan.detail:
-        inset = min(3.2, 0.35 * d, 0.35 * w)
-        parts.append(
-            boxes([(inset, inset, 0)], [(w - inset, d - inset, plan.eaves - 0.1)], ROOM)
-        )
-        floors = plan.plinth + plan.storey * np.arange(plan.floors)
-        parts.append(
-            quads(
-                [
-                    [
-                        (0.1, 0.3, z),
-                        (w - 0.1, 0.3, z),
-                        (w - 0.1, d - 0.3, z),
-                        (0.1, d - 0.3, z),
-                    ]
-                    for z in floors
-                ],
-                ROOM,
-            )
-        )
-        parts.append(tube([(0.12, -0.06, 0), (0.12, -0.06, plan.eaves)], 0.05, 5, RAIL))
+        parts += _rooms(plan)
         if plan.balconies:
             parts.append(_balconies(plan, rng))
     return merge(parts)
 
 
+def _rooms(plan: BuildingPlan) -> list[Mesh]:
+    """What is seen through the windows, the floors, and a gutter."""
+    w = plan.width
+    d = plan.depth
+    inset = min(3.2, 0.35 * d, 0.35 * w)
+    inner = (w - inset, d - inset, plan.eaves - 0.1)
+    floors = [
+        [(0.1, 0.3, z), (w - 0.1, 0.3, z), (w - 0.1, d - 0.3, z), (0.1, d - 0.3, z)]
+        for z in plan.plinth + plan.storey * np.arange(plan.floors)
+    ]
+    return [
+        boxes((inset, inset, 0), inner, ROOM),
+        quads(floors, ROOM),
+        tube([(0.12, -0.06, 0), (0.12, -0.06, plan.eaves)], 0.05, 5, RAIL),
+    ]
+
+
 def garage(width: float, depth: float) -> Mesh:
     """A flat-roofed garage with its door to the front."""
-    axes = np.eye(3)
-    frame: Frame = (np.zeros(3), axes[0], axes[1])
     door = np.array([[0.3, width - 0.3, 0.0, 2.1]])
-    shell = boxes([(0, 0.12, -0.5)], [(width, depth, 2.6)], WALL)
-    slats = np.linspace(0, 2.1, 6)
-    leaves = np.stack(
-        [np.full(5, 0.3), np.full(5, width - 0.3), slats[:-1] + 0.02, slats[1:]], 1
-    )
+    slats = np.repeat(door, 5, axis=0)
+    heights = np.linspace(0, 2.1, 6)
+    slats[:, 2] = heights[:-1] + 0.02
+    slats[:, 3] = heights[1:]
     return merge(
         [
-            shell,
-            wall_around(width, -0.5, 2.6, door, frame),
-            quads(reveals(door, 0.1, frame), WALL),
-            quads(panels(leaves, 0.1, frame), DOOR),
+            boxes([(0, 0.12, -0.5)], [(width, depth, 2.6)], WALL),
+            wall_around(width, -0.5, 2.6, door, FRONT),
+            reveals(door, 0.1, FRONT),
+            sheets(slats, 0.1, FRONT, DOOR),
             boxes([(-0.1, -0.1, 2.55)], [(width + 0.1, depth + 0.1, 2.75)], SLAB),
         ]
     )
+
+
+def finish_building(mesh: Mesh, rng: Rng) -> StaticObject:
+    """A building with random finishes."""
+    wall = Finish("brick")
+    if rng.random() >= 0.10:
+        wall = Finish("render", pick_colour("walls", rng))
+    roof = Finish("tile", pick_colour("roofs", rng))
+    door = Finish("wood", pick_colour("doors", rng))
+    finishes = {WALL: wall, ROOF: roof, DOOR: door}
+    return make_object("building", mesh, finishes=finishes)

@@ -4,9 +4,10 @@ Street coordinates are (s, t): metres along the centre line, and metres to its l
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from lidar_synth.lab.town.catalogue import Rng
+from lidar_synth.lab.town.meshes import Array
 
 
 class Course:
@@ -19,7 +20,11 @@ class Course:
     """
 
     def __init__(
-        self, start: float, end: float, bend: float, rng: np.random.Generator
+        self,
+        start: float,
+        end: float,
+        bend: float,
+        rng: Rng,
     ) -> None:
         self._s = np.arange(start, end + 1.0)
         waves = sum(
@@ -53,7 +58,7 @@ class Relief:
         rng: samples hills, banks and slopes.
     """
 
-    def __init__(self, grade: float, rng: np.random.Generator) -> None:
+    def __init__(self, grade: float, rng: Rng) -> None:
         self._length = rng.uniform(70, 240, 4)
         self._phase = rng.uniform(0, 2 * np.pi, 4)
         self._way = rng.uniform(-0.6, 0.6, 4)
@@ -66,15 +71,11 @@ class Relief:
         """Height at street coordinates, metres."""
         s = np.asarray(s, float)
         t = np.asarray(t, float)
-        along = (
-            s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)
-        ) / self._length
+        ways = s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)
+        along = ways / self._length
         hills = (self._height * np.sin(2 * np.pi * along + self._phase)).sum(-1)
-        bank = np.where(t > 0, self._banks[0], self._banks[1]) * np.clip(
-            np.abs(t) - 9, 0, 40
-        )
-        far = (
-            np.where(t > 0, self._far[0], self._far[1])
-            * np.clip((np.abs(t) - 90) / 100, 0, 1) ** 2
-        )
+        left = t > 0
+        out = np.abs(t)
+        bank = np.where(left, *self._banks) * np.clip(out - 9, 0, 40)
+        far = np.where(left, *self._far) * np.clip((out - 90) / 100, 0, 1) ** 2
         return np.asarray(hills + self._slope * s + bank + far)

@@ -131,7 +131,11 @@ def _write_times(path: Path, town: Town) -> None:
 
 
 def _claim_folder(
-    out: Path, town: Town, layout: str, sequence: int, camera: bool
+    out: Path,
+    town: Town,
+    layout: str,
+    sequence: int,
+    camera: bool,
 ) -> None:
     """Write the settings and a README into the folder.
 
@@ -185,7 +189,11 @@ def _write_group(
 
 
 def _write_windows(
-    town: Town, out: Path, drive: str, jobs: int, progress: bool
+    town: Town,
+    out: Path,
+    drive: str,
+    jobs: int,
+    progress: bool,
 ) -> None:
     missing = [
         w for w in windows_of(town) if not window_paths(out, drive, w)[0].is_file()

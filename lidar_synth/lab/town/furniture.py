@@ -1,267 +1,124 @@
-"""Static objects along a street: plants, lamps, benches, bins, bus shelters, market stalls.
+"""Static objects along a street whose measures vary: lamps, signs, walls and fences.
 
-Every function returns a ``StaticObject`` whose origin is on the ground and whose front (or long
-side) is along +x.
+The front of a sign is along +x, as is the arm of a lamp; walls and fences run along +x.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_synth.lab.town.materials import RGB, Finish
-from lidar_synth.lab.town.meshes import Mesh, boxes, merge, prism, quads, tube, tubes
-from lidar_synth.lab.town.plants import (
-    SPECIES,
-    TREE_CLASSES,
-    VARIANTS,
-    coarse_plant,
-    plant,
-    tufts,
-)
-
-BUILDING = 50
-FENCE = 51
-STRUCTURE = 52
-VEGETATION = 70
-TERRAIN = 72
-POLE = 80
-SIGN = 81
-OTHER = 99
-GALVANISED = Finish("metal", (0.55, 0.57, 0.58))
-
-
-@dataclass(frozen=True)
-class StaticObject:
-    """A static object without an instance number ("stuff" in panoptic segmentation).
-
-    Args:
-        mesh: its triangles.
-        finishes: the finish of each slot.
-        raw: SemanticKITTI's class id of each slot.
-    """
-
-    mesh: Mesh
-    finishes: tuple[Finish, ...]
-    raw: tuple[int, ...]
-
-
-def random_plant(
-    species: str, rng: np.random.Generator, size: float = 1.0, near: bool = True
-) -> StaticObject:
-    """A tree or bush of a species with a random shape, size and tint; with fewer leaves unless it
-    is ``near``."""
-    mesh = (plant if near else coarse_plant)(species, int(rng.integers(VARIANTS)))
-    mesh = mesh.moved(
-        yaw=rng.uniform(0, 2 * np.pi), scale=size * rng.uniform(0.85, 1.15, 3)
-    )
-    leaf, *rest = SPECIES[species]
-    assert leaf.colour is not None
-    tint = rng.uniform(0.8, 1.25) * rng.uniform(0.9, 1.1, 3)
-    if species == "bush" and rng.random() < 0.2:
-        tint = np.array((1.9, 0.6, 1.0))
-    r, g, b = np.clip(np.array(leaf.colour) * tint, 0, 1)
-    return StaticObject(mesh, (Finish("leaf", (r, g, b)), *rest), TREE_CLASSES)
-
-
-def weeds(
-    length: float, depth: float, height: float, rng: np.random.Generator
-) -> StaticObject:
-    """A strip of high grass along +x."""
-    return StaticObject(
-        tufts(length, depth, height, 26, rng),
-        (Finish("leaf", (0.36, 0.45, 0.18)),),
-        (TERRAIN,),
-    )
+from lidar_synth.lab.town.catalogue import RGB, TABLES, Rng, pick_colour
+from lidar_synth.lab.town.materials import Finish
+from lidar_synth.lab.town.meshes import Array, boxes, circle, fan, quads, tube, tubes
+from lidar_synth.lab.town.objects import StaticObject, make_object
+from lidar_synth.lab.town.plants import random_plant
 
 
 def lamp_post(height: float, reach: float) -> StaticObject:
     """A street lamp with its arm towards +x."""
-    pole = tube(
-        [(0, 0, -0.2), (0, 0, 0.9), (0, 0, 1.0), (0, 0, height)],
-        (0.085, 0.085, 0.06, 0.045),
-        8,
-    )
-    arm = tube(
-        [(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)],
-        0.035,
-        6,
-    )
-    head = boxes(
-        [(reach - 0.1, -0.14, height + 0.22)], [(reach + 0.6, 0.14, height + 0.36)], 1
-    )
-    return StaticObject(
-        merge([pole, arm, head]),
-        (GALVANISED, Finish("lamp", (0.6, 0.6, 0.6))),
-        (POLE, POLE),
+    levels = [(0, 0, z) for z in (-0.2, 0.9, 1.0, height)]
+    arm = [(0, 0, height), (0.4 * reach, 0, height + 0.25), (reach, 0, height + 0.3)]
+    low = (reach - 0.1, -0.14, height + 0.22)
+    return make_object(
+        "lamp_post",
+        tube(levels, (0.085, 0.085, 0.06, 0.045), 8),
+        tube(arm, 0.035, 6),
+        boxes([low], [(reach + 0.6, 0.14, height + 0.36)], 1),
     )
 
 
-def mast(height: float, radius: float, wood: bool) -> StaticObject:
-    """A plain pole: a telegraph mast, or a mast of a tram's overhead line."""
-    return StaticObject(
-        tube([(0, 0, -0.2), (0, 0, height)], (radius, 0.75 * radius), 8),
-        (Finish("bark") if wood else GALVANISED,),
-        (POLE,),
+def bin_(rng: Rng) -> StaticObject:
+    """A wheeled rubbish bin of a random colour."""
+    return make_object("bin", finishes={0: Finish("plastic", pick_colour("bins", rng))})
+
+
+def stall(rng: Rng) -> StaticObject:
+    """A market stall with an awning of a random colour."""
+    return make_object(
+        "stall", finishes={1: Finish("cloth", pick_colour("awnings", rng))}
     )
 
 
-def bench() -> StaticObject:
-    """A park bench facing +x, its seat 0.45 m high."""
-    slats = [(-0.22 + 0.11 * i, 0.43) for i in range(4)] + [
-        (-0.27, 0.60),
-        (-0.30, 0.76),
-    ]
-    low = [(x, -0.85, z) for x, z in slats]
-    high = [
-        (x + (0.09 if z < 0.5 else 0.03), 0.85, z + (0.04 if z < 0.5 else 0.11))
-        for x, z in slats
-    ]
-    legs = boxes(
-        [(-0.25, y, -0.05) for y in (-0.7, 0.64)],
-        [(0.2, y + 0.06, 0.43) for y in (-0.7, 0.64)],
-        1,
-    )
-    return StaticObject(
-        merge([boxes(low, high), legs]),
-        (Finish("wood"), Finish("metal", (0.2, 0.2, 0.2))),
-        (OTHER, OTHER),
-    )
-
-
-def bin_(rng: np.random.Generator) -> StaticObject:
-    """A wheeled rubbish bin."""
-    colours: tuple[RGB, ...] = (
-        (0.10, 0.11, 0.12),
-        (0.10, 0.22, 0.12),
-        (0.10, 0.16, 0.35),
-        (0.55, 0.45, 0.10),
-    )
-    mesh = merge(
-        [
-            boxes([(-0.26, -0.24, 0.04)], [(0.26, 0.24, 0.98)]),
-            boxes([(-0.30, -0.28, 0.98)], [(0.32, 0.28, 1.06)]),
-        ]
-    )
-    return StaticObject(mesh, (Finish("plastic", colours[rng.integers(4)]),), (OTHER,))
-
-
-def cabinet() -> StaticObject:
-    """A roadside cabinet of a telephone or power company."""
-    mesh = merge(
-        [
-            boxes([(-0.2, -0.5, -0.1)], [(0.2, 0.5, 1.15)]),
-            boxes([(-0.24, -0.54, 1.15)], [(0.24, 0.54, 1.22)]),
-        ]
-    )
-    return StaticObject(mesh, (Finish("plastic", (0.50, 0.53, 0.50)),), (OTHER,))
-
-
-def bollard(height: float = 0.9) -> StaticObject:
-    """A short post."""
-    ring = tube([(0, 0, height - 0.22), (0, 0, height - 0.12)], 0.066, 6, 1)
-    return StaticObject(
-        merge([tube([(0, 0, -0.1), (0, 0, height)], 0.06, 6), ring]),
-        (Finish("metal", (0.3, 0.3, 0.32)), Finish("sign")),
-        (POLE, POLE),
-    )
-
-
-def shelter() -> StaticObject:
-    """A bus shelter, open to +x: glass walls, a roof, a bench."""
-    glass = [
-        [(-0.7, -2, 0.15), (-0.7, 2, 0.15), (-0.7, 2, 2.2), (-0.7, -2, 2.2)],
-        [(-0.7, -2, 0.15), (0.5, -2, 0.15), (0.5, -2, 2.2), (-0.7, -2, 2.2)],
-        [(-0.7, 2, 0.15), (0.5, 2, 0.15), (0.5, 2, 2.2), (-0.7, 2, 2.2)],
-    ]
-    posts = [(x, y) for x in (-0.7, 0.5) for y in (-2.0, 2.0)]
-    mesh = merge(
-        [
-            quads(glass, 1),
-            boxes(
-                [(x - 0.04, y - 0.04, -0.1) for x, y in posts],
-                [(x + 0.04, y + 0.04, 2.3) for x, y in posts],
-            ),
-            boxes(
-                [(-0.9, -2.2, 2.3), (-0.65, -1.2, 0.42)],
-                [(0.8, 2.2, 2.42), (-0.3, 1.2, 0.47)],
-            ),
-        ]
-    )
-    return StaticObject(
-        mesh,
-        (Finish("metal", (0.25, 0.27, 0.28)), Finish("glass")),
-        (STRUCTURE, STRUCTURE),
-    )
-
-
-def advertising_column() -> StaticObject:
-    """An advertising column."""
-    angle = np.linspace(0, 2 * np.pi, 15)[:-1]
-    circle = np.c_[np.cos(angle), np.sin(angle)]
-    mesh = merge(
-        [
-            prism(0.6 * circle, -0.2, 2.6, 0, 0),
-            prism(0.75 * circle, 2.6, 2.8, 1, 1),
-            prism(0.5 * circle, 2.8, 3.1, 1, 1),
-        ]
-    )
-    return StaticObject(
-        mesh, (Finish("cloth", (0.75, 0.55, 0.40)), Finish("concrete")), (OTHER, OTHER)
-    )
-
-
-def fountain() -> StaticObject:
-    """A basin with a pillar."""
-    angle = np.linspace(0, 2 * np.pi, 13)[:-1]
-    circle = np.c_[np.cos(angle), np.sin(angle)]
-    mesh = merge(
-        [
-            prism(2.6 * circle, -0.2, 0.55),
-            prism(2.3 * circle, 0.0, 0.56, 1, 1),
-            prism(0.4 * circle, 0, 2.4),
-            prism(0.9 * circle, 1.5, 1.65),
-        ]
-    )
-    return StaticObject(
-        mesh,
-        (Finish("stone"), Finish("plastic", (0.2, 0.3, 0.34))),
-        (STRUCTURE, STRUCTURE),
-    )
-
-
-def stall(rng: np.random.Generator) -> StaticObject:
-    """A market stall: counter, posts and an awning."""
-    colours: tuple[RGB, ...] = (
-        (0.72, 0.10, 0.09),
-        (0.85, 0.83, 0.78),
-        (0.18, 0.38, 0.22),
-        (0.2, 0.3, 0.55),
-    )
-    posts = [(x, y) for x in (-1.0, 1.0) for y in (-1.5, 1.5)]
-    awning = [
-        [(-1.3, -1.7, 2.3), (-1.3, 1.7, 2.3), (0, 1.7, 2.8), (0, -1.7, 2.8)],
-        [(1.3, -1.7, 2.3), (1.3, 1.7, 2.3), (0, 1.7, 2.8), (0, -1.7, 2.8)],
-    ]
-    mesh = merge(
-        [
-            quads(awning, 1),
-            tubes([([(x, y, -0.1), (x, y, 2.4)], 0.025) for x, y in posts], 4, 0),
-            boxes([(0.2, -1.5, 0.0)], [(1.0, 1.5, 0.9)], 2),
-        ]
-    )
-    return StaticObject(
-        mesh,
-        (GALVANISED, Finish("cloth", colours[rng.integers(4)]), Finish("wood")),
-        (STRUCTURE, STRUCTURE, STRUCTURE),
-    )
-
-
-def planter(rng: np.random.Generator) -> StaticObject:
+def planter(rng: Rng) -> StaticObject:
     """A tub with flowers."""
     bush = random_plant("bush", rng, 0.45)
-    tub = boxes([(-0.45, -0.45, -0.05)], [(0.45, 0.45, 0.5)], 3)
-    return StaticObject(
-        merge([bush.mesh.moved((0, 0, 0.4)), tub]),
-        (*bush.finishes, Finish("concrete")),
-        (*bush.raw, OTHER),
+    mesh = bush.mesh.moved((0, 0, 0.4))
+    return make_object("planter", mesh, finishes=dict(enumerate(bush.finishes)))
+
+
+def _outline(shape: str, *measures: float) -> Array:
+    """(P, 2) left and up of the corners of a board, metres."""
+    if shape == "regular":
+        sides, radius = measures
+        return radius * circle(int(sides))[:, ::-1]
+    width, height, *up = measures
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    return corners * (width / 2, height / 2) + (0, sum(up))
+
+
+def road_sign(kind: str, height: float) -> StaticObject:
+    """A traffic sign facing +x; ``kind`` is one of the tables' signs, ``height`` is the centre of
+    the board in metres."""
+    board, ground, mark, colour = TABLES["signs"][kind]
+    parts = [tube([(0, 0, -0.2), (0, 0, height + 0.3)], 0.038, 6)]
+    for slot, shape, x in ((1, board, 0.05), (2, mark, 0.054), (3, board, 0.042)):
+        corners = [(x, y, height + z) for y, z in _outline(*shape)]
+        parts.append(fan(corners, slot))
+    colours = {1: Finish("sign", (*ground,)), 2: Finish("sign", (*colour,))}
+    return make_object("sign", *parts, finishes=colours)
+
+
+def _post_places(length: float) -> Array:
+    """Places of the posts of a fence, about 2.5 m apart."""
+    step = max(1.0, length / max(1, round(length / 2.5)))
+    return np.arange(0, length + 0.01, step)
+
+
+def bar_fence(
+    length: float,
+    height: float,
+    pitch: float,
+    colour: RGB,
+    wood: bool,
+) -> StaticObject:
+    """A fence of upright bars or boards along +x; rays pass between them."""
+    thick = 0.075 if wood else 0.022
+    bars = [
+        [(a, 0, 0.06), (a + thick, 0, 0.06), (a + thick, 0, height), (a, 0, height)]
+        for a in np.arange(0, length, pitch)
+    ]
+    posts = _post_places(length)
+    top = height - 0.18
+    return make_object(
+        "bar_fence",
+        quads(bars),
+        boxes(
+            [(0, 0.01, 0.2), (0, 0.01, top)],
+            [(length, 0.04, 0.26), (length, 0.04, top + 0.06)],
+        ),
+        boxes(
+            [(p - 0.04, -0.04, -0.2) for p in posts],
+            [(p + 0.04, 0.04, height + 0.05) for p in posts],
+        ),
+        finishes={0: Finish("wood" if wood else "metal", colour)},
+    )
+
+
+def wire_fence(length: float, height: float) -> StaticObject:
+    """A wire fence between posts along +x; most rays pass through the mesh."""
+    wire = [(0, 0, 0.03), (length, 0, 0.03), (length, 0, height), (0, 0, height)]
+    posts = [[(p, 0, -0.2), (p, 0, height + 0.04)] for p in _post_places(length)]
+    return make_object("wire_fence", quads(wire, 1), tubes(posts, 0.025))
+
+
+def low_wall(length: float, height: float, finish: Finish) -> StaticObject:
+    """A garden wall along +x with pillars and a coping."""
+    last = max(0.4, length - 0.4)
+    return make_object(
+        "low_wall",
+        boxes([(0, -0.12, -0.4)], [(length, 0.12, height)]),
+        boxes([(0, -0.16, height)], [(length, 0.16, height + 0.06)], 1),
+        boxes(
+            [(0, -0.2, -0.4), (last, -0.2, -0.4)],
+            [(0.4, 0.2, height + 0.3), (last + 0.4, 0.2, height + 0.3)],
+        ),
+        finishes={0: finish},
     )

@@ -6,18 +6,20 @@ whose lines are the rectangles' edges. The course bends this grid, and the relie
 vertical face (a kerb) closes the gap where neighbouring cells differ in height.
 """
 
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.course import Course, Relief
-from lidar_synth.lab.town.materials import Finish
-from lidar_synth.lab.town.meshes import Mesh, merge, quads
+from lidar_synth.lab.town.materials import Finish, read_finishes
+from lidar_synth.lab.town.meshes import Array, Ints, Mesh, merge, quads
+from lidar_synth.lab.town.street import LEFT, RIGHT
 
 Rect = tuple[float, float, float, float, int]
-Array = NDArray[np.float64]
 
 
 class GroundKind(NamedTuple):
@@ -29,21 +31,9 @@ class GroundKind(NamedTuple):
     lift: float
 
 
-KINDS: dict[str, GroundKind] = {
-    "grass": GroundKind(Finish("grass"), 72, 0.10),
-    "soil": GroundKind(Finish("soil"), 72, 0.09),
-    "field": GroundKind(Finish("soil", (0.52, 0.46, 0.27)), 72, 0.05),
-    "yard": GroundKind(Finish("gravel"), 49, 0.08),
-    "road": GroundKind(Finish("asphalt"), 40, 0.0),
-    "old_road": GroundKind(Finish("asphalt", (0.33, 0.32, 0.31)), 40, 0.0),
-    "marking": GroundKind(Finish("marking"), 60, 0.0),
-    "parking": GroundKind(Finish("paving", (0.40, 0.38, 0.37)), 44, 0.015),
-    "driveway": GroundKind(Finish("paving", (0.55, 0.50, 0.46)), 44, 0.11),
-    "sidewalk": GroundKind(Finish("paving"), 48, 0.12),
-    "cycleway": GroundKind(Finish("asphalt", (0.45, 0.27, 0.24)), 48, 0.12),
-    "kerb": GroundKind(Finish("kerbstone"), 48, 0.12),
-    "plaza": GroundKind(Finish("cobble"), 49, 0.12),
-    "rails": GroundKind(Finish("gravel", (0.38, 0.35, 0.33)), 49, 0.03),
+KINDS = {
+    name: GroundKind(read_finishes([row["finish"]])[0], row["raw"], row["lift"])
+    for name, row in TABLES["ground"].items()
 }
 """The kinds of ground by name."""
 
@@ -74,8 +64,8 @@ class TownGround:
     Args:
         course: the centre line that it follows.
         relief: the heights of the terrain.
-        edge: metres from the centre line to the kerb, (right, left); the carriageway slopes down
-            towards the kerb.
+        edge: metres from the centre line to the kerb, by side; the carriageway slopes down towards
+            the kerb.
         reach: (lowest s, highest s, lowest t, highest t) of all ground, metres.
         fine: the interval of s in which cells are at most 3 m long; they are longer outside.
         rects: (lowest s, highest s, lowest t, highest t, index in ``NAMES``); later rectangles
@@ -87,7 +77,7 @@ class TownGround:
         self,
         course: Course,
         relief: Relief,
-        edge: tuple[float, float],
+        edge: Mapping[int, float],
         reach: tuple[float, float, float, float],
         fine: tuple[float, float],
         rects: list[Rect],
@@ -98,30 +88,20 @@ class TownGround:
         self.edge = edge
         self.corners = corners
         ends = np.array(rects, float).reshape(-1, 5)
-        squares = np.array(
-            [
-                (c.s, c.s + c.along * c.radius, c.t, c.t + c.across * c.radius)
-                for c in corners
-            ]
-        ).reshape(-1, 4)
-        edges = np.concatenate([ends[:, :4], squares])
-        self._s = _lines(edges[:, :2].ravel(), (reach[0], reach[1]), fine)
-        self._t = _lines(edges[:, 2:].ravel(), (reach[2], reach[3]), (-15.0, 15.0))
+        squares = [
+            (c.s, c.s + c.along * c.radius, c.t, c.t + c.across * c.radius)
+            for c in corners
+        ]
+        edges = np.concatenate([ends[:, :4], np.reshape(squares, (-1, 4))])
+        self._s = _lines(edges[:, :2].ravel(), reach[:2], fine)
+        self._t = _lines(edges[:, 2:].ravel(), reach[2:], (-15.0, 15.0))
         self._kinds = np.zeros((len(self._s) - 1, len(self._t) - 1), np.int32)
-        first = [
-            np.searchsorted(line, ends[:, i] - 0.011)
-            for line, i in ((self._s, 0), (self._t, 2))
-        ]
-        last = [
-            np.searchsorted(line, ends[:, i] - 0.011)
-            for line, i in ((self._s, 1), (self._t, 3))
-        ]
-        for s0, s1, t0, t1, kind in zip(
-            first[0], last[0], first[1], last[1], ends[:, 4], strict=True
-        ):
+        along = np.searchsorted(self._s, ends[:, :2] - 0.011)
+        across = np.searchsorted(self._t, ends[:, 2:4] - 0.011)
+        for (s0, s1), (t0, t1), kind in zip(along, across, ends[:, 4], strict=True):
             self._kinds[s0:s1, t0:t1] = int(kind)
 
-    def kind(self, s: ArrayLike, t: ArrayLike) -> NDArray[np.int32]:
+    def kind(self, s: ArrayLike, t: ArrayLike) -> Ints:
         """Index in ``NAMES`` of the ground at street coordinates (rounded corners count as
         square)."""
         i = np.clip(np.searchsorted(self._s, s, "right") - 1, 0, len(self._s) - 2)
@@ -134,12 +114,9 @@ class TownGround:
         """Height at street coordinates, metres: of the ground there, or of the given kind of ground
         instead."""
         lift = _LIFT[self.kind(s, t) if kind is None else np.asarray(kind)]
-        s = np.asarray(s, float)
-        t = np.asarray(t, float)
-        half = np.where(t > 0, self.edge[1], self.edge[0])
-        return np.asarray(
-            self.relief(s, t) - 0.018 * np.minimum(np.abs(t), half) + lift
-        )
+        half = np.where(np.asarray(t) > 0, self.edge[LEFT], self.edge[RIGHT])
+        slope = 0.018 * np.minimum(np.abs(t), half)
+        return np.asarray(self.relief(s, t) - slope + lift)
 
     def points(
         self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
@@ -150,67 +127,78 @@ class TownGround:
             [self.course.points(s, t), self.height(s, t, kind)[..., None]], -1
         )
 
-    def mesh(self, rng: np.random.Generator) -> Mesh:
+    def mesh(self, rng: Rng) -> Mesh:
         """All ground as triangles, with indices in ``NAMES`` as slots; ``rng`` roughens unpaved
         ground."""
         bare = self.points(self._s[:, None], self._t[None], 0) - (0, 0, _LIFT[0])
-        rough = np.ones(bare.shape[:2], bool)
-        soft = np.isin(self._kinds, _ROUGH)
+        rows, columns = self._kinds.shape
         picks = [
-            np.s_[i : len(self._s) - 1 + i, j : len(self._t) - 1 + j]
+            np.s_[i : rows + i, j : columns + j]
             for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
         ]
-        for pick in picks:
-            rough[pick] &= soft
-        rough[[0, -1]] = rough[:, [0, -1]] = False
-        bare[..., 2] += np.where(rough, rng.normal(0, 0.035, rough.shape), 0)
+        bare[..., 2] += self._roughness(picks, rng)
         cells = np.stack([bare[pick] for pick in picks], 2)
         cells[..., 2] += _LIFT[self._kinds][..., None]
-        middle = np.meshgrid(
-            (self._s[:-1] + self._s[1:]) / 2,
-            (self._t[:-1] + self._t[1:]) / 2,
-            indexing="ij",
+        hole = self._holes()
+        return merge(
+            [
+                quads(cells[~hole], self._kinds[~hole]),
+                *_steps(cells, self._kinds, hole),
+                *(self._round(c) for c in self.corners),
+            ]
         )
+
+    def _roughness(self, picks: list[tuple[slice, slice]], rng: Rng) -> Array:
+        """Random heights of the grid's points that have unpaved ground on all sides, metres."""
+        rough = np.zeros((len(self._s), len(self._t)), bool)
+        rough[1:-1, 1:-1] = True
+        soft = np.isin(self._kinds, _ROUGH)
+        for pick in picks:
+            rough[pick] &= soft
+        return np.where(rough, rng.normal(0, 0.035, rough.shape), 0)
+
+    def _holes(self) -> NDArray[np.bool_]:
+        """Cells of rounded corners, which are built apart."""
+        s, t = np.meshgrid(_middles(self._s), _middles(self._t), indexing="ij")
         hole = np.zeros(self._kinds.shape, bool)
         for c in self.corners:
             half = c.radius / 2
-            hole |= (abs(middle[0] - c.s - c.along * half) < half) & (
-                abs(middle[1] - c.t - c.across * half) < half
-            )
-        solid = quads(cells[~hole], self._kinds[~hole])
-        steps = [_steps(cells, self._kinds, hole, axis) for axis in (0, 1)]
-        return merge([solid, *steps, *(self._rounded(c) for c in self.corners)])
+            along = abs(s - c.s - c.along * half) < half
+            hole |= along & (abs(t - c.t - c.across * half) < half)
+        return hole
 
-    def _rounded(self, c: Corner) -> Mesh:
+    def _round(self, c: Corner) -> Mesh:
         """The square cell of a rounded corner: carriageway outside the arc, kerb and pavement
         inside."""
         angle = np.linspace(0, np.pi / 2, 7)
-        centre = np.array((c.s + c.along * c.radius, c.t + c.across * c.radius))
-        way = -np.stack([c.along * np.cos(angle), c.across * np.sin(angle)], -1)
+        point = np.array((c.s, c.t))
+        sense = np.array((c.along, c.across))
+        centre = point + c.radius * sense
+        way = -sense * np.stack([np.cos(angle), np.sin(angle)], -1)
         arc = centre + c.radius * way
         inner = centre + (c.radius - 0.13) * way
-        point = np.broadcast_to((c.s, c.t), arc.shape)
-        middle = np.broadcast_to(centre, arc.shape)
         road, kerb, pavement = (NAMES.index(k) for k in ("road", "kerb", "sidewalk"))
-
-        def sheet(a: Array, b: Array, low: int, slot: int) -> Mesh:
-            ends = (
-                self.points(a[:, 0], a[:, 1], low),
-                self.points(b[:, 0], b[:, 1], slot),
-            )
-            return quads(
-                np.stack([ends[0][:-1], ends[0][1:], ends[1][1:], ends[1][:-1]], 1),
-                slot,
-            )
-
         return merge(
             [
-                sheet(point, arc, road, road),
-                sheet(arc, arc, road, kerb),
-                sheet(arc, inner, kerb, kerb),
-                sheet(inner, middle, kerb, pavement),
+                self._sheet(np.broadcast_to(point, arc.shape), arc, road, road),
+                self._sheet(arc, arc, road, kerb),
+                self._sheet(arc, inner, kerb, kerb),
+                self._sheet(inner, np.broadcast_to(centre, arc.shape), kerb, pavement),
             ]
         )
+
+    def _sheet(
+        self,
+        outer: Array,
+        inner: Array,
+        low: int,
+        kind: int,
+    ) -> Mesh:
+        """A strip of one kind of ground between two lines of street coordinates (P, 2); the outer
+        one lies as high as the kind ``low``."""
+        a = self.points(outer[:, 0], outer[:, 1], low)
+        b = self.points(inner[:, 0], inner[:, 1], kind)
+        return quads(np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1), kind)
 
 
 def _lines(
@@ -218,38 +206,33 @@ def _lines(
 ) -> Array:
     """Grid lines along one axis: all edges, and lines between them at most 3 m apart, wider outside
     ``fine``."""
-    edges = np.unique(
-        np.round(np.r_[edges[(edges > reach[0]) & (edges < reach[1])], reach], 3)
-    )
+    low, high = reach
+    inside = edges[(edges > low) & (edges < high)]
+    edges = np.unique(np.round(np.r_[inside, low, high], 3))
     edges = edges[np.r_[True, np.diff(edges) > 0.02]]
     lines = [edges[:1]]
     for a, b in pairwise(edges):
-        outside = max(0.0, fine[0] - (a + b) / 2, (a + b) / 2 - fine[1])
-        lines.append(
-            np.linspace(a, b, max(1, int(np.ceil((b - a) / (3 + 0.3 * outside)))) + 1)[
-                1:
-            ]
-        )
+        middle = (a + b) / 2
+        outside = max(0.0, fine[0] - middle, middle - fine[1])
+        steps = max(1, int(np.ceil((b - a) / (3 + 0.3 * outside))))
+        lines.append(np.linspace(a, b, steps + 1)[1:])
     return np.concatenate(lines)
 
 
-def _steps(
-    cells: Array, kinds: NDArray[np.int32], hole: NDArray[np.bool_], axis: int
-) -> Mesh:
-    """Vertical faces between neighbouring cells of different height along an axis."""
-    before, after = (
-        (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-    )
-    a, b = (
-        (cells[before][:, :, [1, 2]], cells[after][:, :, [0, 3]])
-        if axis == 0
-        else (cells[before][:, :, [3, 2]], cells[after][:, :, [0, 1]])
-    )
-    apart = (np.abs(a[..., 2] - b[..., 2]).max(-1) > 0.004) & ~(
-        hole[before] & hole[after]
-    )
-    faces = np.stack([a[:, :, 0], a[:, :, 1], b[:, :, 1], b[:, :, 0]], 2)[apart]
-    upper = np.where(
-        a[..., 2].mean(-1) > b[..., 2].mean(-1), kinds[before], kinds[after]
-    )[apart]
-    return quads(faces, upper)
+def _middles(lines: Array) -> Array:
+    return (lines[:-1] + lines[1:]) / 2
+
+
+def _steps(cells: Array, kinds: Ints, hole: NDArray[np.bool_]) -> Iterator[Mesh]:
+    """Vertical faces between neighbouring cells of different height, along each axis."""
+    along = (np.s_[:-1, :], np.s_[1:, :], [1, 2], [0, 3])
+    across = (np.s_[:, :-1], np.s_[:, 1:], [3, 2], [0, 1])
+    for before, after, here, there in (along, across):
+        a = cells[before][:, :, here]
+        b = cells[after][:, :, there]
+        apart = np.abs(a[..., 2] - b[..., 2]).max(-1) > 0.004
+        apart &= ~(hole[before] & hole[after])
+        faces = np.stack([a[:, :, 0], a[:, :, 1], b[:, :, 1], b[:, :, 0]], 2)
+        above = a[..., 2].mean(-1) > b[..., 2].mean(-1)
+        upper = np.where(above, kinds[before], kinds[after])
+        yield quads(faces[apart], upper[apart])

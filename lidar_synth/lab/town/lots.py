@@ -6,14 +6,10 @@ Lots are sampled before the ground is built, because driveways and yards are pai
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from lidar_synth.lab.town.boundaries import sample_kind
+from lidar_synth.lab.town.catalogue import TABLES, Rng, pick, pick_name, sample_range
 from lidar_synth.lab.town.facades import BuildingPlan
 from lidar_synth.lab.town.paving import PLAZA_DEPTH, Paint
-from lidar_synth.lab.town.street import LEFT, RIGHT, Street
-
-Rng = np.random.Generator
+from lidar_synth.lab.town.street import SIDES, Street
 
 
 @dataclass(frozen=True)
@@ -28,7 +24,7 @@ class Lot:
         plan: the plan of its house, or None for an empty lot.
         house_offset: metres along s from ``start`` to the house.
         driveway: (start, end) of a paved strip along s, metres, or None.
-        boundary: the kind of its front boundary, one of ``boundaries.KINDS``.
+        boundary: the kind of its front boundary, one of the choices of ``boundaries``.
         garden: density of its plants, 0..1.
     """
 
@@ -44,194 +40,141 @@ class Lot:
     garden: float
 
     @property
-    def sign(self) -> int:
-        """The sign of t on this side of the street."""
-        return 2 * self.side - 1
+    def house(self) -> tuple[float, float]:
+        """The interval of s of its house, metres; empty without one."""
+        low = self.start + self.house_offset
+        return low, low + (self.plan.width if self.plan else 0.0)
 
 
-def sample_house(style: str, width: float, depth: float, rng: Rng) -> BuildingPlan:
+def sample_house(
+    style: str,
+    width: float,
+    depth: float,
+    rng: Rng,
+) -> BuildingPlan:
     """The sampled plan of a house, row, block, shop or hall of the given width and depth in
     metres."""
-    match style:
-        case "house":
-            roof = str(rng.choice(["gable", "cross", "hip"], p=[0.6, 0.25, 0.15]))
-            floors = int(rng.choice([1, 2, 3], p=[0.3, 0.55, 0.15]))
-            return BuildingPlan(
-                width,
-                depth,
-                floors,
-                rng.uniform(2.6, 2.9),
-                rng.uniform(0.2, 1.1),
-                roof,
-                rng.random() < 0.15,
-            )
-        case "row":
-            return BuildingPlan(
-                width,
-                depth,
-                int(rng.integers(2, 4)),
-                rng.uniform(2.7, 3.0),
-                rng.uniform(0.2, 0.8),
-            )
-        case "block":
-            roof = str(rng.choice(["gable", "hip", "flat"]))
-            return BuildingPlan(
-                width,
-                depth,
-                int(rng.integers(3, 6)),
-                2.8,
-                rng.uniform(0.5, 1.2),
-                roof,
-                rng.random() < 0.6,
-            )
-        case "shop":
-            roof = str(rng.choice(["gable", "hip", "flat"]))
-            return BuildingPlan(
-                width,
-                depth,
-                int(rng.integers(2, 5)),
-                3.1,
-                0.15,
-                roof,
-                rng.random() < 0.2,
-                shop=True,
-            )
-    return BuildingPlan(width, depth, 1, rng.uniform(4, 7), 0.2, "flat")
-
-
-_SIZES = {
-    "house": (8.5, 13.5),
-    "row": (6.0, 8.5),
-    "block": (15.0, 26.0),
-    "shop": (10.0, 18.0),
-    "hall": (18.0, 34.0),
-}
-
-
-def _style(street: Street, side: int, rng: Rng) -> str:
-    """The sampled style of a building: house, row, block, shop or hall."""
-    if street.kind == "residential":
-        return str(rng.choice(["house", "row", "block"], p=[0.74, 0.14, 0.12]))
-    if street.kind == "edge":
-        return str(rng.choice(["house", "hall"], p=[0.6, 0.4]))
-    if street.plaza == side:
-        return "shop"
-    return str(
-        rng.choice(
-            ["house", "row", "block", "shop", "hall"], p=[0.25, 0.12, 0.28, 0.27, 0.08]
-        )
+    row = TABLES["houses"][style]
+    # The order of the draws: the roof of a row or hall is known.
+    roof = pick(row["roofs"], rng)
+    return BuildingPlan(
+        width,
+        depth,
+        pick(row["floors"], rng),
+        sample_range(row["storey"], rng),
+        sample_range(row["plinth"], rng),
+        roof,
+        balconies="balconies" in row and rng.random() < row["balconies"],
+        shop=style == "shop",
     )
+
+
+def _sample_style(street: Street, side: int, rng: Rng) -> str:
+    """The sampled style of a building: house, row, block, shop or hall."""
+    if street.kind in ("residential", "edge"):
+        return pick_name(f"houses_{street.kind}", rng)
+    return "shop" if street.plaza == side else pick_name("houses", rng)
 
 
 def sample_lots(street: Street, rng: Rng) -> list[Lot]:
     """Sampled lots on both sides, from one end of the stretch to the other."""
     lots = []
-    for side in (RIGHT, LEFT):
+    for side in SIDES:
         front = street.front(side)
-        boundary = sample_kind(rng)
-        setback = (
-            rng.uniform(2.0, 8.0)
-            if street.kind in ("residential", "edge")
-            else rng.uniform(0.0, 6.0)
-        )
-        for low, high in street.gaps(side, 1.0):
-            s = low
+        boundary = pick_name("boundaries", rng)
+        garden = street.kind in ("residential", "edge")
+        setback = rng.uniform(*((2.0, 8.0) if garden else (0.0, 6.0)))
+        for s, high in street.gaps(side, 1.0):
             while high - s > 7:
-                on_plaza = (
-                    street.plaza == side and s + 9 > -12 and s < street.length + 12
-                )
-                lot = _sample_lot(
-                    street,
-                    side,
+                on_plaza = street.plaza == side and -21 < s < street.length + 12
+                lot = Lot(
                     s,
                     high,
+                    side,
                     front + (PLAZA_DEPTH if on_plaza else 0.0),
                     setback,
+                    None,
+                    0.0,
+                    None,
                     boundary,
-                    rng,
+                    0.0,
                 )
-                lots.append(lot)
-                s = lot.end
+                lots.append(_sample_lot(lot, street, rng))
+                s = lots[-1].end
     return lots
 
 
-def _sample_lot(
-    street: Street,
-    side: int,
-    s: float,
-    high: float,
-    front: float,
-    setback: float,
-    boundary: str,
-    rng: Rng,
-) -> Lot:
-    """A sampled lot that starts at s and ends at ``high`` at the latest."""
-    style = _style(street, side, rng)
-    low, top = _SIZES[style]
-    if rng.random() < (0.72 if street.kind == "edge" else 0.07) or high - s < low + 2:
-        return Lot(
-            s,
-            min(high, s + rng.uniform(10, 26)),
-            side,
-            front,
-            setback,
-            None,
-            0.0,
-            None,
-            boundary,
-            rng.uniform(0.4, 1.0),
-        )
-    width = min(rng.uniform(low, top), high - s - 1.5)
-    between = (
-        0.0
-        if style in ("row", "shop") and rng.random() < 0.8
-        else rng.uniform(3.2, 9.0)
-    )
-    end = min(high, s + width + between)
-    back = 0.3 if style == "shop" else max(0.3, setback + rng.uniform(-1.5, 1.5))
-    first = bool(rng.random() < 0.5)
-    at = between * 0.85 if first and between else 0.15 * between
-    room = (s, s + at) if first else (s + at + width, end)
-    driveway = None
-    if room[1] - room[0] > 3.0 and rng.random() < 0.7:
-        middle = (room[0] + room[1]) / 2
-        driveway = (middle - 1.4, middle + 1.4)
-    if rng.random() < 0.25 and style not in ("shop", "row"):
-        boundary = sample_kind(rng)
-    near = -45 < s + width / 2 < street.length + 50
-    plan = replace(sample_house(style, width, rng.uniform(8, 12), rng), detail=near)
-    return Lot(
-        s,
+def _sample_lot(lot: Lot, street: Street, rng: Rng) -> Lot:
+    """The lot with a sampled length and, mostly, a house; it ends at its present end at the
+    latest."""
+    style = _sample_style(street, lot.side, rng)
+    low, high = TABLES["houses"][style]["width"]
+    room = lot.end - lot.start
+    if rng.random() < (0.72 if street.kind == "edge" else 0.07) or room < low + 2:
+        end = min(lot.end, lot.start + rng.uniform(10, 26))
+        return replace(lot, end=end, garden=rng.uniform(0.4, 1.0))
+    width = min(rng.uniform(low, high), room - 1.5)
+    close = style in ("row", "shop") and rng.random() < 0.8
+    between = 0.0 if close else rng.uniform(3.2, 9.0)
+    end = min(lot.end, lot.start + width + between)
+    setback = 0.3
+    if style != "shop":
+        setback = max(0.3, lot.setback + rng.uniform(-1.5, 1.5))
+    first = rng.random() < 0.5
+    offset = (0.85 if first else 0.15) * between
+    driveway = _sample_driveway(
+        lot.start,
+        offset,
+        width,
         end,
-        side,
-        front,
-        back,
-        plan,
-        min(at, end - s - width),
-        driveway,
-        "none" if back < 1.2 else boundary,
-        rng.uniform(0, 1),
+        first,
+        rng,
     )
+    boundary = lot.boundary
+    if rng.random() < 0.25 and style not in ("shop", "row"):
+        boundary = pick_name("boundaries", rng)
+    near = -45 < lot.start + width / 2 < street.length + 50
+    plan = sample_house(style, width, rng.uniform(8, 12), rng)
+    return replace(
+        lot,
+        end=end,
+        setback=setback,
+        plan=replace(plan, detail=near),
+        house_offset=min(offset, end - lot.start - width),
+        driveway=driveway,
+        boundary="none" if setback < 1.2 else boundary,
+        garden=rng.uniform(0, 1),
+    )
+
+
+def _sample_driveway(
+    start: float,
+    offset: float,
+    width: float,
+    end: float,
+    first: bool,
+    rng: Rng,
+) -> tuple[float, float] | None:
+    """A driveway between a lot's start and its house or, unless ``first``, between the house and
+    the lot's end; None where there is no room."""
+    house = start + offset
+    low, high = (start, house) if first else (house + width, end)
+    if high - low <= 3.0 or rng.random() >= 0.7:
+        return None
+    middle = (low + high) / 2
+    return middle - 1.4, middle + 1.4
 
 
 def paint_lots(lots: list[Lot], paint: Paint, rng: Rng) -> None:
     """Paint driveways, yards and flower beds onto the ground."""
     for lot in lots:
-        if lot.plan is not None and lot.garden < 0.25:
-            paint(
-                (lot.start, lot.end),
-                (lot.sign * lot.front, lot.sign * (lot.front + lot.setback)),
-                "yard",
-            )
-        elif lot.plan is not None and rng.random() < 0.3:
-            paint(
-                (lot.start + 1, lot.end - 1),
-                (lot.sign * lot.front, lot.sign * (lot.front + 0.4 * lot.setback)),
-                "soil",
-            )
+        near = lot.side * lot.front
+        house = lot.side * (lot.front + lot.setback)
+        if lot.plan and lot.garden < 0.25:
+            paint((lot.start, lot.end), (near, house), "yard")
+        elif lot.plan and rng.random() < 0.3:
+            bed = lot.side * (lot.front + 0.4 * lot.setback)
+            paint((lot.start + 1, lot.end - 1), (near, bed), "soil")
         if lot.driveway:
-            paint(
-                lot.driveway,
-                (lot.sign * lot.front, lot.sign * (lot.front + lot.setback + 9)),
-                "driveway",
-            )
+            behind = lot.side * (lot.front + lot.setback + 9)
+            paint(lot.driveway, (near, behind), "driveway")

@@ -7,12 +7,12 @@ at 10 to 25 m.
 
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-RGB = tuple[float, float, float]
+from lidar_synth.lab.town.catalogue import RGB, TABLES
 
 
 class Material(NamedTuple):
@@ -47,172 +47,9 @@ class Material(NamedTuple):
     colour_dependent: bool = False
 
 
-MATERIALS: dict[str, Material] = {
-    "asphalt": Material(
-        0.296, 0.028, roughness=0.0005, colour=(0.27, 0.27, 0.28), grain=0.18
-    ),
-    "marking": Material(0.5, 0.06, roughness=0.0005, colour=(0.82, 0.82, 0.8)),
-    "paving": Material(
-        0.325,
-        0.03,
-        roughness=0.0006,
-        grazing=0.02,
-        colour=(0.5, 0.48, 0.46),
-        grain=0.14,
-    ),
-    "cobble": Material(
-        0.305,
-        0.035,
-        roughness=0.002,
-        grazing=0.03,
-        colour=(0.42, 0.4, 0.39),
-        grain=0.25,
-    ),
-    "kerbstone": Material(
-        0.315, 0.035, roughness=0.0008, grazing=0.02, colour=(0.56, 0.55, 0.53)
-    ),
-    "grass": Material(
-        0.365,
-        0.052,
-        roughness=0.0036,
-        relief=0.07,
-        grazing=0.12,
-        colour=(0.3, 0.37, 0.17),
-        grain=0.5,
-    ),
-    "soil": Material(
-        0.35,
-        0.05,
-        roughness=0.0035,
-        relief=0.07,
-        grazing=0.1,
-        colour=(0.41, 0.33, 0.23),
-        grain=0.35,
-    ),
-    "gravel": Material(
-        0.315,
-        0.03,
-        roughness=0.0022,
-        relief=0.02,
-        grazing=0.06,
-        colour=(0.55, 0.52, 0.48),
-        grain=0.3,
-    ),
-    "render": Material(
-        0.42,
-        0.035,
-        gloss=0.03,
-        roughness=0.0008,
-        colour=(0.86, 0.84, 0.79),
-        grain=0.06,
-        colour_dependent=True,
-    ),
-    "brick": Material(
-        0.36, 0.04, roughness=0.0015, colour=(0.55, 0.28, 0.2), grain=0.15
-    ),
-    "concrete": Material(
-        0.35, 0.03, roughness=0.001, colour=(0.58, 0.57, 0.55), grain=0.12
-    ),
-    "stone": Material(0.37, 0.05, roughness=0.003, colour=(0.5, 0.45, 0.4), grain=0.3),
-    "tile": Material(
-        0.34, 0.05, roughness=0.002, grazing=0.05, colour=(0.45, 0.21, 0.15), grain=0.15
-    ),
-    "wood": Material(
-        0.38,
-        0.05,
-        roughness=0.002,
-        colour=(0.45, 0.31, 0.19),
-        grain=0.18,
-        colour_dependent=True,
-    ),
-    "plastic": Material(
-        0.31,
-        0.05,
-        gloss=0.15,
-        dropout=0.01,
-        colour=(0.25, 0.25, 0.26),
-        grain=0.03,
-        colour_dependent=True,
-    ),
-    "metal": Material(
-        0.42,
-        0.08,
-        gloss=0.45,
-        dropout=0.04,
-        colour=(0.52, 0.54, 0.55),
-        grain=0.05,
-        colour_dependent=True,
-    ),
-    "wire": Material(
-        0.3, 0.08, transmission=0.8, roughness=0.003, colour=(0.35, 0.42, 0.36)
-    ),
-    "paint": Material(
-        0.52,
-        0.05,
-        gloss=0.75,
-        dropout=0.015,
-        colour=(0.6, 0.6, 0.62),
-        grain=0.0,
-        colour_dependent=True,
-    ),
-    "glass": Material(
-        0.22,
-        0.05,
-        gloss=0.6,
-        transmission=0.45,
-        dropout=0.5,
-        colour=(0.1, 0.12, 0.14),
-        grain=0.0,
-    ),
-    "carglass": Material(
-        0.15,
-        0.03,
-        gloss=0.9,
-        transmission=0.1,
-        dropout=0.9,
-        colour=(0.06, 0.07, 0.08),
-        grain=0.0,
-    ),
-    "tyre": Material(0.21, 0.03, gloss=0.1, dropout=0.08, colour=(0.06, 0.06, 0.065)),
-    "interior": Material(0.25, 0.04, gloss=0.1, dropout=0.2, colour=(0.11, 0.1, 0.1)),
-    "curtain": Material(0.4, 0.05, roughness=0.002, colour=(0.78, 0.76, 0.72)),
-    "plate": Material(0.9, 0.1, colour=(0.85, 0.85, 0.82), grain=0.0),
-    "sign": Material(0.8, 0.15, colour=(0.8, 0.8, 0.8), grain=0.0),
-    "lamp": Material(
-        0.38, 0.15, gloss=0.3, dropout=0.1, colour=(0.85, 0.85, 0.8), grain=0.0
-    ),
-    "leaf": Material(
-        0.365,
-        0.085,
-        transmission=0.35,
-        dropout=0.006,
-        roughness=0.08,
-        relief=0.4,
-        grazing=1.0,
-        colour=(0.19, 0.33, 0.1),
-        grain=0.5,
-    ),
-    "foliage": Material(
-        0.355,
-        0.085,
-        roughness=0.08,
-        relief=0.4,
-        grazing=1.0,
-        colour=(0.12, 0.21, 0.07),
-        grain=0.6,
-    ),
-    "bark": Material(
-        0.39, 0.08, roughness=0.003, colour=(0.33, 0.27, 0.21), grain=0.45
-    ),
-    "cloth": Material(
-        0.4,
-        0.06,
-        dropout=0.01,
-        colour=(0.3, 0.3, 0.4),
-        grain=0.12,
-        colour_dependent=True,
-    ),
-    "skin": Material(0.4, 0.05, colour=(0.78, 0.58, 0.47), grain=0.05),
+MATERIALS = {
+    name: Material(**{**row, "colour": tuple(row["colour"])})
+    for name, row in TABLES["materials"].items()
 }
 """The materials by name."""
 
@@ -232,13 +69,19 @@ class Finish(NamedTuple):
     colour: RGB | None = None
 
 
+def read_finishes(rows: list[list[Any]]) -> tuple[Finish, ...]:
+    """Finishes as the tables have them: a material, and the values of its colour."""
+    return tuple(Finish(material, (*colour,) or None) for material, *colour in rows)
+
+
 @cache
 def _reflectance(finish: Finish) -> float:
     material = MATERIALS[finish.material]
     if finish.colour is None or not material.colour_dependent:
         return material.reflectance
     # Dark paints and cloths are mostly dark at 905 nm too; red ones are bright.
-    bright = 0.55 * finish.colour[0] + 0.3 * finish.colour[1] + 0.15 * finish.colour[2]
+    red, green, blue = finish.colour
+    bright = 0.55 * red + 0.3 * green + 0.15 * blue
     low = 0.03 if material.gloss > 0.5 else 0.45
     return material.reflectance * (low + (1.15 - low) * min(1.0, bright / 0.75))
 
@@ -268,14 +111,8 @@ class Finishes:
 
     def freeze(self) -> "SurfaceTable":
         """The surfaces as columns."""
-        material, raw, instance, reflectance, colour = zip(*self.rows, strict=True)
-        return SurfaceTable(
-            np.array(material, np.uint8),
-            np.array(raw, np.uint32),
-            np.array(instance, np.int32),
-            np.array(reflectance, np.float32),
-            np.array(colour, np.float32),
-        )
+        columns = zip(*self.rows, strict=True)
+        return SurfaceTable(*map(np.array, columns, _TYPES))
 
 
 class SurfaceTable(NamedTuple):
@@ -294,3 +131,7 @@ class SurfaceTable(NamedTuple):
     instance: NDArray[np.int32]
     reflectance: NDArray[np.float32]
     colour: NDArray[np.float32]
+
+
+_TYPES = (np.uint8, np.uint32, np.int32, np.float32, np.float32)
+"""Types of the columns of ``SurfaceTable``."""

@@ -6,15 +6,21 @@ right-handed, z up; an object's own frame has x forward, y left and its origin o
 its centre.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Points = NDArray[np.float32]
-Slots = int | NDArray[np.int32]
+from lidar_synth.lab.town.catalogue import Rng
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+Slots = int | Ints
 
 
 @dataclass(frozen=True)
@@ -26,8 +32,8 @@ class Mesh:
         slot: (F,) int32.
     """
 
-    triangles: Points
-    slot: NDArray[np.int32]
+    triangles: Floats
+    slot: Ints
 
     def __len__(self) -> int:
         return len(self.slot)
@@ -40,27 +46,26 @@ class Mesh:
         c = np.cos(yaw)
         s = np.sin(yaw)
         turn = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)], np.float32)
-        shape = np.asarray(scale, np.float32)
-        points = (self.triangles * shape).reshape(-1, 3) @ turn + np.asarray(
-            offset, np.float32
-        )
-        return Mesh(points.reshape(-1, 3, 3).astype(np.float32), self.slot)
+        scaled = self.triangles * np.asarray(scale, np.float32)
+        return self._turned(scaled, turn, offset)
 
-    def posed(self, pose: NDArray[np.float64]) -> "Mesh":
+    def posed(self, pose: Array) -> "Mesh":
         """The mesh transformed by a rigid motion (4, 4)."""
-        points = self.triangles.reshape(-1, 3) @ pose[:3, :3].T.astype(
-            np.float32
-        ) + pose[:3, 3].astype(np.float32)
+        turn = pose[:3, :3].T.astype(np.float32)
+        return self._turned(self.triangles, turn, pose[:3, 3])
+
+    def _turned(self, triangles: Floats, turn: Floats, offset: ArrayLike) -> "Mesh":
+        points = triangles.reshape(-1, 3) @ turn + np.asarray(offset, np.float32)
         return Mesh(points.reshape(-1, 3, 3), self.slot)
 
     @cached_property
-    def bounds(self) -> tuple[Points, Points]:
+    def bounds(self) -> tuple[Floats, Floats]:
         """Lowest and highest corner, each (3,) metres."""
         points = self.triangles.reshape(-1, 3)
         return points.min(0), points.max(0)
 
     @cached_property
-    def outline(self) -> Points:
+    def outline(self) -> Floats:
         """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image
         boxes."""
         angle = np.pi * (1 + 5**0.5) * np.arange(160)
@@ -68,25 +73,28 @@ class Mesh:
         flat = np.sqrt(1 - up * up)
         points = self.triangles.reshape(-1, 3)
         ways = np.stack([flat * np.cos(angle), flat * np.sin(angle), up])
-        outermost: Points = points[np.unique((points @ ways).argmax(0))]
+        outermost: Floats = points[np.unique((points @ ways).argmax(0))]
         return outermost
+
+
+_NOTHING = Mesh(np.zeros((0, 3, 3), np.float32), np.zeros(0, np.int32))
 
 
 def merge(parts: Iterable[Mesh]) -> Mesh:
     """Merge meshes into one; no parts give an empty mesh."""
-    parts = list(parts)
-    if not parts:
-        return Mesh(np.zeros((0, 3, 3), np.float32), np.zeros(0, np.int32))
+    parts = [p for p in parts if len(p.slot)] or [_NOTHING]
+    if len(parts) == 1:
+        return parts[0]
     return Mesh(
         np.concatenate([p.triangles for p in parts]),
         np.concatenate([p.slot for p in parts]),
     )
 
 
-def _slots(slot: Slots, shape: tuple[int, ...]) -> NDArray[np.int32]:
+def _slots(slot: Slots, *shape: int) -> Ints:
     if isinstance(slot, int):
-        return np.full(int(np.prod(shape)), slot, np.int32)
-    return np.broadcast_to(np.asarray(slot, np.int32), shape).reshape(-1)
+        return np.full(math.prod(shape), slot, np.int32)
+    return np.broadcast_to(np.asarray(slot, np.int32), shape).ravel()
 
 
 def quads(corners: ArrayLike, slot: Slots = 0) -> Mesh:
@@ -98,9 +106,10 @@ def quads(corners: ArrayLike, slot: Slots = 0) -> Mesh:
     """
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     triangles = points[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
-    return Mesh(triangles, np.repeat(_slots(slot, (len(points),)), 2))
+    return Mesh(triangles, np.repeat(_slots(slot, len(points)), 2))
 
 
+_BOX_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 _BOX_FACES = np.array(
     [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 )
@@ -108,16 +117,10 @@ _BOX_FACES = np.array(
 
 def boxes(low: ArrayLike, high: ArrayLike, slot: Slots = 0) -> Mesh:
     """Axis-aligned boxes, given by their lowest and highest corners, each (B, 3) metres."""
-    ends = np.stack(
-        [
-            np.asarray(low, np.float32).reshape(-1, 3),
-            np.asarray(high, np.float32).reshape(-1, 3),
-        ]
-    )
-    pick = np.array([(i >> 2, i >> 1 & 1, i & 1) for i in range(8)])
-    corners = np.stack([ends[pick[:, axis], :, axis] for axis in range(3)], -1)
-    faces = corners[_BOX_FACES].transpose(2, 0, 1, 3)
-    return quads(faces, np.repeat(_slots(slot, (faces.shape[0],)), 6))
+    ends = np.array([low, high], np.float32).reshape(2, -1, 3)
+    corners = ends[_BOX_CORNERS, :, np.arange(3)]
+    faces = corners[_BOX_FACES].transpose(3, 0, 1, 2)
+    return quads(faces, np.repeat(_slots(slot, len(faces)), 6))
 
 
 def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
@@ -131,66 +134,83 @@ def loft(sections: ArrayLike, slot: Slots = 0, closed: bool = False) -> Mesh:
     points = np.asarray(sections, np.float32)
     if closed:
         points = np.concatenate([points, points[:, :1]], 1)
-    corners = np.stack(
-        [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]], 2
-    )
-    return quads(corners, _slots(slot, corners.shape[:2]))
+    here = points[:-1]
+    there = points[1:]
+    corners = np.stack([here[:, :-1], here[:, 1:], there[:, 1:], there[:, :-1]], 2)
+    return quads(corners, _slots(slot, *corners.shape[:2]))
 
 
 def fan(outline: ArrayLike, slot: int = 0) -> Mesh:
     """A flat convex polygon with corners (P, 3), metres."""
     points = np.asarray(outline, np.float32)
-    triangles = np.stack(
-        [np.broadcast_to(points[0], points[2:].shape), points[1:-1], points[2:]], 1
-    )
-    return Mesh(triangles, np.full(len(triangles), slot, np.int32))
+    corners = np.broadcast_arrays(points[0], points[1:-1], points[2:])
+    triangles = np.stack(corners, 1)
+    return Mesh(triangles, _slots(slot, len(triangles)))
 
 
-def prism(
-    outline: ArrayLike, bottom: float, top: float, slot: int = 0, cap: int | None = None
+def circle(sides: int) -> Array:
+    """(sides, 2) the corners of a regular polygon on the unit circle."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    return np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def sphere(rings: int, sides: int) -> Array:
+    """(rings + 1, sides, 3) points on the unit sphere, from its top to its bottom."""
+    polar = np.linspace(0, np.pi, rings + 1)[:, None]
+    x, y = circle(sides).T
+    flat = np.sin(polar)
+    return np.stack([flat * x, flat * y, np.cos(polar) + 0 * x], -1)
+
+
+def cylinder(
+    radius: float,
+    bottom: float,
+    top: float,
+    sides: int,
+    slot: int = 0,
 ) -> Mesh:
-    """Vertical walls over a convex outline (P, 2) with a flat top (of slot ``cap``), open at the
-    bottom."""
-    plan = np.asarray(outline, np.float32)
-    low = np.c_[plan, np.full(len(plan), bottom)]
-    high = np.c_[plan, np.full(len(plan), top)]
-    return merge(
-        [loft([low, high], slot, closed=True), fan(high, slot if cap is None else cap)]
-    )
+    """An upright cylinder around the z axis, open at the bottom."""
+    plan = radius * circle(sides)
+    rings = [np.c_[plan, np.full(sides, z)] for z in (bottom, top)]
+    return merge([loft(rings, slot, closed=True), fan(rings[1], slot)])
 
 
 def disc(
-    centre: ArrayLike, normal: ArrayLike, radius: float, sides: int = 8, slot: int = 0
+    centre: ArrayLike,
+    normal: ArrayLike,
+    radius: float,
+    sides: int = 8,
+    slot: int = 0,
 ) -> Mesh:
     """A flat regular polygon around ``centre``."""
-    return fan(
-        np.asarray(centre) + radius * _rings(np.asarray(normal, float)[None], sides)[0],
-        slot,
-    )
+    [ring] = _rings(np.array([normal], float), sides)
+    return fan(np.asarray(centre) + radius * ring, slot)
 
 
-def _rings(axes: NDArray[np.float64], sides: int) -> NDArray[np.float64]:
+def _cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """(N, 3) cross products; ``np.cross`` is slow for few vectors."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
+
+
+def _rings(axes: Array, sides: int) -> Array:
     """(K, sides, 3) unit circles perpendicular to K axes (K, 3)."""
-    ahead = axes / np.sqrt((axes * axes).sum(1, keepdims=True))
-    steep = np.abs(ahead[:, 2]) >= 0.9
-    x, y, z = ahead.T
-    nought = np.zeros(len(x))
-    across = np.where(
-        steep[:, None], np.stack([nought, z, -y], 1), np.stack([y, -x, nought], 1)
-    )
-    across /= np.sqrt((across * across).sum(1, keepdims=True))
-    u, v, w = across.T
-    other = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
-    angle = 2 * np.pi * np.arange(sides) / sides
-    ring: NDArray[np.float64] = (
-        np.cos(angle)[:, None] * across[:, None]
-        + np.sin(angle)[:, None] * other[:, None]
-    )
+    ahead = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    steep = np.abs(ahead[:, 2:]) >= 0.9
+    across = _cross(ahead, np.where(steep, (1, 0, 0), (0, 0, 1)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    x, y = circle(sides).T[..., None]
+    ring: Array = x * across[:, None] + y * _cross(ahead, across)[:, None]
     return ring
 
 
 def tube(
-    path: ArrayLike, radius: ArrayLike, sides: int = 6, slot: int = 0, caps: bool = True
+    path: ArrayLike,
+    radius: ArrayLike,
+    sides: int = 6,
+    slot: int = 0,
+    caps: bool = True,
 ) -> Mesh:
     """A tube along a path.
 
@@ -202,24 +222,44 @@ def tube(
         caps: whether its ends are closed.
     """
     points = np.asarray(path, float)
-    radii = np.broadcast_to(np.asarray(radius, float), (len(points),))
-    along = np.empty_like(points)
-    along[1:-1] = points[2:] - points[:-2]
-    along[0], along[-1] = points[1] - points[0], points[-1] - points[-2]
-    rings = points[:, None] + radii[:, None, None] * _rings(along, sides)
+    radii = np.broadcast_to(np.asarray(radius, float), len(points))
+    circles = _rings(np.gradient(points, axis=0), sides)
+    rings = points[:, None] + radii[:, None, None] * circles
     ends = [fan(rings[0], slot), fan(rings[-1], slot)] if caps else []
     return merge([loft(rings, slot, closed=True), *ends])
 
 
 def tubes(
-    pieces: Sequence[tuple[ArrayLike, ArrayLike]], sides: int = 5, slot: int = 0
+    paths: Sequence[ArrayLike],
+    radius: ArrayLike,
+    sides: int = 5,
+    slot: int = 0,
 ) -> Mesh:
-    """Several tubes, each given as (path, radius)."""
-    return merge(tube(path, radius, sides, slot) for path, radius in pieces)
+    """Several tubes of the same radius."""
+    return merge(tube(path, radius, sides, slot) for path in paths)
+
+
+def hoop(
+    x: float,
+    radius: float,
+    thick: float,
+    slot: int,
+) -> Mesh:
+    """The tyre of an upright wheel of 14 sides that touches the ground at x."""
+    out = np.insert(circle(14), 1, 0, axis=1)
+    centre = np.array((x, 0, radius))
+    outer = centre + radius * out
+    inner = outer - thick * out
+    across = np.array((0, thick, 0))
+    sections = np.stack([inner, inner + across, outer, inner - across], 1)
+    return loft(np.concatenate([sections, sections[:1]]), slot, closed=True)
 
 
 def leaves(
-    centres: ArrayLike, size: ArrayLike, rng: np.random.Generator, slot: Slots = 0
+    centres: ArrayLike,
+    size: ArrayLike,
+    rng: Rng,
+    slot: int = 0,
 ) -> Mesh:
     """Small triangles of random orientation, each representing a cluster of leaves.
 
@@ -227,34 +267,27 @@ def leaves(
         centres: (L, 3) metres.
         size: metres from the centre to a corner, one or (L,).
         rng: samples the orientations.
-        slot: one for all, or (L,).
+        slot: of all.
     """
-    middle = np.asarray(centres, np.float32).reshape(-1, 3)
+    middle = np.asarray(centres, np.float32)
     axes = rng.standard_normal((2, len(middle), 3)).astype(np.float32)
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
-    (x, y, z), (u, v, w) = axes[0].T, axes[1].T
     first = axes[0]
-    second = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
+    second = _cross(first, axes[1])
     second /= np.linalg.norm(second, axis=-1, keepdims=True) + 1e-6
-    reach = np.broadcast_to(np.asarray(size, np.float32), (len(middle),))[:, None]
+    reach = np.broadcast_to(np.asarray(size, np.float32), len(middle))[:, None]
     corners = [first, -0.5 * first + 0.87 * second, -0.5 * first - 0.87 * second]
-    return Mesh(
-        np.stack([middle + reach * c for c in corners], 1), _slots(slot, (len(middle),))
-    )
+    triangles = np.stack([middle + reach * c for c in corners], 1)
+    return Mesh(triangles, _slots(slot, len(middle)))
 
 
 def ball(
-    centre: ArrayLike, radii: ArrayLike, slot: int = 0, rings: int = 4, sides: int = 8
+    centre: ArrayLike,
+    radii: ArrayLike,
+    slot: int = 0,
+    rings: int = 4,
+    sides: int = 8,
 ) -> Mesh:
     """An ellipsoid with semi-axes ``radii`` (one or three, metres)."""
-    polar = np.linspace(0, np.pi, rings + 1)[:, None]
-    angle = 2 * np.pi * np.arange(sides) / sides
-    unit = np.stack(
-        [
-            np.sin(polar) * np.cos(angle),
-            np.sin(polar) * np.sin(angle),
-            np.cos(polar) * np.ones_like(angle),
-        ],
-        -1,
-    )
-    return loft(np.asarray(centre) + unit * np.asarray(radii, float), slot, closed=True)
+    points = np.asarray(centre) + sphere(rings, sides) * np.asarray(radii, float)
+    return loft(points, slot, closed=True)

@@ -2,13 +2,32 @@
 street."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lidar_synth.lab.town.prototype import Prototype
+from lidar_synth.lab.town.meshes import Array, Ints
+from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.scene import PlacedObject, Pose, Scene
-from lidar_synth.lab.town.street import Street
+from lidar_synth.lab.town.street import LEFT, RIGHT, Street
+
+
+class Line(NamedTuple):
+    """A motion with constant speed, or a place at which something waits.
+
+    Args:
+        along: True if it moves along s, False if it moves along t.
+        at: the constant coordinate, metres.
+        start: the changing coordinate at time 0, metres.
+        direction: +1 or -1, the direction in which it faces.
+        speed: m/s; 0 for one that waits.
+    """
+
+    along: bool
+    at: float
+    start: float
+    direction: int
+    speed: float
 
 
 @dataclass(frozen=True)
@@ -18,11 +37,7 @@ class Mover:
     Args:
         shapes: its prototypes by phase of the stride; a single one for a vehicle.
         stride: metres travelled per cycle of the phases.
-        along: True if it moves along s, False if it moves along t.
-        at: the constant coordinate, metres.
-        start: the changing coordinate at time 0, metres.
-        direction: +1 or -1, the direction in which it faces.
-        speed: m/s; 0 for one that waits.
+        line: its motion.
         instance: its instance number.
         surfaces: the surface number of each slot.
         scale: the scale of its prototype.
@@ -30,30 +45,24 @@ class Mover:
 
     shapes: tuple[Prototype, ...]
     stride: float
-    along: bool
-    at: float
-    start: float
-    direction: int
-    speed: float
+    line: Line
     instance: int
-    surfaces: NDArray[np.int32]
+    surfaces: Ints
     scale: float
 
     def place(self, time: float) -> tuple[float, float, float]:
         """Its s and t (metres) and its yaw relative to the street (radians) at a time in
         seconds."""
-        moving = self.start + self.direction * self.speed * time
-        yaw = (0.0 if self.along else np.pi / 2) + (
-            np.pi if self.direction < 0 else 0.0
-        )
-        return (moving, self.at, yaw) if self.along else (self.at, moving, yaw)
+        along, at, start, direction, speed = self.line
+        moving = start + direction * speed * time
+        back = np.pi if direction < 0 else 0.0
+        return (moving, at, back) if along else (at, moving, np.pi / 2 + back)
 
     def shape(self, time: float) -> Prototype:
         """Its prototype at a time in seconds."""
-        return self.shapes[
-            int((abs(self.start) + self.speed * time) / self.stride * len(self.shapes))
-            % len(self.shapes)
-        ]
+        travelled = abs(self.line.start) + self.line.speed * time
+        phase = int(travelled / self.stride * len(self.shapes))
+        return self.shapes[phase % len(self.shapes)]
 
 
 def place_movers(
@@ -66,15 +75,15 @@ def place_movers(
     """The movers within ``reach`` metres of street coordinates ``about``, placed in the world at a
     time in seconds."""
     places = np.array([m.place(time) for m in movers]).reshape(-1, 3)
-    near = np.flatnonzero(
-        np.hypot(places[:, 0] - about[0], places[:, 1] - about[1]) < reach
-    )
-    lengths = [2.0 if len(movers[i].shapes) == 1 else 0.5 for i in near]
+    apart = places[:, :2] - about
+    near = np.flatnonzero(np.hypot(*apart.T) < reach)
+    close = [movers[i] for i in near]
+    lengths = [2.0 if len(m.shapes) == 1 else 0.5 for m in close]
     s, t, yaw = places[near].T
     poses = scene.poses(s, t, yaw, lengths)
     return [
         PlacedObject(m.shape(time), pose, m.instance, m.surfaces, m.scale)
-        for m, pose in zip((movers[i] for i in near), poses, strict=True)
+        for m, pose in zip(close, poses, strict=True)
     ]
 
 
@@ -90,21 +99,21 @@ def ego_place(street: Street, time: float) -> tuple[float, float, float]:
     if street.turn is None:
         return travelled, float(lane + 0.15 * np.sin(0.11 * travelled)), 0.0
     crossing, side = street.turn
-    sign = 2 * side - 1
-    radius = (4.0, 8.0)[side]
-    target = crossing.s + sign * crossing.half / 2
-    angle = float(np.clip((travelled - (target - radius)) / radius, 0, np.pi / 2))
-    beyond = max(0.0, travelled - (target - radius) - radius * np.pi / 2)
-    s = min(travelled, target - radius) + radius * np.sin(angle)
-    return (
-        float(s),
-        float(lane + sign * (radius * (1 - np.cos(angle)) + beyond)),
-        sign * angle,
-    )
+    radius = {RIGHT: 4.0, LEFT: 8.0}[side]
+    begin = crossing.s + side * crossing.half / 2 - radius
+    angle = float(np.clip((travelled - begin) / radius, 0, np.pi / 2))
+    beyond = max(0.0, travelled - begin - radius * np.pi / 2)
+    s = min(travelled, begin) + radius * np.sin(angle)
+    t = lane + side * (radius * (1 - np.cos(angle)) + beyond)
+    return float(s), float(t), side * angle
 
 
 def ego_pose(
-    street: Street, scene: Scene, time: float, height: float, sway: NDArray[np.float64]
+    street: Street,
+    scene: Scene,
+    time: float,
+    height: float,
+    sway: Array,
 ) -> Pose:
     """(4, 4) sensor to world at a time in seconds.
 
@@ -115,17 +124,9 @@ def ego_pose(
         sway: (roll, pitch) of the body on its suspension, radians.
     """
     pose = scene.poses(*ego_place(street, time), 4.0)
-    roll, pitch = sway
-    rolled = np.array(
-        [(1, 0, 0), (0, np.cos(roll), -np.sin(roll)), (0, np.sin(roll), np.cos(roll))]
-    )
-    pitched = np.array(
-        [
-            (np.cos(pitch), 0, np.sin(pitch)),
-            (0, 1, 0),
-            (-np.sin(pitch), 0, np.cos(pitch)),
-        ]
-    )
+    (c, d), (s, z) = np.cos(sway), np.sin(sway)
+    rolled = np.array([(1, 0, 0), (0, c, -s), (0, s, c)])
+    pitched = np.array([(d, 0, z), (0, 1, 0), (-z, 0, d)])
     pose[:3, :3] = pose[:3, :3] @ pitched @ rolled
     pose[:3, 3] += height * pose[:3, 2]
     return pose

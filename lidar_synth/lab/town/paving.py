@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lidar_synth.lab.town.catalogue import Rng, pick_name
 from lidar_synth.lab.town.ground import NAMES, Corner, Rect
-from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, SideStreet, Street
+from lidar_synth.lab.town.street import LEFT, REACH, RIGHT, SIDES, SideStreet, Street
 
 PLAZA_DEPTH = 34.0
 """Depth of an open square behind the pavement, metres."""
@@ -36,119 +37,127 @@ class Paint:
         self.rects.append((min(s), max(s), min(t), max(t), NAMES.index(kind)))
 
 
-def pave(street: Street, rng: np.random.Generator) -> Paint:
+def pave(street: Street, rng: Rng) -> Paint:
     """Paint all ground of a street except its lots, from the pavements inwards to the markings."""
     paint = Paint((-BEYOND, street.length + BEYOND, -BEYOND, BEYOND))
     full_length = paint.reach[:2]
     asphalt = "road" if rng.random() < 0.7 else "old_road"
-    for side, sign in ((RIGHT, -1), (LEFT, 1)):
+    for side in SIDES:
         front = street.front(side)
         if street.kind == "edge" and rng.random() < 0.6:
-            paint(
-                full_length,
-                (sign * (front + rng.uniform(2, 8)), sign * BEYOND),
-                "field",
-            )
+            far = (side * (front + rng.uniform(2, 8)), side * BEYOND)
+            paint(full_length, far, "field")
         if street.plaza == side:
-            paint(
-                (-12, street.length + 12),
-                (sign * front, sign * (front + PLAZA_DEPTH)),
-                "plaza",
-            )
-        at = front
-        for band in reversed(street.bands[side]):
-            at -= band.width
-            paint(full_length, (sign * at, sign * (at + band.width)), band.kind)
-            if band.kind == "sidewalk":
-                paint(full_length, (sign * at, sign * (at + 0.13)), "kerb")
-            if band.kind == "parking":
-                for s in np.arange(-REACH, street.length + REACH, rng.uniform(18, 40)):
-                    paint((s, s + 1.6), (sign * at, sign * (at + band.width)), "grass")
+            square = (side * front, side * (front + PLAZA_DEPTH))
+            paint((-12, street.length + 12), square, "plaza")
+        _paint_bands(street, side, paint, rng)
     for c in street.crossings:
-        _pavements(street, c, paint)
+        for side in c.sides if c.pavement else ():
+            _paint_pavements(street, c, side, paint)
     paint(full_length, (-street.edge[RIGHT], street.edge[LEFT]), asphalt)
     if street.median:
         inner = street.median - 0.15
-        paint(full_length, (-inner, inner), str(rng.choice(["grass", "rails", "kerb"])))
+        paint(full_length, (-inner, inner), pick_name("medians", rng))
     if street.marked:
-        _markings(street, paint)
+        _mark_lanes(street, paint)
     for c in street.crossings:
-        _carriageway(street, c, asphalt, paint)
+        _paint_carriageway(street, c, asphalt, paint)
+        if street.marked and street.kind in ("junction", "main", "square"):
+            for side in c.sides:
+                _mark_side_street(street, c, side, paint)
+            if street.kind == "junction":
+                _mark_zebras(street, c, paint)
     return paint
 
 
-def _pavements(street: Street, c: SideStreet, paint: Paint) -> None:
-    """Paint the pavements and kerbs of a side street."""
-    if not c.pavement:
-        return
-    for side in c.sides:
-        sign = 2 * side - 1
-        edge = street.edge[side]
-        out = c.half + c.pavement
-        paint((c.s - out, c.s + out), (sign * edge, sign * BEYOND), "sidewalk")
-        for direction in (-1, 1):
-            paint(
-                (c.s + direction * c.half, c.s + direction * (c.half + 0.13)),
-                (sign * edge, sign * BEYOND),
-                "kerb",
-            )
-            paint(
-                (c.s, c.s + direction * out),
-                (sign * edge, sign * (edge + 0.13)),
-                "kerb",
-            )
-            paint.corners.append(
-                Corner(
-                    c.s + direction * c.half,
-                    sign * edge,
-                    direction,
-                    sign,
-                    min(c.pavement, 3.0),
-                )
-            )
+def _paint_bands(
+    street: Street,
+    side: int,
+    paint: Paint,
+    rng: Rng,
+) -> None:
+    """Paint the strips of a side, their kerbs, and grass between parking bays."""
+    full_length = paint.reach[:2]
+    inner = street.front(side)
+    for kind, width in reversed(street.bands[side]):
+        inner -= width
+        near = side * inner
+        far = side * (inner + width)
+        paint(full_length, (near, far), kind)
+        if kind == "sidewalk":
+            paint(full_length, (near, side * (inner + 0.13)), "kerb")
+        if kind == "parking":
+            for s in np.arange(-REACH, street.length + REACH, rng.uniform(18, 40)):
+                paint((s, s + 1.6), (near, far), "grass")
 
 
-def _carriageway(street: Street, c: SideStreet, asphalt: str, paint: Paint) -> None:
-    """Paint the asphalt of a side street, and on larger streets its lines, stop lines and zebra
-    crossings."""
+def _paint_pavements(
+    street: Street,
+    c: SideStreet,
+    side: int,
+    paint: Paint,
+) -> None:
+    """Paint the pavements and kerbs of a side street on one side of the stretch."""
+    edge = side * street.edge[side]
+    beyond = (edge, side * BEYOND)
+    inner = (edge, side * (street.edge[side] + 0.13))
+    out = c.half + c.pavement
+    paint((c.s - out, c.s + out), beyond, "sidewalk")
+    for direction in (-1, 1):
+        kerb = c.s + direction * c.half
+        paint((kerb, c.s + direction * (c.half + 0.13)), beyond, "kerb")
+        paint((c.s, c.s + direction * out), inner, "kerb")
+        radius = min(c.pavement, 3.0)
+        paint.corners.append(Corner(kerb, edge, direction, side, radius))
+
+
+def _paint_carriageway(
+    street: Street,
+    c: SideStreet,
+    asphalt: str,
+    paint: Paint,
+) -> None:
+    """Paint the asphalt of a side street, which ends at a median unless it crosses."""
     low = -BEYOND if RIGHT in c.sides else -street.edge[RIGHT]
     high = BEYOND if LEFT in c.sides else street.edge[LEFT]
-    if len(c.sides) == 1 and street.median:
-        low, high = (low, -street.median) if RIGHT in c.sides else (street.median, high)
+    if street.median and c.sides == (RIGHT,):
+        high = -street.median
+    elif street.median and c.sides == (LEFT,):
+        low = street.median
     paint((c.s - c.half, c.s + c.half), (low, high), asphalt)
     if street.kind == "junction" and street.median:
         # The median ends before the zebra crossings.
-        paint(
-            (c.s - c.half - 6.5, c.s + c.half + 6.5),
-            (-street.median, street.median),
-            asphalt,
-        )
-    if not street.marked or street.kind not in ("junction", "main", "square"):
-        return
-    for side in c.sides:
-        sign = 2 * side - 1
-        edge = street.edge[side]
-        paint(
-            (c.s, c.s - sign * c.half),
-            (sign * (edge + 1.0), sign * (edge + 1.4)),
-            "marking",
-        )
-        for t in np.arange(edge + 3, 60, 6.0):
-            paint((c.s - 0.06, c.s + 0.06), (sign * t, sign * (t + 3)), "marking")
-    if street.kind == "junction":
-        for direction in (-1, 1):
-            s = c.s + direction * (c.half + 1.8)
-            for t in np.arange(-street.edge[RIGHT] + 0.4, street.edge[LEFT] - 0.5, 1.0):
-                paint((s, s + direction * 3.0), (t, t + 0.5), "marking")
-            lanes = (
-                (-street.edge[RIGHT], -0.1)
-                if direction < 0
-                else (0.1, street.edge[LEFT])
-            )
-            paint((s + direction * 4.2, s + direction * 4.6), lanes, "marking")
+        reach = c.half + 6.5
+        median = (-street.median, street.median)
+        paint((c.s - reach, c.s + reach), median, asphalt)
 
 
-def _markings(street: Street, paint: Paint) -> None:
+def _mark_side_street(
+    street: Street,
+    c: SideStreet,
+    side: int,
+    paint: Paint,
+) -> None:
+    """Paint the stop line and the middle line of a side street."""
+    edge = street.edge[side]
+    stop = (side * (edge + 1.0), side * (edge + 1.4))
+    paint((c.s, c.s - side * c.half), stop, "marking")
+    for t in np.arange(edge + 3, 60, 6.0):
+        paint((c.s - 0.06, c.s + 0.06), (side * t, side * (t + 3)), "marking")
+
+
+def _mark_zebras(street: Street, c: SideStreet, paint: Paint) -> None:
+    """Paint the zebra crossings and the stop lines before a junction."""
+    right = -street.edge[RIGHT]
+    left = street.edge[LEFT]
+    for direction, lanes in ((-1, (right, -0.1)), (1, (0.1, left))):
+        s = c.s + direction * (c.half + 1.8)
+        for t in np.arange(right + 0.4, left - 0.5, 1.0):
+            paint((s, s + direction * 3.0), (t, t + 0.5), "marking")
+        paint((s + direction * 4.2, s + direction * 4.6), lanes, "marking")
+
+
+def _mark_lanes(street: Street, paint: Paint) -> None:
     """Paint the lane markings of the street."""
     full_length = paint.reach[:2]
     dashes = {
@@ -162,20 +171,16 @@ def _markings(street: Street, paint: Paint) -> None:
     for s in np.arange(-REACH - 60, street.length + REACH + 60, 9.0):
         for t in dashes:
             paint((s, s + 3.0), (t - 0.06, t + 0.06), "marking")
+    lines = []
     if street.median:
-        for sign in (-1, 1):
-            paint(
-                full_length,
-                (sign * street.median, sign * (street.median + 0.12)),
-                "marking",
-            )
+        inner = street.median
+        lines += [(side * inner, side * (inner + 0.12)) for side in SIDES]
     if street.kind == "edge":
-        for t in (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32):
-            paint(full_length, (t, t + 0.12), "marking")
-    for side, sign in ((RIGHT, -1), (LEFT, 1)):
+        kerbs = (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32)
+        lines += [(t, t + 0.12) for t in kerbs]
+    for side in SIDES:
         if street.parking[side] == "street":
-            paint(
-                full_length,
-                (sign * (street.edge[side] - 2.15), sign * (street.edge[side] - 2.05)),
-                "marking",
-            )
+            edge = street.edge[side]
+            lines.append((side * (edge - 2.15), side * (edge - 2.05)))
+    for line in lines:
+        paint(full_length, line, "marking")

@@ -14,7 +14,12 @@ _SCALE = 1 / np.sqrt(sum(w * w for w in WEIGHTS) / 12 * 0.41)
 
 
 @njit(cache=True)
-def _corner(x: int, y: int, z: int, octave: int) -> float:
+def _corner(
+    x: int,
+    y: int,
+    z: int,
+    octave: int,
+) -> float:
     """A pseudo-random value in [0, 1) of a lattice point."""
     h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(y) * np.uint64(
         0xC2B2AE3D27D4EB4F

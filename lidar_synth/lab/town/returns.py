@@ -192,7 +192,10 @@ def measure(
 
 
 def _return_probability(
-    power: Floats, facing: Floats, distance: Floats, noise: ReturnNoise
+    power: Floats,
+    facing: Floats,
+    distance: Floats,
+    noise: ReturnNoise,
 ) -> Floats:
     """(N,) probability that the signal of a hit exceeds the sensor's threshold."""
     spreading = np.minimum(1, 900 / np.maximum(distance * distance, 1))

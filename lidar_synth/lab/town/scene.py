@@ -7,15 +7,15 @@ ground, and collects their triangles with a surface number for each.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lidar_synth.lab.town.furniture import StaticObject
+from lidar_synth.lab.town.catalogue import RGB
 from lidar_synth.lab.town.ground import TownGround
-from lidar_synth.lab.town.materials import RGB, Finishes
-from lidar_synth.lab.town.meshes import Mesh, merge
-from lidar_synth.lab.town.prototype import Prototype
+from lidar_synth.lab.town.materials import Finishes
+from lidar_synth.lab.town.meshes import Array, Ints, Mesh, merge
+from lidar_synth.lab.town.objects import Prototype, StaticObject
 
-Pose = NDArray[np.float64]
+Pose = Array
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PlacedObject:
     prototype: Prototype
     pose: Pose
     instance: int
-    surfaces: NDArray[np.int32]
+    surfaces: Ints
     scale: float = 1.0
 
 
@@ -61,7 +61,7 @@ class Scene:
     footprints: list[tuple[float, float, float, float]] = field(default_factory=list)
     instances: int = 0
 
-    def add_mesh(self, mesh: Mesh, surfaces: NDArray[np.int32]) -> None:
+    def add_mesh(self, mesh: Mesh, surfaces: Ints) -> None:
         """Add a mesh in world coordinates; ``surfaces`` holds the surface number of each slot."""
         self.meshes.append(Mesh(mesh.triangles, surfaces[mesh.slot]))
 
@@ -91,23 +91,22 @@ class Scene:
     def mesh(self) -> Mesh:
         """All static triangles in the world, with surface numbers as slots."""
         places = np.array([row[1:] for row in self.pending]).reshape(-1, 4)
-        points = self.ground.points(places[:, 0], places[:, 1]) + places[:, 3:] * (
-            0,
-            0,
-            1,
-        )
-        yaws = self.ground.course.heading(places[:, 0]) + places[:, 2]
-        for (item, *_), point, yaw in zip(self.pending, points, yaws, strict=True):
-            rows = [
-                self.surfaces.add(f, raw)
-                for f, raw in zip(item.finishes, item.raw, strict=True)
-            ]
-            self.add_mesh(item.mesh.moved(point, float(yaw)), np.array(rows, np.int32))
+        s, t, yaw, lift = places.T
+        points = self.ground.points(s, t)
+        points[:, 2] += lift
+        yaws = self.ground.course.heading(s) + yaw
+        for (item, *_), point, turn in zip(self.pending, points, yaws, strict=True):
+            rows = list(map(self.surfaces.add, item.finishes, item.raw))
+            self.add_mesh(item.mesh.moved(point, float(turn)), np.array(rows, np.int32))
         self.pending.clear()
         return merge(self.meshes)
 
     def poses(
-        self, s: ArrayLike, t: ArrayLike, yaw: ArrayLike, length: ArrayLike
+        self,
+        s: ArrayLike,
+        t: ArrayLike,
+        yaw: ArrayLike,
+        length: ArrayLike,
     ) -> Pose:
         """(..., 4, 4) poses of objects on the ground, tilted with the ground under them.
 
@@ -116,24 +115,18 @@ class Scene:
             yaw: radians relative to the street's heading.
             length: length of the objects, metres.
         """
-        s, t, yaw, half = np.broadcast_arrays(
-            *(np.asarray(v, float) for v in (s, t, yaw, np.asarray(length, float) / 3))
-        )
-        heading = self.ground.course.heading(s) + yaw
-        c = np.cos(yaw)
-        d = np.sin(yaw)
+        s, t, yaw, half = np.broadcast_arrays(s, t, yaw, np.asarray(length, float) / 3)
         # One kind of ground under all probes: a wheel on the kerb does not tilt the whole car.
-        probes = [
-            (s + a * half, t + b * half)
-            for a, b in ((c, d), (-c, -d), (-d, c), (d, -c))
-        ]
-        front, back, left, right = (self.ground.height(*p, 0) for p in probes)
-        ahead = np.stack(
-            [np.cos(heading), np.sin(heading), (front - back) / (2 * half)], -1
-        )
-        across = np.stack(
-            [-np.sin(heading), np.cos(heading), (left - right) / (2 * half)], -1
-        )
+        c = np.cos(yaw) * half
+        d = np.sin(yaw) * half
+        height = self.ground.height
+        rise = height(s + c, t + d, 0) - height(s - c, t - d, 0)
+        bank = height(s - d, t + c, 0) - height(s + d, t - c, 0)
+        heading = self.ground.course.heading(s) + yaw
+        x = np.cos(heading)
+        y = np.sin(heading)
+        ahead = np.stack([x, y, rise / (2 * half)], -1)
+        across = np.stack([-y, x, bank / (2 * half)], -1)
         up = np.cross(ahead, across)
         ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
         up /= np.linalg.norm(up, axis=-1, keepdims=True)
@@ -145,12 +138,13 @@ class Scene:
 
     def add_instance(
         self, prototype: Prototype, colour: RGB, moving: bool
-    ) -> tuple[int, NDArray[np.int32]]:
+    ) -> tuple[int, Ints]:
         """Register a new instance; return its number and the surface number of each slot."""
         self.instances += 1
+        raw = prototype.raw[int(moving)]
         rows = [
-            self.surfaces.add(f, prototype.raw[int(moving)], self.instances)
-            for f in prototype.painted(colour)
+            self.surfaces.add(finish, raw, self.instances)
+            for finish in prototype.painted(colour)
         ]
         return self.instances, np.array(rows, np.int32)
 
@@ -165,28 +159,19 @@ class Scene:
     ) -> None:
         """Put a static object with an instance number on the ground."""
         instance, surfaces = self.add_instance(prototype, colour, moving=False)
-        low, high = prototype.mesh.bounds
-        pose = self.poses(s, t, yaw, high[0] - low[0])
+        pose = self.poses(s, t, yaw, prototype.length)
         placed = PlacedObject(prototype, pose, instance, surfaces, scale)
         self.placed.append(placed)
         self.add_mesh(prototype.mesh.moved(scale=scale).posed(pose), surfaces)
-        half = (
-            np.abs(np.array([[np.cos(yaw), np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]))
-            @ (high[:2] - low[:2])
-            / 2
-        )
+        low, high = prototype.mesh.bounds
+        c = np.cos(yaw)
+        d = np.sin(yaw)
+        half = np.abs([(c, d), (d, c)]) @ (high[:2] - low[:2]) / 2
         self.footprints.append((s - half[0], s + half[0], t - half[1], t + half[1]))
 
-    def is_free(self, s: float, t: float, half: tuple[float, float]) -> bool:
-        """Whether no obstacle lies within the half extents ``half`` (along s, along t) around a
-        position, metres."""
-        if not self.footprints:
-            return True
-        f = np.array(self.footprints)
-        hit = (
-            (f[:, 0] < s + half[0])
-            & (f[:, 1] > s - half[0])
-            & (f[:, 2] < t + half[1])
-            & (f[:, 3] > t - half[1])
-        )
-        return not hit.any()
+    def is_free(self, s: float, t: float, half: float) -> bool:
+        """Whether no obstacle lies in the square of ``half`` metres on each side around a
+        position."""
+        low_s, high_s, low_t, high_t = np.array(self.footprints).reshape(-1, 4).T
+        hit = (low_s < s + half) & (high_s > s - half)
+        return not (hit & (low_t < t + half) & (high_t > t - half)).any()

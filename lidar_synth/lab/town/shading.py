@@ -96,7 +96,10 @@ def _value_noise(places: Floats, layer: float) -> Floats:
 
 
 def camera_hits(
-    snapshot: Snapshot, eye: Floats, directions: Floats, surfaces: SurfaceTable
+    snapshot: Snapshot,
+    eye: Floats,
+    directions: Floats,
+    surfaces: SurfaceTable,
 ) -> SceneHits:
     """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of
     foliage and wire mesh."""
@@ -128,7 +131,10 @@ def camera_hits(
 
 
 def _texture(
-    place: Floats, normal: Floats, far: Floats, material: NDArray[np.uint8]
+    place: Floats,
+    normal: Floats,
+    far: Floats,
+    material: NDArray[np.uint8],
 ) -> Floats:
     """(N,) brightness factors of the texture, around 1: noise at two scales, no finer than a pixel,
     and the joints between bricks, tiles, stones and slabs."""
@@ -203,7 +209,14 @@ def shade(
         * (lit * facing)[:, None]
         * np.array([1.06, 1.0, 0.90], np.float32)
     )
-    _reflect(shaded, ray, normal, material, lit, light)
+    _reflect(
+        shaded,
+        ray,
+        normal,
+        material,
+        lit,
+        light,
+    )
     haze = 1 - np.exp(-far / 700)[:, None]
     image[rays] = shaded * (1 - haze) + haze * np.array([0.85, 0.9, 0.97], np.float32)
     return image, hits

@@ -6,19 +6,23 @@ There are five kinds: ``residential``, ``main`` (main road), ``junction``, ``squ
 Traffic drives on the right: lanes at t < 0 run towards +s.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-KINDS = ("residential", "main", "junction", "square", "edge")
-SHARES = (0.40, 0.15, 0.12, 0.08, 0.25)
+from lidar_synth.lab.town.catalogue import TABLES, Rng, pick, pick_name, sample_range
+
+KINDS = tuple(TABLES["streets"])
+SHARES = tuple(row["share"] for row in TABLES["streets"].values())
 """Probability of each kind."""
 REACH = 88.0
 """Metres of detailed world in front of, behind and beside the ego vehicle: slightly more than the
 sensor's range."""
-RIGHT = 0
+RIGHT = -1
 LEFT = 1
+SIDES = (RIGHT, LEFT)
+"""The sides of the street: the sign of t on each."""
 
 
 class Band(NamedTuple):
@@ -58,35 +62,41 @@ class Street:
     Args:
         kind: one of ``KINDS``.
         length: metres that the ego vehicle drives, from s = 0.
-        edge: metres from the centre line to the kerb, (right, left).
-        bands: strips beyond the kerb, from the inside to the outside, (right, left).
-        lanes: the lanes; the ego vehicle drives in the first.
-        crossings: the side streets.
-        parking: how cars park, (right, left): ``none``, ``street`` (inside the kerb), ``bay``,
-            ``kerb`` (half on the pavement).
         speed: speed of the ego vehicle, m/s.
-        median: half of the width of the strip between the two directions of traffic, metres; 0 =
-            none.
-        marked: whether lane markings are painted.
-        plaza: the side with an open square (RIGHT or LEFT), or None.
-        turn: (side street into which the ego vehicle turns, side to which it turns), or None.
         ends: lowest and highest s of the street, where it meets a cross street with houses behind
             it; infinite where the street continues.
+        crossings: the side streets.
+        marked: whether lane markings are painted.
+        plaza: the side with an open square (RIGHT or LEFT), or None.
+        edge: metres from the centre line to the kerb, by side.
+        bands: strips beyond the kerb, from the inside to the outside, by side.
+        lanes: the lanes; the ego vehicle drives in the first.
+        parking: how cars park, by side: ``none``, ``street`` (inside the kerb), ``bay``, ``kerb``
+            (half on the pavement).
+        median: half of the width of the strip between the two directions of traffic, metres; 0 =
+            none.
+        turn: (side street into which the ego vehicle turns, side to which it turns), or None.
     """
 
     kind: str
     length: float
-    edge: tuple[float, float]
-    bands: tuple[tuple[Band, ...], tuple[Band, ...]]
-    lanes: tuple[Lane, ...]
-    crossings: tuple[SideStreet, ...]
-    parking: tuple[str, str]
     speed: float
+    ends: tuple[float, float]
+    crossings: list[SideStreet]
+    marked: bool
+    plaza: int | None
+    edge: dict[int, float]
+    bands: dict[int, list[Band]]
+    lanes: list[Lane]
+    parking: dict[int, str]
     median: float = 0.0
-    marked: bool = True
-    plaza: int | None = None
     turn: tuple[SideStreet, int] | None = None
-    ends: tuple[float, float] = (-np.inf, np.inf)
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The line of its kind in the table of streets."""
+        line: dict[str, Any] = TABLES["streets"][self.kind]
+        return line
 
     def front(self, side: int) -> float:
         """|t| at which the lots of a side begin, metres."""
@@ -115,167 +125,158 @@ class Street:
         return [(a, b) for a, b in [*gaps, (low, high)] if b - a > 2]
 
 
-def _ends(kind: str, length: float, rng: np.random.Generator) -> tuple[float, float]:
+def _sample_ends(kind: str, length: float, rng: Rng) -> tuple[float, float]:
     """Sampled ends of the street; infinite where it continues."""
     share = {"edge": 0.1, "main": 0.3}.get(kind, 0.6)
-    back = -rng.uniform(30, 85) if rng.random() < share else -np.inf
-    return back, length + rng.uniform(30, 85) if rng.random() < share else np.inf
+    back, ahead = (
+        rng.uniform(30, 85) if rng.random() < share else np.inf for _ in SIDES
+    )
+    return -back, length + ahead
 
 
-def _crossings(
-    kind: str, length: float, ends: tuple[float, float], rng: np.random.Generator
-) -> tuple[SideStreet, ...]:
+def _sample_crossings(
+    kind: str,
+    length: float,
+    ends: tuple[float, float],
+    rng: Rng,
+) -> list[SideStreet]:
     """Sampled side streets: at closed ends, at a junction, and at random elsewhere."""
     places = [
-        SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, (RIGHT, LEFT))
+        SideStreet(e - np.sign(e) * 6.0, 2.8, 1.6, SIDES)
         for e in ends
         if np.isfinite(e)
     ]
     if kind == "junction":
         middle = length * rng.uniform(0.45, 0.75) + 5
-        places = [p for p in places if abs(p.s - middle) > 30]
-        return (
-            *places,
-            SideStreet(
-                middle, rng.uniform(3.3, 6.8), rng.uniform(2, 3.2), (RIGHT, LEFT)
-            ),
-        )
+        half = rng.uniform(3.3, 6.8)
+        return _add_apart(places, SideStreet(middle, half, rng.uniform(2, 3.2), SIDES))
+    share = 0.10 if kind == "edge" else 0.22
     for s in np.arange(-70, length + 70, 14.0) + rng.uniform(0, 14):
-        apart = all(abs(s - p.s) > 45 for p in places)
-        if apart and rng.random() < (0.10 if kind == "edge" else 0.22):
-            sides = ((RIGHT, LEFT), (RIGHT,), (LEFT,))[rng.integers(3)]
-            places.append(
-                SideStreet(
-                    float(s),
-                    rng.uniform(2.5, 3.4),
-                    0.0 if kind == "edge" else rng.uniform(1.5, 2.2),
-                    sides,
-                )
-            )
-    return tuple(places)
+        if all(abs(s - p.s) > 45 for p in places) and rng.random() < share:
+            sides = pick((SIDES, (RIGHT,), (LEFT,)), rng)
+            half = rng.uniform(2.5, 3.4)
+            pavement = 0.0 if kind == "edge" else rng.uniform(1.5, 2.2)
+            places.append(SideStreet(float(s), half, pavement, sides))
+    return places
 
 
-def _residential(
-    rng: np.random.Generator,
-) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
-    """Sampled bands, kerbs, parking and lanes of a residential street."""
-    parking = [
-        str(rng.choice(["none", "street", "bay", "kerb"], p=[0.34, 0.30, 0.18, 0.18]))
-        for _ in range(2)
-    ]
+def _add_apart(places: list[SideStreet], new: SideStreet) -> list[SideStreet]:
+    """The side streets that lie more than 30 m from a new one, and that one."""
+    return [p for p in places if abs(p.s - new.s) > 30] + [new]
+
+
+def _sample_bands(section: str, parking: dict[int, str], rng: Rng) -> dict[int, Any]:
+    """Sampled strips beyond the kerb, by side."""
+    bands = {}
+    for side, how in parking.items():
+        bay = Band("parking", 2.2 if section == "main" else 2.1)
+        bands[side] = [bay] if how == "bay" else []
+        for kind, share, width in TABLES["strips"][section]:
+            if share == 1 or rng.random() < share:
+                bands[side].append(Band(kind, sample_range(width, rng)))
+    return bands
+
+
+def _lay_lanes(each: int, width: float, median: float = 0.0) -> list[Lane]:
+    """Lanes in both directions, ``each`` in one."""
+    middles = [median + width * (i + 0.5) for i in range(each)]
+    return [Lane(-t, 1) for t in middles] + [Lane(t, -1) for t in middles]
+
+
+def _sample_residential(rng: Rng) -> dict[str, Any]:
+    """The sampled cross-section of a residential street."""
+    parking = {side: pick_name("parking_residential", rng) for side in SIDES}
     lane = rng.uniform(2.7, 3.5)
-    edge = [lane + (2.0 if p == "street" else 0.0) for p in parking]
-    bands = []
-    for p in parking:
-        side = [Band("parking", 2.1)] if p == "bay" else []
-        if rng.random() < 0.3:
-            side.append(Band("grass", rng.uniform(1.0, 3.5)))
-        bands.append([*side, Band("sidewalk", rng.uniform(1.4, 2.4))])
-    return bands, edge, parking, [Lane(-lane / 2, 1), Lane(lane / 2, -1)]
+    return {
+        "parking": parking,
+        "lanes": _lay_lanes(1, lane),
+        "edge": {
+            side: lane + (2.0 if how == "street" else 0.0)
+            for side, how in parking.items()
+        },
+        "bands": _sample_bands("residential", parking, rng),
+    }
 
 
-def _main(
-    rng: np.random.Generator,
-) -> tuple[list[list[Band]], list[float], list[str], list[Lane], float]:
-    """Sampled bands, kerbs, parking, lanes and median of a main road."""
-    each = int(rng.choice([1, 2], p=[0.6, 0.4]))
+def _sample_main(rng: Rng) -> dict[str, Any]:
+    """The sampled cross-section of a main road."""
+    each = pick({1: 0.6, 2: 0.4}, rng)
     width = rng.uniform(3.2, 3.9)
-    median = float(rng.choice([0.0, rng.uniform(1.0, 3.6)], p=[0.6, 0.4]))
-    lanes = [Lane(-(median + width * (i + 0.5)), 1) for i in range(each)]
-    lanes += [Lane(median + width * (i + 0.5), -1) for i in range(each)]
+    median = pick({0.0: 0.6, rng.uniform(1.0, 3.6): 0.4}, rng)
+    lanes = _lay_lanes(each, width, median)
     if each == 2 and rng.random() < 0.5:
-        lanes[0], lanes[1] = lanes[1], lanes[0]
-    parking = [
-        str(rng.choice(["none", "bay", "street"], p=[0.4, 0.4, 0.2])) for _ in range(2)
-    ]
-    edge = [
-        median + width * each + 0.2 + (2.2 if p == "street" else 0.0) for p in parking
-    ]
-    bands = []
-    for p in parking:
-        side = [Band("parking", 2.2)] if p == "bay" else []
-        if rng.random() < 0.5:
-            side.append(Band("grass", rng.uniform(1.5, 4.5)))
-        if rng.random() < 0.4:
-            side.append(Band("cycleway", 1.7))
-        bands.append([*side, Band("sidewalk", rng.uniform(2.2, 3.6))])
-    return bands, edge, parking, lanes, median
+        lanes[:2] = lanes[1::-1]
+    parking = {side: pick_name("parking_main", rng) for side in SIDES}
+    kerb = median + width * each + 0.2
+    return {
+        "parking": parking,
+        "lanes": lanes,
+        "edge": {
+            side: kerb + (2.2 if how == "street" else 0.0)
+            for side, how in parking.items()
+        },
+        "bands": _sample_bands("main", parking, rng),
+        "median": median,
+    }
 
 
-def _edge(
-    rng: np.random.Generator,
-) -> tuple[list[list[Band]], list[float], list[str], list[Lane]]:
-    """Sampled bands, kerbs, parking and lanes of a road at the edge of town."""
+def _sample_edge(rng: Rng) -> dict[str, Any]:
+    """The sampled cross-section of a road at the edge of town."""
     width = rng.uniform(3.1, 4.4)
-    bands = []
-    for _ in range(2):
-        side = [Band("soil", rng.uniform(0.5, 1.2)), Band("grass", rng.uniform(1.5, 5))]
-        if rng.random() < 0.3:
-            side.append(Band("cycleway", 2.0))
-        bands.append(side)
-    return (
-        bands,
-        [width, width],
-        ["none", "none"],
-        [Lane(-width / 2, 1), Lane(width / 2, -1)],
-    )
+    parking = dict.fromkeys(SIDES, "none")
+    return {
+        "parking": parking,
+        "lanes": _lay_lanes(1, width),
+        "edge": dict.fromkeys(SIDES, width),
+        "bands": _sample_bands("edge", parking, rng),
+    }
 
 
-_TURNS = {"residential": 0.3, "main": 0.1, "junction": 0.4, "square": 0.25, "edge": 0.0}
-"""Probability that the ego vehicle turns into a side street."""
-_SPEEDS = {
-    "residential": (6.5, 9.5),
-    "main": (10.0, 14.5),
-    "junction": (6.0, 11.0),
-    "square": (5.0, 9.0),
-    "edge": (12.0, 18.0),
-}
-
-
-def sample_street(kind: str, seconds: float, rng: np.random.Generator) -> Street:
+def sample_street(kind: str, seconds: float, rng: Rng) -> Street:
     """The sampled plan of a street of a kind, long enough for the ego vehicle to drive
     ``seconds``."""
-    turns = rng.random() < _TURNS[kind]
-    speed = rng.uniform(4.5, 7.0) if turns else rng.uniform(*_SPEEDS[kind])
+    row = TABLES["streets"][kind]
+    turns = rng.random() < row["turns"]
+    speed = rng.uniform(*((4.5, 7.0) if turns else row["speed"]))
     length = speed * seconds
-    median = 0.0
     marked = True
-    plaza = None
-    wide = kind == "main" or (kind in ("junction", "square") and rng.random() < 0.55)
-    if wide:
-        bands, edge, parking, lanes, median = _main(rng)
+    if kind == "main" or (kind in ("junction", "square") and rng.random() < 0.55):
+        section = _sample_main(rng)
     elif kind == "edge":
-        bands, edge, parking, lanes = _edge(rng)
+        section = _sample_edge(rng)
     else:
-        bands, edge, parking, lanes = _residential(rng)
+        section = _sample_residential(rng)
         marked = rng.random() < 0.25
-    ends = _ends(kind, length, rng)
-    if kind == "square":
-        plaza = int(rng.integers(2))
-    crossings = _crossings(kind, length, ends, rng)
-    exits = [(c, side) for c in crossings for side in c.sides if 12 < c.s < length - 10]
-    if turns and not exits:
-        added = SideStreet(
-            0.4 * length + 4,
-            rng.uniform(2.7, 3.4),
-            rng.uniform(1.5, 2.2),
-            (RIGHT, LEFT),
-        )
-        crossings = (*(c for c in crossings if abs(c.s - added.s) > 30), added)
-        exits = [(added, RIGHT), (added, LEFT)]
-    turn = exits[rng.integers(len(exits))] if turns and exits else None
-    return Street(
+    ends = _sample_ends(kind, length, rng)
+    plaza = pick(SIDES, rng) if kind == "square" else None
+    crossings = _sample_crossings(kind, length, ends, rng)
+    street = Street(
         kind,
         length,
-        (edge[0], edge[1]),
-        (tuple(bands[0]), tuple(bands[1])),
-        tuple(lanes),
-        crossings,
-        (parking[0], parking[1]),
         speed,
-        median,
+        ends,
+        crossings,
         marked,
         plaza,
-        turn,
-        ends,
+        **section,
     )
+    return _sample_turn(street, rng) if turns else street
+
+
+def _sample_turn(street: Street, rng: Rng) -> Street:
+    """The street with a side street into which the ego vehicle turns, which is added if there is
+    none."""
+    exits = [
+        (c, side)
+        for c in street.crossings
+        for side in c.sides
+        if 12 < c.s < street.length - 10
+    ]
+    crossings = street.crossings
+    if not exits:
+        half = rng.uniform(2.7, 3.4)
+        pavement = rng.uniform(1.5, 2.2)
+        added = SideStreet(0.4 * street.length + 4, half, pavement, SIDES)
+        crossings = _add_apart(crossings, added)
+        exits = [(added, side) for side in SIDES]
+    return replace(street, crossings=crossings, turn=pick(exits, rng))

@@ -310,7 +310,15 @@ class Town:
         eye = pose[:3, 3].astype(np.float32)
         origins = eye + moved + self._heights[:, None] * turn[:, 2]
         hits = snapshot.cast(origins, directions, eye)
-        see_through(snapshot, hits, origins, directions, eye, surfaces, rng)
+        see_through(
+            snapshot,
+            hits,
+            origins,
+            directions,
+            eye,
+            surfaces,
+            rng,
+        )
         back, far, reflectance = measure(
             hits,
             origins,

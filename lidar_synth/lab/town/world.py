@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.lab.town.backdrop import close_ends, line_side_streets, second_row
+from lidar_synth.lab.town.backdrop import close_ends, line_horizon, line_side_streets
+from lidar_synth.lab.town.catalogue import Rng, pick
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.furnish import furnish
 from lidar_synth.lab.town.ground import KINDS, TownGround
@@ -34,8 +35,11 @@ WORLD, LIGHT, SCAN, IMAGE = range(4)
 
 
 def rng_for(
-    purpose: int, seed: int, stretch: int, frame: int = 0
-) -> np.random.Generator:
+    purpose: int,
+    seed: int,
+    stretch: int,
+    frame: int = 0,
+) -> Rng:
     """The random generator for one purpose in a stretch or in one of its frames."""
     return np.random.Generator(
         np.random.Philox(key=(seed, purpose), counter=(0, 0, stretch, frame))
@@ -77,34 +81,34 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
         interval: seconds between neighbouring frames.
     """
     rng = rng_for(WORLD, seed, stretch)
-    kind = str(rng.choice(STREETS, p=SHARES))
+    kind = pick(dict(zip(STREETS, SHARES, strict=True)), rng)
     times = np.arange(STRETCH_FRAMES, dtype=float) * interval
     street = sample_street(kind, float(times[-1]), rng)
-    course = Course(
-        -REACH - 40,
-        street.length + REACH + 40,
-        float(rng.choice([0.0, 1 / 500, 1 / 220, 1 / 150], p=[0.3, 0.2, 0.3, 0.2])),
-        rng,
-    )
+    fine = (-REACH, street.length + REACH)
+    bend = pick({0.0: 0.3, 1 / 500: 0.2, 1 / 220: 0.3, 1 / 150: 0.2}, rng)
+    course = Course(fine[0] - 40, fine[1] + 40, bend, rng)
     relief = Relief(0.004 if rng.random() < 0.6 else 0.014, rng)
     lots = sample_lots(street, rng)
     paint = pave(street, rng)
     paint_lots(lots, paint, rng)
-    fine = (-REACH, street.length + REACH)
-    ground = TownGround(
-        course, relief, street.edge, paint.reach, fine, paint.rects, paint.corners
-    )
-    scene = Scene(ground)
+    edges = (paint.reach, fine, paint.rects, paint.corners)
+    scene = Scene(TownGround(course, relief, street.edge, *edges))
     rows = [scene.surfaces.add(k.finish, k.raw) for k in KINDS.values()]
-    scene.add_mesh(ground.mesh(rng), np.array(rows, np.int32))
+    scene.add_mesh(scene.ground.mesh(rng), np.array(rows, np.int32))
     for lot in lots:
         build_lot(lot, street, scene, rng)
     close_ends(street, scene, rng)
     line_side_streets(street, scene, rng)
     furnish(street, lots, scene, rng)
-    second_row(street, scene, rng)
+    line_horizon(street, scene, rng)
     movers = Traffic(street, scene, times, rng).movers
     mesh = scene.mesh()
+    surfaces = scene.surfaces.freeze()
     return World(
-        street, scene, mesh.triangles, mesh.slot, scene.surfaces.freeze(), movers
+        street,
+        scene,
+        mesh.triangles,
+        mesh.slot,
+        surfaces,
+        movers,
     )

@@ -49,7 +49,11 @@ class Returns(NamedTuple):
 
 
 def returns_of(
-    scan: Scan, lasers: Sensor, step: float, rng: np.random.Generator, centred: bool
+    scan: Scan,
+    lasers: Sensor,
+    step: float,
+    rng: np.random.Generator,
+    centred: bool,
 ) -> Returns:
     """The returns of a scan in the order of features.
 

@@ -69,7 +69,10 @@ class RayFeatures(NamedTuple):
 
 
 def features(
-    points: Floats, reflectance: Floats, ring: Ints, sensor: Sensor
+    points: Floats,
+    reflectance: Floats,
+    ring: Ints,
+    sensor: Sensor,
 ) -> RayFeatures:
     """Compute the features of a scan.
 
@@ -89,9 +92,24 @@ def features(
         rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings
     )
     roughness = _roughness(rows, residual)
-    kind, below = _across(rows, turn, distance, level, z, sensor.shape[0], firings)
+    kind, below = _across(
+        rows,
+        turn,
+        distance,
+        level,
+        z,
+        sensor.shape[0],
+        firings,
+    )
     cell = _cells(distance, kind, z - ground_height(z, level, kind))
-    return RayFeatures(mean, residual, roughness, cell, below, gap)
+    return RayFeatures(
+        mean,
+        residual,
+        roughness,
+        cell,
+        below,
+        gap,
+    )
 
 
 def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
@@ -117,7 +135,11 @@ def strata(found: RayFeatures, cuts: Floats) -> Ints:
 
 @njit(cache=True)
 def _along(
-    ring: Ints, turn: Floats, distance: Floats, reflectance: Floats, firings: int
+    ring: Ints,
+    turn: Floats,
+    distance: Floats,
+    reflectance: Floats,
+    firings: int,
 ) -> tuple[Floats, Floats, Ints]:
     count = len(ring)
     mean = np.empty(count, np.float32)

@@ -99,7 +99,14 @@ def fit_skin(
         "sha256": digest.hexdigest(),
         "town": {"version": version("lidar_synth"), "seed": seed, "scans": len(picked)},
     }
-    return estimate(Domain.of(real), Domain.of(cast), own, step, provenance, lasers)
+    return estimate(
+        Domain.of(real),
+        Domain.of(cast),
+        own,
+        step,
+        provenance,
+        lasers,
+    )
 
 
 def _step(reflectance: NDArray[np.float32]) -> float:

@@ -192,7 +192,12 @@ class Skin:
         rows = np.ascontiguousarray(ring, np.int32)
         found = features(points, bright, rows, self.sensor)
         return self.dress(
-            found, strata(found, self.arrays["cuts"]), bright, rows, boxed, uniform[1]
+            found,
+            strata(found, self.arrays["cuts"]),
+            bright,
+            rows,
+            boxed,
+            uniform[1],
         )
 
     def dress(

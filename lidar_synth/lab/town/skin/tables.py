@@ -13,7 +13,10 @@ coarser ones."""
 
 
 def grouped_quantiles(
-    value: Floats, group: NDArray[np.integer], groups: int, count: int
+    value: Floats,
+    group: NDArray[np.integer],
+    groups: int,
+    count: int,
 ) -> tuple[Floats, Floats]:
     """Quantiles of values by group.
 
