@@ -23,7 +23,7 @@ from lidar_synth.lab.town import (
     returns,
 )
 from lidar_synth.lab.town.returns import ReturnNoise
-from lidar_synth.lab.town.skin.features import features
+from lidar_synth.lab.town.skin.features import find_features
 from lidar_synth.lab.town.skin.skin import BOXED, LONGEST, SOFT, shapes
 from lidar_synth.lab.town.skin.tables import grouped_quantiles, lookup
 
@@ -106,7 +106,7 @@ def reflectance_quantiles(scans: list[Scan], ring: int | None = None) -> np.ndar
 def range_residual(scans: list[Scan]) -> float:
     """Metres, median deviation of the range from its neighbours in the ring."""
     found = [
-        features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual
+        find_features(s.points, s.reflectance, s.ring.astype(np.int32), SENSOR).residual
         for s in scans
     ]  # type: ignore[union-attr]
     return float(np.nanmedian(np.abs(np.concatenate(found))))

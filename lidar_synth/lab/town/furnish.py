@@ -14,7 +14,7 @@ from lidar_synth.lab.town.street import REACH, RIGHT, SIDES, SideStreet, Street
 from lidar_synth.lab.town.vehicles import vehicles
 
 
-def furnish(
+def furnish_street(
     street: Street,
     lots: list[Lot],
     scene: Scene,

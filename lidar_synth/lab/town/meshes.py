@@ -65,6 +65,13 @@ class Mesh:
         return points.min(0), points.max(0)
 
     @cached_property
+    def sphere(self) -> tuple[Floats, float]:
+        """Centre (3,) and radius of a sphere around it, metres."""
+        low, high = self.bounds
+        middle = np.asarray((low + high) / 2, np.float32)
+        return middle, float(np.linalg.norm(high - low)) / 2
+
+    @cached_property
     def outline(self) -> Floats:
         """(P, 3) extreme corners in 160 directions, which approximate the convex hull for image
         boxes."""

@@ -6,12 +6,13 @@ and its arguments.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 from lidar_synth.lab.town import bodywork, meshes
 from lidar_synth.lab.town.catalogue import RGB, TABLES
 from lidar_synth.lab.town.materials import Finish, read_finishes
 from lidar_synth.lab.town.meshes import Mesh, merge
+from lidar_synth.lab.town.solid import Solid
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class Prototype:
     finishes: tuple[Finish, ...]
     name: str
     raw: tuple[int, int]
+
+    @cached_property
+    def solid(self) -> Solid:
+        """Its triangles for casting rays, built once per process."""
+        return Solid(self.mesh.triangles)
 
     @property
     def length(self) -> float:

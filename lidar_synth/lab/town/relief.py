@@ -66,7 +66,7 @@ def _noise(
         out[i] = total
 
 
-def relief(points: Floats) -> Floats:
+def sample_relief(points: Floats) -> Floats:
     """(N,) displacement at points (N, 3) of the world in metres, with mean 0 and standard deviation
     1."""
     out = np.empty(len(points), np.float32)

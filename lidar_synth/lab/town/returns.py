@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
+from lidar_synth.lab.town.cast import SceneHits, Snapshot
+from lidar_synth.lab.town.catalogue import TABLES, Rng
 from lidar_synth.lab.town.materials import SurfaceTable, column
-from lidar_synth.lab.town.relief import relief
+from lidar_synth.lab.town.meshes import Floats
+from lidar_synth.lab.town.relief import sample_relief
 
-Floats = NDArray[np.float32]
 LEVELS = 256
 """Reflectance is stored as k / 256, as KITTI-360 does."""
 
@@ -32,12 +33,10 @@ _ROUGHNESS = column("roughness")
 _GRAZING = column("grazing")
 _RELIEF = column("relief")
 _STEP = 0.25
-_RANGES = np.array([0, 5, 8, 12, 20, 25, 30, 35, 40, 50, 65, 80, 130])
-_DISTANCE_FACTOR = np.interp(
-    np.arange(0, 130, _STEP),
-    _RANGES,
-    [1.0, 1.0, 1.0, 1.0, 1.0, 0.95, 0.87, 0.81, 0.77, 0.71, 0.65, 0.60, 0.45],
-).astype(np.float32)
+_KNOTS, _FACTORS = np.array(TABLES["reflectance by distance"]).T
+_DISTANCE_FACTOR = np.interp(np.arange(0, 130, _STEP), _KNOTS, _FACTORS).astype(
+    np.float32
+)
 """Factor of reflectance by distance, in steps of ``_STEP`` metres."""
 _KNEE = 0.30
 _SLOPE = 3.0
@@ -103,54 +102,39 @@ def cell_noise(points: Floats, size: float) -> Floats:
 def see_through(
     snapshot: Snapshot,
     hits: SceneHits,
-    origins: Floats,
-    directions: Floats,
     eye: Floats,
     surfaces: SurfaceTable,
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> None:
     """Continue, in place, the rays that pass through glass, wire mesh and leaves, through at most
     three layers."""
-    rays = np.flatnonzero(hits.surface != MISS)
+    rays = hits.found()
     for _ in range(3):
-        share = _TRANSMISSION[surfaces.material[hits.surface[rays]]]
-        rays = rays[share > 0]
-        share = share[share > 0]
-        pane = _GLOSS[surfaces.material[hits.surface[rays]]] > 0
+        material = surfaces.material[hits.surface[rays]]
+        open_ = _TRANSMISSION[material] > 0
+        rays = rays[open_]
+        material = material[open_]
         sample = rng.random(len(rays), np.float32)
-        glass = rays[pane]
-        sample[pane] = cell_noise(
-            origins[glass] + hits.distance[glass, None] * directions[glass], 0.4
-        )
-        rays = rays[sample < share]
+        pane = _GLOSS[material] > 0
+        sample[pane] = cell_noise(hits.places(rays[pane]), 0.4)
+        rays = rays[sample < _TRANSMISSION[material]]
         if not len(rays):
             return
-        start = hits.distance[rays] + np.float32(0.004)
-        beyond = snapshot.cast(
-            origins[rays] + start[:, None] * directions[rays], directions[rays], eye
-        )
-        hits.distance[rays] = start + beyond.distance
-        hits.surface[rays] = beyond.surface
-        hits.normal[rays] = beyond.normal
-        rays = rays[beyond.surface != MISS]
+        rays = snapshot.cast_on(hits, rays, 0.004, eye)
 
 
 def measure(
     hits: SceneHits,
-    origins: Floats,
-    directions: Floats,
     laser: NDArray[np.intp],
     surfaces: SurfaceTable,
     gains: Floats,
     noise: ReturnNoise,
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Sample which rays return, and their range and reflectance.
 
     Args:
         hits: the hits of N rays.
-        origins: (N, 3) metres, world frame.
-        directions: (N, 3) unit vectors.
         laser: (N,) the laser of each ray.
         surfaces: the surfaces of the scene.
         gains: (H,) gain of each laser.
@@ -160,35 +144,44 @@ def measure(
     Returns:
         (M,) indices of the rays that return, (M,) ranges in metres and (M,) reflectances in [0, 1).
     """
-    hit = np.flatnonzero(hits.surface != MISS)
-    surface = hits.surface[hit]
-    distance = hits.distance[hit]
+    rays = hits.found()
+    surface = hits.surface[rays]
     material = surfaces.material[surface]
-    facing = np.abs(np.einsum("ij,ij->i", hits.normal[hit], directions[hit]))
-    power = surfaces.reflectance[surface] * (
-        1 - _GLOSS[material] * (1 - facing * facing)
-    )
-    probability = (1 - _DROPOUT[material]) * _return_probability(
-        power, facing, distance, noise
-    )
-    kept = np.flatnonzero(rng.random(len(hit), np.float32) < probability)
-    hit = hit[kept]
-    distance = distance[kept]
+    normal = hits.normal[rays]
+    facing = np.abs(np.einsum("ij,ij->i", normal, hits.directions[rays]))
+    sheen = _GLOSS[material] * (1 - facing * facing)
+    power = surfaces.reflectance[surface] * (1 - sheen)
+    returned = _return_probability(power, facing, hits.distance[rays], noise)
+    probability = (1 - _DROPOUT[material]) * returned
+    kept = np.flatnonzero(rng.random(len(rays), np.float32) < probability)
+    rays = rays[kept]
     material = material[kept]
-    power = power[kept]
-    facing = facing[kept]
-    gaussian = rng.standard_normal((3, len(hit)), np.float32)
-    slope = facing + _GRAZING[material]
-    shift = _displacement(
-        material, origins[hit], directions[hit], distance, gaussian[1:]
-    ) / np.clip(slope, _FLATTEST, 1)
-    measured = distance + np.clip(shift, -_DEEPEST * distance, _DEEPEST * distance)
-    measured += np.float32(noise.range_std) * gaussian[1]
-    value = _response(power * gains[laser[hit]], slope, distance)
+    gaussian = rng.standard_normal((3, len(rays)), np.float32)
+    slope = facing[kept] + _GRAZING[material]
+    far = _measure_range(hits, rays, material, slope, gaussian[1:])
+    far += np.float32(noise.range_std) * gaussian[1]
+    value = _response(power[kept] * gains[laser[rays]], slope, hits.distance[rays])
     value += _SPECKLE[material] * gaussian[0] * np.minimum(1, 4 * value)
-    value = value * (rng.random(len(hit), np.float32) > _ZERO_SHARE)
+    value = value * (rng.random(len(rays), np.float32) > _ZERO_SHARE)
     reflectance = np.floor(np.clip(value, 0, 0.995) * LEVELS) / LEVELS
-    return hit, measured, reflectance.astype(np.float32)
+    return rays, far, reflectance.astype(np.float32)
+
+
+def _measure_range(
+    hits: SceneHits,
+    rays: NDArray[np.intp],
+    material: NDArray[np.uint8],
+    slope: Floats,
+    gaussian: Floats,
+) -> Floats:
+    """(K,) metres to soft and rough surfaces, which lie before or behind their triangle."""
+    behind = _ROUGHNESS[material] * gaussian[0] * np.exp(_TAIL * gaussian[1])
+    soft = np.flatnonzero(_RELIEF[material])
+    behind[soft] += _RELIEF[material[soft]] * sample_relief(hits.places(rays[soft]))
+    distance = hits.distance[rays]
+    limit = _DEEPEST * distance
+    shift = np.clip(behind / np.clip(slope, _FLATTEST, 1), -limit, limit)
+    return np.asarray(distance + shift)
 
 
 def _return_probability(
@@ -206,31 +199,10 @@ def _return_probability(
 def _response(power: Floats, slope: Floats, distance: Floats) -> Floats:
     """(N,) the reflectance that the sensor gives for a reflected power, 0 and more, without
     noise."""
-    distance_bin = np.minimum(
-        distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1
-    ).astype(np.int32)
-    value = (
-        power * _DISTANCE_FACTOR[distance_bin] * np.clip((slope - 0.015) / 0.06, 0, 1)
-    )
-    value = value + np.float32(_RISE - 1) * np.maximum(value - np.float32(_SHOULDER), 0)
-    return np.asarray(
-        np.maximum(
-            np.where(value < _KNEE, _SLOPE * value - (_SLOPE - 1) * _KNEE, value), 0
-        )
-    )
-
-
-def _displacement(
-    material: NDArray[np.uint8],
-    origins: Floats,
-    directions: Floats,
-    distance: Floats,
-    gaussian: Floats,
-) -> Floats:
-    """(N,) metres by which the surface at each hit lies behind its triangle."""
-    displaced = _ROUGHNESS[material] * gaussian[0] * np.exp(_TAIL * gaussian[1])
-    soft = np.flatnonzero(_RELIEF[material])
-    displaced[soft] += _RELIEF[material[soft]] * relief(
-        origins[soft] + distance[soft, None] * directions[soft]
-    )
-    return np.asarray(displaced)
+    place = np.minimum(distance * np.float32(1 / _STEP), len(_DISTANCE_FACTOR) - 1)
+    factor = _DISTANCE_FACTOR[place.astype(np.int32)]
+    value = power * factor * np.clip((slope - 0.015) / 0.06, 0, 1)
+    bright = np.maximum(value - np.float32(_SHOULDER), 0)
+    value = value + np.float32(_RISE - 1) * bright
+    dark = _SLOPE * value - (_SLOPE - 1) * _KNEE
+    return np.asarray(np.maximum(np.where(value < _KNEE, dark, value), 0))

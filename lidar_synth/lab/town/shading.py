@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 
 from lidar_synth.lab.town.camera import CAMERA, all_pixels, pixel_rays
 from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
+from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.materials import INDEX, SurfaceTable, column
+from lidar_synth.lab.town.meshes import Floats
 from lidar_synth.lab.town.returns import cell_noise
 from lidar_synth.lab.town.scene import Pose
 
-Floats = NDArray[np.float32]
 _GRAIN = column("grain")
 _GLOSS = column("gloss")
-_GLASS = np.array([INDEX["glass"], INDEX["carglass"]])
-_OPEN_SHARE = {INDEX["leaf"]: 0.42, INDEX["wire"]: 0.78}
-"""Share of each of these materials that is open to camera rays."""
+_GLASS = [INDEX["glass"], INDEX["carglass"]]
+_FOLIAGE = [INDEX["leaf"], INDEX["grass"]]
+_OPEN_SHARES = np.zeros(len(INDEX))
+"""Share of each material that is open to camera rays."""
+_OPEN_SHARES[[INDEX["leaf"], INDEX["wire"]]] = 0.42, 0.78
 
 
 @dataclass(frozen=True)
@@ -42,41 +45,38 @@ class Light:
     cloud: float
 
 
-def sample_light(rng: np.random.Generator) -> Light:
+def sample_light(rng: Rng) -> Light:
     """A random time of day and weather."""
     height = np.radians(rng.uniform(25, 62))
     azimuth = rng.uniform(0, 2 * np.pi)
-    sun = np.array(
-        [
-            np.cos(azimuth) * np.cos(height),
-            np.sin(azimuth) * np.cos(height),
-            np.sin(height),
-        ],
-        np.float32,
-    )
+    level = np.cos(height)
+    sun = (np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(height))
     cloud = float(np.clip(rng.normal(0.3, 0.4), 0, 1))
-    return Light(sun, 3.0 * (1 - cloud) ** 0.7, 0.55 + 0.45 * cloud, cloud)
+    direct = 3.0 * (1 - cloud) ** 0.7
+    return Light(np.array(sun, np.float32), direct, 0.55 + 0.45 * cloud, cloud)
 
 
 def sky(directions: Floats, light: Light) -> Floats:
     """(N, 3) linear RGB of the sky along unit vectors; overexposed at the horizon and near the sun,
     as in photos."""
     up = np.clip(directions[:, 2:], 0, 1)
-    blue = (
-        np.array([0.22, 0.44, 0.86], np.float32) * (1 - light.cloud)
-        + 0.85 * light.cloud
-    )
-    colour = blue * up**0.45 + np.array([1.0, 1.02, 1.04], np.float32) * (1 - up**0.45)
-    flat: Floats = (directions[:, :2] / (up + 0.12)).astype(np.float32)
-    puffs = np.sum([_value_noise(flat * k, k) / k for k in (1.5, 3.0, 6.0)], axis=0)[
-        :, None
-    ]
-    white = np.clip(2.2 * (puffs - 0.62 + 0.35 * light.cloud), 0, 1) * up**0.3
+    zenith = up**0.45
+    clear = np.array([0.22, 0.44, 0.86], np.float32)
+    horizon = np.array([1.0, 1.02, 1.04], np.float32)
+    blue = clear * (1 - light.cloud) + 0.85 * light.cloud
+    colour = blue * zenith + horizon * (1 - zenith)
+    white = _clouds(directions[:, :2] / (up + 0.12), light.cloud) * up**0.3
     colour = colour * (1 - white) + 1.05 * white
     near = np.clip(directions @ light.sun, 0, 1)[:, None]
-    return np.asarray(
-        colour + light.direct * (0.25 * near**8 + 2 * near**300), np.float32
-    )
+    glare = 0.25 * near**8 + 2 * near**300
+    return np.asarray(colour + light.direct * glare, np.float32)
+
+
+def _clouds(places: Floats, cover: float) -> Floats:
+    """(N, 1) how white clouds are at places (N, 2) of the sky, 0..1."""
+    octaves = [_value_noise(places * k, k) / k for k in (1.5, 3.0, 6.0)]
+    puffs = np.sum(octaves, axis=0)[:, None]
+    return np.asarray(np.clip(2.2 * (puffs - 0.62 + 0.35 * cover), 0, 1))
 
 
 def _value_noise(places: Floats, layer: float) -> Floats:
@@ -86,12 +86,11 @@ def _value_noise(places: Floats, layer: float) -> Floats:
     f = places - base
     f = f * f * (3 - 2 * f)
     value = np.zeros(len(places), np.float32)
-    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        weight = (f[:, 0] if i else 1 - f[:, 0]) * (f[:, 1] if j else 1 - f[:, 1])
-        corner = np.column_stack(
-            [base[:, 0] + i, base[:, 1] + j, np.full(len(base), layer)]
-        )
-        value += weight * cell_noise(corner.astype(np.float32) + np.float32(0.5), 1.0)
+    cell = np.insert(base, 2, layer, axis=1) + np.float32(0.5)
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        shares = np.where(corner, f, 1 - f)
+        noise = cell_noise(cell + np.array((*corner, 0), np.float32), 1.0)
+        value += shares[:, 0] * shares[:, 1] * noise
     return value
 
 
@@ -103,31 +102,25 @@ def camera_hits(
 ) -> SceneHits:
     """The first hits of camera rays: as ``Snapshot.cast``, but rays pass through the gaps of
     foliage and wire mesh."""
-    origins = np.broadcast_to(eye, directions.shape)
-    hits = snapshot.cast(origins, directions, eye)
-    rays = np.flatnonzero(hits.surface != MISS)
+    hits = snapshot.cast(np.broadcast_to(eye, directions.shape), directions, eye)
+    rays = hits.found()
     for _ in range(4):
-        material = surfaces.material[hits.surface[rays]]
-        share = np.select(
-            [material == m for m in _OPEN_SHARE], list(_OPEN_SHARE.values()), 0.0
-        )
+        share = _OPEN_SHARES[surfaces.material[hits.surface[rays]]]
         rays = rays[share > 0]
-        share = share[share > 0]
-        place = eye + hits.distance[rays, None] * directions[rays]
-        rays = rays[cell_noise(place, 0.035) < share]
+        rays = rays[cell_noise(hits.places(rays), 0.035) < share[share > 0]]
         if not len(rays):
             break
-        start = hits.distance[rays] + np.float32(0.01)
-        beyond = snapshot.cast(
-            origins[rays] + start[:, None] * directions[rays], directions[rays], eye
-        )
-        hits.distance[rays], hits.surface[rays], hits.normal[rays] = (
-            start + beyond.distance,
-            beyond.surface,
-            beyond.normal,
-        )
-        rays = rays[beyond.surface != MISS]
+        rays = snapshot.cast_on(hits, rays, 0.01, eye)
     return hits
+
+
+_JOINTS = (
+    ("brick", 0.075, 0.25, 14),
+    ("tile", 0.33, 0.26, 45),
+    ("stone", 0.24, 0.45, 30),
+)
+"""Walls and roofs with joints: height and width of a stone, metres, and the distance up to which
+they are seen."""
 
 
 def _texture(
@@ -143,20 +136,13 @@ def _texture(
     coarse = cell_noise(place, 0.55) - 0.5
     value = 1 + _GRAIN[material] * (1.1 * fine + 0.5 * coarse)
     along = place[:, 0] * -normal[:, 1] + place[:, 1] * normal[:, 0]
-    for name, height, width, near in (
-        ("brick", 0.075, 0.25, 14),
-        ("tile", 0.33, 0.26, 45),
-        ("stone", 0.24, 0.45, 30),
-    ):
+    for name, height, width, near in _JOINTS:
         rays = np.flatnonzero((material == INDEX[name]) & (far < near))
-        row = np.floor(place[rays, 2] / height)
-        edge = (place[rays, 2] / height % 1 < 0.16) | (
-            (along[rays] / width + 0.5 * row) % 1 < 0.07
-        )
-        value[rays] *= np.where(edge, 0.72, 1)
-    rays = np.flatnonzero(
-        (material == INDEX["paving"]) & (far < 14) & (normal[:, 2] > 0.8)
-    )
+        level = place[rays, 2] / height
+        upright = (along[rays] / width + 0.5 * np.floor(level)) % 1 < 0.07
+        value[rays] *= np.where((level % 1 < 0.16) | upright, 0.72, 1)
+    slabs = (material == INDEX["paving"]) & (far < 14) & (normal[:, 2] > 0.8)
+    rays = np.flatnonzero(slabs)
     value[rays] *= np.where((place[rays, :2] / 0.4 % 1 < 0.05).any(1), 0.8, 1)
     return value.astype(np.float32)
 
@@ -170,56 +156,55 @@ def shade(
 ) -> tuple[Floats, SceneHits]:
     """Linear RGB (N, 3) along camera rays, and their hits."""
     hits = camera_hits(snapshot, eye, directions, surfaces)
-    missed = hits.surface == MISS
     image = np.empty_like(directions)
+    missed = hits.surface == MISS
     image[missed] = sky(directions[missed], light)
-    rays = np.flatnonzero(~missed)
+    rays = hits.found()
     ray = directions[rays]
     far = hits.distance[rays]
     surface = hits.surface[rays]
-    normal = (
-        hits.normal[rays]
-        * -np.sign(np.einsum("ij,ij->i", hits.normal[rays], ray))[:, None]
-    )
-    place = eye + far[:, None] * ray
+    normal = hits.normal[rays]
+    normal = normal * -np.sign(np.einsum("ij,ij->i", normal, ray))[:, None]
+    place = hits.places(rays)
     material = surfaces.material[surface]
-    colour = (
-        surfaces.colour[surface] ** 2.2
-        * _texture(place, normal, far, material)[:, None]
-    )
-    # Light passes through foliage: both sides of its triangles are lit.
-    leaf = (material == INDEX["leaf"]) | (material == INDEX["grass"])
-    facing = normal @ light.sun
-    facing = np.where(leaf, 0.35 + 0.5 * np.abs(facing), np.clip(facing, 0, 1))
-    lit = np.zeros(len(rays), np.float32)
-    if light.direct > 0.1:
-        test = np.flatnonzero(facing > 0)
-        start = place[test] + 0.02 * normal[test]
-        lit[test] = (
-            snapshot.cast(
-                start, np.ascontiguousarray(np.broadcast_to(light.sun, start.shape))
-            ).surface
-            == MISS
-        )
+    texture = _texture(place, normal, far, material)
+    colour = surfaces.colour[surface] ** 2.2 * texture[:, None]
+    facing = _facing(normal, material, light)
+    lit = _lit(snapshot, place, normal, facing, light)
     under = 0.55 + 0.45 * normal[:, 2]
     glow = light.ambient * under[:, None] * np.array([0.92, 0.98, 1.08], np.float32)
-    shaded = colour * (
-        glow
-        + light.direct
-        * (lit * facing)[:, None]
-        * np.array([1.06, 1.0, 0.90], np.float32)
-    )
-    _reflect(
-        shaded,
-        ray,
-        normal,
-        material,
-        lit,
-        light,
-    )
+    warm = np.array([1.06, 1.0, 0.90], np.float32)
+    shaded = colour * (glow + light.direct * (lit * facing)[:, None] * warm)
+    _reflect(shaded, ray, normal, material, lit, light)
     haze = 1 - np.exp(-far / 700)[:, None]
     image[rays] = shaded * (1 - haze) + haze * np.array([0.85, 0.9, 0.97], np.float32)
     return image, hits
+
+
+def _facing(normal: Floats, material: NDArray[np.uint8], light: Light) -> Floats:
+    """(N,) share of the sunlight that surfaces reflect by their direction."""
+    facing = normal @ light.sun
+    # Light passes through foliage: both sides of its triangles are lit.
+    leaf = np.isin(material, _FOLIAGE)
+    lit = np.where(leaf, 0.35 + 0.5 * np.abs(facing), np.clip(facing, 0, 1))
+    return np.asarray(lit)
+
+
+def _lit(
+    snapshot: Snapshot,
+    place: Floats,
+    normal: Floats,
+    facing: Floats,
+    light: Light,
+) -> Floats:
+    """(N,) 1 where the sun is seen from a place, 0 in the shadow."""
+    lit = np.zeros(len(place), np.float32)
+    if light.direct > 0.1:
+        test = np.flatnonzero(facing > 0)
+        start = place[test] + 0.02 * normal[test]
+        towards = np.ascontiguousarray(np.broadcast_to(light.sun, start.shape))
+        lit[test] = snapshot.cast(start, towards).surface == MISS
+    return lit
 
 
 def _reflect(
@@ -237,12 +222,10 @@ def _reflect(
     mirrored = ray[rays] - 2 * across[:, None] * normal[rays]
     above = np.clip((mirrored[:, 2:] - 0.12) * 4, 0, 1)
     picture = above * sky(mirrored, light) + (1 - above) * 0.16 * light.ambient
-    glass = np.isin(material[rays], _GLASS)
-    share = np.where(glass, 0.18, 0.05) + 0.75 * (1 - np.abs(across)) ** 4
-    shaded[rays] = shaded[rays] * (1 - share[:, None]) + share[:, None] * np.minimum(
-        picture, 1.6
-    )
+    base = np.where(np.isin(material[rays], _GLASS), 0.18, 0.05)
+    share = (base + 0.75 * (1 - np.abs(across)) ** 4)[:, None]
     glint = np.clip(mirrored @ light.sun, 0, 1) ** 90 * lit[rays] * light.direct
+    shaded[rays] = shaded[rays] * (1 - share) + share * np.minimum(picture, 1.6)
     shaded[rays] += 0.8 * glint[:, None]
 
 
@@ -251,7 +234,7 @@ def render(
     pose: Pose,
     surfaces: SurfaceTable,
     light: Light,
-    rng: np.random.Generator,
+    rng: Rng,
 ) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB camera image of the scene.
 
@@ -268,15 +251,14 @@ def render(
     eye, rays = pixel_rays(pose, pixels)
     image, hits = shade(snapshot, eye, rays, surfaces, light)
     edge = np.flatnonzero(_edges(hits, height, width).ravel())
-    for du, dv in ((0.33, 0.33), (-0.33, 0.33), (0.0, -0.33)):
-        _, more = pixel_rays(pose, pixels[edge] + (du, dv))
+    for shift in ((0.33, 0.33), (-0.33, 0.33), (0.0, -0.33)):
+        _, more = pixel_rays(pose, pixels[edge] + shift)
         image[edge] += np.minimum(shade(snapshot, eye, more, surfaces, light)[0], 1.3)
     image[edge] /= 4
     value = image.reshape(height, width, 3)
     value *= _exposure(value)
-    value += rng.standard_normal(value.shape, np.float32) * (
-        0.004 + 0.012 * np.sqrt(np.clip(value, 0, 1))
-    )
+    grain = 0.004 + 0.012 * np.sqrt(np.clip(value, 0, 1))
+    value += rng.standard_normal(value.shape, np.float32) * grain
     return tone_map(value)
 
 

@@ -7,7 +7,6 @@ of them.
 
 import hashlib
 import json
-from collections import OrderedDict
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,10 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
 from lidar_synth.lab.town.cast import Snapshot
-from lidar_synth.lab.town.ego import HEIGHT, free_rays
+from lidar_synth.lab.town.catalogue import Rng
+from lidar_synth.lab.town.ego import HEIGHT, free_rays, point_rays
 from lidar_synth.lab.town.materials import SurfaceTable
+from lidar_synth.lab.town.meshes import Floats, Ints
 from lidar_synth.lab.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.lab.town.returns import ReturnNoise, laser_gains, measure, see_through
 from lidar_synth.lab.town.scene import Pose
@@ -104,31 +105,25 @@ class Town:
         self._noise = noise or (ReturnNoise(gain_std=0) if self.skin else ReturnNoise())
         self._scans = scans
         self._motion = motion
-        self._worlds: OrderedDict[int, World] = OrderedDict()
+        self._worlds: dict[int, World] = {}
+        self._fire()
+        self._gains = laser_gains(self.sensor, self._noise)
+
+    def _fire(self) -> None:
+        """The rays of one turn, in the order in which the sensor writes points: ring by ring from
+        the top, counter-clockwise from straight ahead."""
         elevation, height = self.sensor.optics()
-        # The order in which the sensor writes points: ring by ring from the top, counter-clockwise
-        # from straight ahead.
         azimuths = self.sensor.firing_azimuths()
         order = np.argsort(-azimuths % (2 * np.pi), axis=1)
-        self._laser, place = np.nonzero(
-            np.take_along_axis(free_rays(self.sensor), order, 1)
-        )
+        free = np.take_along_axis(free_rays(self.sensor), order, 1)
+        self._laser, place = np.nonzero(free)
         azimuth = azimuths[self._laser, order[self._laser, place]]
-        tilt = elevation[self._laser]
-        self._rays = np.stack(
-            [
-                np.cos(azimuth) * np.cos(tilt),
-                -np.sin(azimuth) * np.cos(tilt),
-                np.sin(tilt),
-            ],
-            1,
-        ).astype(np.float32)
+        rays = point_rays(azimuth, elevation[self._laser])
+        self._rays = rays.astype(np.float32)
         self._heights = height[self._laser].astype(np.float32)
         # It turns counter-clockwise and looks straight ahead at the moment of the pose.
-        self._turned = (-(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5).astype(
-            np.float32
-        )
-        self._gains = laser_gains(self.sensor, self._noise)
+        turned = -(azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) - 0.5
+        self._turned = turned.astype(np.float32)
 
     def __reduce__(self) -> tuple[type["Town"], tuple[object, ...]]:
         return Town, (
@@ -145,26 +140,19 @@ class Town:
     def provenance(self) -> dict[str, Any]:
         """Where the scans come from: the town's seed and interval, and its skin with the licence of
         that."""
-        skin = (
-            {}
-            if self.skin is None
-            else {
-                "skin": self.skin.digest,
-                "skin_licence": self.skin.provenance["licence"],
-            }
-        )
-        return {"made_by": "town", "seed": self.seed, "interval": self.interval, **skin}
+        made = {"made_by": "town", "seed": self.seed, "interval": self.interval}
+        if self.skin is None:
+            return made
+        licence = self.skin.provenance["licence"]
+        return made | {"skin": self.skin.digest, "skin_licence": licence}
 
     @property
     def settings(self) -> dict[str, Any]:
         """Plain values that determine the scans, apart from their number."""
-        plain = {
+        return {
             "seed": self.seed,
             "interval": self.interval,
             "sensor": self.sensor.to_dict(),
-        }
-        return {
-            **plain,
             "noise": asdict(self._noise),
             "motion": self._motion,
             "skin": self.skin and self.skin.digest,
@@ -173,9 +161,8 @@ class Town:
     @property
     def identity(self) -> str:
         """A text that tells it from other towns."""
-        digest = hashlib.sha256(
-            json.dumps(self.settings, sort_keys=True).encode()
-        ).hexdigest()
+        text = json.dumps(self.settings, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()
         return f"town:{len(self)}:{digest[:16]}"
 
     @property
@@ -194,25 +181,22 @@ class Town:
         """The stretch of road of a scan; the last two stretches are cached."""
         stretch = index // STRETCH_FRAMES
         if stretch not in self._worlds:
-            if len(self._worlds) > 1:
-                self._worlds.popitem(last=False)
+            self._worlds = dict(list(self._worlds.items())[-1:])
             self._worlds[stretch] = build_world(self.seed, stretch, self.interval)
         return self._worlds[stretch]
 
-    def moment(self, index: int) -> tuple[Snapshot, Pose, np.random.Generator]:
+    def moment(self, index: int) -> tuple[Snapshot, Pose, Rng]:
         """The scene of a scan, the sensor's pose in its stretch, and the random generator of the
         scan."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
         rng = rng_for(SCAN, self.seed, stretch, frame)
         world = self.world(index)
         time = frame * self.interval
-        pose = ego_pose(
-            world.street, world.scene, time, HEIGHT, rng.normal(0, 0.003, 2)
-        )
+        sway = rng.normal(0, 0.003, 2)
+        pose = ego_pose(world.street, world.scene, time, HEIGHT, sway)
         about = ego_place(world.street, time)[:2]
-        movers = place_movers(
-            world.movers, world.scene, time, about, self.sensor.range_max + 20
-        )
+        reach = self.sensor.range_max + 20
+        movers = place_movers(world.movers, world.scene, time, about, reach)
         return Snapshot(world, movers), pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
@@ -222,18 +206,13 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        snapshot, pose, _ = self.moment(self._checked(index))
+        snapshot, pose, _ = self.moment(self._check(index))
         stretch, frame = divmod(index, STRETCH_FRAMES)
         light = sample_light(rng_for(LIGHT, self.seed, stretch))
-        return render(
-            snapshot,
-            pose,
-            self.world(index).surfaces,
-            light,
-            rng_for(IMAGE, self.seed, stretch, frame),
-        )
+        rng = rng_for(IMAGE, self.seed, stretch, frame)
+        return render(snapshot, pose, self.world(index).surfaces, light, rng)
 
-    def _checked(self, index: int) -> int:
+    def _check(self, index: int) -> int:
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of a town of {len(self)} scans")
         return index
@@ -244,18 +223,19 @@ class Town:
         Raises:
             IndexError: on an index outside 0 to ``len - 1``.
         """
-        snapshot, pose, rng = self.moment(self._checked(index))
+        snapshot, pose, rng = self.moment(self._check(index))
         world = self.world(index)
-        laser, surface, points, reflectance = self._turn(
-            snapshot, pose, self._travelled(index), world.surfaces, rng
+        travelled = self._travelled(index)
+        rays, surface, points, reflectance = self._turn(
+            snapshot, pose, travelled, world.surfaces, rng
         )
         raw = world.surfaces.raw[surface]
         instance = world.surfaces.instance[surface]
-        returned = np.bincount(instance, minlength=world.scene.instances + 1)
+        returned = set(instance.tolist())
         objects = [
             o
             for o in (*world.scene.placed, *snapshot.movers)
-            if o.prototype.name and returned[o.instance]
+            if o.prototype.name and o.instance in returned
         ]
         placed = pose.copy()
         placed[0, 3] += APART * (index // STRETCH_FRAMES)
@@ -266,7 +246,7 @@ class Town:
             label=SEMANTIC_KITTI.decode(world.surfaces.raw)[surface],
             raw_label=raw | instance.astype(np.uint32) << np.uint32(16),
             instance=instance,
-            ring=laser.astype(np.int16),
+            ring=self._laser[rays].astype(np.int16),
             boxes=boxes_of(objects, pose, snapshot),
             pose=placed,
             id=f"town-{self.seed}-{index:06d}",
@@ -274,80 +254,55 @@ class Town:
             provenance=self.provenance,
         )
 
-    def _travelled(self, index: int) -> NDArray[np.float32]:
+    def _travelled(self, index: int) -> Floats:
         """(3,) metres that the ego vehicle drives during the revolution of a scan, in the world
         frame."""
-        if not self._motion:
-            return np.zeros(3, np.float32)
         world = self.world(index)
         time = index % STRETCH_FRAMES * self.interval
         still = np.zeros(2)
-        ends = [
+        half = REVOLUTION / 2 if self._motion else 0.0
+        before, after = (
             ego_pose(world.street, world.scene, time + t, HEIGHT, still)
-            for t in (-REVOLUTION / 2, REVOLUTION / 2)
-        ]
-        return (ends[1] - ends[0])[:3, 3].astype(np.float32)
+            for t in (-half, half)
+        )
+        return (after - before)[:3, 3].astype(np.float32)
 
     def _turn(
         self,
         snapshot: Snapshot,
         pose: Pose,
-        travelled: NDArray[np.float32],
+        travelled: Floats,
         surfaces: SurfaceTable,
-        rng: np.random.Generator,
-    ) -> tuple[
-        NDArray[np.intp], NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]
-    ]:
-        """Laser, surface number, point in the sensor frame and reflectance of each return of one
+        rng: Rng,
+    ) -> tuple[NDArray[np.intp], Ints, Floats, Floats]:
+        """Ray, surface number, point in the sensor frame and reflectance of each return of one
         revolution.
 
         The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion
         compensated scans.
         """
         turn = pose[:3, :3].astype(np.float32)
-        directions = self._rays @ turn.T
         moved = self._turned[:, None] * travelled
         eye = pose[:3, 3].astype(np.float32)
         origins = eye + moved + self._heights[:, None] * turn[:, 2]
-        hits = snapshot.cast(origins, directions, eye)
-        see_through(
-            snapshot,
-            hits,
-            origins,
-            directions,
-            eye,
-            surfaces,
-            rng,
+        hits = snapshot.cast(origins, self._rays @ turn.T, eye)
+        see_through(snapshot, hits, eye, surfaces, rng)
+        rays, far, reflectance = measure(
+            hits, self._laser, surfaces, self._gains, self._noise, rng
         )
-        back, far, reflectance = measure(
-            hits,
-            origins,
-            directions,
-            self._laser,
-            surfaces,
-            self._gains,
-            self._noise,
-            rng,
-        )
-        points = far[:, None] * self._rays[back]
-        points[:, 2] += self._heights[back]
-        points += moved[back] @ turn
+        points = far[:, None] * self._rays[rays]
+        points[:, 2] += self._heights[rays]
+        points += moved[rays] @ turn
+        kept = np.ones(len(rays), bool)
         if self.skin is not None:
-            boxed = surfaces.instance[hits.surface[back]] > 0
-            dressed = self.skin.apply(
-                points, reflectance, self._laser[back], boxed, rng
-            )
-            points += dressed.shift[:, None] * self._rays[back]
-            back = back[dressed.kept]
-            points = points[dressed.kept]
-            reflectance = dressed.reflectance[dressed.kept]
+            boxed = surfaces.instance[hits.surface[rays]] > 0
+            laser = self._laser[rays]
+            dressed = self.skin.apply(points, reflectance, laser, boxed, rng)
+            points += dressed.shift[:, None] * self._rays[rays]
+            reflectance = dressed.reflectance
+            kept = dressed.kept
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
-        kept = np.flatnonzero(
-            (distance >= self.sensor.range_min) & (distance <= self.sensor.range_max)
-        )
-        return (
-            self._laser[back[kept]],
-            hits.surface[back[kept]],
-            points[kept],
-            reflectance[kept],
-        )
+        kept &= distance >= self.sensor.range_min
+        kept &= distance <= self.sensor.range_max
+        rays = rays[kept]
+        return rays, hits.surface[rays], points[kept], reflectance[kept]

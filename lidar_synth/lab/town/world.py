@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lidar_synth.lab.town.backdrop import close_ends, line_horizon, line_side_streets
 from lidar_synth.lab.town.catalogue import Rng, pick
 from lidar_synth.lab.town.course import Course, Relief
-from lidar_synth.lab.town.furnish import furnish
+from lidar_synth.lab.town.furnish import furnish_street
 from lidar_synth.lab.town.ground import KINDS, TownGround
 from lidar_synth.lab.town.lots import paint_lots, sample_lots
 from lidar_synth.lab.town.materials import SurfaceTable
@@ -99,7 +99,7 @@ def build_world(seed: int, stretch: int, interval: float) -> World:
         build_lot(lot, street, scene, rng)
     close_ends(street, scene, rng)
     line_side_streets(street, scene, rng)
-    furnish(street, lots, scene, rng)
+    furnish_street(street, lots, scene, rng)
     line_horizon(street, scene, rng)
     movers = Traffic(street, scene, times, rng).movers
     mesh = scene.mesh()

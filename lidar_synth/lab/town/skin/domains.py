@@ -10,19 +10,20 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.projection import laser_rows
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.skin.features import (
+    BANDS,
     CELLS,
     HEIGHTS,
     KINDS,
-    RANGES,
     ROUGH,
     STRATA,
     Floats,
     Ints,
     RayFeatures,
+    find_features,
+    find_strata,
 )
-from lidar_synth.lab.town.skin.features import features as features_of
-from lidar_synth.lab.town.skin.features import strata as strata_of
 from lidar_synth.lab.town.skin.skin import PARTS
 from lidar_synth.lab.town.skin.tables import pool_quantiles
 
@@ -52,7 +53,7 @@ def returns_of(
     scan: Scan,
     lasers: Sensor,
     step: float,
-    rng: np.random.Generator,
+    rng: Rng,
     centred: bool,
 ) -> Returns:
     """The returns of a scan in the order of features.
@@ -68,19 +69,16 @@ def returns_of(
         DataError: on a scan that is not in ring order, or of another sensor.
     """
     rows = laser_rows(scan, lasers.by_beams())
-    points = scan.points
-    reflectance = scan.reflectance
-    boxed = np.zeros(len(points), bool) if scan.instance is None else scan.instance > 0
     if scan.ring is not None:
-        order = np.lexsort((np.arctan2(points[:, 1], points[:, 0]), rows))
-        boxed = boxed[order]
-        points = points[order]
-        reflectance = reflectance[order]
+        turn = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+        order = np.lexsort((turn, rows))
+        scan = scan[order]
         rows = rows[order]
+    points = scan.points
+    boxed = np.zeros(len(points), bool) if scan.instance is None else scan.instance > 0
     distance = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
-    away = np.abs(np.arcsin(points[:, 2] / distance) - lasers.laser_elevations[rows])[
-        distance > 5
-    ]
+    elevation = np.arcsin(points[:, 2] / distance)
+    away = np.abs(elevation - lasers.laser_elevations[rows])[distance > 5]
     if len(away) and np.median(away) > _ANOTHER:
         raise DataError(
             f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
@@ -88,11 +86,10 @@ def returns_of(
             "scans of this sensor",
         )
     dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step
-    bright = (reflectance + dither).astype(np.float32)
+    bright = (scan.reflectance + dither).astype(np.float32)
     laser = rows.astype(np.int32)
-    return Returns(
-        features_of(points, bright, laser, lasers), points, bright, laser, boxed
-    )
+    found = find_features(points, bright, laser, lasers)
+    return Returns(found, points, bright, laser, boxed)
 
 
 @dataclass(frozen=True)
@@ -112,27 +109,22 @@ class Domain:
     @classmethod
     def of(cls, scans: list[Returns]) -> "Domain":
         """Rank the roughness of the returns of some scans."""
-        cell, rough = (
-            np.concatenate([getattr(s.found, name) for s in scans])
-            for name in ("cell", "roughness")
-        )
-        coarse = np.arange(CELLS) // (len(RANGES) + 1)
-        [table] = pool_quantiles(
-            [(rough, cell)],
-            [np.arange(CELLS), coarse, np.zeros(CELLS, np.int64)],
-            ROUGH + 1,
-        )
+        cell = np.concatenate([s.found.cell for s in scans])
+        rough = np.concatenate([s.found.roughness for s in scans])
+        fine = np.arange(CELLS)
+        levels = [fine, fine // BANDS, 0 * fine]
+        [table] = pool_quantiles([(rough, cell)], levels, ROUGH + 1)
         cuts = np.ascontiguousarray(table[:, 1:-1])
-        return cls(scans, cuts, [strata_of(s.found, cuts) for s in scans])
+        return cls(scans, cuts, [find_strata(s.found, cuts) for s in scans])
 
 
-def levels(parts: int = 1) -> list[NDArray[np.int64]]:
+def _pool_levels(parts: int = 1) -> list[NDArray[np.int64]]:
     """From fine to coarse, the set of strata to which each stratum belongs: without range, without
     height, all."""
     stratum, part = np.divmod(np.arange(STRATA * parts), parts)
     cell, rank = np.divmod(stratum, ROUGH)
-    place = cell // (len(RANGES) + 1)
-    kind = cell // ((len(RANGES) + 1) * (len(HEIGHTS) + 1))
+    place = cell // BANDS
+    kind = place // (len(HEIGHTS) + 1)
     assert kind.max() == len(KINDS) - 1
     return [
         np.arange(STRATA * parts),
@@ -142,5 +134,5 @@ def levels(parts: int = 1) -> list[NDArray[np.int64]]:
     ]
 
 
-PART_LEVELS = levels(PARTS)
-STRATUM_LEVELS = levels()
+PART_LEVELS = _pool_levels(PARTS)
+STRATUM_LEVELS = _pool_levels()

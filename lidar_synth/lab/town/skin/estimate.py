@@ -17,7 +17,7 @@ from lidar_synth.lab.town.skin.features import (
     STRATUM_KIND,
     Floats,
     Ints,
-    features,
+    find_features,
 )
 from lidar_synth.lab.town.skin.skin import MEANS, RESIDUALS, Skin, part_of
 from lidar_synth.lab.town.skin.tables import FEWEST, pool_quantiles
@@ -36,7 +36,7 @@ LEVELS = {"mean": BAND_LEVELS, "residual": PART_LEVELS, "range": STRATUM_LEVELS}
 Pair = tuple[Floats, NDArray[np.integer]]
 
 
-def estimate(
+def estimate_skin(
     real: Domain,
     town: Domain,
     sensor: Sensor,
@@ -123,7 +123,7 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
         )
         far = np.maximum(np.linalg.norm(one.points, axis=1), 1e-3)
         points = one.points * (1 + dressed.shift / far)[:, None].astype(np.float32)
-        found = features(points, dressed.reflectance, one.rows, skin.sensor)
+        found = find_features(points, dressed.reflectance, one.rows, skin.sensor)
         scans.append(one._replace(found=found, bright=dressed.reflectance))
     now = _tables(replace(town, scans=scans), zeros, skin.arrays["mean_real"])
     arrays = dict(skin.arrays)

@@ -24,10 +24,10 @@ KINDS = ("level", "upright", "isolated")
 ROUGH = 4
 """Bins of the rank of roughness among the returns of the same range, kind and height in one
 domain."""
-CELLS = (len(RANGES) + 1) * len(KINDS) * (len(HEIGHTS) + 1)
+BANDS = len(RANGES) + 1
+CELLS = BANDS * len(KINDS) * (len(HEIGHTS) + 1)
 """Combinations of range, kind and height."""
 STRATA = CELLS * ROUGH
-BANDS = len(RANGES) + 1
 BAND = (np.arange(STRATA) // ROUGH % BANDS).astype(np.int32)
 """(STRATA,) the bin of range of each stratum."""
 STRATUM_KIND = (np.arange(STRATA) // (ROUGH * BANDS * (len(HEIGHTS) + 1))).astype(
@@ -68,7 +68,7 @@ class RayFeatures(NamedTuple):
     gap: Ints
 
 
-def features(
+def find_features(
     points: Floats,
     reflectance: Floats,
     ring: Ints,
@@ -123,7 +123,7 @@ def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
     return np.float32((np.argmax(smooth) + 1.5) / 20 - 5)
 
 
-def strata(found: RayFeatures, cuts: Floats) -> Ints:
+def find_strata(found: RayFeatures, cuts: Floats) -> Ints:
     """(N,) stratum of each return, by its cell and the rank of its roughness.
 
     Args:
@@ -134,6 +134,13 @@ def strata(found: RayFeatures, cuts: Floats) -> Ints:
 
 
 @njit(cache=True)
+def _apart(turn: Floats, i: int, j: int, firings: int) -> float:
+    """Firings between two returns of a ring."""
+    step = abs(turn[j] - turn[i])
+    return float(min(step, firings - step))
+
+
+@njit(cache=True)
 def _along(
     ring: Ints,
     turn: Floats,
@@ -141,9 +148,10 @@ def _along(
     reflectance: Floats,
     firings: int,
 ) -> tuple[Floats, Floats, Ints]:
+    """Mean reflectance, residual of the range, and gap of each return."""
     count = len(ring)
     mean = np.empty(count, np.float32)
-    residual = np.empty(count, np.float32)
+    residual = np.full(count, np.nan, np.float32)
     gap = np.zeros(count, np.int32)
     for i in range(count):
         total = reflectance[i]
@@ -152,28 +160,23 @@ def _along(
         for j in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, count)):
             if j == i or ring[j] != ring[i] or abs(distance[j] - distance[i]) > limit:
                 continue
-            step = abs(turn[j] - turn[i])
-            if min(step, firings - step) <= _FARTHEST:
+            if _apart(turn, i, j, firings) <= _FARTHEST:
                 total += reflectance[j]
                 weight += np.float32(1)
         mean[i] = total / weight
-        residual[i] = np.nan
-        if i + 1 < count and ring[i + 1] == ring[i]:
-            step = abs(turn[i + 1] - turn[i])
-            step = min(step, firings - step)
-            if abs(distance[i + 1] - distance[i]) <= limit and step <= _FARTHEST:
-                gap[i] = max(1, int(step + 0.5))
-            if i > 0 and ring[i - 1] == ring[i]:
-                back = abs(turn[i] - turn[i - 1])
-                back = min(back, firings - back)
-                if step < 3.5 and back < 3.5:
-                    value = distance[i] - (distance[i - 1] + distance[i + 1]) / 2
-                    ends = max(
-                        abs(distance[i - 1] - distance[i]),
-                        abs(distance[i + 1] - distance[i]),
-                    )
-                    if abs(value) < LARGEST and ends < LARGEST + limit:
-                        residual[i] = value
+        if i + 1 == count or ring[i + 1] != ring[i]:
+            continue
+        step = _apart(turn, i, i + 1, firings)
+        ahead = abs(distance[i + 1] - distance[i])
+        if ahead <= limit and step <= _FARTHEST:
+            gap[i] = max(1, int(step + 0.5))
+        if i == 0 or ring[i - 1] != ring[i]:
+            continue
+        if step < 3.5 and _apart(turn, i - 1, i, firings) < 3.5:
+            value = distance[i] - (distance[i - 1] + distance[i + 1]) / 2
+            ends = max(abs(distance[i - 1] - distance[i]), ahead)
+            if abs(value) < LARGEST and ends < LARGEST + limit:
+                residual[i] = value
     return mean, residual, gap
 
 
@@ -215,39 +218,38 @@ def _across(
     below = np.full(count, -1, np.int32)
     for i in range(count):
         for side in (1, -1):
-            row = ring[i] + side
-            if row < 0 or row >= rows:
-                continue
-            other = -1
-            for offset in (0, 1, -1, 2, -2):
-                other = table[row, (column[i] + offset) % firings]
-                if other >= 0:
-                    break
+            other = _nearest(table, ring[i] + side, column[i])
             if other < 0:
                 continue
             along = abs(level[i] - level[other])
             rise = abs(z[i] - z[other])
             if kind[i] == 2:
                 kind[i] = 0 if rise < _LEVEL * along else 1
-            if side == 1 and (
-                abs(distance[i] - distance[other]) < 0.1 + 0.02 * distance[i]
-                or rise < 0.05 * along
-            ):
+            step = abs(distance[i] - distance[other])
+            same = step < 0.1 + 0.02 * distance[i] or rise < 0.05 * along
+            if side == 1 and same:
                 below[i] = other
     return kind, below
+
+
+@njit(cache=True)
+def _nearest(table: Ints, row: int, column: int) -> int:
+    """The return of a ring at most two firings away, -1 if there is none."""
+    if 0 <= row < len(table):
+        for offset in (0, 1, -1, 2, -2):
+            other = table[row, (column + offset) % table.shape[1]]
+            if other >= 0:
+                return int(other)
+    return -1
 
 
 @njit(cache=True)
 def _cells(distance: Floats, kind: Ints, height: Floats) -> Ints:
     out = np.empty(len(distance), np.int32)
     for i in range(len(distance)):
-        a = 0
-        while a < len(RANGES) and distance[i] >= RANGES[a]:
-            a += 1
-        b = 0
-        while b < len(HEIGHTS) and height[i] >= HEIGHTS[b]:
-            b += 1
-        out[i] = (kind[i] * (len(HEIGHTS) + 1) + b) * (len(RANGES) + 1) + a
+        a = np.searchsorted(RANGES, distance[i], side="right")
+        b = np.searchsorted(HEIGHTS, height[i], side="right")
+        out[i] = (kind[i] * (len(HEIGHTS) + 1) + b) * BANDS + a
     return out
 
 

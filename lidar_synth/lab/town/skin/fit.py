@@ -19,7 +19,7 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.returns import LEVELS, ReturnNoise
 from lidar_synth.lab.town.skin.domains import Domain, returns_of
-from lidar_synth.lab.town.skin.estimate import estimate
+from lidar_synth.lab.town.skin.estimate import estimate_skin
 from lidar_synth.lab.town.skin.skin import Skin
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES
@@ -99,7 +99,7 @@ def fit_skin(
         "sha256": digest.hexdigest(),
         "town": {"version": version("lidar_synth"), "seed": seed, "scans": len(picked)},
     }
-    return estimate(
+    return estimate_skin(
         Domain.of(real),
         Domain.of(cast),
         own,

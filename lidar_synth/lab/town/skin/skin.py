@@ -29,8 +29,8 @@ from lidar_synth.lab.town.skin.features import (
     Floats,
     Ints,
     RayFeatures,
-    features,
-    strata,
+    find_features,
+    find_strata,
 )
 from lidar_synth.lab.town.skin.tables import lookup
 
@@ -190,10 +190,10 @@ class Skin:
         uniform = rng.random((2, len(points)), np.float32)
         bright = reflectance + uniform[0] * np.float32(TOWN_STEP)
         rows = np.ascontiguousarray(ring, np.int32)
-        found = features(points, bright, rows, self.sensor)
+        found = find_features(points, bright, rows, self.sensor)
         return self.dress(
             found,
-            strata(found, self.arrays["cuts"]),
+            find_strata(found, self.arrays["cuts"]),
             bright,
             rows,
             boxed,
