@@ -12,7 +12,7 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.proof import Job, Row
 from lidar_synth.lab.proof.command import write_scans
-from lidar_synth.lab.proof.pools import read_pool
+from lidar_synth.lab.proof.pools import POOLS, read_pool
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.objects import LABELS
@@ -67,7 +67,7 @@ def job(
     )
     named.save(folder / "pool" / "objects.npz")
     pool = read_pool(folder / "pool")
-    pools = dict.fromkeys(("town", "skin", "generator"), pool)
+    pools = dict.fromkeys(POOLS, pool)
     return Job(
         Row(name, ratio),
         "left out",

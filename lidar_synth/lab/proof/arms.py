@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidar_synth.errors import ConfigError, suggest
+from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
 
@@ -76,7 +77,7 @@ _RARE = {"bank": True, "turn": 180.0}
 RARE = {"Pedestrian": 3, "Person_sitting": 1, "Cyclist": 2, "Truck": 1, "Tram": 1}
 """Largest number of pasted objects in a scan by name of their boxes."""
 
-_TOWN = "labels of the town, which cost nothing"
+_TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
 GENERATOR_BUDGET = "what the generator was trained on"
 _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
 
@@ -84,11 +85,12 @@ PRETRAINING = 0.75
 """Share of the iterations on synthetic scans alone, in the arms that begin with them."""
 
 
-def _then_real(pool: str) -> tuple[ArmStage, ArmStage]:
-    """Synthetic scans first, then half real ones, at a lower learning rate."""
-    return ArmStage(PRETRAINING, 1, pool), ArmStage(
-        1 - PRETRAINING, 0.5, pool, rate=0.25
-    )
+def _then_real(pool: str, *ratios: float) -> tuple[ArmStage, ...]:
+    """Synthetic scans first, then equal parts with these shares of them, at a lower learning
+    rate."""
+    share = (1 - PRETRAINING) / len(ratios)
+    later = [ArmStage(share, ratio, pool, rate=0.25) for ratio in ratios]
+    return ArmStage(PRETRAINING, 1, pool), *later
 
 
 ARMS: dict[str, Arm] = {
@@ -97,6 +99,11 @@ ARMS: dict[str, Arm] = {
         "real scans only, twice as long",
         lambda ratio: (ArmStage(),),
         iterations=2,
+        synthetic=False,
+    ),
+    "staged": Arm(
+        "real scans only, the last quarter at a quarter of the rate",
+        lambda ratio: (ArmStage(PRETRAINING), ArmStage(1 - PRETRAINING, rate=0.25)),
         synthetic=False,
     ),
     "exchange": Arm(
@@ -124,17 +131,27 @@ ARMS: dict[str, Arm] = {
     ),
     "pretrain": Arm(
         "the town first, then half your scans",
-        lambda ratio: _then_real("town"),
+        lambda ratio: _then_real("town", 0.5),
         budget=_TOWN,
     ),
     "pretrain-skin": Arm(
         "the town in your skin first, then half your scans",
-        lambda ratio: _then_real("skin"),
+        lambda ratio: _then_real("skin", 0.5),
         budget=_SKIN,
     ),
     "pretrain-generator": Arm(
         "generated scans first, then half your scans",
-        lambda ratio: _then_real("generator"),
+        lambda ratio: _then_real("generator", 0.5),
+        budget=GENERATOR_BUDGET,
+    ),
+    "pretrain-generator-real": Arm(
+        "generated scans first, then half your scans, then your scans alone",
+        lambda ratio: _then_real("generator", 0.5, 0),
+        budget=GENERATOR_BUDGET,
+    ),
+    "pretrain-learnt": Arm(
+        "the scans that the generator learnt from first, then half your scans",
+        lambda ratio: _then_real("learnt", 0.5),
         budget=GENERATOR_BUDGET,
     ),
     "paste": Arm(

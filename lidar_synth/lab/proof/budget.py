@@ -42,9 +42,9 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
         for place in {place for place, _ in pairs}:
             scans = len(plan.skin_scans(place))
             seconds += town + scans * SKIN_SECONDS + 2 * SKIN_STREETS * TOWN_SECONDS
-    seconds += town * ("town" in pools) + settings.synthetic * GENERATOR_SECONDS * (
-        "generator" in pools
-    )
+    seconds += town * len(pools & {"town", "learnt"})
+    if "generator" in pools:
+        seconds += settings.synthetic * GENERATOR_SECONDS
     return seconds / 60 / plan.jobs
 
 

@@ -29,6 +29,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.lab.evaluate.leakage import content_of, contents, overlap, town
 from lidar_synth.lab.proof.arms import RARE
+from lidar_synth.lab.proof.places import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
 from lidar_synth.labels import ObjectBank
@@ -99,23 +100,52 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
     """Scans of a generator, turned into scans of the user's sensor where theirs is another one.
     What a model with a condition needs, the town gives: label maps or layouts of its streets."""
     generator = load_generator(task.model)
-    change = None if _alike(generator.sensor, task.sensor) else Transfer(task.sensor)
-    streets = (
-        repeat(None)
-        if generator.condition is None
-        else _streets(replace(task, sensor=generator.sensor), None)
+    streets: Iterable[Scan | None] = repeat(None, task.count)
+    if generator.condition is not None:
+        streets = _streets(replace(task, sensor=generator.sensor), None)
+    made = (generator.scans(0, [i], s)[0] for i, s in enumerate(streets))
+    yield from _as_sensor(made, task.sensor)
+
+
+def learnt_town(task: PoolTask) -> Iterator[Scan]:
+    """Scans of the town that the generator learnt from, evenly spread, turned into scans of the
+    user's sensor where the generator's is another one.
+
+    Raises:
+        ConfigError: if it did not learn from the town.
+    """
+    generator = load_generator(task.model)
+    data = generator.header.provenance.get("data", {})
+    if not data.get("town"):
+        raise ConfigError(
+            f"generator {task.model!r}, which did not learn from the town",
+            "one that did, such as town",
+            "Leave out the arm pretrain-learnt.",
+        )
+    interval, motion = data["interval"], data["motion"]
+    made = Town(data["seed"], generator.sensor, data["town"], interval, motion=motion)
+    yield from _as_sensor(
+        (made[i] for i in spread(range(len(made)), task.count)), task.sensor
     )
-    for index, street in zip(range(task.count), streets, strict=False):
-        [scan] = generator.scans(0, [index], street)
-        yield scan if change is None else change(scan, keyed_rng(0, index))
+
+
+def _as_sensor(scans: Iterable[Scan], sensor: Sensor) -> Iterator[Scan]:
+    """The scans as a sensor would measure them, where their own has other beams."""
+    change = Transfer(sensor)
+    for index, scan in enumerate(scans):
+        alike = _alike(scan.sensor, sensor)
+        yield scan if alike else change(scan, keyed_rng(0, index))
 
 
 POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
     "town": raw_town,
     "skin": make_skinned_town,
     "generator": make_generated,
+    "learnt": learnt_town,
 }
 """Makers of pools by name."""
+OF_GENERATOR = {"generator", "learnt"}
+"""Pools that depend on the generator."""
 
 
 def make_pool(task: PoolTask) -> Path:
@@ -211,7 +241,7 @@ def _settings(task: PoolTask) -> dict[str, Any]:
         "count": task.count,
     }
     streets = {"seed": task.town_seed}
-    if task.kind == "generator":
+    if task.kind in OF_GENERATOR:
         header, checkpoint = read_header(find_model(task.model))
         return (
             plain

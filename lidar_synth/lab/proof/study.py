@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from lidar_synth.datasets.recordings import PLACES, seen_by
+from lidar_synth.datasets.recordings import PLACES, TOWN, seen_by
 from lidar_synth.errors import DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import read_text, write_file
@@ -29,6 +29,7 @@ from lidar_synth.lab.proof.page import write_page
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.planning import make_plan
 from lidar_synth.lab.proof.pools import (
+    OF_GENERATOR,
     PoolTask,
     make_pool,
     read_objects,
@@ -48,6 +49,7 @@ from lidar_synth.lab.proof.trial import (
     reference,
     run_trainer,
 )
+from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 
 STUDY = "study.json"
@@ -235,7 +237,7 @@ def prove(
         source, settings or ProofSettings(), minutes, jobs, _earlier(out)
     )
     seen = ""
-    if any("generator" in row.arm.pools() for row in plan.rows):
+    if any(OF_GENERATOR & row.arm.pools() for row in plan.rows):
         generator = refuse_leaks(
             plan.settings.model, plan.recordings, _nameless(source, plan)
         )
@@ -243,10 +245,10 @@ def prove(
             out / GENERATOR,
             {"model": plan.settings.model, "checkpoint": generator.hash},
         )
-        seen = (
-            str(seen_by(generator.header.provenance))
-            or "scans that its file does not name"
-        )
+        recordings = seen_by(generator.header.provenance)
+        seen = str(recordings) or "scans that its file does not name"
+        if any(dataset == TOWN for dataset, _ in recordings.drives):
+            seen += f" ({CALIBRATED_ON})"
     named = getattr(
         trainer, "command", getattr(trainer, "__name__", type(trainer).__name__)
     )
