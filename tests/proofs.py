@@ -32,10 +32,14 @@ class Scans(list[Scan]):
     """Scans in memory with names, as a source."""
 
     def __init__(
-        self, names: Sequence[str], poses: Sequence[float] | None = None
+        self,
+        names: Sequence[str],
+        poses: Sequence[float] | None = None,
+        first: int = 0,
     ) -> None:
         super().__init__(
-            replace(street(i, boxes=False), id=name) for i, name in enumerate(names)
+            replace(street(i, boxes=False), id=name)
+            for i, name in enumerate(names, first)
         )
         self.ids = tuple(names)
         for i, x in enumerate(poses or ()):
@@ -44,11 +48,10 @@ class Scans(list[Scan]):
             self[i].pose = pose
 
 
-def drives(count: int = 3, scans: int = 4) -> Scans:
-    """Scans of several drives."""
-    return Scans(
-        [f"{drive:02d}/{frame:06d}" for drive in range(count) for frame in range(scans)]
-    )
+def drives(count: int = 3, scans: int = 4, first: int = 0) -> Scans:
+    """Scans of several drives, on streets from this one on."""
+    names = [f"{n:02d}/{frame:06d}" for n in range(count) for frame in range(scans)]
+    return Scans(names, first=first)
 
 
 def job(
@@ -70,10 +73,9 @@ def job(
     pools = dict.fromkeys(POOLS, pool)
     return Job(
         Row(name, ratio),
-        "left out",
         3,
         real,
-        [street(9, boxes=False)],
+        {"left out": [street(9, boxes=False)]},
         pools,
         named,
         iterations,

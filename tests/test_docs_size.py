@@ -37,7 +37,7 @@ LIMITS = {
     "docs/how-to/layouts.md": 150,
     "docs/how-to/bake.md": 320,
     "docs/how-to/look.md": 130,
-    "docs/how-to/prove.md": 180,
+    "docs/how-to/prove.md": 210,
     "docs/how-to/weather.md": 230,
     "docs/reference/api.md": 40,
     "docs/reference/command-line.md": 30,

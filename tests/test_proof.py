@@ -21,11 +21,13 @@ from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.evaluate.leakage import content_of, contents
 from lidar_synth.lab.proof import ARMS, Job, Proof, pools
 from lidar_synth.lab.proof.pools import PoolTask, make_pool, refuse_leaks
+from lidar_synth.lab.town import Town
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
@@ -54,7 +56,7 @@ def proof(town: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, P
     out = tmp_path_factory.mktemp("proof")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pools, "SKIN_STREETS", 1)
-        arms = tuple(name for name in ARMS if "generator" not in ARMS[name].pools())
+        arms = tuple(n for n in ARMS if not ARMS[n].pools() & pools.OF_GENERATOR)
         settings = replace(SMALL, arms=arms, columns=128)
         return out, prove(town, out, settings, jobs=1, progress=False)
 
@@ -70,6 +72,7 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
     assert keys == [
         "real",
         "longer",
+        "staged",
         "exchange",
         "town-50",
         "skin-50",
@@ -89,7 +92,7 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
             None if row["key"] == "real" else pytest.approx(gain)
         )
     assert (
-        "5 scans of the training places without labels" in values["arms"][4]["budget"]
+        "5 scans of the training places without labels" in values["arms"][5]["budget"]
     )
     assert "too few for an interval" in result.headline and result.headline in str(
         result
@@ -188,9 +191,8 @@ def test_a_short_time_has_fewer_iterations_which_a_resumed_comparison_keeps(
 def perfect(job: Job) -> np.ndarray:
     """A trainer that knows the labels where its arm exchanges parts, and takes everything for road
     otherwise."""
-    label = np.concatenate(
-        [scan.label for scan in job.held_out if scan.label is not None]
-    )
+    [scans] = job.held_out.values()
+    label = np.concatenate([scan.label for scan in scans if scan.label is not None])
     label = label[label != 255].astype(int)
     given = label if job.row.name == "exchange" else np.full_like(label, 8)
     return np.bincount(label * 19 + given, minlength=361).reshape(19, 19)
@@ -208,6 +210,42 @@ def test_a_trainer_of_ones_own_is_measured(tmp_path: Path) -> None:
     )
     low, high = exchange["interval"]
     assert low <= exchange["difference"] <= high and low > 0
+
+
+def test_one_training_is_tested_on_all_scans_of_other_places(tmp_path: Path) -> None:
+    tests = drives(2, 2, first=20)
+    asked = replace(SMALL, arms=("exchange",), seeds=2)
+    result = prove(drives(1, 4), tmp_path, asked, jobs=1, tests=tests, progress=False)
+    assert result.values["pairs"] == 4 and not result.values["left_out"]
+    assert "were recorded apart" in (tmp_path / "index.html").read_text()
+    single = prove(
+        drives(1, 4), tmp_path / "one", asked, jobs=1, tests=tests[2:], progress=False
+    )
+    [place] = single.values["tested_places"]
+    assert place == "01"
+    for key in ("real", "exchange"):
+        both, alone = (
+            next(row for row in r.values["arms"] if row["key"] == key)["miou_by_place"]
+            for r in (result, single)
+        )
+        assert both["01"] == alone["01"], "other places change nothing"
+
+
+def test_the_scans_that_a_generator_learnt_from_are_those_of_its_town(
+    tmp_path: Path,
+) -> None:
+    generator = load_generator("town")
+    sensor = generator.sensor
+    task = PoolTask("learnt", tmp_path / "pool", sensor, None, 2)
+    first, last = pools.read_pool(make_pool(task))
+    data = generator.header.provenance["data"]
+    town = Town(data["seed"], sensor, data["town"], data["interval"], motion=False)
+    for scan, own in ((first, town[0]), (last, town[len(town) - 1])):
+        assert np.array_equal(scan.points, own.points)
+        assert np.array_equal(scan.label, own.label)
+    other = write_model(tmp_path / "mine.safetensors")
+    with pytest.raises(ConfigError, match="did not learn from the town"):
+        make_pool(replace(task, folder=tmp_path / "other", model=str(other)))
 
 
 def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(

@@ -16,6 +16,7 @@ from conftest import random_scan
 from proofs import SENSOR, Scans, drives, job
 from safetensors.torch import load_file
 from scipy import stats
+from streets import street
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
 from lidar_synth.errors import (
@@ -34,6 +35,7 @@ from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
 from lidar_synth.lab.proof.places import APART, SPLITS, choose, clusters, find_places
+from lidar_synth.lab.proof.plan import describe as describe_plan
 from lidar_synth.lab.proof.planning import make_plan
 from lidar_synth.lab.proof.scores import (
     FEWEST_PLACES,
@@ -48,6 +50,7 @@ from lidar_synth.lab.proof.trial import (
     pretrain,
     pretraining_seconds,
     reference,
+    run_trainer,
     turn_scan,
 )
 from lidar_synth.lab.town import Town
@@ -144,8 +147,8 @@ def test_the_reference_trainer_learns_and_repeats_itself(
     name: str, tmp_path: Path, one_thread: None
 ) -> None:
     task = job(name, tmp_path, iterations=20)
-    first = reference(task)
-    second = reference(task)
+    [first] = reference(task).values()
+    [second] = reference(task).values()
     assert np.array_equal(first.table, second.table)
     assert first.losses[-1] < first.losses[0]
     steps = [step for step, _ in first.curve]
@@ -161,8 +164,9 @@ def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) 
     pretrain(whole, tmp_path / "start.safetensors")
     assert 0 < pretraining_seconds(tmp_path / "start.safetensors") < 60
     other = replace(whole, real=whole.real[::-1], start=tmp_path / "start.safetensors")
-    shared = reference(replace(other, real=whole.real))
-    assert np.array_equal(reference(whole).table, shared.table)
+    [shared] = reference(replace(other, real=whole.real)).values()
+    [once] = reference(whole).values()
+    assert np.array_equal(once.table, shared.table)
     assert [step for step, _ in shared.curve] == [15, 18, 20]
     pretrain(other, tmp_path / "other.safetensors")  # the labelled scans do not matter
     assert equal(
@@ -278,6 +282,33 @@ def test_a_plan_is_paired_and_tests_on_places_left_out() -> None:
         } <= set(scans)
         assert not set(plan.skin_scans(place)) & set(plan.places[place])
     assert all(scan.sensor.columns == 64 for scan in scans.values())
+
+
+def test_scans_of_other_places_are_tested_by_one_training_for_each_seed() -> None:
+    source = drives(1, 5)
+    tests = drives(3, 2, first=20)
+    plan, scans = make_plan(source, SMALL, None, 1, tests=tests)
+    assert len(plan.trainings(plan.pairs)) == 2 and len(plan.pairs) == 6
+    assert all(max(indices) < len(source) for indices in plan.labelled.values())
+    assert plan.tested == {"00": [5, 6], "01": [7, 8], "02": [9, 10]}
+    assert scans[7].id == tests[2].id and plan.skin_scans("00") == list(range(5))
+    assert "all tested places" in describe_plan(plan)
+
+
+def test_tests_that_are_trained_on_or_of_another_sensor_are_refused() -> None:
+    source = drives(2, 3)
+    with pytest.raises(ConfigError, match="tests that are labelled scans too: scan"):
+        make_plan(source, SMALL, None, 1, tests=drives(1, 4))
+    other = drives(1, 4, first=20)
+    other[:] = [replace(s, sensor=replace(s.sensor, name="other")) for s in other]
+    with pytest.raises(ConfigError, match="tests of sensor 'other'"):
+        make_plan(source, SMALL, None, 1, tests=other)
+
+
+def test_a_trainer_gives_a_table_for_every_tested_place(tmp_path: Path) -> None:
+    task = replace(job("real", tmp_path), held_out={"a": [], "b": []})
+    with pytest.raises(DataError, match="results of 'a'; expected one of each"):
+        run_trainer(lambda job: np.zeros((19, 19)), task)
 
 
 def test_a_plan_keeps_to_its_minutes_by_whole_pairs_and_places_come_before_seeds() -> (
@@ -414,13 +445,20 @@ for i in range(len(held_out)):
 def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(TRAINER)
     task = job(name, tmp_path)
-    table = CommandTrainer(f"{sys.executable} {tmp_path / 'mine.py'} {{job}}")(task)
-    label = np.concatenate([scan.label for scan in task.held_out])
-    road = TRAIN_ID["road"]
-    assert (
-        table.sum() == (label != 255).sum() == table[:, road].sum()
-        and table[road, road] == (label == road).sum()
+    task = replace(
+        task,
+        held_out={
+            "one": [street(9, boxes=False)],
+            "another": [street(8, boxes=False), street(7, boxes=False)],
+        },
     )
+    tables = CommandTrainer(f"{sys.executable} {tmp_path / 'mine.py'} {{job}}")(task)
+    road = TRAIN_ID["road"]
+    for place, scans in task.held_out.items():
+        label = np.concatenate([scan.label for scan in scans])
+        table = tables[place]
+        assert table.sum() == (label != 255).sum() == table[:, road].sum()
+        assert table[road, road] == (label == road).sum()
 
 
 def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
@@ -454,10 +492,11 @@ def test_returns_without_a_prediction_are_errors_in_every_pool(
         "(out / '000000.label').write_bytes(bytes(4 * n))"
     )
     task = job("real", tmp_path)
-    [scan] = task.held_out
+    [[scan]] = task.held_out.values()
     everything = replace(scan, label=np.arange(len(scan)).astype(np.uint8) % len(NAMES))
-    task = replace(task, held_out=[everything])
-    table = CommandTrainer(shlex.join([sys.executable, "-c", program, "{job}"]))(task)
+    task = replace(task, held_out={"left out": [everything]})
+    command = shlex.join([sys.executable, "-c", program, "{job}"])
+    [table] = CommandTrainer(command)(task).values()
     assert (
         table.sum() == len(scan)
         and np.nanmax(group_ious(table, groups_of(classes))) == 0

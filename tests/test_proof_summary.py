@@ -51,6 +51,7 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
         7,
         {pair: [0] for pair in pairs},
         {n: [i] for i, n in enumerate(names)},
+        None,
         Recordings(),
         False,
         0.1,

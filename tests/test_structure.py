@@ -169,7 +169,7 @@ def test_every_module_is_imported_by_something() -> None:
 
 LIMITS = {
     "plugin": (150_500, 6.0, 141),
-    "laboratory": (110_100, 6.0, 154),
+    "laboratory": (111_100, 6.0, 154),
     "tools": (39_550, 6.0, 128),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

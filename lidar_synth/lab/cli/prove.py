@@ -68,6 +68,10 @@ def prove(
     split: Annotated[
         str | None, typer.Option(help="split of ROOT, if its layout has splits")
     ] = None,
+    tests: Annotated[
+        Path | None,
+        typer.Option(help="labelled scans of other places to test on"),
+    ] = None,
     pools: Annotated[
         Path | None,
         typer.Option(help="folder of the synthetic scans, to share between runs"),
@@ -80,7 +84,7 @@ def prove(
     ] = False,
 ) -> None:
     """Trains a small network with and without synthetic scans, and tests on places that were left
-    out.
+    out, or on other scans.
 
     Writes a page with paired differences and their intervals, index.html in the output folder. Run
     it again to resume, or to add arms, shares and seeds.
@@ -88,6 +92,7 @@ def prove(
     \b
     Examples:
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
+      lidar-synth prove SemanticKITTI --split train --labelled 24 --tests validation_scans
       lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
     """
     import os
@@ -113,15 +118,21 @@ def prove(
         columns=None if trainer else 512,
     )
     source = open_scans(root, sensor=sensor, split=split)
+    others = open_scans(tests, sensor=sensor) if tests else None
     if dry_run:
-        typer.echo(
-            describe(
-                make_plan(source, settings, minutes, jobs or os.cpu_count() or 1)[0]
-            )
-        )
+        jobs = jobs or os.cpu_count() or 1
+        plan, _ = make_plan(source, settings, minutes, jobs, tests=others)
+        typer.echo(describe(plan))
         return
     chosen = CommandTrainer(trainer) if trainer else reference
     proof = run(
-        source, out, settings, minutes=minutes, jobs=jobs, trainer=chosen, pools=pools
+        source,
+        out,
+        settings,
+        minutes=minutes,
+        jobs=jobs,
+        trainer=chosen,
+        pools=pools,
+        tests=others,
     )
     typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")

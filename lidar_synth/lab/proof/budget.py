@@ -29,7 +29,7 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     """The time that some pairs take, with the pools that they need."""
     settings = plan.settings
     pools = {pool for row in plan.rows for pool in row.arm.pools()}
-    seconds = sum(map(plan.seconds, plan.rows)) * len(pairs)
+    seconds = sum(map(plan.seconds, plan.rows)) * len(plan.trainings(pairs))
     for row in plan.rows:
         if (stage := row.pretraining) is not None:
             starts = (

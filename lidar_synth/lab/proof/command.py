@@ -53,21 +53,17 @@ class CommandTrainer:
                 f"a command with {FIELD}, such as 'python my.py {FIELD}'",
             )
 
-    def __call__(self, job: Job) -> NDArray[np.int64]:
-        """(19, 19) confusion table of the predictions.
+    def __call__(self, job: Job) -> dict[str, NDArray[np.int64]]:
+        """{place: (19, 19) confusion table of the predictions}.
 
         Raises:
             ProcessError: if the command fails.
             FileError, DataError: on missing or wrong predictions.
         """
         write_scans(job.real, job.folder / "real")
-        write_scans(
-            [
-                replace(s, label=None, raw_label=None, instance=None)
-                for s in job.held_out
-            ],
-            job.folder / "held_out",
-        )
+        tested = [scan for part in job.held_out.values() for scan in part]
+        bare = [replace(s, label=None, raw_label=None, instance=None) for s in tested]
+        write_scans(bare, job.folder / "held_out")
         path = job.folder / "job.yaml"
         write_file(path, yaml.safe_dump(describe(job), sort_keys=False).encode())
         words = [word.replace(FIELD, str(path)) for word in shlex.split(self.command)]
@@ -85,7 +81,12 @@ class CommandTrainer:
                 f"{(done.stderr or done.stdout)[-_TAIL:].strip()}",
                 "status 0",
             )
-        return _table(job.held_out, job.folder / "predictions")
+        tables = {}
+        first = 0
+        for place, scans in job.held_out.items():
+            tables[place] = _table(scans, job.folder / "predictions", first)
+            first += len(scans)
+        return tables
 
 
 def describe(job: Job) -> dict[str, Any]:
@@ -115,7 +116,7 @@ def describe(job: Job) -> dict[str, Any]:
     folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}
     plain = {
         "arm": job.row.key,
-        "place": job.place,
+        "places": list(job.held_out),
         "seed": job.seed,
         "batch": job.batch,
     }
@@ -130,10 +131,11 @@ def write_scans(scans: Sequence[Scan], folder: Path) -> None:
     writer.finish()
 
 
-def _table(scans: Sequence[Scan], folder: Path) -> NDArray[np.int64]:
+def _table(scans: Sequence[Scan], folder: Path, first: int) -> NDArray[np.int64]:
+    """The table of the predictions from this number on."""
     count = len(NAMES)
     table = np.zeros((count, count), np.int64)
-    for index, scan in enumerate(scans):
+    for index, scan in enumerate(scans, first):
         path = folder / f"{index:06d}.label"
         raw = read_values(path, "<u4")
         assert scan.label is not None

@@ -44,7 +44,7 @@ def body(values: Values) -> str:
         _section(
             "During the training",
             curves(values["arms"]),
-            "Mean mIoU on the places left out.",
+            "Mean mIoU on the tested places.",
         )
         if any(len(row["curve"]) > 1 for row in values["arms"])
         else "",
@@ -69,11 +69,15 @@ _DIFFERENCE = (
 
 def what_was_done(values: Values) -> str:
     """One paragraph for a reader who has never seen such a comparison."""
+    count = len(values["tested_places"])
+    if values["left_out"]:
+        where = f"each of {count} places was left out in turn"
+    else:
+        where = f"scans of {count} places that were recorded apart"
     return (
         f"The same small network was trained in {len(values['arms'])} ways on the same "
-        f"{values['labelled']} labelled scans, and tested on places that it had not seen: each of "
-        f"{len(values['tested_places'])} places was left out in turn, with {values['seeds']} "
-        f"seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations and "
+        f"{values['labelled']} labelled scans, and tested on places that it had not seen: {where}, "
+        f"with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations and "
         "augmentation, unless the table says otherwise. mIoU is the mean over classes of the "
         "share of correctly labelled returns (intersection over union)."
     )

@@ -77,17 +77,18 @@ SPLITS: dict[str, Callable[[Source, Sequence[str]], Places]] = {
 """Ways to find places, by name."""
 
 
-def find_places(source: Source, by: str = "auto") -> Places:
+def find_places(source: Source, by: str = "auto", fewest: int = 2) -> Places:
     """The places of a source.
 
     Args:
         source: scans; their names are its ``ids`` or those of the scans.
         by: a name of ``SPLITS``; ``"auto"`` takes drives if there are at least two, and otherwise
             clusters of poses. ``"stretch:2"`` is the split with two stretches.
+        fewest: places that are needed.
 
     Raises:
         ConfigError: on an unknown split.
-        DataError: if there is only one place.
+        DataError: on fewer places.
     """
     by, mark, count = by.partition(":")
     counted = by == "stretch" and count.isdigit() and int(count) > 1
@@ -106,7 +107,7 @@ def find_places(source: Source, by: str = "auto") -> Places:
     places = (
         by_stretch(source, names, int(count)) if count else SPLITS[by](source, names)
     )
-    if len(places) < 2:
+    if len(places) < fewest:
         raise DataError(
             f"{len(source)} scans of one place ({next(iter(places))})",
             "scans of at least two places, better of five or more: networks are tested on places "
@@ -165,14 +166,14 @@ def _position(source: Source, index: int) -> NDArray[np.float64]:
 
 
 def choose(
-    places: Places, without: str, count: int | None, rng: np.random.Generator
+    places: Places, without: str | None, count: int | None, rng: np.random.Generator
 ) -> list[int]:
     """The labelled scans to train on: at random, from as many places as possible, none from the
     place left out.
 
     Args:
         places: the places.
-        without: the place that is tested on.
+        without: the place that is tested on; None if it is not among them.
         count: number of scans; None for all.
         rng: source of the random numbers.
 
@@ -190,13 +191,17 @@ def choose(
     if not 1 <= count <= there:
         raise ConfigError(
             f"{count} labelled scans",
-            f"1 to {there}, the scans of the places other than {without!r}",
+            f"1 to {there}, the scans of {_others(without)}",
         )
     order = [piles[i] for i in rng.permutation(len(piles))]
     dealt = [
         pile[n] for n in range(max(map(len, order))) for pile in order if n < len(pile)
     ]
     return sorted(dealt[:count])
+
+
+def _others(without: str | None) -> str:
+    return "all places" if without is None else f"the places other than {without!r}"
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:

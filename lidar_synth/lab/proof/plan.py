@@ -4,6 +4,7 @@ A *pair* is a place that is left out and a seed; it has one training of every ar
 labelled scans. Only whole pairs are compared.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -39,6 +40,8 @@ class ProofPlan:
         wanted: number of pairs without a limit of time.
         labelled: {pair: indices of the labelled scans that are trained on}.
         tested: {place: indices of the scans that are tested on}.
+        training: the places of the labelled scans, if others are tested; None where each place is
+            left out in turn.
         recordings: of the tested scans.
         half: whether the reference network computes in bfloat16.
         step: seconds of one of its iterations.
@@ -58,6 +61,7 @@ class ProofPlan:
     wanted: int
     labelled: dict[Pair, list[int]]
     tested: dict[str, list[int]]
+    training: Places | None
     recordings: Recordings
     half: bool
     step: float
@@ -72,10 +76,21 @@ class ProofPlan:
     def skin_scans(self, place: str) -> list[int]:
         """Indices of the scans, of other places than this, that a skin is learnt from; their labels
         are not used."""
-        indices = [
-            i for name, members in self.places.items() if name != place for i in members
-        ]
+        others = self.training
+        if others is None:
+            others = {n: part for n, part in self.places.items() if n != place}
+        indices = [i for members in others.values() for i in members]
         return spread(indices, MOST_SKIN_SCANS)
+
+    def trainings(self, pairs: Sequence[Pair]) -> list[list[Pair]]:
+        """The pairs that each training serves: one, or all places of a seed where no place is left
+        out."""
+        served: dict[Any, list[Pair]] = {}
+        for pair in pairs:
+            served.setdefault(pair if self.training is None else pair[1], []).append(
+                pair
+            )
+        return list(served.values())
 
     def seconds(self, row: Row) -> float:
         """Expected seconds of the iterations of a training, without a pretraining that it shares
@@ -102,19 +117,21 @@ class ProofPlan:
             "sensor": self.sensor.name,
             "half": self.half,
             **{name: value for name, value in own.items() if name not in free},
+            **({} if self.training is None else {"tested": sorted(self.places)}),
         }
 
 
 def describe(plan: ProofPlan) -> str:
     """The plan in words, for a user who decides whether to start it."""
     tested = sorted({place for place, _ in plan.pairs})
+    left_out = "a place that was left out"
+    where = left_out if plan.training is None else "all tested places"
     lines = [
         f"{len(plan.names)} scans of {plan.sensor.name} in {len(plan.places)} places: "
         + ", ".join(
             f"{name} ({len(members)})" for name, members in plan.places.items()
         ),
-        f"each training gets {plan.budget} labelled scans and is tested on a place that was left "
-        "out",
+        f"each training gets {plan.budget} labelled scans and is tested on {where}",
         f"tested places: {', '.join(tested)}; seeds: {len({seed for _, seed in plan.pairs})}; "
         f"{len(plan.pairs)} of {plan.wanted} pairs of place and seed",
         f"classes without a label: {', '.join(plan.absent) or 'none'}",
@@ -131,4 +148,5 @@ def describe(plan: ProofPlan) -> str:
         if plan.step
         else "time: that of your trainer"
     )
-    return "\n".join([*lines, f"{len(plan.rows) * len(plan.pairs)} trainings; {time}"])
+    count = len(plan.rows) * len(plan.trainings(plan.pairs))
+    return "\n".join([*lines, f"{count} trainings; {time}"])

@@ -15,10 +15,17 @@ from lidar_synth.formats import layout_of
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.evaluate.leakage import recordings_of
+from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
 from lidar_synth.lab.proof.arms import rows
 from lidar_synth.lab.proof.budget import measure_step, within
-from lidar_synth.lab.proof.places import Places, choose, find_places, names_of, spread
+from lidar_synth.lab.proof.places import (
+    Places,
+    by_drive,
+    choose,
+    find_places,
+    names_of,
+    spread,
+)
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import GROUPS, groups_of, require_labels
 from lidar_synth.lab.proof.settings import MOST_LABELLED, ProofSettings
@@ -32,6 +39,7 @@ def make_plan(
     minutes: float | None,
     jobs: int,
     earlier: Mapping[str, Any] | None = None,
+    tests: Source | None = None,
 ) -> tuple[ProofPlan, dict[int, Scan]]:
     """Plan a comparison.
 
@@ -42,33 +50,46 @@ def make_plan(
         jobs: processes.
         earlier: ``ProofPlan.identity`` of the comparison that is resumed. It computed in bfloat16
             or not, as the machine was faster then, and had fewer iterations if the time was short.
+        tests: labelled scans of other places to test on; None leaves out each place in turn.
 
     Returns:
-        The plan, and {index: scan on the grid} of all labelled and tested scans.
+        The plan, and {index: scan on the grid} of all labelled and tested scans. The indices of
+        ``tests`` follow those of ``source``.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, or too short a time.
+        ConfigError: on settings that do not fit the scans, too short a time, or tests of another
+            sensor or of scans that are trained on.
         DataError: on one place only, on scans without labels, or on a class that nothing is
             labelled as.
     """
     arms = rows(settings.arms, settings.ratios)
     groups = groups_of(_classes(source, settings.classes), settings.only)
-    places = find_places(source, settings.places)
     sensor = sensor_of(source)
+    training, places = _split(source, tests, settings.places)
     grid = (
         None if settings.columns is None else replace(sensor, columns=settings.columns)
     )
     rng = np.random.default_rng(settings.seed)
     order = [list(places)[i] for i in rng.permutation(len(places))]
     pairs = [(place, seed) for seed in range(settings.seeds) for place in order]
-    labelled = {pair: _labelled(places, pair, settings) for pair in pairs}
+    labelled = {pair: _labelled(places, training, pair, settings) for pair in pairs}
     tested = {
         place: spread(indices, settings.tested) for place, indices in places.items()
     }
     needed = sorted(
         {i for part in (*labelled.values(), *tested.values()) for i in part}
     )
-    scans = {i: _read(source, i, grid) for i in needed}
+    names = (*names_of(source), *names_of([] if tests is None else tests))
+    scans = {i: _read(*locate(source, tests, i), grid) for i in needed}
+    recordings = recordings_of_scans(
+        source if tests is None else tests,
+        [names[i] for part in tested.values() for i in part],
+    )
+    if tests is not None:
+        _refuse_shared(scans, len(source))
+        seen = recordings_of_scans(source, names_of(source))
+        if shared := seen & recordings:
+            raise _shared(str(shared))
     absent = require_labels(_counts(scans), groups, settings.only)
     batch = [scans[i] for i in needed[: settings.batch]]
     half, step = measure_step(batch, settings, earlier.get("half") if earlier else None)
@@ -76,7 +97,6 @@ def make_plan(
         settings = replace(
             settings, iterations=min(settings.iterations, earlier["iterations"])
         )
-    names = tuple(names_of(source))
     plan = ProofPlan(
         settings,
         places,
@@ -90,9 +110,8 @@ def make_plan(
         len(pairs),
         labelled,
         tested,
-        recordings_of_scans(
-            source, [names[i] for part in tested.values() for i in part]
-        ),
+        training,
+        recordings,
         half,
         step,
         0.0,
@@ -111,22 +130,74 @@ def recordings_of_scans(source: Source, names: Sequence[str]) -> Recordings:
     return every if of_town or layout not in PLACES else frames_of(layout, names)
 
 
-def _labelled(places: Places, pair: Pair, settings: ProofSettings) -> list[int]:
+def locate(source: Source, tests: Source | None, index: int) -> tuple[Source, int]:
+    """The source of a scan of the plan, and its index there."""
+    if tests is None or index < len(source):
+        return source, index
+    return tests, index - len(source)
+
+
+def _split(
+    source: Source, tests: Source | None, by: str
+) -> tuple[Places | None, Places]:
+    """The places of the labelled scans, None if they are left out in turn, and those that are
+    tested."""
+    if tests is None:
+        return None, find_places(source, by)
+    own = sensor_of(source)
+    other = sensor_of(tests)
+    if other.name != own.name:
+        raise ConfigError(
+            f"tests of sensor {other.name!r} for labelled scans of {own.name!r}",
+            "scans of one sensor",
+            f"lidar-synth convert IN OUT --as-sensor {own.name} turns them into its scans.",
+        )
+    found = find_places(tests, by, fewest=1)
+    tested = {name: [len(source) + i for i in part] for name, part in found.items()}
+    return by_drive(source, names_of(source)), tested
+
+
+def _refuse_shared(scans: Mapping[int, Scan], labelled: int) -> None:
+    """Refuse scans that are both labelled, the first so many indices, and tested."""
+    trained = {content_of(scan): scan.id for i, scan in scans.items() if i < labelled}
+    for index, scan in scans.items():
+        if index >= labelled and (twin := trained.get(content_of(scan))) is not None:
+            raise _shared(f"scan {scan.id!r}, which is {twin!r} of the labelled scans")
+
+
+def _shared(what: str) -> ConfigError:
+    return ConfigError(
+        f"tests that are labelled scans too: {what}",
+        "tests of other places than those that are trained on",
+    )
+
+
+def _labelled(
+    places: Places, training: Places | None, pair: Pair, settings: ProofSettings
+) -> list[int]:
     place, seed = pair
-    there = sum(len(members) for name, members in places.items() if name != place)
+    if training is not None:
+        rng = np.random.default_rng((settings.seed, seed))
+        return choose(training, None, _count_labelled(training, settings, ""), rng)
+    others = {name: part for name, part in places.items() if name != place}
+    count = _count_labelled(others, settings, f", where {place!r} is left out")
+    number = sorted(places).index(place)
+    rng = np.random.default_rng((settings.seed, seed, number))
+    return choose(places, place, count, rng)
+
+
+def _count_labelled(places: Places, settings: ProofSettings, where: str) -> int:
+    there = sum(map(len, places.values()))
     count = (
         min(there, MOST_LABELLED) if settings.labelled is None else settings.labelled
     )
     if count < settings.batch:
         raise ConfigError(
-            f"{count} labelled scans for batches of {settings.batch}, where {place!r} is left out",
+            f"{count} labelled scans for batches of {settings.batch}{where}",
             "at least as many scans as a batch has",
             f"Use --batch {count} (batch={count}), or label more scans.",
         )
-    number = sorted(places).index(place)
-    return choose(
-        places, place, count, np.random.default_rng((settings.seed, seed, number))
-    )
+    return count
 
 
 def _read(source: Source, index: int, grid: Sensor | None) -> Scan:

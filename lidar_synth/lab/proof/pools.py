@@ -115,8 +115,8 @@ def learnt_town(task: PoolTask) -> Iterator[Scan]:
         ConfigError: if it did not learn from the town.
     """
     generator = load_generator(task.model)
-    data = generator.header.provenance.get("data", {})
-    if not data.get("town"):
+    data = generator.header.provenance.get("data")
+    if not isinstance(data, dict) or not data.get("town"):
         raise ConfigError(
             f"generator {task.model!r}, which did not learn from the town",
             "one that did, such as town",

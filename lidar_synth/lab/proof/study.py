@@ -27,7 +27,7 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.page import write_page
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
-from lidar_synth.lab.proof.planning import make_plan
+from lidar_synth.lab.proof.planning import locate, make_plan
 from lidar_synth.lab.proof.pools import (
     OF_GENERATOR,
     PoolTask,
@@ -60,6 +60,10 @@ STARTS = "starts"
 JOBS = "jobs"
 PAGE = "index.html"
 RESULTS = "results.json"
+
+
+Task = tuple[Row, Sequence[Pair]]
+"""A training, and the pairs whose places it is tested on."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,9 @@ class Trainings:
     def pool_folder(self, kind: str, place: str) -> Path:
         """The folder of a pool: one for all places, but for skins, which must not know the place
         that is tested on."""
-        return self.pools / (
-            kind
-            if kind != "skin"
-            else f"skin-{sorted(self.plan.places).index(place):03d}"
-        )
+        own = kind == "skin" and self.plan.training is None
+        number = sorted(self.plan.places).index(place)
+        return self.pools / (f"skin-{number:03d}" if own else kind)
 
     def start(self, row: Row, pair: Pair) -> Path | None:
         """The file of the reference network after the row's pretraining, which all places of a seed
@@ -113,35 +115,39 @@ class Trainings:
             / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
         )
 
-    def pretrain(self, task: tuple[Row, Pair]) -> None:
+    def pretrain(self, task: Task) -> None:
         """Write the file of ``start``."""
-        path = self.start(*task)
+        row, pairs = task
+        path = self.start(row, pairs[0])
         assert path is not None
         with _one_thread():
-            pretrain(self._job(*task), path)
+            pretrain(self._job(row, pairs), path)
 
-    def __call__(self, task: tuple[Row, Pair]) -> bool:
-        """Train and write the outcome, unless the time is over; returns whether it did."""
-        row, pair = task
+    def __call__(self, task: Task) -> bool:
+        """Train and write the outcomes, unless the time is over; returns whether it did."""
+        row, pairs = task
         expected = self.plan.seconds(row)
         if self.deadline is not None and time.time() + expected > self.deadline:
             return False
         with _one_thread():
-            outcome = run_trainer(self.trainer, self._job(row, pair))
-        write_file(self.path(row, pair), seal(to_values(outcome)))
+            outcomes = run_trainer(self.trainer, self._job(row, pairs))
+        for pair in pairs:
+            write_file(self.path(row, pair), seal(to_values(outcomes[pair[0]])))
         return True
 
-    def _job(self, row: Row, pair: Pair) -> Job:
-        plan, (place, seed) = self.plan, pair
+    def _job(self, row: Row, pairs: Sequence[Pair]) -> Job:
+        plan = self.plan
+        place, seed = pairs[0]
         kinds = row.arm.pools()
         folders = {kind: self.pool_folder(kind, place) for kind in kinds}
         used = {stage.pool for stage in row.stages()}
         return Job(
             row,
-            place,
             seed,
-            real=[self.scans[i] for i in plan.labelled[pair]],
-            held_out=[self.scans[i] for i in plan.tested[place]],
+            real=[self.scans[i] for i in plan.labelled[pairs[0]]],
+            held_out={
+                name: [self.scans[i] for i in plan.tested[name]] for name, _ in pairs
+            },
             pools={
                 kind: _pool(folder) for kind, folder in folders.items() if kind in used
             },
@@ -150,9 +156,9 @@ class Trainings:
             batch=plan.settings.batch,
             widths=plan.settings.widths,
             half=plan.half,
-            folder=self.out / JOBS / row.key / self.path(row, pair).stem,
+            folder=self.out / JOBS / row.key / self.path(row, pairs[0]).stem,
             pool_folders=folders,
-            start=self.start(row, pair),
+            start=self.start(row, pairs[0]),
         )
 
 
@@ -190,6 +196,7 @@ def prove(
     jobs: int | None = None,
     trainer: Trainer = reference,
     pools: str | Path | None = None,
+    tests: str | Path | Source | None = None,
     progress: bool = True,
 ) -> Proof:
     """Measure what synthetic scans add to your labelled scans, on places that no training has seen.
@@ -210,6 +217,9 @@ def prove(
             ``CommandTrainer``.
         pools: folder of the synthetic scans, which several comparisons may share; by default in
             ``out``.
+        tests: labelled scans of other places to test on, such as a dataset's validation split; one
+            training is tested on all of them. By default each place of ``scans`` is left out in
+            turn.
         progress: whether to show progress bars.
 
     Returns:
@@ -232,14 +242,16 @@ def prove(
     start = time.time()
     out = Path(out)
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
+    if isinstance(tests, str | Path):
+        tests = open_scans(tests)
     jobs = jobs or os.cpu_count() or 1
     plan, loaded = make_plan(
-        source, settings or ProofSettings(), minutes, jobs, _earlier(out)
+        source, settings or ProofSettings(), minutes, jobs, _earlier(out), tests
     )
     seen = ""
     if any(OF_GENERATOR & row.arm.pools() for row in plan.rows):
         generator = refuse_leaks(
-            plan.settings.model, plan.recordings, _nameless(source, plan)
+            plan.settings.model, plan.recordings, _nameless(source, tests, plan)
         )
         claim(
             out / GENERATOR,
@@ -257,10 +269,10 @@ def prove(
     work = Trainings(plan, loaded, out, Path(pools or out / POOLS), trainer, deadline)
     _make_pools(work, source, progress)
     tasks = [
-        (row, pair)
-        for pair in plan.pairs
+        (row, pairs)
+        for pairs in plan.trainings(plan.pairs)
         for row in plan.rows
-        if not _is_there(work.path(row, pair), read_outcome)
+        if not all(_is_there(work.path(row, pair), read_outcome) for pair in pairs)
     ]
     _pretrain(work, tasks, progress)
     with map_in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
@@ -389,14 +401,12 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
             pass
 
 
-def _pretrain(
-    work: Trainings, tasks: Sequence[tuple[Row, Pair]], progress: bool
-) -> None:
+def _pretrain(work: Trainings, tasks: Sequence[Task], progress: bool) -> None:
     """Make the pretrained networks that the trainings begin with."""
     needed = {
-        path: task
-        for task in tasks
-        if (path := work.start(*task)) is not None
+        path: (row, pairs)
+        for row, pairs in tasks
+        if (path := work.start(row, pairs[0])) is not None
         and not _is_there(path, pretraining_seconds)
     }
     with map_in_processes(
@@ -408,12 +418,15 @@ def _pretrain(
             pass
 
 
-def _nameless(source: Source, plan: ProofPlan) -> Iterator[Scan]:
+def _nameless(source: Source, tests: Source | None, plan: ProofPlan) -> Iterator[Scan]:
     """The scans of the tested places, unless their names say which recordings they are of."""
-    if isinstance(source, ScanFiles) and layout_of(source.root) in PLACES:
+    tested = source if tests is None else tests
+    if isinstance(tested, ScanFiles) and layout_of(tested.root) in PLACES:
         return
     for place in dict.fromkeys(place for place, _ in plan.pairs):
-        yield from (source[i] for i in plan.places[place])
+        for index in plan.places[place]:
+            origin, number = locate(source, tests, index)
+            yield origin[number]
 
 
 def _scans(source: Source, indices: Sequence[int]) -> list[Scan]:

@@ -115,6 +115,7 @@ def summarise(
             for place, seed in found
         },
         "places": sizes,
+        "left_out": plan.training is None,
         "tested_places": places,
         "seeds": len(seeds),
         "pairs": len(found),

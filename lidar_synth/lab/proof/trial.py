@@ -1,11 +1,11 @@
-"""One training and its test: an arm, a place that is left out, a seed.
+"""One training and its test: an arm, the places that are tested, a seed.
 
 ``reference`` trains the package's small range-view segmenter. A trainer of your own is a function
 of the same form.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -50,10 +50,9 @@ class Job:
 
     Args:
         row: the arm.
-        place: the place that is tested on.
         seed: of the weights, of the order, and of all that is random.
         real: the labelled scans.
-        held_out: scans of ``place``.
+        held_out: {place: scans} to test on.
         pools: {name: synthetic scans} of the arm.
         objects: to paste, if the arm pastes any.
         iterations: of the arm.
@@ -66,10 +65,9 @@ class Job:
     """
 
     row: Row
-    place: str
     seed: int
     real: Sequence[Scan]
-    held_out: Sequence[Scan]
+    held_out: Mapping[str, Sequence[Scan]]
     pools: dict[str, list[Scan]]
     objects: ObjectBank | None
     iterations: int
@@ -79,6 +77,11 @@ class Job:
     folder: Path
     pool_folders: dict[str, Path] = field(default_factory=dict)
     start: Path | None = None
+
+    @property
+    def sensor(self) -> Sensor:
+        """The grid of the scans."""
+        return self.real[0].sensor
 
     def stages(self) -> Iterator[tuple[ArmStage, int]]:
         """The stages with their iterations, which add up to ``iterations``."""
@@ -131,7 +134,7 @@ class Job:
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """What came of a training.
+    """What came of a training on a place.
 
     Args:
         table: (19, 19) number of returns of the held-out scans by label (row) and prediction
@@ -148,9 +151,10 @@ class TrialOutcome:
     seconds: float = 0.0
 
 
-Trainer = Callable[[Job], "TrialOutcome | NDArray[np.int64]"]
-"""Trains as a job says and tests on its held-out scans; returns a ``TrialOutcome``, or its table
-alone."""
+Outcome = TrialOutcome | NDArray[np.int64]
+Trainer = Callable[[Job], Mapping[str, Outcome] | Outcome]
+"""Trains as a job says and tests on its held-out scans; returns {place: outcome}, or an outcome if
+there is one place. An outcome is a ``TrialOutcome``, or its table alone."""
 
 
 def turn_scan(scan: Scan, rng: np.random.Generator) -> Scan:
@@ -165,43 +169,60 @@ def turn_scan(scan: Scan, rng: np.random.Generator) -> Scan:
     return mirror_scan(scan, "y") if rng.random() < 0.5 else scan
 
 
-def run_trainer(trainer: Trainer, job: Job) -> TrialOutcome:
-    """Run a trainer, and take its time.
+def run_trainer(trainer: Trainer, job: Job) -> dict[str, TrialOutcome]:
+    """Run a trainer, and take its time; returns the outcome of each place.
 
     Raises:
-        DataError: on a table of another shape than (19, 19).
+        DataError: on a table of another shape than (19, 19), or other places than those of the
+            job.
     """
     start = time.monotonic()
     result = trainer(job)
-    outcome = (
-        result
-        if isinstance(result, TrialOutcome)
-        else TrialOutcome(np.asarray(result, np.int64))
-    )
+    if not isinstance(result, Mapping):
+        result = dict.fromkeys(list(job.held_out)[:1], result)
+    if set(result) != set(job.held_out):
+        raise DataError(
+            f"a trainer with results of {', '.join(map(repr, sorted(result)))}",
+            f"one of each of {', '.join(map(repr, job.held_out))}",
+        )
+    seconds = time.monotonic() - start
+    return {place: _outcome_of(result[place], seconds) for place in job.held_out}
+
+
+def _outcome_of(result: Outcome, seconds: float) -> TrialOutcome:
+    outcome = result
+    if not isinstance(outcome, TrialOutcome):
+        outcome = TrialOutcome(np.asarray(outcome, np.int64))
     expected = (len(NAMES), len(NAMES))
     if outcome.table.shape != expected:
         raise DataError(
             f"a trainer that returns a table of shape {outcome.table.shape}",
             f"{expected}",
         )
-    return replace(outcome, seconds=time.monotonic() - start)
+    return replace(outcome, seconds=seconds)
 
 
-def reference(job: Job) -> TrialOutcome:
+Tables = dict[str, NDArray[np.int64]]
+"""{place: table}"""
+
+
+def reference(job: Job) -> dict[str, TrialOutcome]:
     """Train the package's range-view segmenter on the grid of the scans, and test it on the
     held-out scans."""
     network, height = _fresh(job)
-    held_out = images(job.held_out, job.held_out[0].sensor)
+    held_out = {name: images(part, job.sensor) for name, part in job.held_out.items()}
     looks = {round(job.iterations * part / LOOKS) for part in range(1, LOOKS)} - {
         job.iterations
     }
-    curve: list[tuple[int, NDArray[np.int64]]] = []
+    curve: list[tuple[int, Tables]] = []
     losses: list[float] = []
 
-    def test(batches: int) -> NDArray[np.int64]:
-        return _test(
-            _settled(network, job, height, batches), held_out, height, job.half
-        )
+    def test(batches: int) -> Tables:
+        settled = _settled(network, job, height, batches)
+        return {
+            place: _test(settled, part, height, job.half)
+            for place, part in held_out.items()
+        }
 
     def watch(step: int) -> None:
         if done + step in looks:
@@ -217,9 +238,13 @@ def reference(job: Job) -> TrialOutcome:
         else:
             losses += _learn(network, job, stage, mixed, count, height, watch)
         done += count
-    table = test(SETTLING)
+    curve.append((job.iterations, test(SETTLING)))
     parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
-    return TrialOutcome(table, [*curve, (job.iterations, table)], parts)
+    outcomes = {}
+    for place in held_out:
+        own = [(step, tables[place]) for step, tables in curve]
+        outcomes[place] = TrialOutcome(own[-1][1], own, parts)
+    return outcomes
 
 
 def pretrain(job: Job, path: Path) -> None:
@@ -263,7 +288,7 @@ def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
     """A network that has learnt nothing, and the (H, W) sine of the elevations of the grid."""
     torch.manual_seed(job.seed)
     return RangeSegmenter(widths=job.widths), torch.from_numpy(
-        np.sin(job.held_out[0].sensor.ray_angles()[0])
+        np.sin(job.sensor.ray_angles()[0])
     )
 
 
