@@ -13,17 +13,26 @@ from project import ROOT
 
 sys.path.append(str(ROOT / "tools" / "research"))
 
-from detector.bev import CELL, CHANNELS, REACH, SLICES, Found, decode, targets, view
-from detector.scores import (
+from streets import street
+
+from lidar_synth import Boxes, Scan, load_sensor
+from lidar_synth.lab.proof.detection.bev import (
+    CELL,
+    CHANNELS,
+    REACH,
+    SLICES,
+    Found,
+    decode,
+    targets,
+    view,
+)
+from lidar_synth.lab.proof.detection.scores import (
     Truth,
     average_precision,
     footprint_ious,
     matched,
     precisions,
 )
-from streets import street
-
-from lidar_synth import Boxes, Scan, load_sensor
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -107,7 +116,8 @@ def test_each_box_is_found_once_and_unwanted_boxes_do_not_count() -> None:
     hidden = (30, 0, 0, 4, 2, 1, 0)
     found = boxes(car, (10.2, 0, 0, 4, 2, 1, 0), hidden, hidden, (50, 0, 0, 4, 2, 1, 0))
     scores = np.array([0.5, 0.9, 0.8, 0.7, 0.6])
-    right = matched(found, scores, boxes(car, hidden), np.array([True, False]), 0.5)
+    fit = footprint_ious(found, boxes(car, hidden)) / 0.5
+    right = matched(fit, scores, np.array([True, False]))
     assert right.tolist() == [0, 1, -1, -1, 0]
 
 

@@ -18,18 +18,26 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import detector_pools as pools
 import numpy as np
 import torch
 import typer
-from detector import pools
-from detector.bev import view
-from detector.classes import CLASSES
-from detector.network import Detector, Sample, collate, detect, sample, settled, train
-from detector.scores import Truth, precisions
 from tqdm import tqdm
 
 from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
 from lidar_synth.files.disk import write_file
+from lidar_synth.lab.proof.detection.bev import view
+from lidar_synth.lab.proof.detection.boxes import CLASSES
+from lidar_synth.lab.proof.detection.network import (
+    Detector,
+    Sample,
+    collate,
+    detect,
+    sample,
+    settled,
+    train,
+)
+from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw

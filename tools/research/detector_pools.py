@@ -5,12 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from detector.classes import CLASS_OF, LEAST
-from lidar_synth import Boxes, Scan, Source, Town, load_generator, open_scans
+from lidar_synth import Scan, Source, Town, load_generator, open_scans
 from lidar_synth.formats.npz import write_scan
+from lidar_synth.lab.proof.detection.boxes import with_points
 from lidar_synth.lab.town import STRETCH_FRAMES
 from lidar_synth.labels.edit import remove_unboxed
 
@@ -104,26 +103,3 @@ def laid_out(folder: Path, model: str, layouts: Source) -> Source:
             remove_unboxed(generator.scans(0, [i], condition=layouts[i])[0])
         ),
     )
-
-
-def with_points(scan: Scan) -> Scan:
-    """The scan with those boxes that hold ``LEAST`` returns."""
-    assert scan.boxes is not None
-    scan.boxes = scan.boxes[points_in(scan.boxes, scan) >= LEAST]
-    return scan
-
-
-def points_in(boxes: Boxes, scan: Scan) -> NDArray[np.int64]:
-    """(M,) number of returns of a scan in each of M boxes, above its floor."""
-    return np.asarray(boxes.contain(scan.points, above_floor=0.1).sum(1))
-
-
-def detected(scan: Scan) -> Boxes:
-    """The boxes of a scan's detected classes."""
-    assert scan.boxes is not None
-    return scan.boxes[np.array([name in CLASS_OF for name in scan.boxes.names], bool)]
-
-
-def classes_of(boxes: Boxes) -> NDArray[np.int64]:
-    """(M,) the class of each box."""
-    return np.array([CLASS_OF[name] for name in boxes.names], np.int64)

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detector.classes import CLASSES
+from lidar_synth.lab.proof.detection.boxes import CLASSES
 
 REACH = 51.2
 """Metres from the sensor to each of the four sides of the view."""

@@ -6,14 +6,19 @@ precision is interpolated at all recalls (PASCAL VOC since 2010).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.bev import REACH, Found
-from detector.classes import LEAST
-from detector.pools import classes_of, detected, points_in
-from lidar_synth import Boxes, Scan
+from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.lab.proof.detection.bev import REACH, Found
+from lidar_synth.lab.proof.detection.boxes import (
+    LEAST,
+    classes_of,
+    detected,
+    points_in,
+)
 
 OVERLAP = (0.5, 0.25, 0.25)
 """Minimum intersection over union of the footprints of cars, pedestrians and cyclists."""
@@ -38,47 +43,94 @@ class Truth:
         )
 
 
+@dataclass(frozen=True)
+class Criterion:
+    """When a detection is right, and which boxes count.
+
+    Args:
+        overlap: minimum intersection over union of the footprints; 0 for a criterion by distance.
+        distance: maximum distance of the centres, metres.
+        near, far: distance of the boxes from the sensor, metres.
+    """
+
+    overlap: float = 0.0
+    distance: float = 0.0
+    near: float = 0.0
+    far: float = np.inf
+
+    def fit(
+        self, boxes: NDArray[np.float32], truth: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
+        if self.overlap:
+            return footprint_ious(boxes, truth) / self.overlap
+        apart = np.hypot(*(boxes[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1))
+        return np.asarray(self.distance / np.maximum(apart, 1e-9), np.float64)
+
+    def includes(self, boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(M,) whether boxes (M, 7) are within the limits of distance."""
+        away = np.hypot(*boxes[:, :2].T)
+        return np.asarray((self.near <= away) & (away < self.far))
+
+
+class Judged(NamedTuple):
+    """The detections of a class that count, in some scans: (D,) scores and (D,) 1 for right ones;
+    and the number of boxes that have to be found."""
+
+    scores: NDArray[np.float32]
+    hits: NDArray[np.int64]
+    wanted: int
+
+
+def judge(found: Found, truth: Truth, each: int, criterion: Criterion) -> Judged:
+    """The detections of a class in one scan by a criterion."""
+    mine = found.classes == each
+    real = truth.classes == each
+    boxes = found.boxes[mine]
+    scores = found.scores[mine]
+    wanted = truth.wanted[real] & criterion.includes(truth.boxes[real])
+    right = matched(criterion.fit(boxes, truth.boxes[real]), scores, wanted)
+    counted = (right == 1) | ((right == 0) & criterion.includes(boxes))
+    return Judged(scores[counted], right[counted], int(wanted.sum()))
+
+
+def precision_of(judged: Sequence[Judged]) -> float:
+    """The average precision over some scans, 0 to 1; NaN without a box."""
+    if not judged:
+        return float("nan")
+    return average_precision(
+        np.concatenate([one.scores for one in judged]),
+        np.concatenate([one.hits for one in judged]),
+        sum(one.wanted for one in judged),
+    )
+
+
 def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
     """The average precision of every class over some scans, 0 to 1; NaN for one without a box."""
-    every = []
-    for each, least in enumerate(OVERLAP):
-        scores = []
-        hits = []
-        for some, truth in zip(found, truths, strict=True):
-            mine = some.classes == each
-            real = truth.classes == each
-            right = matched(
-                some.boxes[mine],
-                some.scores[mine],
-                truth.boxes[real],
-                truth.wanted[real],
-                least,
-            )
-            scores.append(some.scores[mine][right >= 0])
-            hits.append(right[right >= 0])
-        wanted = sum(int(truth.wanted[truth.classes == each].sum()) for truth in truths)
-        every.append(
-            average_precision(np.concatenate(scores), np.concatenate(hits), wanted)
-        )
-    return every
+    pairs = list(zip(found, truths, strict=True))
+    return [
+        precision_of([judge(*pair, each, Criterion(least)) for pair in pairs])
+        for each, least in enumerate(OVERLAP)
+    ]
 
 
 def matched(
-    boxes: NDArray[np.float32],
-    scores: NDArray[np.float32],
-    truth: NDArray[np.float32],
-    wanted: NDArray[np.bool_],
-    least: float,
+    fit: NDArray[np.float64], scores: NDArray[np.float32], wanted: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box
-    that is not wanted."""
-    result = np.zeros(len(boxes), np.int64)
-    overlaps = footprint_ious(boxes, truth)
-    free = np.ones(len(truth), bool)
+    that is not wanted.
+
+    Args:
+        fit: (D, M), 1 and more where a detection may be of a box.
+        scores: (D,) of the detections; the best are matched first.
+        wanted: (M,) the boxes that have to be found.
+    """
+    result = np.zeros(len(scores), np.int64)
+    free = np.ones(len(wanted), bool)
     for i in np.argsort(-scores, kind="stable"):
         for mine, value in ((wanted & free, 1), (~wanted, -1)):
-            fits = np.where(mine, overlaps[i], 0)
-            if len(fits) and fits.max() >= least:
+            fits = np.where(mine, fit[i], 0)
+            if len(fits) and fits.max() >= 1:
                 result[i] = value
                 free[fits.argmax()] = False
                 break

@@ -12,10 +12,17 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import update_bn
 from tqdm import tqdm
 
-from detector.bev import CHANNELS, REGRESSED, Found, Target, decode, targets, view
-from detector.classes import CLASSES
-from detector.pools import classes_of, detected
-from lidar_synth import Scan
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.proof.detection.bev import (
+    CHANNELS,
+    REGRESSED,
+    Found,
+    Target,
+    decode,
+    targets,
+    view,
+)
+from lidar_synth.lab.proof.detection.boxes import CLASSES, classes_of, detected
 from lidar_synth.lab.train.precision import faster_in_bfloat16
 
 PIXEL = 0.8

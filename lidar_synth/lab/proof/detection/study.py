@@ -1,0 +1,308 @@
+"""``prove_detection``: trainings of a detector on a few real scans, tested on places left out."""
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.files.claims import claim
+from lidar_synth.files.disk import hash_of_names, write_file
+from lidar_synth.files.parsing import read_sealed, seal
+from lidar_synth.formats import open_scans
+from lidar_synth.formats.npz import write_scan
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.proof.detection.arms import (
+    ARMS,
+    BASE,
+    OWN,
+    make_mixture,
+)
+from lidar_synth.lab.proof.detection.bev import Found, view
+from lidar_synth.lab.proof.detection.boxes import with_points
+from lidar_synth.lab.proof.detection.network import (
+    Detector,
+    detect,
+    settled,
+    train,
+)
+from lidar_synth.lab.proof.detection.scores import Truth
+from lidar_synth.lab.proof.detection.summary import summarise
+from lidar_synth.lab.proof.machine import command_line, machine
+from lidar_synth.lab.proof.places import Places, choose, find_places, names_of
+from lidar_synth.lab.proof.pools import TOWN_SEED
+from lidar_synth.lab.town import STRETCH_FRAMES, Town
+from lidar_synth.lab.train.segmentation import endless_batches
+from lidar_synth.labels import ObjectBank
+
+RATE = 3e-3
+SETTLING = 16
+"""Batches of labelled scans for the statistics of the batch normalisation."""
+MOMENTS = (3, 10, 17)
+"""The scans of each stretch of the town in its pool."""
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """The settings of ``prove_detection``.
+
+    Args:
+        labelled: number of real scans with boxes that each training gets.
+        arms: names of ``ARMS``; "gt_sampling" is always among them.
+        iterations: of each training.
+        batch: scans of an iteration.
+        seeds: repetitions, with other weights, order and scans. Two in a row exchange the halves
+            of the places, so that each place is tested on once.
+        places: how places are found: "auto" or a name of ``SPLITS``.
+        synthetic: scans of the town.
+
+    Raises:
+        ConfigError: on an unknown arm, or numbers below 1.
+    """
+
+    labelled: int = 4
+    arms: tuple[str, ...] = ("objects", "first", "recipe", "town")
+    iterations: int = 800
+    batch: int = 2
+    seeds: int = 2
+    places: str = "auto"
+    synthetic: int = 120
+
+    def __post_init__(self) -> None:
+        for name in ("labelled", "iterations", "batch", "seeds", "synthetic"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "1 or more")
+        if unknown := [name for name in self.arms if name not in ARMS]:
+            raise ConfigError(
+                f"arm {', '.join(map(repr, unknown))}",
+                f"some of {', '.join(ARMS)}",
+                suggest(unknown[0], ARMS),
+            )
+
+    @property
+    def compared(self) -> list[str]:
+        """The names of the arms, ``BASE`` included, in the order of ``ARMS``."""
+        return [name for name in ARMS if name in {BASE, *self.arms}]
+
+
+def half_of(places: Places, seed: int) -> list[str]:
+    """The names of the places that a seed tests on; seeds 2n and 2n + 1 share them out.
+
+    Raises:
+        ConfigError: on a negative seed.
+    """
+    names = sorted(places)
+    order = np.random.default_rng(seed // 2).permutation(len(names))
+    return sorted(names[i] for i in order[seed % 2 :: 2])
+
+
+@dataclass
+class DetectionWork:
+    """The scans of a comparison, and where its results are kept.
+
+    Args:
+        source: real scans with boxes.
+        settings: what is compared.
+        out: the folder of results.
+        pool: the folder of the town's scans.
+    """
+
+    source: Source
+    settings: DetectionSettings
+    out: Path
+    pool: Path
+
+    @cached_property
+    def places(self) -> Places:
+        """The places of the source."""
+        return find_places(self.source, self.settings.places)
+
+    @cached_property
+    def town(self) -> Source:
+        """Scans of the town by the sensor of the real scans, kept in ``pool``."""
+        count = self.settings.synthetic
+        stretches = -(-count // len(MOMENTS))
+        town = Town(
+            TOWN_SEED,
+            self.source[0].sensor,
+            stretches * STRETCH_FRAMES,
+            interval=2.0,
+            motion=False,
+        )
+        self.pool.mkdir(parents=True, exist_ok=True)
+        for number in tqdm(range(count), "scans of the town", disable=None):
+            path = self.pool / f"{number:06d}.npz"
+            stretch, moment = divmod(number, len(MOMENTS))
+            if not path.exists():
+                index = stretch * STRETCH_FRAMES + MOMENTS[moment]
+                write_scan(path, with_points(town[index]))
+        return open_scans(self.pool)
+
+    @cached_property
+    def objects(self) -> ObjectBank:
+        """Objects of the town."""
+        return ObjectBank.from_town(self.source[0].sensor)
+
+    def labelled(self, seed: int) -> list[Scan]:
+        """The real scans that a seed trains on, from the places that it does not test."""
+        held_out = half_of(self.places, seed)
+        others = {n: i for n, i in self.places.items() if n not in held_out}
+        rng = np.random.default_rng((seed, self.settings.labelled))
+        return [self.source[i] for i in choose(others, "", self.settings.labelled, rng)]
+
+    def tested(self, seed: int) -> dict[str, list[int]]:
+        """{place: indices of its scans} that a seed tests on."""
+        return {name: self.places[name] for name in half_of(self.places, seed)}
+
+    def path(self, arm: str, seed: int) -> Path:
+        """The file of an outcome."""
+        return self.out / "runs" / f"{arm}-{self.settings.labelled}-{seed}.json"
+
+    def run(self, name: str, seed: int) -> dict[str, Any]:
+        """Train and test one detector."""
+        arm = ARMS[name]
+        start = time.monotonic()
+        torch.manual_seed(seed)
+        network = Detector()
+        labelled = self.labelled(seed)
+        count = self.settings.iterations * self.settings.batch
+        town = self.town if any(arm.shares) else None
+        objects = self.objects if set(arm.pasted) - {OWN} else None
+        mixed = make_mixture(arm, labelled, town, objects, seed, count)
+        batches = endless_batches(mixed, self.settings.batch)
+        losses = train(network, batches, self.settings.iterations, RATE, name)
+        seconds = time.monotonic() - start
+        base = make_mixture(ARMS["real"], labelled, None, None, seed, count)
+        settling = islice(endless_batches(base, self.settings.batch), SETTLING)
+        network = settled(network, settling)
+        return {
+            "found": self._detect(network, seed),
+            "losses": [float(part.mean()) for part in np.array_split(losses, 10)],
+            "seconds": seconds,
+        }
+
+    def _detect(self, network: Detector, seed: int) -> dict[str, Any]:
+        """{index of a tested scan: what is found in it}, as plain values."""
+        indices = [i for part in self.tested(seed).values() for i in part]
+        scans = [self.source[i] for i in indices]
+        found = detect(
+            network,
+            lambda i: view(scans[i].points, scans[i].reflectance),
+            len(scans),
+        )
+        return {
+            str(index): {name: values.tolist() for name, values in vars(one).items()}
+            for index, one in zip(indices, found, strict=True)
+        }
+
+    def outcome(self, arm: str, seed: int) -> dict[int, Found]:
+        """{index of a tested scan: what a training found in it}.
+
+        Raises:
+            FileError: if the training is not there.
+            DataError: if its file is damaged.
+        """
+        path = self.path(arm, seed)
+        values = read_sealed(path, "the outcome of a training")
+        try:
+            return {int(i): _found(one) for i, one in values["found"].items()}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(
+                f"{path} is damaged ({error!r})", "what was detected", "Remove it."
+            ) from error
+
+
+def _found(values: Mapping[str, Any]) -> Found:
+    return Found(
+        np.array(values["boxes"], np.float32).reshape(-1, 7),
+        np.array(values["scores"], np.float32),
+        np.array(values["classes"], np.int64),
+    )
+
+
+def prove_detection(
+    scans: str | Path | Source,
+    out: str | Path = "proof",
+    settings: DetectionSettings | None = None,
+    *,
+    minutes: float = float("inf"),
+    pools: str | Path | None = None,
+) -> dict[str, Any]:
+    """Measure what the town adds to a few real scans with boxes, for a small detector.
+
+    Half of the places are left out of each training and tested on. Run it again to resume, or to
+    add arms and seeds.
+
+    Args:
+        scans: real scans with boxes: what ``open_scans`` opens, or a source.
+        out: folder to write to: outcomes, ``results.json`` and the page ``index.html``.
+        settings: of the comparison.
+        minutes: no training begins after so many.
+        pools: folder of the town's scans, which several comparisons may share.
+
+    Returns:
+        The values of ``results.json``.
+
+    Raises:
+        ConfigError: on settings that do not fit the scans, or a folder with another comparison.
+        DataError: on one place only, or scans without boxes.
+    """
+    start = time.monotonic()
+    out = Path(out)
+    settings = settings or DetectionSettings()
+    source = open_scans(scans) if isinstance(scans, str | Path) else scans
+    work = DetectionWork(source, settings, out, Path(pools or out / "town"))
+    truths = {i: Truth.of(source[i]) for i in range(len(source))}
+    claim(out / "study.json", _identity(work))
+    for seed in range(settings.seeds):
+        for arm in settings.compared:
+            path = work.path(arm, seed)
+            if path.exists() or time.monotonic() - start > 60 * minutes:
+                continue
+            write_file(path, seal(work.run(arm, seed)))
+    return report(work, truths)
+
+
+def _identity(work: DetectionWork) -> dict[str, Any]:
+    """Plain values that determine every training."""
+    own = asdict(work.settings)
+    for name in ("arms", "seeds", "labelled"):  # they add trainings
+        del own[name]
+    return {"scans": hash_of_names(names_of(work.source)), **own}
+
+
+def report(work: DetectionWork, truths: Mapping[int, Truth]) -> dict[str, Any]:
+    """Summarise the trainings that are there, and write ``results.json`` and the page.
+
+    Raises:
+        DataError: if there is no seed with all arms.
+    """
+    names = work.settings.compared
+    seeds = [
+        seed
+        for seed in range(work.settings.seeds)
+        if all(work.path(name, seed).is_file() for name in names)
+    ]
+    if not seeds:
+        raise DataError("no seed with trainings of all arms", "one", "Give more time.")
+    found = {name: {seed: work.outcome(name, seed) for seed in seeds} for name in names}
+    values = summarise(found, truths, {seed: work.tested(seed) for seed in seeds})
+    values |= {
+        "labelled": work.settings.labelled,
+        "settings": asdict(work.settings),
+        "sensor": work.source[0].sensor.name,
+        "machine": machine(),
+        "date": time.strftime("%Y-%m-%d"),
+        "command": command_line(),
+    }
+    name = f"results-{work.settings.labelled}.json"
+    write_file(work.out / name, (json.dumps(values, indent=1) + "\n").encode())
+    return values

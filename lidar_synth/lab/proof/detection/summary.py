@@ -1,0 +1,152 @@
+"""From detections to what can be said: average precision by criterion, and paired differences with
+intervals over places and seeds."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.lab.proof.detection.arms import ARMS, BASE
+from lidar_synth.lab.proof.detection.bev import Found
+from lidar_synth.lab.proof.detection.boxes import CLASSES
+from lidar_synth.lab.proof.detection.scores import (
+    Criterion,
+    Judged,
+    Truth,
+    judge,
+    precision_of,
+)
+
+CRITERIA = {
+    "overlap 0.5": Criterion(0.5),
+    "overlap 0.3": Criterion(0.3),
+    **{f"centre {far:g} m": Criterion(distance=far) for far in (0.5, 1, 2, 4)},
+    "overlap 0.5, 0 to 20 m": Criterion(0.5, far=20),
+    "overlap 0.5, 20 to 35 m": Criterion(0.5, near=20, far=35),
+    "overlap 0.5, over 35 m": Criterion(0.5, near=35),
+}
+MAIN = "overlap 0.5"
+"""The criterion of the paired differences."""
+DRAWS = 2000
+FEWEST_PLACES = 6
+"""Tested places from which an interval is given."""
+
+Outcomes = Mapping[int, Mapping[int, Found]]
+"""{seed: {index of a tested scan: what is found in it}} of an arm."""
+Tested = Mapping[int, Mapping[str, Sequence[int]]]
+"""{seed: {place: indices of its scans}}."""
+Groups = list[list[list[Judged]]]
+"""The judged scans by seed and place."""
+
+
+def summarise(
+    found: Mapping[str, Outcomes], truths: Mapping[int, Truth], tested: Tested
+) -> dict[str, Any]:
+    """The values of a comparison, by class; percent.
+
+    Args:
+        found: {arm: outcomes}; ``BASE`` is one of them.
+        truths: the boxes of every scan by its index.
+        tested: what each seed tests on.
+    """
+    classes = [
+        number
+        for number in range(len(CLASSES))
+        if any(
+            (truth.wanted & (truth.classes == number)).any()
+            for truth in truths.values()
+        )
+    ]
+    names = list(CLASSES)
+    return {
+        "arms": [
+            {"arm": arm, "title": ARMS[arm].title, "budget": ARMS[arm].budget}
+            for arm in found
+        ],
+        "places": {
+            name: len(scans) for part in tested.values() for name, scans in part.items()
+        },
+        "classes": {
+            names[each]: _of_class(found, truths, tested, each) for each in classes
+        },
+    }
+
+
+def _of_class(
+    found: Mapping[str, Outcomes],
+    truths: Mapping[int, Truth],
+    tested: Tested,
+    each: int,
+) -> dict[str, Any]:
+    """{arm: its figures} for one class."""
+    base = _groups(found[BASE], truths, tested, each, CRITERIA[MAIN])
+    table = {}
+    for arm, outcomes in found.items():
+        own = _groups(outcomes, truths, tested, each, CRITERIA[MAIN])
+        by_seed = [_percent(a) - _percent(b) for a, b in zip(own, base, strict=True)]
+        other = arm != BASE
+        table[arm] = {
+            "by_seed": [round(_percent(one), 1) for one in own],
+            "difference": round(float(np.mean(by_seed)), 1) if other else None,
+            "interval": interval_of(own, base) if other else None,
+            **{
+                name: _mean(_groups(outcomes, truths, tested, each, criterion))
+                for name, criterion in CRITERIA.items()
+            },
+        }
+    wanted = [sum(one.wanted for place in seed for one in place) for seed in base]
+    return {"boxes": wanted, "arms": table}
+
+
+def _groups(
+    outcomes: Outcomes,
+    truths: Mapping[int, Truth],
+    tested: Tested,
+    each: int,
+    criterion: Criterion,
+) -> Groups:
+    return [
+        [
+            [judge(outcomes[seed][i], truths[i], each, criterion) for i in scans]
+            for scans in places.values()
+        ]
+        for seed, places in tested.items()
+    ]
+
+
+def _percent(places: Sequence[Sequence[Judged]]) -> float:
+    return 100 * precision_of([one for place in places for one in place])
+
+
+def _mean(groups: Groups) -> float | None:
+    """Mean over seeds; None without a box."""
+    values = [value for seed in groups if not np.isnan(value := _percent(seed))]
+    return round(float(np.mean(values)), 1) if values else None
+
+
+def interval_of(
+    own: Groups, base: Groups, draws: int = DRAWS
+) -> tuple[float, float] | None:
+    """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over the
+    tested places of each seed.
+
+    The average precision is of all drawn places together. None with fewer than
+    ``FEWEST_PLACES`` places.
+    """
+    if sum(map(len, own)) < FEWEST_PLACES:
+        return None
+    rng = np.random.default_rng(0)
+    values = [_draw(own, base, rng) for _ in range(draws)]
+    low, high = np.nanquantile(values, (0.025, 0.975))
+    return round(float(low), 1), round(float(high), 1)
+
+
+def _draw(own: Groups, base: Groups, rng: np.random.Generator) -> float:
+    differences = []
+    for a, b in zip(own, base, strict=True):
+        picks: NDArray[np.int64] = rng.integers(0, len(a), len(a))
+        differences.append(
+            _percent([a[i] for i in picks]) - _percent([b[i] for i in picks])
+        )
+    return float(np.nanmean(differences))

@@ -1,1 +1,0 @@
-"""The detector of ``tools/research/detector_trial.py``: its scans, its network, its score."""
