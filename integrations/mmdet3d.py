@@ -30,6 +30,7 @@ from lidar_synth.integrations.mmdet3d_slots import (
     scan_of,
     split_url,
 )
+from lidar_synth.integrations.weights import KEY, weigh_mmdet3d
 
 from lidar_synth.errors import ConfigError, DataError, LibraryError
 from lidar_synth.geometry.scan import Scan
@@ -191,7 +192,8 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
     """
 
     def __init__(self, dataset: Any, seed: int | None = None, **options: Any) -> None:
-        folders = _checked(dataset)
+        self.folders = _checked(dataset)
+        folders = self.folders
         super().__init__(dataset, seed=int(folders[0].settings["seed"]), **options)
         dataset.__getitems__ = Fetch(dataset, [folder.path for folder in folders])
         self.start = 0
@@ -224,6 +226,11 @@ class SynthSampler(DefaultSampler):  # type: ignore[misc]
             else self._planned(self.planned.entries(epoch).tolist())
         )
         return ((epoch, index) for index in islice(order, start, None))
+
+    def weights_of(self, paths: list[str]) -> list[float]:
+        """The weight in the loss of samples by the paths of their points, in this epoch."""
+        synthetic = float(self.folders[0].mixed.synthetic_weight(self.epoch))
+        return [synthetic if path.startswith(PREFIX) else 1.0 for path in paths]
 
     def _planned(self, entries: list[int]) -> Iterator[int]:
         """This process's entries; the first ones once more where all processes need as many."""
@@ -271,6 +278,9 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
                 f"SynthEpochHook with the sampler {type(runner.train_dataloader.sampler).__name__}",
                 "train_dataloader = dict(sampler=dict(_delete_=True, type='SynthSampler'))",
             )
+        sampler = runner.train_dataloader.sampler
+        if any(KEY in folder.settings for folder in sampler.folders):
+            weigh_mmdet3d(runner.model, sampler.weights_of)
         self._resumes = True
 
     def before_train_epoch(self, runner: Any) -> None:

@@ -86,14 +86,12 @@ class Folder:
 
     def __init__(self, path: Path, facts: dict[str, Any]) -> None:
         self.path = path
-        self.settings = facts["settings"]
+        self.settings = {k: _by_epoch(v) for k, v in facts["settings"].items()}
         self.real = int(facts["real"])
-        if isinstance(ratio := self.settings["ratio"], dict):  # JSON knows names only
-            self.settings = self.settings | {
-                "ratio": {int(epoch): share for epoch, share in ratio.items()}
-            }
         self.layout = LAYOUTS[facts.get("layout", "kitti")]
-        self.mixed = mix_for_trainer(self.real, self.settings, lambda scan, rng: scan)
+        self.mixed = mix_for_trainer(
+            self.real, self.settings, lambda scan, rng: scan, True
+        )
         self.slots = self.mixed.mixture.laps[0]
         self._view = (
             None if facts.get("view") is None else Calibration(**_arrays(facts["view"]))
@@ -190,6 +188,13 @@ class Folder:
         if self._positions is None or self._positions[0] != epoch:
             self._positions = (epoch, np.flatnonzero(self.mixed.plan(epoch).domain))
         return epoch, int(self._positions[1][slot % len(self._positions[1])])
+
+
+def _by_epoch(value: Any) -> Any:
+    """A setting by epoch with numbers for its epochs: JSON knows names only."""
+    if not isinstance(value, dict):
+        return value
+    return {int(k) if str(k).isdigit() else k: v for k, v in value.items()}
 
 
 open_folder = cache(Folder.open)

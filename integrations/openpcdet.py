@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from lidar_synth.integrations.launcher import prepare_script, run
+from lidar_synth.integrations.weights import weigh_openpcdet
 from torch.utils.data import Sampler, SequentialSampler
 
 from lidar_synth.errors import LibraryError
@@ -99,6 +100,8 @@ def tell_epochs() -> None:
             )
             # Nothing for the iterator that OpenPCDet makes and drops.
             batches.sampler.skipped = len(batches.sampler)
+            if train_loader.dataset.weighed:
+                weigh_openpcdet(model)
         return whole_training(model, optimizer, train_loader, *args, **options)
 
     def train_one_epoch(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
+from lidar_synth.integrations.weights import KEY
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
@@ -30,6 +31,8 @@ class MixedDetection:
     # Processes a synthetic scan with the trainer's own augmentation.
     _synthetic: Callable[[Scan], Any]
     mixed: Any = None
+    weighed = False
+    """Whether samples have a weight in the loss."""
     dataset_cfg: Any
     class_names: Any
 
@@ -38,7 +41,10 @@ class MixedDetection:
         a box may have."""
         settings = read_settings(self.dataset_cfg.get("LIDAR_SYNTH", None))
         real: int = super().__len__()  # type: ignore[misc]
-        self.mixed = mix_for_trainer(real, settings, lambda scan, rng: scan)
+        self.weighed = KEY in settings
+        self.mixed = mix_for_trainer(
+            real, settings, lambda scan, rng: scan, weighs=True
+        )
         self._check_boxes({*self.class_names, *known})
 
     def merge_all_iters_to_one_epoch(
@@ -81,9 +87,11 @@ class MixedDetection:
         self._current = index % len(self.mixed)
         try:
             sample = self.mixed[self._current]
-            if isinstance(sample, Scan):
-                return self._synthetic(sample)
-            return super().__getitem__(int(sample))  # type: ignore[misc]
+            make = self._synthetic if isinstance(sample, Scan) else super().__getitem__  # type: ignore[misc]
+            made = make(sample)
+            if self.weighed:
+                made[KEY] = np.float32(self.mixed.loss_weight(self._current))
+            return made
         finally:
             self._current = None
 

@@ -131,6 +131,16 @@ def test_the_class_is_registered_beside_the_trainers_own(made: Path) -> None:
     assert issubclass(registered[NAME], KittiDataset) and create_kitti_infos is not None
 
 
+def test_samples_have_the_weight_of_their_domain(made: Path) -> None:
+    dataset = build(made, LOSS_WEIGHT=0.1)
+    samples = [dataset[i] for i in range(len(dataset))]
+    expected = [0.1 if dataset.domain(i) else 1.0 for i in range(len(dataset))]
+    assert [s["loss_weight"] for s in samples] == pytest.approx(expected)
+    batch = dataset.collate_batch(samples)
+    assert batch["loss_weight"].tolist() == pytest.approx(expected)
+    assert "loss_weight" not in build(made)[0]
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_two_epochs_see_exactly_the_planned_scans(made: Path, workers: int) -> None:
     dataset = build(made)

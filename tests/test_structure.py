@@ -168,9 +168,9 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (150_500, 6.0, 141),
-    "laboratory": (111_100, 6.0, 154),
-    "tools": (39_550, 6.0, 128),
+    "plugin": (151_200, 6.0, 141),
+    "laboratory": (116_100, 6.0, 154),
+    "tools": (37_450, 6.0, 128),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -121,6 +121,16 @@ def jitter(
     )
 
 
+def drop_reflectance(scan: Scan, rng: np.random.Generator, chance: float = 1.0) -> Scan:
+    """Set the reflectance to 0 with probability ``chance``: a network cannot tell domains by it.
+
+    Use it for real and synthetic scans alike, in training and, with ``chance=1``, in use.
+    """
+    if rng.random() >= check_share("chance", chance):
+        return scan
+    return replace(scan, reflectance=np.zeros_like(scan.reflectance))
+
+
 def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
     """Drop entire rings, at most ``share`` of the sensor's beams.
 

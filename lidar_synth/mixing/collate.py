@@ -31,7 +31,8 @@ class Collate:
     """A ``collate_fn`` that makes a batch of B items.
 
     Every batch has ``boxes`` (ΣM, 7) float32 with ``box_offsets`` (B + 1,) int64, ``names`` (B
-    tuples), ``domain`` (B,) int64 and ``id`` (B names). The other keys depend on the form:
+    tuples), ``domain`` (B,) int64, ``loss_weight`` (B,) float32 and ``id`` (B names). The other
+    keys depend on the form:
 
     - ``offsets``: ``points`` (ΣN, 4) float32, ``label`` (ΣN,) int64, ``confidence`` (ΣN,) float32,
       the concatenation of all scans; ``offsets`` (B + 1,) int64: scan b is
@@ -81,6 +82,9 @@ class Collate:
             "box_offsets": _offsets(boxes),
             "names": [item["names"] for item in items],
             "domain": torch.tensor([item["domain"] for item in items]),
+            "loss_weight": torch.tensor(
+                [item.get("loss_weight", 1.0) for item in items]
+            ),
             "id": [item["id"] for item in items],
         }
         if (

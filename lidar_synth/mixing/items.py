@@ -23,6 +23,7 @@ class Item(dict[str, Any]):
             = 0 without boxes.
         names: M class names in KITTI's spelling.
         domain: 0 real, 1 synthetic.
+        loss_weight: by which the loss of this sample is to be multiplied.
         id: the scan's name.
     """
 
@@ -82,5 +83,6 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         boxes=torch.from_numpy(boxes),
         names=() if scan.boxes is None else scan.boxes.names,
         domain=scan.domain,
+        loss_weight=1.0,
         id=scan.id,
     )

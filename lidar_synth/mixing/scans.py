@@ -19,14 +19,20 @@ from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
+from lidar_synth.mixing.domains import make_weight
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
-from lidar_synth.mixing.items import copy_scan, to_item
+from lidar_synth.mixing.items import Item, copy_scan, to_item
 from lidar_synth.mixing.loader import MixedLoader
 from lidar_synth.mixing.notices import Notices, report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
-from lidar_synth.mixing.schedules import Schedule, make_schedule, to_integer
-from lidar_synth.mixing.sources import check_together, each
+from lidar_synth.mixing.schedules import (
+    Schedule,
+    make_schedule,
+    share_of,
+    to_integer,
+)
+from lidar_synth.mixing.sources import check_together, each, loss_weights_of
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -60,10 +66,14 @@ class MixedScans(Dataset[Any]):
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
         synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
         ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch,
-            ``{epoch: share}``, ``Linear(first, last, epochs)`` or a function of the epoch.
+            ``{epoch: share}``, ``Linear(first, last, epochs)``, ``EndOnReal(epochs)`` or a
+            function of the epoch.
         labels: label policy of the synthetic scans: a policy of ``lidar_synth.labels`` such as
             ``PasteObjects(bank, count=8)``, a name of ``lidar_synth.labels.POLICIES``, ``{name:
             {argument: value}}``, or your own ``(scan, rng) -> scan``.
+        loss_weight: weight of the synthetic samples in the loss, from 0 to 1: a number, or one by
+            epoch as for ``ratio``. Items and batches have it as ``loss_weight``; ``Sources`` may
+            have one for each source. The training multiplies.
         seed: of the order, of all random numbers of a sample, and of a generator's scans.
         epoch_size: the length of every epoch. ``"add"`` uses every real scan once and adds
             synthetic ones, as many as the largest ratio of a schedule needs; where the ratio is
@@ -100,6 +110,7 @@ class MixedScans(Dataset[Any]):
         collate: the ``collate_fn``.
         mixture: the settings that determine the plan.
         real, synthetic: the sources, in the plan's order.
+        synthetic_weight: the weight of synthetic samples in the loss by epoch.
         current: the current epoch, shared by all processes of this dataset.
 
     Raises:
@@ -113,7 +124,7 @@ class MixedScans(Dataset[Any]):
         >>> len(train), sum(train.domain(i) for i in range(len(train)))  # three real scans, one synthetic
         (4, 1)
         >>> list(train[0])
-        ['points', 'label', 'confidence', 'boxes', 'names', 'domain', 'id']
+        ['points', 'label', 'confidence', 'boxes', 'names', 'domain', 'loss_weight', 'id']
     """
 
     def __init__(
@@ -124,6 +135,7 @@ class MixedScans(Dataset[Any]):
         labels: Labels = "generated",
         seed: int = 0,
         *,
+        loss_weight: Ratio = 1.0,
         epoch_size: EpochSize = "add",
         reuse: int = 1,
         balanced: bool = False,
@@ -151,6 +163,8 @@ class MixedScans(Dataset[Any]):
         ]
         self.real = tuple(source for source, _ in reals)
         self.synthetic = tuple(source for source, _ in synthetics)
+        self.synthetic_weight = make_weight(loss_weight)
+        self._loss_weights = (*loss_weights_of(real), *loss_weights_of(synth))
         self._transfer = _make_transfer(as_sensor)
         suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
         self.mixture = Mixture(
@@ -392,6 +406,33 @@ class MixedScans(Dataset[Any]):
             else REAL
         )
 
+    def loss_weight(self, index: int) -> float:
+        """The weight in the loss of the sample at ``index`` in the current epoch.
+
+        Example:
+            >>> from lidar_synth import Bank, MixedScans, open_scans
+            >>> train = MixedScans(
+            ...     open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5, loss_weight=0.1
+            ... )
+            >>> sorted(train.loss_weight(i) for i in range(len(train)))
+            [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
+        """
+        plan = self.plan(index.epoch if isinstance(index, Position) else None)
+        return self._weight_of(plan, index if index >= 0 else index + len(plan))
+
+    def _weight_of(self, plan: MixingPlan, position: int) -> float:
+        source = plan[position][0]
+        weight = float(self._loss_weights[source])
+        if source < plan.reals:
+            return weight
+        return weight * float(share_of(self.synthetic_weight, plan.epoch))
+
+    def _weighed(self, sample: Any, plan: MixingPlan, position: int) -> Any:
+        """The sample, with its weight if it is a plain item."""
+        if isinstance(sample, Item):
+            sample["loss_weight"] = self._weight_of(plan, position)
+        return sample
+
     def epoch_of(self, index: int) -> int:
         """The epoch of an index that is being fetched: the one in which iteration began.
 
@@ -421,7 +462,7 @@ class MixedScans(Dataset[Any]):
         rng = keyed_rng(self.seed, epoch, position)
         if self._augment is not None and self._augment_real:
             real = self._augment(real, rng)
-        return self._to_sample(real, rng)
+        return self._weighed(self._to_sample(real, rng), plan, position)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
         """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation,
@@ -431,7 +472,8 @@ class MixedScans(Dataset[Any]):
         """
         plan = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
-        return self._finish(plan[position][0] - plan.reals, scan, rng)
+        sample = self._finish(plan[position][0] - plan.reals, scan, rng)
+        return self._weighed(sample, plan, position)
 
     def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
         scan = copy_scan(scan) if self._transfer is None else self._transfer(scan, rng)

@@ -17,6 +17,8 @@ Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
 1]."""
 
+END_ON_REAL = "end_on_real"
+"""Names ``EndOnReal`` in settings."""
 _FINEST = (
     10**6
 )  # largest denominator of a share: products with positions stay within 64 bits
@@ -100,6 +102,44 @@ class Linear:
         return self.first * (1 - progress) + self.last * progress
 
 
+@dataclass(frozen=True)
+class EndOnReal:
+    """Synthetic scans alone at first, then beside real ones, and real scans alone at the end.
+
+    Args:
+        epochs: number of epochs of the training, at least 4.
+        share: of synthetic samples in the third quarter, in [0, 1].
+
+    Raises:
+        ConfigError: on fewer epochs, or another share.
+
+    Example:
+        >>> from lidar_synth.mixing import EndOnReal
+        >>> ratio = EndOnReal(epochs=8)
+        >>> [ratio(epoch) for epoch in range(8)]
+        [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
+    """
+
+    epochs: int
+    share: float = 0.5
+
+    def __post_init__(self) -> None:
+        _checked(self.share, 0)
+        if to_integer(self.epochs, "epochs") < 4:
+            given = f"{self.epochs} epochs of a schedule that ends on real scans"
+            raise ConfigError(given, "at least 4")
+
+    @property
+    def constant_from(self) -> int:
+        """The epoch from which on the share is constant."""
+        return 3 * self.epochs // 4
+
+    def __call__(self, epoch: int) -> float:
+        if epoch < self.epochs // 2:
+            return 1.0
+        return self.share if epoch < self.constant_from else 0.0
+
+
 def make_schedule(
     ratio: float | Sequence[float] | Mapping[int, float] | Schedule,
 ) -> Schedule:
@@ -107,13 +147,16 @@ def make_schedule(
 
     Args:
         ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its
-            epoch on; ``Linear(first, last, epochs)``; or any function of the epoch.
+            epoch on; ``Linear(first, last, epochs)``; ``EndOnReal(epochs)``, in YAML
+            ``{end_on_real: epochs}``; or any function of the epoch.
 
     Raises:
         ConfigError: on a share outside [0, 1], or no share for epoch 0.
     """
     if callable(ratio):
         return ratio
+    if isinstance(ratio, Mapping) and END_ON_REAL in ratio and len(ratio) == 1:
+        return EndOnReal(ratio[END_ON_REAL])  # type: ignore[index]
     if isinstance(ratio, Mapping):
         return Steps(
             tuple(

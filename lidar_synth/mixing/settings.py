@@ -27,6 +27,7 @@ further keys."""
 OPTIONS = (
     "synthetic",
     "ratio",
+    "loss_weight",
     "labels",
     "seed",
     "reuse",
@@ -145,6 +146,7 @@ def mix_for_trainer(
     real: int,
     settings: Mapping[str, Any],
     to_sample: Callable[[Scan, np.random.Generator], Any],
+    weighs: bool = False,
 ) -> MixedScans:
     """Make a mixture from settings, for a trainer that loads real samples itself.
 
@@ -152,6 +154,7 @@ def mix_for_trainer(
         real: number of the trainer's real samples.
         settings: keys of ``OPTIONS``; ``synthetic`` is required.
         to_sample: ``(scan, rng) -> sample`` for synthetic scans.
+        weighs: whether the trainer multiplies losses by ``loss_weight``.
 
     Returns:
         A dataset whose real samples are only their numbers, 0 <= n < real, by which the trainer
@@ -169,6 +172,13 @@ def mix_for_trainer(
             f"classes: {settings['classes']} for this trainer",
             "no key classes: SemanticKITTI's",
             "The adapters of lidar-bonnetal's family, Cylinder3D and Pointcept take others.",
+        )
+    if "loss_weight" in settings and not weighs:
+        raise ConfigError(
+            f"loss_weight: {settings['loss_weight']} for this trainer, which adds up the losses "
+            "of all samples of a batch",
+            "no key loss_weight",
+            "Use a smaller ratio, or one that falls: ratio: {end_on_real: EPOCHS}.",
         )
     if settings.get("synthetic") is None:
         raise ConfigError(

@@ -9,6 +9,7 @@ from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.labels.own import check_share
 
 
 class Sources:
@@ -19,9 +20,12 @@ class Sources:
         weights: one for each source; its number of samples in an epoch is proportional to its
             weight. By default the weight of a real source is its length, and synthetic sources have
             equal weights.
+        loss_weights: one for each source, from 0 to 1, by which the loss of its samples is to be
+            multiplied; by default 1.
 
     Raises:
-        ConfigError: without a source, or on another number of weights.
+        ConfigError: without a source, on another number of weights, or on loss weights that are
+            not from 0 to 1.
 
     Example:
         >>> from lidar_synth import Bank, MixedScans, Sources, load_generator
@@ -31,12 +35,22 @@ class Sources:
         ['town/0/0', 'town/1/0', 'town/1/1', 'town/1/2']
     """
 
-    def __init__(self, *sources: Any, weights: Sequence[float] | None = None) -> None:
-        if not sources or (weights is not None and len(weights) != len(sources)):
-            raise ConfigError(
-                f"{len(sources)} sources with weights {weights}",
-                "sources, and a weight for each or none",
-            )
+    def __init__(
+        self,
+        *sources: Any,
+        weights: Sequence[float] | None = None,
+        loss_weights: Sequence[float] | None = None,
+    ) -> None:
+        for name, given in (("weights", weights), ("loss_weights", loss_weights)):
+            if not sources or (given is not None and len(given) != len(sources)):
+                raise ConfigError(
+                    f"{len(sources)} sources with {name} {given}",
+                    "sources, and a weight for each or none",
+                )
+        self.loss_weights = tuple(
+            check_share("loss weight", weight)
+            for weight in loss_weights or [1.0] * len(sources)
+        )
         self.sources = sources
         plain = (
             None
@@ -68,6 +82,11 @@ def each(source: Any) -> tuple[tuple[Any, float | None], ...]:
     if isinstance(source, Sources):
         return tuple(zip(source.sources, source.weights, strict=True))
     return ((source, None),)
+
+
+def loss_weights_of(source: Any) -> tuple[float, ...]:
+    """The loss weight of each source of an argument, as ``each``."""
+    return getattr(source, "loss_weights", (1.0,) * len(each(source)))
 
 
 def sensor_of(source: Any) -> Sensor:

@@ -22,6 +22,7 @@ import detector_pools as pools
 import numpy as np
 import torch
 import typer
+from torch import nn
 from tqdm import tqdm
 
 from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
@@ -31,17 +32,17 @@ from lidar_synth.lab.proof.detection.boxes import CLASSES
 from lidar_synth.lab.proof.detection.network import (
     Detector,
     Sample,
+    answer_batch,
     collate,
     detect,
     sample,
-    settled,
     train,
 )
 from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
-from lidar_synth.mixing import Sources
+from lidar_synth.mixing import Sources, settle
 
 LABELLED = 30
 TRAIN_TOWN = 7
@@ -63,7 +64,7 @@ BASE = "gt_sampling"
 """The arm with which the others are compared."""
 
 
-Test = Callable[[Detector], list[float]]
+Test = Callable[[nn.Module], list[float]]
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ def run(work: Work, name: str, seed: int, test: Test) -> dict[str, Any]:
     losses = train(network, batches, work.iterations, RATE, f"{name} {seed}")
     seconds = time.process_time() - start
     base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
-    found = test(settled(network, _one_epoch(base)))
+    found = test(settle(network, _one_epoch(base), answer_batch))
     tenths = [part for part in np.array_split(losses, 10) if len(part)]
     return {
         "arm": name,
@@ -276,7 +277,7 @@ def make_test(work: Work) -> Test:
         flush=True,
     )
 
-    def test(network: Detector) -> list[float]:
+    def test(network: nn.Module) -> list[float]:
         return precisions(
             detect(
                 network,

@@ -6,7 +6,6 @@ of the same form.
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -18,7 +17,6 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
-from torch.optim.swa_utils import update_bn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
@@ -33,7 +31,7 @@ from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
 from lidar_synth.lab.train.segmentation import RATE, endless_batches, train_segmenter
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.augment import mirror_scan, rotate_scan
-from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing import MixedScans, settle
 
 LOOKS = 8
 """Points of the curve of a training."""
@@ -341,7 +339,7 @@ def _test(
 
 def _settled(
     network: RangeSegmenter, job: Job, height: Tensor, batches: int
-) -> RangeSegmenter:
+) -> nn.Module:
     """A copy whose statistics of the normalisation are those of the labelled real scans; the same
     in every arm.
 
@@ -357,13 +355,9 @@ def _settled(
         collate="range",
     )
     some = islice(endless_batches(mixed, job.batch), batches)
-    network = deepcopy(network)
+
+    def forward(model: nn.Module, batch: Images) -> Any:
+        return model(segmenter_input(batch["range"], batch["reflectance"], height))
+
     with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
-        update_bn(
-            (
-                segmenter_input(batch["range"], batch["reflectance"], height)
-                for batch in some
-            ),
-            network,
-        )
-    return network.eval()
+        return settle(network, some, forward)

@@ -62,7 +62,10 @@ class Found:
     classes: NDArray[np.int64]
 
 
-def view(points: NDArray[np.float32], reflectance: NDArray[np.float32]) -> Tensor:
+def view(
+    points: NDArray[np.float32],
+    reflectance: NDArray[np.float32],
+) -> Tensor:
     """(n, n, CHANNELS) uint8: a scan of N points from above, x along the first axis."""
     image = np.zeros((CELLS * CELLS, SLICES + 2), np.uint8)
     count = np.zeros(CELLS * CELLS, np.int32)
@@ -88,7 +91,9 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
 
 
 def targets(
-    boxes: NDArray[np.float32], classes: NDArray[np.int64], pixel: float
+    boxes: NDArray[np.float32],
+    classes: NDArray[np.int64],
+    pixel: float,
 ) -> Target:
     """The targets of M boxes (M, 7) with classes (M,); pixels have sides of ``pixel`` metres."""
     count = round(2 * REACH / pixel)
@@ -119,7 +124,9 @@ def targets(
 
 
 def _offsets(
-    centre: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+    centre: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
 ) -> list[NDArray]:
     """From the middle of each pixel to a centre, in pixels: along the rows and along the
     columns."""
@@ -134,7 +141,12 @@ def _shape(box: NDArray[np.float64]) -> list[float]:
     return [box[2], *np.log(box[3:6]), np.cos(2 * box[6]), np.sin(2 * box[6])]
 
 
-def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) -> Found:
+def decode(
+    heat: Tensor,
+    values: Tensor,
+    least: float = 0.05,
+    most: int = 80,
+) -> Found:
     """The boxes of one view.
 
     Args:
@@ -159,7 +171,10 @@ def decode(heat: Tensor, values: Tensor, least: float = 0.05, most: int = 80) ->
     return Found(np.concatenate(boxes), np.concatenate(scores), classes)
 
 
-def _apart(places: NDArray[np.float32], distance: float) -> list[int]:
+def _apart(
+    places: NDArray[np.float32],
+    distance: float,
+) -> list[int]:
     """The places (D, 2) in order, without those within a distance of an earlier one."""
     kept: list[int] = []
     for i, place in enumerate(places):
@@ -168,7 +183,10 @@ def _apart(places: NDArray[np.float32], distance: float) -> list[int]:
     return kept
 
 
-def boxes_at(index: Tensor, values: Tensor) -> NDArray[np.float32]:
+def boxes_at(
+    index: Tensor,
+    values: Tensor,
+) -> NDArray[np.float32]:
     """(D, 7) boxes that the pixels with these flat indices hold."""
     count = values.shape[-1]
     found = values.flatten(1)[:, index].double().numpy()

@@ -22,7 +22,10 @@ LEAST = 5
 """Minimum number of points of a box that is trained on, or that has to be found."""
 
 
-def points_in(boxes: Boxes, scan: Scan) -> NDArray[np.int64]:
+def points_in(
+    boxes: Boxes,
+    scan: Scan,
+) -> NDArray[np.int64]:
     """(M,) number of returns of a scan in each of M boxes, above its floor."""
     return np.asarray(boxes.contain(scan.points, above_floor=0.1).sum(1))
 

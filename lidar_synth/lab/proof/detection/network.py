@@ -2,14 +2,12 @@
 and its test."""
 
 from collections.abc import Callable, Iterable, Sequence
-from copy import deepcopy
 from itertools import islice
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.optim.swa_utils import update_bn
 from tqdm import tqdm
 
 from lidar_synth.geometry.scan import Scan
@@ -36,7 +34,10 @@ RARE_HEAT = -4.6
 Sample = tuple[Tensor, Target]
 
 
-def sample(scan: Scan, rng: np.random.Generator) -> Sample:
+def sample(
+    scan: Scan,
+    rng: np.random.Generator,
+) -> Sample:
     """The view and the targets of a scan with boxes."""
     boxes = detected(scan)
     return view(scan.points, scan.reflectance), targets(
@@ -52,7 +53,11 @@ def collate(samples: Sequence[Sample]) -> Sample:
     )
 
 
-def _layer(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+def _layer(
+    inputs: int,
+    outputs: int,
+    stride: int = 1,
+) -> nn.Sequential:
     convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
@@ -96,7 +101,18 @@ class Detector(nn.Module):
         return out[:, : len(CLASSES)], out[:, len(CLASSES) :]
 
 
-def answer(network: nn.Module, views: Tensor) -> tuple[Tensor, Tensor]:
+def answer_batch(
+    network: nn.Module,
+    batch: Sample,
+) -> tuple[Tensor, Tensor]:
+    """The network on the views of a batch."""
+    return answer(network, batch[0])
+
+
+def answer(
+    network: nn.Module,
+    views: Tensor,
+) -> tuple[Tensor, Tensor]:
     """The network on views (B, 2n, 2n, CHANNELS) uint8. The first layer is normalised, so that the
     scale of its input does not matter."""
     with _precision():
@@ -114,7 +130,11 @@ def _precision() -> torch.autocast:
     return torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16())
 
 
-def loss_of(logits: Tensor, values: Tensor, target: Target) -> Tensor:
+def loss_of(
+    logits: Tensor,
+    values: Tensor,
+    target: Target,
+) -> Tensor:
     """CenterPoint's focal loss of the heat, and the absolute error of the values around centres."""
     p = logits.sigmoid()
     log_p = F.logsigmoid(logits)
@@ -160,17 +180,10 @@ def train(
     return losses
 
 
-def settled(network: Detector, batches: Iterable[Sample]) -> Detector:
-    """A copy whose statistics of the batch normalisation are those of some batches, of labelled
-    scans in every arm."""
-    network = deepcopy(network)
-    with _precision():
-        update_bn((_input(views) for views, _ in batches), network)
-    return network.eval()
-
-
 def detect(
-    network: Detector, views: Callable[[int], Tensor], count: int
+    network: Detector,
+    views: Callable[[int], Tensor],
+    count: int,
 ) -> list[Found]:
     """The boxes that a network in evaluation mode finds in views 0 to ``count`` - 1."""
     every = []

@@ -59,7 +59,9 @@ class Criterion:
     far: float = np.inf
 
     def fit(
-        self, boxes: NDArray[np.float32], truth: NDArray[np.float32]
+        self,
+        boxes: NDArray[np.float32],
+        truth: NDArray[np.float32],
     ) -> NDArray[np.float64]:
         """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
         if self.overlap:
@@ -82,7 +84,12 @@ class Judged(NamedTuple):
     wanted: int
 
 
-def judge(found: Found, truth: Truth, each: int, criterion: Criterion) -> Judged:
+def judge(
+    found: Found,
+    truth: Truth,
+    each: int,
+    criterion: Criterion,
+) -> Judged:
     """The detections of a class in one scan by a criterion."""
     mine = found.classes == each
     real = truth.classes == each
@@ -105,7 +112,10 @@ def precision_of(judged: Sequence[Judged]) -> float:
     )
 
 
-def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
+def precisions(
+    found: Sequence[Found],
+    truths: Sequence[Truth],
+) -> list[float]:
     """The average precision of every class over some scans, 0 to 1; NaN for one without a box."""
     pairs = list(zip(found, truths, strict=True))
     return [
@@ -115,7 +125,9 @@ def precisions(found: Sequence[Found], truths: Sequence[Truth]) -> list[float]:
 
 
 def matched(
-    fit: NDArray[np.float64], scores: NDArray[np.float32], wanted: NDArray[np.bool_]
+    fit: NDArray[np.float64],
+    scores: NDArray[np.float32],
+    wanted: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """(D,) 1 for a right detection, 0 for a wrong one, -1 for one that does not count: of a box
     that is not wanted.
@@ -138,7 +150,8 @@ def matched(
 
 
 def footprint_ious(
-    a: NDArray[np.float32], b: NDArray[np.float32]
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     """(A, B) intersection over union of the footprints of boxes (A, 7) and (B, 7)."""
     ious = np.zeros((len(a), len(b)))
@@ -165,7 +178,10 @@ def _footprints(values: NDArray[np.float32]) -> NDArray[np.float64]:
     return boxes.corners()[:, :4, :2].astype(np.float64)
 
 
-def _common_area(polygon: NDArray[np.float64], window: NDArray[np.float64]) -> float:
+def _common_area(
+    polygon: NDArray[np.float64],
+    window: NDArray[np.float64],
+) -> float:
     """Area of the intersection of two convex polygons (n, 2), counter-clockwise: Sutherland and
     Hodgman (1974)."""
     for start, end in zip(window, np.roll(window, -1, 0), strict=True):

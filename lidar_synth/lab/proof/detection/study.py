@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from tqdm import tqdm
 
 from lidar_synth.errors import ConfigError, DataError, suggest
@@ -30,8 +31,8 @@ from lidar_synth.lab.proof.detection.bev import Found, view
 from lidar_synth.lab.proof.detection.boxes import with_points
 from lidar_synth.lab.proof.detection.network import (
     Detector,
+    answer_batch,
     detect,
-    settled,
     train,
 )
 from lidar_synth.lab.proof.detection.scores import Truth
@@ -42,6 +43,7 @@ from lidar_synth.lab.proof.pools import TOWN_SEED
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
+from lidar_synth.mixing import settle
 
 RATE = 3e-3
 SETTLING = 16
@@ -93,7 +95,10 @@ class DetectionSettings:
         return [name for name in ARMS if name in {BASE, *self.arms}]
 
 
-def half_of(places: Places, seed: int) -> list[str]:
+def half_of(
+    places: Places,
+    seed: int,
+) -> list[str]:
     """The names of the places that a seed tests on; seeds 2n and 2n + 1 share them out.
 
     Raises:
@@ -162,11 +167,19 @@ class DetectionWork:
         """{place: indices of its scans} that a seed tests on."""
         return {name: self.places[name] for name in half_of(self.places, seed)}
 
-    def path(self, arm: str, seed: int) -> Path:
+    def path(
+        self,
+        arm: str,
+        seed: int,
+    ) -> Path:
         """The file of an outcome."""
         return self.out / "runs" / f"{arm}-{self.settings.labelled}-{seed}.json"
 
-    def run(self, name: str, seed: int) -> dict[str, Any]:
+    def run(
+        self,
+        name: str,
+        seed: int,
+    ) -> dict[str, Any]:
         """Train and test one detector."""
         arm = ARMS[name]
         start = time.monotonic()
@@ -182,14 +195,17 @@ class DetectionWork:
         seconds = time.monotonic() - start
         base = make_mixture(ARMS["real"], labelled, None, None, seed, count)
         settling = islice(endless_batches(base, self.settings.batch), SETTLING)
-        network = settled(network, settling)
         return {
-            "found": self._detect(network, seed),
+            "found": self._detect(settle(network, settling, answer_batch), seed),
             "losses": [float(part.mean()) for part in np.array_split(losses, 10)],
             "seconds": seconds,
         }
 
-    def _detect(self, network: Detector, seed: int) -> dict[str, Any]:
+    def _detect(
+        self,
+        network: nn.Module,
+        seed: int,
+    ) -> dict[str, Any]:
         """{index of a tested scan: what is found in it}, as plain values."""
         indices = [i for part in self.tested(seed).values() for i in part]
         scans = [self.source[i] for i in indices]
@@ -203,7 +219,11 @@ class DetectionWork:
             for index, one in zip(indices, found, strict=True)
         }
 
-    def outcome(self, arm: str, seed: int) -> dict[int, Found]:
+    def outcome(
+        self,
+        arm: str,
+        seed: int,
+    ) -> dict[int, Found]:
         """{index of a tested scan: what a training found in it}.
 
         Raises:
@@ -279,7 +299,10 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
     return {"scans": hash_of_names(names_of(work.source)), **own}
 
 
-def report(work: DetectionWork, truths: Mapping[int, Truth]) -> dict[str, Any]:
+def report(
+    work: DetectionWork,
+    truths: Mapping[int, Truth],
+) -> dict[str, Any]:
     """Summarise the trainings that are there, and write ``results.json`` and the page.
 
     Raises:

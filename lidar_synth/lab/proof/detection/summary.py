@@ -41,7 +41,9 @@ Groups = list[list[list[Judged]]]
 
 
 def summarise(
-    found: Mapping[str, Outcomes], truths: Mapping[int, Truth], tested: Tested
+    found: Mapping[str, Outcomes],
+    truths: Mapping[int, Truth],
+    tested: Tested,
 ) -> dict[str, Any]:
     """The values of a comparison, by class; percent.
 
@@ -126,7 +128,9 @@ def _mean(groups: Groups) -> float | None:
 
 
 def interval_of(
-    own: Groups, base: Groups, draws: int = DRAWS
+    own: Groups,
+    base: Groups,
+    draws: int = DRAWS,
 ) -> tuple[float, float] | None:
     """95 % interval of the mean difference of two arms, percentage points, by a bootstrap over the
     tested places of each seed.
@@ -142,7 +146,11 @@ def interval_of(
     return round(float(low), 1), round(float(high), 1)
 
 
-def _draw(own: Groups, base: Groups, rng: np.random.Generator) -> float:
+def _draw(
+    own: Groups,
+    base: Groups,
+    rng: np.random.Generator,
+) -> float:
     differences = []
     for a, b in zip(own, base, strict=True):
         picks: NDArray[np.int64] = rng.integers(0, len(a), len(a))

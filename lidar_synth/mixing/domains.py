@@ -1,0 +1,118 @@
+"""Real and synthetic scans as two domains of one training: weights of the loss, statistics of the
+normalisation, and layers of their own."""
+
+from collections.abc import Callable, Iterable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from lidar_synth.errors import ConfigError
+from lidar_synth.mixing.schedules import Schedule, make_schedule
+
+Forward = Callable[[nn.Module, Any], Any]
+
+
+def make_weight(given: Any) -> Schedule:
+    """The weight of synthetic samples in the loss, by epoch.
+
+    Args:
+        given: a number from 0 to 1, or one by epoch, as a ratio (``make_schedule``).
+
+    Raises:
+        ConfigError: on anything else.
+    """
+    try:
+        return make_schedule(given)
+    except ConfigError as error:
+        raise ConfigError(
+            f"loss_weight={given!r}",
+            "the weight of synthetic samples in the loss, from 0 to 1, or one by epoch, such as "
+            "{0: 1.0, 10: 0.1}",
+        ) from error
+
+
+def settle(
+    model: nn.Module, batches: Iterable[Any], forward: Forward | None = None
+) -> nn.Module:
+    """A copy of a network whose batch normalisation has the statistics of some batches, in
+    evaluation mode.
+
+    Those of a training on a mixture are of real and synthetic scans together; a network that is
+    used on real scans wants those of real scans. They need no labels.
+
+    Args:
+        model: the trained network; it stays as it is.
+        batches: of real scans, such as 20 of ``MixedScans(real, ratio=0).loader(4)``.
+        forward: runs the network on a batch; by default ``model(batch)``.
+
+    Raises:
+        ConfigError: without a batch.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth.mixing import settle
+        >>> network = torch.nn.BatchNorm1d(1)
+        >>> settled = settle(network, [torch.full((4, 1), 3.0)])
+        >>> settled.running_mean, network.running_mean
+        (tensor([3.]), tensor([0.]))
+    """
+    model = deepcopy(model).train()
+    norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # the mean of all batches
+    count = 0
+    with torch.no_grad():
+        for batch in batches:
+            (model if forward is None else _of(model, forward))(batch)
+            count += 1
+    if not count:
+        raise ConfigError("no batch to settle on", "batches of real scans")
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+    return model.eval()
+
+
+def _of(model: nn.Module, forward: Forward) -> Callable[[Any], Any]:
+    return lambda batch: forward(model, batch)
+
+
+class ByDomain(nn.Module):
+    """A layer with a copy for each domain, such as the first one, a normalisation or a head.
+
+    Args:
+        layer: the layer that both domains begin with.
+
+    Attributes:
+        domain: (B,) the domain of each sample of the next batch, 0 real, 1 synthetic; set it
+            before the network runs. None, as for a test, takes the real one.
+
+    Example:
+        >>> import torch
+        >>> from lidar_synth.mixing import ByDomain
+        >>> network = torch.nn.Sequential(ByDomain(torch.nn.Linear(4, 8)), torch.nn.ReLU())
+        >>> network[0].domain = torch.tensor([0, 1, 1])  # batch["domain"]
+        >>> network(torch.zeros(3, 4)).shape
+        torch.Size([3, 8])
+    """
+
+    def __init__(self, layer: nn.Module) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([layer, deepcopy(layer)])
+        self.domain: Tensor | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The output (B, ...) of each sample (B, ...) by the layer of its domain."""
+        if self.domain is None:
+            return self.layers[0](x)  # type: ignore[no-any-return]
+        of = [torch.nonzero(self.domain == number)[:, 0] for number in (0, 1)]
+        parts = [
+            layer(x[indices])
+            for layer, indices in zip(self.layers, of, strict=True)
+            if len(indices)
+        ]
+        return torch.cat(parts)[torch.argsort(torch.cat(of))]

@@ -1,0 +1,141 @@
+"""Real and synthetic scans as two domains: weights of the loss, the schedule that ends on real
+scans, statistics and layers by domain."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from streets import street
+
+from lidar_synth import MixedScans, MixedStream, Sources
+from lidar_synth.errors import ConfigError
+from lidar_synth.labels.augment import drop_reflectance
+from lidar_synth.mixing import ByDomain, EndOnReal, make_schedule, settle
+from lidar_synth.mixing.settings import mix_for_trainer
+
+REAL = [street(i) for i in range(4)]
+SYNTHETIC = [street(10 + i) for i in range(4)]
+
+
+def weights(mixed: MixedScans, epoch: int) -> dict[int, set[float]]:
+    """{domain: weights of its items} in an epoch."""
+    mixed.set_epoch(epoch)
+    found: dict[int, set[float]] = {}
+    for i in range(len(mixed)):
+        item = mixed[i]
+        assert item["loss_weight"] == mixed.loss_weight(i)
+        found.setdefault(item["domain"], set()).add(item["loss_weight"])
+    return found
+
+
+def test_synthetic_items_have_the_weight_of_their_epoch() -> None:
+    mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight={0: 0.5, 2: 0.1})
+    assert weights(mixed, 0) == {0: {1.0}, 1: {0.5}}
+    assert weights(mixed, 1) == {0: {1.0}, 1: {0.5}}
+    assert weights(mixed, 2) == {0: {1.0}, 1: {0.1}}
+
+
+def test_sources_have_weights_of_their_own() -> None:
+    synthetic = Sources(SYNTHETIC[:2], SYNTHETIC[2:], loss_weights=[0.5, 1])
+    mixed = MixedScans(REAL, synthetic, 0.5, loss_weight=0.2)
+    assert weights(mixed, 0) == {0: {1.0}, 1: {0.1, 0.2}}
+
+
+@pytest.mark.parametrize("collate", ["offsets", "padded", "range"])
+def test_batches_have_the_weights_in_the_order_of_their_domains(collate: Any) -> None:
+    mixed = MixedScans(
+        REAL, SYNTHETIC, 0.5, loss_weight=0.25, balanced=True, collate=collate
+    )
+    for batch in mixed.loader(4):
+        expected = torch.where(batch["domain"] == 1, 0.25, 1.0)
+        assert torch.equal(batch["loss_weight"], expected)
+    stream = MixedStream(mixed, batch_size=4, endless=False)
+    assert sorted(item["loss_weight"] for item in stream) == [0.25] * 4 + [1.0] * 4
+
+
+def test_a_weighted_loss_moves_the_network_as_far_as_its_weights() -> None:
+    mixed = MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=0.1, collate="padded")
+    scale = torch.ones(1, requires_grad=True)
+    batch = mixed.collate([mixed[i] for i in range(len(mixed))])
+    loss = (batch["loss_weight"] * scale).sum()
+    loss.backward()
+    assert scale.grad is not None
+    assert scale.grad.item() == pytest.approx(4 * 1 + 4 * 0.1)
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.5, "much", {3: 0.5}, {0: -1}])
+def test_other_weights_are_refused(wrong: Any) -> None:
+    with pytest.raises(ConfigError, match="loss_weight"):
+        MixedScans(REAL, SYNTHETIC, 0.5, loss_weight=wrong)
+
+
+@pytest.mark.parametrize("wrong", [[0.5], [0.5, -1], [0.5, 2]])
+def test_other_weights_of_sources_are_refused(wrong: list[float]) -> None:
+    with pytest.raises(ConfigError, match="weight"):
+        Sources(SYNTHETIC, SYNTHETIC, loss_weights=wrong)
+
+
+def test_a_named_schedule_ends_on_real_scans() -> None:
+    mixed = MixedScans(REAL, SYNTHETIC, EndOnReal(8), epoch_size=8)
+    found = []
+    for epoch in range(10):
+        mixed.set_epoch(epoch)
+        found.append(sum(mixed.domain(i) for i in range(len(mixed))))
+    assert found == [8, 8, 8, 8, 4, 4, 0, 0, 0, 0]
+    assert make_schedule({"end_on_real": 8}) == EndOnReal(8)
+
+
+@pytest.mark.parametrize("wrong", [{"epochs": 3}, {"epochs": 8, "share": 2}])
+def test_a_schedule_needs_epochs_and_a_share(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        EndOnReal(**wrong)
+
+
+def test_settings_of_trainers_take_a_schedule_by_name() -> None:
+    mixed = mix_for_trainer(
+        8,
+        {"synthetic": SYNTHETIC, "ratio": {"end_on_real": 4}, "epoch_size": 8},
+        lambda scan, rng: scan,
+    )
+    mixed.set_epoch(3)
+    assert [mixed[i] for i in range(8)] != []
+    assert sum(mixed.domain(i) for i in range(8)) == 0
+
+
+def test_settling_takes_the_statistics_of_its_batches_alone() -> None:
+    network = torch.nn.Sequential(torch.nn.BatchNorm1d(1), torch.nn.ReLU())
+    network[0].running_mean.fill_(9.0)
+    batches = [{"points": torch.full((8, 1), float(value))} for value in (1, 3)]
+    settled = settle(network, batches, lambda model, batch: model(batch["points"]))
+    assert settled[0].running_mean.item() == 2.0
+    assert network[0].running_mean.item() == 9.0
+    assert not settled.training
+    assert settled[0].momentum == network[0].momentum
+    with pytest.raises(ConfigError, match="no batch"):
+        settle(network, [])
+
+
+def test_each_domain_has_its_layer_and_its_statistics() -> None:
+    layer = ByDomain(torch.nn.BatchNorm1d(2, momentum=1.0))
+    x = torch.arange(12.0).reshape(6, 2)
+    layer.domain = torch.tensor([0, 1, 0, 1, 1, 0])
+    out = layer(x)
+    for number in (0, 1):
+        mine = layer.domain == number
+        assert torch.allclose(out[mine].mean(0), torch.zeros(2), atol=1e-6)
+        assert torch.equal(layer.layers[number].running_mean, x[mine].mean(0))
+    layer.domain = None
+    layer.eval()
+    expected = (x - x[[0, 2, 5]].mean(0)) / x[[0, 2, 5]].var(0).add(1e-5).sqrt()
+    assert torch.allclose(layer(x), expected)
+
+
+def test_reflectance_is_dropped_by_chance() -> None:
+    rng = np.random.default_rng(0)
+    scan = REAL[0]
+    assert not drop_reflectance(scan, rng).reflectance.any()
+    assert drop_reflectance(scan, rng, 0.0) is scan
+    assert scan.reflectance.any()
+    dropped = [drop_reflectance(scan, rng, 0.5) is not scan for _ in range(200)]
+    assert 70 < sum(dropped) < 130
