@@ -4,7 +4,7 @@ Both compute a loss for each anchor of each sample before they add them up, so t
 multiplied by its weight (``loss_weight`` of the mixture). Other heads add up inside of the loss.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -70,9 +70,7 @@ def weigh_openpcdet(model: Any) -> None:
     model.register_forward_pre_hook(take_weights)
 
 
-def weigh_mmdet3d(
-    model: Any, weights_of: Callable[[Sequence[str]], list[float]]
-) -> None:
+def weigh_mmdet3d(model: Any, weights_of: Callable[[list[str]], list[float]]) -> None:
     """Make a model of MMDetection3D multiply the weights of the anchors of each sample.
 
     Args:
@@ -83,7 +81,7 @@ def weigh_mmdet3d(
         ConfigError: on a model with another head than one of anchors, or with a second stage.
     """
     model = getattr(model, "module", model)
-    head = getattr(model, "bbox_head", None)
+    head: Any = getattr(model, "bbox_head", None)
     if not hasattr(head, "anchor_target_3d") or getattr(model, "roi_head", None):
         refuse_weights(type(head).__name__)
     make_targets = head.anchor_target_3d

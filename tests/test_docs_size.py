@@ -12,7 +12,7 @@ LIMITS = {
     "docs/index.md": 130,
     "docs/start/install.md": 160,
     "docs/start/tutorial.md": 460,
-    "docs/how-to/mix.md": 645,
+    "docs/how-to/mix.md": 680,
     "docs/how-to/trainers/index.md": 310,
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,

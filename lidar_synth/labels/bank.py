@@ -16,12 +16,14 @@ Arrays of the file (numpy's format, never pickled), for M objects with P points 
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
+from typing_extensions import Self
 
 from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import DataError
@@ -163,10 +165,42 @@ class ObjectBank:
                 f"objects of the sensors {sorted(s.name for s in sensors)}",
                 "one sensor",
             )
-        return cls._of(objects)
+        return cls.collect(objects)
+
+    @staticmethod
+    def from_town(
+        sensor: str | Path | Sensor = "hdl64e_lasers",
+        classes: Iterable[str] | None = None,
+        scans: int = 60,
+        seed: int = 0,
+        skin: str | Path | None = None,
+    ) -> Any:
+        """Collect objects of the town, which cost no labels; ``paste`` casts each of them anew at
+        its place, by the rays of the scan that it is pasted into, with noise and losses.
+
+        Args:
+            sensor: of the scans that objects are pasted into.
+            classes: names of boxes; by default all that the town has.
+            scans: moments of the town whose objects are taken, about 12 each.
+            seed: of the town.
+            skin: the look of a real sensor's returns, as ``load_skin`` takes it.
+
+        Returns:
+            A bank whose method ``fit_sizes(boxes)`` gives objects the mean sizes of a dataset's
+            boxes. Saved and loaded, it is a plain bank of returns.
+
+        Raises:
+            ConfigError: on classes that these scans do not have.
+            LibraryError: if embreex is missing.
+        """
+        # By name: the plugin does not import the laboratory, whose town this is.
+        town = import_module("lidar_synth.lab.town.pasted")
+        names = None if classes is None else list(classes)
+        return town.collect_objects(sensor, names, scans, seed, skin)
 
     @classmethod
-    def _of(cls, objects: list[tuple[int, Object]]) -> "ObjectBank":
+    def collect(cls, objects: list[tuple[int, Object]]) -> Self:
+        """A bank of (number in its scan, object) pairs of one sensor."""
         parts = [o.scan for _, o in objects]
         return cls(
             sensor=parts[0].sensor,
@@ -221,7 +255,9 @@ class ObjectBank:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of its file by name."""
-        names = [f.name for f in fields(self) if f.name not in ("sensor", "boxes")]
+        names = [
+            f.name for f in fields(ObjectBank) if f.name not in ("sensor", "boxes")
+        ]
         arrays = {name: getattr(self, name) for name in names}
         for f in fields(Boxes):
             arrays[f"box_{f.name}"] = np.asarray(getattr(self.boxes, f.name))

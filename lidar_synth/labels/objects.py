@@ -1,5 +1,6 @@
 """Objects cut out of scans, to be pasted into other scans."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import grow_box, turn_boxes, turn_points
 from lidar_synth.labels.ground import ground_under
 
@@ -40,10 +42,13 @@ class Object(NamedTuple):
     Args:
         scan: its points with reflectance and label, and its one box.
         ground: height of the ground under it, metres above the sensor's origin.
+        cast: ``(boxes, sensor) -> Scan`` makes its returns at another place, as of
+            ``ObjectBank.from_town``; without it, the points themselves are moved.
     """
 
     scan: Scan
     ground: float
+    cast: Callable[[Boxes, Sensor], Scan] | None = None
 
     @property
     def box(self) -> NDArray[np.float32]:

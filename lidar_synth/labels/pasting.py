@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import find_overlapping, forget_images, widen_boxes
 from lidar_synth.labels.ground import CLEARANCE, ground_under, standing
 from lidar_synth.labels.merge import merge_scans
@@ -54,7 +55,8 @@ def paste(
     for candidate in objects:
         if count is not None and len(placed) >= count:
             break
-        refuse_coarser(candidate.scan.sensor, scan.sensor)
+        if candidate.cast is None:
+            refuse_coarser(candidate.scan.sensor, scan.sensor)
         fitted = _fit(scan, candidate, placed)
         if fitted is not None:
             placed.append(fitted)
@@ -77,26 +79,24 @@ def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:
     if taken and find_overlapping(widen_boxes(box, CLEARANCE), np.array(taken)).any():
         return None
     ground = ground_under(scan, box)
-    if (
-        ground is None
-        or not (ground.encloses and ground.free)
-        or abs(ground.height - candidate.ground) > LIFT
-    ):
+    if ground is None or not (ground.encloses and ground.free):
         return None
-    return _raised(candidate, ground.height)
+    if candidate.cast is None and abs(ground.height - candidate.ground) > LIFT:
+        return None
+    return _raised(candidate, ground.height, scan.sensor)
 
 
-def _raised(candidate: Object, height: float) -> Object:
-    """The object raised or lowered to ground of a given height."""
+def _raised(candidate: Object, height: float, sensor: Sensor) -> Object:
+    """The object raised or lowered to ground of a given height, and cast there if it can be."""
     assert candidate.scan.boxes is not None
     lift = np.array([0, 0, height - candidate.ground], np.float32)
     values = candidate.scan.boxes.values.copy()
     values[:, :3] += lift
     boxes = replace(forget_images(candidate.scan.boxes), values=values)
-    return Object(
-        replace(candidate.scan, points=candidate.scan.points + lift, boxes=boxes),
-        height,
-    )
+    if candidate.cast is not None:
+        return Object(candidate.cast(boxes, sensor), height)
+    points = candidate.scan.points + lift
+    return Object(replace(candidate.scan, points=points, boxes=boxes), height)
 
 
 def _as_seen(scan: Scan, part: VisibleReturns) -> Scan:
@@ -132,12 +132,16 @@ def still_visible(
     """
     if scan.boxes is None:
         return seen, Boxes(np.zeros((0, 7), np.float32), ())
-    inside = standing(scan, scan.boxes)
-    before = inside.sum(1)
+    removed = np.zeros(len(scan.boxes), bool)
+    share = np.ones(len(scan.boxes))
+    # The few boxes that lose returns; to look into all of them would take longer than to paste.
+    losing = np.flatnonzero(standing(scan[~seen], scan.boxes).any(1))
+    inside = standing(scan, scan.boxes[losing])
     after = (inside & seen).sum(1)
-    removed = (after < before) & (after < least)
-    share = after / np.maximum(before, 1) + (before == 0)
-    return seen & ~inside[removed].any(0), update_occlusion(scan.boxes, share)[~removed]
+    share[losing] = after / np.maximum(inside.sum(1), 1)
+    removed[losing] = after < least
+    kept = seen & ~inside[removed[losing]].any(0)
+    return kept, update_occlusion(scan.boxes, share)[~removed]
 
 
 def update_occlusion(boxes: Boxes, share: NDArray[np.float64]) -> Boxes:

@@ -155,8 +155,9 @@ def make_schedule(
     """
     if callable(ratio):
         return ratio
-    if isinstance(ratio, Mapping) and END_ON_REAL in ratio and len(ratio) == 1:
-        return EndOnReal(ratio[END_ON_REAL])  # type: ignore[index]
+    named: Any = ratio
+    if isinstance(named, Mapping) and list(named) == [END_ON_REAL]:
+        return EndOnReal(named[END_ON_REAL])
     if isinstance(ratio, Mapping):
         return Steps(
             tuple(

@@ -32,7 +32,7 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
     count = len(objects)
     poses = np.array([o.pose for o in objects]).reshape(-1, 4, 4)
     in_sensor = np.linalg.inv(pose) @ poses
-    rows = list(map(_box_values, objects, in_sensor))
+    rows = list(map(box_values, objects, in_sensor))
     values = np.array(rows, np.float32).reshape(-1, 7)
     image_box = np.full((count, 4), -1, np.float32)
     truncation = np.full(count, -1, np.float32)
@@ -53,7 +53,7 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
     return Boxes(values, names, truncation, occlusion, image_box, instance=instance)
 
 
-def _box_values(placed: PlacedObject, in_sensor: Pose) -> Array:
+def box_values(placed: PlacedObject, in_sensor: Pose) -> Array:
     """(7,) centre, size and yaw of an object's box, from its pose in the sensor frame."""
     low, high = placed.prototype.mesh.bounds
     centre = in_sensor[:3, :3] @ (placed.scale * (low + high) / 2) + in_sensor[:3, 3]

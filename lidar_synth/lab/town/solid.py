@@ -37,8 +37,12 @@ class Solid:
 
     def __init__(self, triangles: Floats) -> None:
         scene, mesh = _embree()
+        self._triangles = np.ascontiguousarray(triangles, np.float32)
         self._scene = scene()
-        self._mesh = mesh(self._scene, np.ascontiguousarray(triangles, np.float32))
+        self._mesh = mesh(self._scene, self._triangles)
+
+    def __reduce__(self) -> tuple[type["Solid"], tuple[Floats]]:
+        return Solid, (self._triangles,)
 
     def first(
         self, origins: Floats, directions: Floats

@@ -8,7 +8,7 @@ back.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -116,7 +116,7 @@ def targets(
         heat[each][at] = np.maximum(heat[each][at], bump)
         # The pixel of the centre and its neighbours.
         nearest = (bump > weight[at]) & (square <= 2)
-        own = (*_offsets(centre, rows, columns), *_shape(box))
+        own: list[Any] = [*_offsets(centre, rows, columns), *_shape(box)]
         for channel, value in zip(values, own, strict=True):
             channel[at] = np.where(nearest, value, channel[at])
         weight[at] = np.where(nearest, bump, weight[at])
@@ -127,7 +127,7 @@ def _offsets(
     centre: NDArray[np.float64],
     rows: NDArray[np.int64],
     columns: NDArray[np.int64],
-) -> list[NDArray]:
+) -> list[NDArray[np.float64]]:
     """From the middle of each pixel to a centre, in pixels: along the rows and along the
     columns."""
     return list(

@@ -81,10 +81,10 @@ class Detector(nn.Module):
             )
             for width, scale in ((second, 2), (third, 4))
         )
-        self.head = nn.Sequential(
-            _layer(3 * first, 48), nn.Conv2d(48, len(CLASSES) + REGRESSED, 1)
-        )
-        nn.init.constant_(self.head[1].bias[: len(CLASSES)], RARE_HEAT)
+        last = nn.Conv2d(48, len(CLASSES) + REGRESSED, 1)
+        self.head = nn.Sequential(_layer(3 * first, 48), last)
+        assert last.bias is not None
+        nn.init.constant_(last.bias[: len(CLASSES)], RARE_HEAT)
 
     def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the heat (B, classes, n, n) and values (B, REGRESSED, n, n) of views (B,
@@ -171,7 +171,7 @@ def train(
     for views, target in bar:
         loss = loss_of(*answer(network, views), target)
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         optimizer.step()
         schedule.step()
@@ -181,7 +181,7 @@ def train(
 
 
 def detect(
-    network: Detector,
+    network: nn.Module,
     views: Callable[[int], Tensor],
     count: int,
 ) -> list[Found]:

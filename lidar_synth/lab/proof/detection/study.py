@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import islice
@@ -154,7 +154,8 @@ class DetectionWork:
     @cached_property
     def objects(self) -> ObjectBank:
         """Objects of the town."""
-        return ObjectBank.from_town(self.source[0].sensor)
+        bank: ObjectBank = ObjectBank.from_town(self.source[0].sensor)
+        return bank
 
     def labelled(self, seed: int) -> list[Scan]:
         """The real scans that a seed trains on, from the places that it does not test."""
@@ -189,11 +190,31 @@ class DetectionWork:
         count = self.settings.iterations * self.settings.batch
         town = self.town if any(arm.shares) else None
         objects = self.objects if set(arm.pasted) - {OWN} else None
-        mixed = make_mixture(arm, labelled, town, objects, seed, count)
-        batches = endless_batches(mixed, self.settings.batch)
-        losses = train(network, batches, self.settings.iterations, RATE, name)
+        mixed = make_mixture(
+            arm,
+            labelled,
+            town,
+            objects,
+            seed,
+            count,
+        )
+        batches: Iterator[Any] = endless_batches(mixed, self.settings.batch)
+        losses = train(
+            network,
+            batches,
+            self.settings.iterations,
+            RATE,
+            name,
+        )
         seconds = time.monotonic() - start
-        base = make_mixture(ARMS["real"], labelled, None, None, seed, count)
+        base = make_mixture(
+            ARMS["real"],
+            labelled,
+            None,
+            None,
+            seed,
+            count,
+        )
         settling = islice(endless_batches(base, self.settings.batch), SETTLING)
         return {
             "found": self._detect(settle(network, settling, answer_batch), seed),

@@ -82,10 +82,22 @@ def _of_class(
     each: int,
 ) -> dict[str, Any]:
     """{arm: its figures} for one class."""
-    base = _groups(found[BASE], truths, tested, each, CRITERIA[MAIN])
+    base = _groups(
+        found[BASE],
+        truths,
+        tested,
+        each,
+        CRITERIA[MAIN],
+    )
     table = {}
     for arm, outcomes in found.items():
-        own = _groups(outcomes, truths, tested, each, CRITERIA[MAIN])
+        own = _groups(
+            outcomes,
+            truths,
+            tested,
+            each,
+            CRITERIA[MAIN],
+        )
         by_seed = [_percent(a) - _percent(b) for a, b in zip(own, base, strict=True)]
         other = arm != BASE
         table[arm] = {
@@ -93,7 +105,15 @@ def _of_class(
             "difference": round(float(np.mean(by_seed)), 1) if other else None,
             "interval": interval_of(own, base) if other else None,
             **{
-                name: _mean(_groups(outcomes, truths, tested, each, criterion))
+                name: _mean(
+                    _groups(
+                        outcomes,
+                        truths,
+                        tested,
+                        each,
+                        criterion,
+                    )
+                )
                 for name, criterion in CRITERIA.items()
             },
         }
