@@ -37,7 +37,7 @@ LIMITS = {
     "docs/how-to/layouts.md": 150,
     "docs/how-to/bake.md": 320,
     "docs/how-to/look.md": 130,
-    "docs/how-to/prove.md": 210,
+    "docs/how-to/prove.md": 225,
     "docs/how-to/weather.md": 230,
     "docs/reference/api.md": 40,
     "docs/reference/command-line.md": 30,
@@ -57,7 +57,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8_500
+MAIN_PATH = 8_515
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [

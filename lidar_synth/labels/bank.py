@@ -194,7 +194,7 @@ class ObjectBank:
             LibraryError: if embreex is missing.
         """
         # By name: the plugin does not import the laboratory, whose town this is.
-        town = import_module("lidar_synth.lab.town.pasted")
+        town = import_module("lidar_synth.lab.town")
         names = None if classes is None else list(classes)
         return town.collect_objects(sensor, names, scans, seed, skin)
 

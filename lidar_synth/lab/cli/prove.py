@@ -1,7 +1,7 @@
 """``lidar-synth prove``: what synthetic scans add to a labelled dataset."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -34,7 +34,10 @@ def prove(
     iterations: Annotated[
         int, typer.Option(min=10, help="of each training; fewer if --minutes is short")
     ] = 1000,
-    batch: Annotated[int, typer.Option(min=1, help="scans of an iteration")] = 4,
+    batch: Annotated[
+        int | None,
+        typer.Option(min=1, help="scans of an iteration [4, of a detector 2]"),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[
         str,
@@ -79,6 +82,10 @@ def prove(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="processes [one for each core]")
     ] = None,
+    task: Annotated[
+        str,
+        typer.Option(help="segmentation | detection: cars and persons, by boxes"),
+    ] = "segmentation",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
     ] = False,
@@ -93,6 +100,7 @@ def prove(
     Examples:
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
       lidar-synth prove SemanticKITTI --split train --labelled 24 --tests validation_scans
+      lidar-synth prove KITTI --task detection --labelled 8 --arm objects --arm first
       lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
     """
     import os
@@ -103,12 +111,33 @@ def prove(
     from lidar_synth.lab.proof.plan import describe
     from lidar_synth.lab.proof.planning import make_plan
 
+    if task != "segmentation":
+        further = {
+            "--trainer": trainer,
+            "--tests": tests,
+            "--ratio": ratio,
+            "--only": only,
+            "--dry-run": dry_run,
+        }
+        _check_task(task, [name for name, given in further.items() if given])
+        options = {
+            "labelled": labelled,
+            "arms": tuple(arm or ()),
+            "batch": batch,
+            "iterations": iterations,
+            "seeds": seeds,
+            "places": places,
+            "synthetic": synthetic,
+        }
+        source = open_scans(root, sensor=sensor, split=split)
+        _prove_detection(source, out, options, minutes, pools)
+        return
     settings = ProofSettings(
         labelled=labelled,
         arms=tuple(arm or ProofSettings.arms),
         ratios=tuple(ratio or (0.5,)),
         iterations=iterations,
-        batch=batch,
+        batch=batch or 4,
         seeds=seeds,
         places=places,
         synthetic=synthetic,
@@ -136,3 +165,35 @@ def prove(
         tests=others,
     )
     typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
+
+
+def _check_task(task: str, further: list[str]) -> None:
+    from lidar_synth.errors import ConfigError
+
+    if task != "detection" or further:
+        raise ConfigError(
+            f"--task {task} {' '.join(further)}".strip(),
+            "segmentation, or detection without options of segmentation",
+        )
+
+
+def _prove_detection(
+    source: Any,
+    out: Path,
+    options: dict[str, Any],
+    minutes: float | None,
+    pools: Path | None,
+) -> None:
+    from lidar_synth.lab.proof.detection import DetectionSettings, prove_detection
+    from lidar_synth.lab.proof.detection.page import format_table
+
+    given = {name: value for name, value in options.items() if value}
+    values = prove_detection(
+        source,
+        out,
+        DetectionSettings(**given),
+        minutes=float("inf") if minutes is None else minutes,
+        pools=pools,
+    )
+    page = (out / "index.html").resolve()
+    typer.echo(f"{format_table(values)}\n\nThe page is {page}")

@@ -41,7 +41,7 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
 
     height = ROW * len(shown) + 30
     parts = [
-        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences of the mIoU">'
+        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences">'
     ]
     for tick in ticks(low, high):
         colour, width = ("#1b1f27", 1.4) if tick == 0 else ("#d8dce4", 1)

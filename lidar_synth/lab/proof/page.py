@@ -22,40 +22,49 @@ def write_page(path: Path, proof: Proof) -> None:
     Raises:
         FileError: if it cannot be written.
     """
+    write_body(path, body(proof.values))
+
+
+def write_body(path: Path, content: str) -> None:
+    """Write a page with some HTML as its content.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
     template = (
         files("lidar_synth.lab.proof").joinpath("page.html").read_text(encoding="utf-8")
     )
-    write_file(path, template.replace("@body@", body(proof.values)).encode())
+    write_file(path, template.replace("@body@", content).encode())
 
 
 def body(values: Values) -> str:
     """The HTML of the page's content."""
     first, _, rest = _sentences(values["headline"])
     parts = [
-        f'<p class="headline">{_text(first)}</p>',
-        f'<p class="more">{_text(rest)}</p>' if rest else "",
-        f"<p>{_text(what_was_done(values))}</p>",
-        _section(
+        f'<p class="headline">{escape(first)}</p>',
+        f'<p class="more">{escape(rest)}</p>' if rest else "",
+        f"<p>{escape(what_was_done(values))}</p>",
+        make_section(
             "Change of the mIoU against real scans only",
             differences(values["arms"]),
             _DIFFERENCE,
         ),
-        _section("Table", _table(values)),
-        _section(
+        make_section("Table", _table(values)),
+        make_section(
             "During the training",
             curves(values["arms"]),
             "Mean mIoU on the tested places.",
         )
         if any(len(row["curve"]) > 1 for row in values["arms"])
         else "",
-        _section(
+        make_section(
             "IoU by class, %",
             _classes(values),
             "Over all tested scans together. – : no label of this class.",
         ),
-        _section("By place: change of the mIoU", _places(values)),
-        _section("What was not tested", _list(values["limits"])),
-        _section("How it was measured", _list(protocol(values))),
+        make_section("By place: change of the mIoU", _places(values)),
+        make_section("What was not tested", make_list(values["limits"])),
+        make_section("How it was measured", make_list(protocol(values))),
     ]
     return "\n".join(filter(None, parts))
 
@@ -139,29 +148,29 @@ def _table(values: Values) -> str:
     for row in values["arms"]:
         best = bool(gains) and row["synthetic"] and row["difference"] == max(gains)
         cells = [
-            _cell(row["title"]),
-            _cell(f"{row['miou']:.1f}"),
-            _cell(format_signed(row["difference"]), _sign(row)),
-            _cell(span(row["interval"]) if row["arm"] != BASE else ""),
-            _cell(row["better_in"]),
-            _cell(str(row["iterations"])),
-            _cell(f"{row['minutes']:.1f}"),
-            _cell(row["budget"], "text"),
+            make_cell(row["title"]),
+            make_cell(f"{row['miou']:.1f}"),
+            make_cell(format_signed(row["difference"]), _sign(row)),
+            make_cell(span(row["interval"]) if row["arm"] != BASE else ""),
+            make_cell(row["better_in"]),
+            make_cell(str(row["iterations"])),
+            make_cell(f"{row['minutes']:.1f}"),
+            make_cell(row["budget"], "text"),
         ]
         rows.append(f"<tr{' class=best' * best}>{''.join(cells)}</tr>")
-    return _grid(head, rows)
+    return make_grid(head, rows)
 
 
 def _classes(values: Values) -> str:
     arms = values["arms"]
     rows = []
     for name in arms[0]["iou"]:
-        cells = [_cell(name)] + [
-            _cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}")
+        cells = [make_cell(name)] + [
+            make_cell("–" if (v := row["iou"][name]) is None else f"{v:.1f}")
             for row in arms
         ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    return _grid(["class", *(row["title"] for row in arms)], rows)
+    return make_grid(["class", *(row["title"] for row in arms)], rows)
 
 
 def _places(values: Values) -> str:
@@ -170,34 +179,38 @@ def _places(values: Values) -> str:
     rows = []
     for place in values["tested_places"]:
         miou = base["miou_by_place"][place]
-        cells = [_cell(place), _cell("–" if miou is None else f"{miou:.1f}")]
-        cells += [_cell(format_signed(row["by_place"][place])) for row in arms]
+        cells = [make_cell(place), make_cell("–" if miou is None else f"{miou:.1f}")]
+        cells += [make_cell(format_signed(row["by_place"][place])) for row in arms]
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    return _grid(
+    return make_grid(
         ["place", f"{base['title']}, mIoU", *(row["title"] for row in arms)], rows
     )
 
 
-def _grid(head: Sequence[str], rows: Sequence[str]) -> str:
+def make_grid(head: Sequence[str], rows: Sequence[str]) -> str:
+    """The HTML of a table."""
     names = "".join(
-        f"<th{' class=text' * (name == _USES)}>{_text(name)}</th>" for name in head
+        f"<th{' class=text' * (name == _USES)}>{escape(name)}</th>" for name in head
     )
     return f'<div class="scroll"><table><thead><tr>{names}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
 
-def _section(title: str, content: str, note: str = "") -> str:
-    below = f'<p class="dim">{_text(note)}</p>' if note else ""
-    return f"<section><h2>{_text(title)}</h2>{content}{below}</section>"
+def make_section(title: str, content: str, note: str = "") -> str:
+    """The HTML of a part with its title."""
+    below = f'<p class="dim">{escape(note)}</p>' if note else ""
+    return f"<section><h2>{escape(title)}</h2>{content}{below}</section>"
 
 
-def _list(sentences: Sequence[str]) -> str:
+def make_list(sentences: Sequence[str]) -> str:
+    """The HTML of some sentences."""
     return (
-        f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in sentences)}</ul>"
+        f"<ul>{''.join(f'<li>{escape(sentence)}</li>' for sentence in sentences)}</ul>"
     )
 
 
-def _cell(text: str, kind: str = "") -> str:
-    return f"<td{f' class={kind}' if kind else ''}>{_text(text)}</td>"
+def make_cell(text: str, kind: str = "") -> str:
+    """The HTML of a cell of a table."""
+    return f"<td{f' class={kind}' if kind else ''}>{escape(text)}</td>"
 
 
 def _sign(row: Values) -> str:
@@ -209,5 +222,6 @@ def _sign(row: Values) -> str:
     )
 
 
-def _text(text: str) -> str:
+def escape(text: str) -> str:
+    """A text as HTML."""
     return html.escape(text)

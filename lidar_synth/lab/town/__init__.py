@@ -2,6 +2,7 @@
 network)."""
 
 from lidar_synth.lab.town.export import LAYOUTS, export_town
+from lidar_synth.lab.town.pasted import TownObjects, collect_objects
 from lidar_synth.lab.town.skin import Skin, load_skin
 from lidar_synth.lab.town.skin.fit import fit_skin
 from lidar_synth.lab.town.town import Town
@@ -12,6 +13,8 @@ __all__ = [
     "STRETCH_FRAMES",
     "Skin",
     "Town",
+    "TownObjects",
+    "collect_objects",
     "export_town",
     "fit_skin",
     "load_skin",

@@ -35,9 +35,11 @@ from lidar_synth.lab.proof.detection.network import (
     detect,
     train,
 )
+from lidar_synth.lab.proof.detection.page import body
 from lidar_synth.lab.proof.detection.scores import Truth
 from lidar_synth.lab.proof.detection.summary import summarise
 from lidar_synth.lab.proof.machine import command_line, machine
+from lidar_synth.lab.proof.page import write_body
 from lidar_synth.lab.proof.places import Places, choose, find_places, names_of
 from lidar_synth.lab.proof.pools import TOWN_SEED
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
@@ -57,7 +59,8 @@ class DetectionSettings:
     """The settings of ``prove_detection``.
 
     Args:
-        labelled: number of real scans with boxes that each training gets.
+        labelled: number of real scans with boxes that each training gets; all, if the places that
+            a seed trains on have fewer.
         arms: names of ``ARMS``; "gt_sampling" is always among them.
         iterations: of each training.
         batch: scans of an iteration.
@@ -162,7 +165,8 @@ class DetectionWork:
         held_out = half_of(self.places, seed)
         others = {n: i for n, i in self.places.items() if n not in held_out}
         rng = np.random.default_rng((seed, self.settings.labelled))
-        return [self.source[i] for i in choose(others, "", self.settings.labelled, rng)]
+        count = min(self.settings.labelled, sum(map(len, others.values())))
+        return [self.source[i] for i in choose(others, "", count, rng)]
 
     def tested(self, seed: int) -> dict[str, list[int]]:
         """{place: indices of its scans} that a seed tests on."""
@@ -349,4 +353,5 @@ def report(
     }
     name = f"results-{work.settings.labelled}.json"
     write_file(work.out / name, (json.dumps(values, indent=1) + "\n").encode())
+    write_body(work.out / "index.html", body(values))
     return values

@@ -1,0 +1,185 @@
+"""``prove --task detection``: places, arms, intervals and the page of a comparison of detectors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from streets import street
+from typer.testing import CliRunner
+
+from lidar_synth import ObjectBank, Scan
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.formats.npz import write_scan
+from lidar_synth.lab.proof.detection import ARMS, DetectionSettings, prove_detection
+from lidar_synth.lab.proof.detection.arms import PHASES, make_mixture
+from lidar_synth.lab.proof.detection.bev import Found
+from lidar_synth.lab.proof.detection.scores import Criterion, Truth, judge, precision_of
+from lidar_synth.lab.proof.detection.study import half_of
+from lidar_synth.lab.proof.detection.summary import interval_of, summarise
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CAR = (10.0, 0, 0, 4, 2, 1.5, 0)
+FAR = (40.0, 0, 0, 4, 2, 1.5, 0)
+
+
+def values(*rows: tuple[float, ...]) -> np.ndarray:
+    return np.array(rows, np.float32).reshape(-1, 7)
+
+
+def found(*rows: tuple[float, ...]) -> Found:
+    count = len(rows)
+    scores = np.linspace(0.9, 0.5, count, dtype=np.float32)
+    return Found(values(*rows), scores, np.zeros(count, np.int64))
+
+
+def truth(*rows: tuple[float, ...]) -> Truth:
+    wanted = np.ones(len(rows), bool)
+    return Truth(values(*rows), np.zeros(len(rows), np.int64), wanted)
+
+
+CASES = {
+    "overlap": (Criterion(0.5), 1.0),
+    "too little overlap": (Criterion(0.7), 0.5),
+    "within 1 m": (Criterion(distance=1), 1.0),
+    "not within 0.5 m": (Criterion(distance=0.5), 0.5),
+    "the near box alone": (Criterion(0.5, far=20), 1.0),
+    "no box so near": (Criterion(0.5, far=5), float("nan")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_criterion_says_what_is_right_and_what_counts(case: str) -> None:
+    """One detection is exact and far, the other 0.8 m beside its near box."""
+    criterion, expected = CASES[case]
+    shifted = (CAR[0] + 0.8, *CAR[1:])
+    judged = judge(found(FAR, shifted), truth(CAR, FAR), 0, criterion)
+    assert precision_of([judged]) == pytest.approx(expected, nan_ok=True)
+
+
+def test_two_seeds_test_every_place_once() -> None:
+    places = {f"p{i}": [i] for i in range(9)}
+    for seed in (0, 2):
+        halves = half_of(places, seed), half_of(places, seed + 1)
+        assert sorted(halves[0] + halves[1]) == sorted(places)
+        assert abs(len(halves[0]) - len(halves[1])) <= 1
+    assert half_of(places, 0) != half_of(places, 2)
+
+
+def outcomes(*good: bool) -> dict[int, dict[int, Found]]:
+    """Two seeds with four scans each; the car of each is found, or something else."""
+    return {
+        seed: {
+            4 * seed + i: found(CAR if good[4 * seed + i] else FAR) for i in range(4)
+        }
+        for seed in range(2)
+    }
+
+
+def compared(*good: bool) -> dict[str, Any]:
+    truths = {i: truth(CAR) for i in range(8)}
+    tested = {s: {f"p{4 * s + i}": [4 * s + i] for i in range(4)} for s in range(2)}
+    base = outcomes(*[False] * 8)
+    made = summarise({"gt_sampling": base, "first": outcomes(*good)}, truths, tested)
+    return dict(made["classes"]["car"]["arms"]["first"])
+
+
+def test_an_arm_that_is_better_everywhere_has_an_interval_above_0() -> None:
+    row = compared(*[True] * 8)
+    assert row["by_seed"] == [100, 100] and row["difference"] == 100
+    assert row["interval"] == (100, 100)
+
+
+def test_an_arm_that_is_better_at_two_places_has_a_wide_interval() -> None:
+    row = compared(True, False, False, False, False, False, False, True)
+    low, high = row["interval"]
+    assert low == 0 < row["difference"] < high < 100
+
+
+def test_few_places_give_no_interval() -> None:
+    judged = [[[judge(found(CAR), truth(CAR), 0, Criterion(0.5))]]]
+    assert interval_of(judged, judged) is None
+
+
+@pytest.mark.parametrize(
+    ("arm", "expected"),
+    [("recipe", [8, 8, 4, 0]), ("first", [8, 8, 8, 4]), ("gt_sampling", [0] * 4)],
+)
+def test_an_arm_has_its_shares_of_the_town_by_phase(
+    arm: str, expected: list[int]
+) -> None:
+    labelled = [street(i) for i in range(2)]
+    town = [street(10 + i) for i in range(2)]
+    objects = ObjectBank.from_scans(town)
+    mixed = make_mixture(ARMS[arm], labelled, town, objects, 0, 8 * PHASES)
+    shares = []
+    for epoch in range(PHASES):
+        mixed.set_epoch(epoch)
+        shares.append(sum(mixed.domain(i) for i in range(len(mixed))))
+    assert shares == expected
+
+
+@pytest.mark.parametrize("wrong", [{"arms": ("frist",)}, {"labelled": 0}, {"batch": 0}])
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"first|1 or more"):
+        DetectionSettings(**wrong)
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    for i in range(4):
+        (folder / f"place{i}").mkdir()
+        write_scan(folder / f"place{i}" / "0.npz", street(i))
+    return folder
+
+
+def test_a_comparison_from_scans_to_page(places: Path, tmp_path: Path) -> None:
+    pool = tmp_path / "pool"
+    pool.mkdir()
+    for i in range(2):
+        write_scan(pool / f"{i:06d}.npz", street(10 + i))
+    options = ["--task", "detection", "--labelled", "2", "--iterations", "10"]
+    options += ["--batch", "1", "--synthetic", "2", "--arm", "first"]
+    folders = ["--out", str(tmp_path / "out"), "--pools", str(pool)]
+    command = ["prove", str(places), *options, *folders]
+    result = CliRunner().invoke(app, command)
+    assert "| GT sampling |" in result.output and "half, GT sampling |" in result.output
+    made = json.loads((tmp_path / "out" / "results-2.json").read_text())
+    assert set(made["places"]) == {f"place{i}" for i in range(4)}
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "Label budget: 2 scans" in page and "<svg" in page
+    runs = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").iterdir()}
+    assert len(runs) == 4
+    CliRunner().invoke(app, command)  # it resumes: nothing is trained
+    assert {p: p.stat().st_mtime_ns for p in runs} == runs
+    [first, *_] = runs
+    first.write_text("{}")
+    with pytest.raises(DataError, match="damaged"):
+        prove_detection(
+            places,
+            tmp_path / "out",
+            DetectionSettings(2, ("first",), 10, 1, synthetic=2),
+            pools=pool,
+        )
+
+
+def test_scans_without_boxes_are_refused(tmp_path: Path) -> None:
+    bare = [
+        Scan(s.points, s.reflectance, s.sensor, id=f"p{i}/0")
+        for i in range(2)
+        for s in [street(i)]
+    ]
+    with pytest.raises(DataError, match="without boxes"):
+        prove_detection(bare, tmp_path)
+
+
+def test_options_of_the_other_task_are_refused(places: Path, tmp_path: Path) -> None:
+    command = ["prove", str(places), "--task", "detection", "--only", "car"]
+    result = CliRunner().invoke(app, [*command, "--out", str(tmp_path)])
+    assert isinstance(result.exception, ConfigError) and "--only" in str(
+        result.exception
+    )
