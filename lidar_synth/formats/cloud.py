@@ -30,6 +30,7 @@ STORED = {
     "ring": "<i4",
     "confidence": "<f4",
     "time": "<f4",
+    "cause": "<u1",
 }
 """Type on disk of each field of a scan except reflectance."""
 
@@ -40,6 +41,7 @@ IN_MEMORY = {
     "ring": "i2",
     "confidence": "f4",
     "time": "f4",
+    "cause": "u1",
 }
 
 REFLECTANCES = ("reflectivity", "intensity", "reflectance")

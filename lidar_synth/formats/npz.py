@@ -51,6 +51,7 @@ TYPES = {
     "ring": "i2",
     "confidence": "f4",
     "time": "f4",
+    "cause": "u1",
 }
 """numpy types of a scan's fields."""
 

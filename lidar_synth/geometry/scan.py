@@ -21,6 +21,10 @@ REAL = 0
 SYNTHETIC = 1
 """Values of ``Scan.domain``."""
 
+CAUSES = "surface", "scattered", "crosstalk"
+"""Why a return is where it is, by ``Scan.cause``: the surface that the ray met, particles in
+the air, or another pulse."""
+
 FARTHEST = 1e5
 """Maximum coordinate, and size of a box, metres; no LiDAR measures farther."""
 
@@ -161,19 +165,21 @@ class Boxes:
         """
         inside = np.zeros((len(self), len(points)), bool)
         for i, (x, y, z, length, width, height, yaw) in enumerate(self.values):
-            dx = points[:, 0] - x
-            dy = points[:, 1] - y
-            dz = points[:, 2] - z
+            reach = np.hypot(length, width)
+            near = np.flatnonzero(np.abs(points[:, 0] - x) <= reach)
+            dx = points[near, 0] - x
+            dy = points[near, 1] - y
+            dz = points[near, 2] - z
             c = np.cos(yaw)
             s = np.sin(yaw)
             along = dx * c + dy * s
             across = dy * c - dx * s
-            inside[i] = (
+            inside[i, near] = (
                 (abs(along) <= length / 2)
                 & (abs(across) <= width / 2)
                 & (dz <= height / 2)
+                & (dz >= above_floor - height / 2)
             )
-            inside[i] &= dz >= above_floor - height / 2
         return inside
 
 
@@ -192,6 +198,7 @@ class Scan:
         ring: (N,) int16 ring numbers if the file has them, 0 = highest.
         confidence: (N,) float32 in [0, 1], the confidence of ``label``.
         time: (N,) float32 seconds from the moment of ``pose`` at which each point was measured.
+        cause: (N,) uint8, an index of ``CAUSES``, of the points of a corrupted scan.
         boxes: of the objects around the sensor, in the same frame.
         pose: (4, 4) float64, sensor to world, metres.
         image_path: the camera image taken with the scan.
@@ -200,6 +207,8 @@ class Scan:
         provenance: what made a synthetic scan, as short texts and numbers: ``made_by`` (``"model"``
             or ``"town"``), ``seed``, and for a model its name ``model`` and ``checkpoint``; empty
             if it is not known. Scans of one origin have the same.
+        augmented: the augmentations of the scan in order, ``{name: {parameter: value}}`` with the
+            values that were drawn; not written to files.
 
     Raises:
         DataError: on shapes that do not match each other.
@@ -224,12 +233,14 @@ class Scan:
     ring: NDArray[np.int16] | None = None
     confidence: NDArray[np.float32] | None = None
     time: NDArray[np.float32] | None = None
+    cause: NDArray[np.uint8] | None = None
     boxes: Boxes | None = None
     pose: NDArray[np.float64] | None = None
     image_path: Path | None = None
     id: str = ""
     domain: int = REAL
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    augmented: tuple[Mapping[str, Mapping[str, Any]], ...] = ()
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -275,6 +286,10 @@ class Scan:
             n: getattr(self, n) for n in POINT_FIELDS if getattr(self, n) is not None
         }
 
+    def noted(self, name: str, **drawn: Any) -> "Scan":
+        """The scan with one more of ``augmented``."""
+        return replace(self, augmented=(*self.augmented, {name: drawn}))
+
 
 POINT_FIELDS = (
     "reflectance",
@@ -284,6 +299,7 @@ POINT_FIELDS = (
     "ring",
     "confidence",
     "time",
+    "cause",
 )
 """The fields of a ``Scan`` that hold one value per point, and of a ``RangeImage`` per cell."""
 

@@ -4,7 +4,8 @@ Each has a physical parameter, and a value for every one of the ``SEVERITIES``; 
 ``corruption.Corruption``.
 """
 
-from lidar_synth.weather.corruption import CAUSES, SEVERITIES, Change, Corruption
+from lidar_synth.weather.corruption import SEVERITIES, Change, Corruption
+from lidar_synth.weather.cover import Dirt, Spray
 from lidar_synth.weather.fog import Fog
 from lidar_synth.weather.precipitation import Rain, Snow
 from lidar_synth.weather.sensor import (
@@ -17,29 +18,33 @@ from lidar_synth.weather.sensor import (
 )
 from lidar_synth.weather.wet_ground import WetGround
 
+BENCHMARK = (
+    Fog,
+    WetGround,
+    Snow,
+    MotionBlur,
+    MissingBeams,
+    Crosstalk,
+    IncompleteEcho,
+    CrossSensor,
+)
+"""Those of the Robo3D benchmark (Kong et al., ICCV 2023), in its order."""
+
 CORRUPTIONS: dict[str, type[Corruption]] = {
-    "fog": Fog,
-    "rain": Rain,
-    "snow": Snow,
-    "wet_ground": WetGround,
-    "motion_blur": MotionBlur,
-    "missing_beams": MissingBeams,
-    "crosstalk": Crosstalk,
-    "incomplete_echo": IncompleteEcho,
-    "cross_sensor": CrossSensor,
-    "low_power": LowPower,
+    kind.name: kind for kind in (*BENCHMARK, Rain, Spray, Dirt, LowPower)
 }
-"""Corruptions by name. To add one, write its class and a line here; the tests take it
+"""Corruptions by name. To add one, write its class and name it here; the tests take it
 from here."""
 
 __all__ = [
-    "CAUSES",
+    "BENCHMARK",
     "CORRUPTIONS",
     "SEVERITIES",
     "Change",
     "Corruption",
     "CrossSensor",
     "Crosstalk",
+    "Dirt",
     "Fog",
     "IncompleteEcho",
     "LowPower",
@@ -47,5 +52,6 @@ __all__ = [
     "MotionBlur",
     "Rain",
     "Snow",
+    "Spray",
     "WetGround",
 ]

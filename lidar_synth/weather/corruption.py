@@ -8,7 +8,7 @@ occlusion 3 (unknown), by which a loader can leave it out.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -17,27 +17,15 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.geometry.assign import assign_beams
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.scan import CAUSES, Boxes, Scan
+
+Values = NDArray[np.float32]
 
 SEVERITIES = "light", "moderate", "heavy"
-CAUSES = "surface", "scattered", "crosstalk"
-"""Why a return is where it is: the surface that the ray met in clear air, particles in
-the air, or a pulse of another beam."""
 SURFACE, SCATTERED, CROSSTALK = range(len(CAUSES))
 
 OUT_OF_SIGHT = 3
 """KITTI's level of occlusion for "unknown"."""
-
-FLOOR = 5e-5
-"""Least signal that a sensor detects, as reflectance / range^2 in 1 / m^2: the HDL-64E
-sees 10 % at 50 m and 80 % at 120 m (Velodyne's data sheet)."""
-DARKEST = 0.05
-"""Reflectance that a return reported as 0 may have had."""
-
-COMPENSATED = 0.7
-"""Share of the logarithm of a loss that a sensor's automatic power and gain make up for
-in the reflectance that it reports (0 = none). Chosen so that a network that learnt in
-clear air loses as much as in the Robo3D benchmark."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +41,8 @@ class Change:
     """
 
     source: NDArray[np.int64]
-    points: NDArray[np.float32]
-    reflectance: NDArray[np.float32]
+    points: Values
+    reflectance: Values
     cause: NDArray[np.uint8]
 
 
@@ -62,15 +50,22 @@ class Change:
 class Corruption(ABC):
     """An augmentation ``(scan, rng) -> scan`` with a physical parameter.
 
+    Args:
+        noise_label: label of the returns that no surface caused.
+
     Attributes:
+        name: in ``CORRUPTIONS``.
         SEVERE: the arguments of each of ``SEVERITIES``.
     """
 
+    name: ClassVar[str]
     SEVERE: ClassVar[tuple[dict[str, Any], ...]]
 
+    noise_label: int = field(default=IGNORE, kw_only=True)
+
     @classmethod
-    def at(cls, severity: str) -> Self:
-        """The corruption of a severity.
+    def at(cls, severity: str, **options: Any) -> Self:
+        """The corruption of a severity; ``options`` are further arguments.
 
         Raises:
             ConfigError: on a name that is not in ``SEVERITIES``.
@@ -81,7 +76,7 @@ class Corruption(ABC):
                 f"one of {', '.join(SEVERITIES)}",
                 suggest(severity, SEVERITIES),
             )
-        return cls(**cls.SEVERE[SEVERITIES.index(severity)])
+        return cls(**cls.SEVERE[SEVERITIES.index(severity)], **options)
 
     @abstractmethod
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
@@ -93,83 +88,48 @@ class Corruption(ABC):
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
         """The corrupted scan; the given one is not changed."""
+        settings = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
+        scan = scan.noted(self.name, **settings)
         if not len(scan):
             return scan
         change = self.change(scan, rng)
         new = scan[change.source]
-        fields: dict[str, Any] = {}
         lost = change.cause != SURFACE
-        for name, value in (("label", IGNORE), ("raw_label", 0), ("instance", 0)):
+        earlier = np.uint8(SURFACE) if new.cause is None else new.cause
+        changed: dict[str, Any] = {"cause": np.where(lost, change.cause, earlier)}
+        marks = {"label": self.noise_label, "raw_label": 0, "instance": 0}
+        for name, value in {**marks, "confidence": 0}.items():
             given = getattr(new, name)
             if given is not None:
-                fields[name] = np.where(lost, given.dtype.type(value), given)
-        if new.confidence is not None:
-            fields["confidence"] = np.where(lost, np.float32(0), new.confidence)
+                changed[name] = np.where(lost, given.dtype.type(value), given)
         if scan.boxes is not None:
-            fields["boxes"] = _flagged(scan.boxes, scan.points, change)
+            changed["boxes"] = _flagged(scan.boxes, scan.points, change)
         return replace(
-            new, points=change.points, reflectance=change.reflectance, **fields
+            new, points=change.points, reflectance=change.reflectance, **changed
         )
 
 
 def keep_points(scan: Scan, keep: NDArray[np.bool_]) -> Change:
     """The points of a scan that a mask (N,) keeps."""
     source = np.flatnonzero(keep)
-    cause = np.zeros(len(source), np.uint8)
-    return Change(source, scan.points[source], scan.reflectance[source], cause)
-
-
-def move_returns(
-    scan: Scan,
-    distance: NDArray[np.float64],
-    where: NDArray[np.float64],
-    signal: NDArray[np.float64],
-    scattered: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
-) -> Change:
-    """Returns at other places along their rays.
-
-    Args:
-        scan: N points.
-        distance, where: (N,) metres from the sensor, before and after.
-        signal: (N,) reflectance / range^2.
-        scattered: (N,) whether particles return the pulse.
-        seen: (N,) whether there is a return.
-    """
-    source = np.flatnonzero(seen)
-    factor = where / np.maximum(distance, 1e-6)
-    points = (scan.points * factor[:, None]).astype(np.float32)
-    loss = np.minimum(signal / signal_of(scan, distance), 1)
-    surface = scan.reflectance * loss ** (1 - COMPENSATED)
-    particle = np.minimum(signal * np.maximum(where, 0.1) ** 2, 1)
-    values = np.where(scattered, particle, surface).astype(np.float32)
-    cause = np.where(scattered, SCATTERED, SURFACE).astype(np.uint8)
-    return Change(source, points[source], values[source], cause[source])
-
-
-def ranges_of(scan: Scan) -> NDArray[np.float64]:
-    """(N,) distances from the sensor, metres."""
-    distance: NDArray[np.float64] = np.linalg.norm(
-        scan.points.astype(np.float64), axis=1
-    )
-    return distance
-
-
-def signal_of(scan: Scan, distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N,) signals of returns in clear air, reflectance / range^2, at least ``FLOOR``:
-    what was recorded was strong enough."""
-    bright = np.maximum(scan.reflectance, DARKEST)
-    signal: NDArray[np.float64] = bright / np.maximum(distance, 0.1) ** 2
-    return np.maximum(signal, FLOOR)
+    cause = np.full(len(source), SURFACE, np.uint8)
+    points = scan.points.take(source, 0)
+    return Change(source, points, scan.reflectance[source], cause)
 
 
 def rings_of(scan: Scan) -> NDArray[np.int64]:
-    """(N,) beams of the points: their rings, or as their directions tell."""
+    """(N,) beams of the points: their rings, or as their directions tell.
+
+    Raises:
+        DataError: on rings that the sensor does not have.
+    """
     rings = assign_beams(scan).ring if scan.ring is None else scan.ring
     if rings.min() < 0 or rings.max() >= scan.sensor.shape[0]:
         raise DataError(
             f"scan {scan.id!r} with rings from {rings.min()} to {rings.max()}",
             f"0 to {scan.sensor.shape[0] - 1}, the beams of {scan.sensor.name!r}",
+            "Remove them by replace(scan, ring=None): the directions of the points tell "
+            "their beams.",
         )
     return rings.astype(np.int64)
 
@@ -184,7 +144,7 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
         raise ConfigError(f"{name}={value}", f"{low:g} to {high:g}")
 
 
-def _flagged(boxes: Boxes, points: NDArray[np.float32], change: Change) -> Boxes:
+def _flagged(boxes: Boxes, points: Values, change: Change) -> Boxes:
     """The boxes, with those that have lost all their returns flagged."""
     inside = boxes.contain(points)
     left = inside[:, change.source[change.cause == SURFACE]].any(1)

@@ -1,93 +1,112 @@
 """Rain and snow: particles along the beam attenuate it, and single ones return it.
 
-The numbers of particles of diameter D (mm) per m^3 and mm at a rate of r mm / h are ::
+The numbers n(D) of particles of diameter D (mm) per m^3 and mm at r mm of water / h are ::
 
     rain  8000 exp(-4.1 r^-0.21 D)                          (Marshall and Palmer 1948)
-    snow  7600 r^-0.87 exp(-2.55 r^-0.48 D)                 (Gunn and Marshall 1958)
+    snow  7600 r^-0.87 exp(-2.55 r^-0.48 D), D when melted  (Gunn and Marshall 1958)
 
-after Kilic et al. 2021 ("Lidar Light Scattering Augmentation") and Hahner et al. 2022
-("LiDAR snowfall simulation for robust 3D object detection"). All of them are much larger
-than the wavelength of 905 nm, where Mie's extinction efficiency is 2: the extinction is
-twice the area of the particles per m^3.
+after Kilic et al. 2021 ("Lidar light scattering augmentation") and Hahner et al. 2022
+("LiDAR snowfall simulation for robust 3D object detection"). Their extinction is ::
+
+    a = int Q(D) (pi / 4) D^2 n(D) dD
+
+with Mie's efficiency Q. A particle of reflectance q at range r in a beam of the full
+angle d fills the share (D / (r d))^2 of it, so that its signal is ::
+
+    S = q (D / d)^2 / r^4
+
+More than S have all those that are nearer than r(D, S). As many as lie in the beam's cone
+up to there are expected, in all the diameters together ::
+
+    k(S) = (pi / 12) d^2 (q / (d^2 S))^(3/4) int D^(3/2) n(D) dD
+
+and the strongest one on a ray is that for which k is a standard exponential number.
 """
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.weather.corruption import (
-    FLOOR,
-    Change,
-    Corruption,
-    move_returns,
-    ranges_of,
-    require_between,
-    signal_of,
-)
+from lidar_synth.weather.corruption import Change, Values, require_between
+from lidar_synth.weather.signal import SignalLoss, overlap, ranges_of
 
-EFFICIENCY = 2.0
-"""Mie's extinction efficiency of particles much larger than the wavelength."""
+WAVELENGTH = 905e-6
+"""mm."""
 DIVERGENCE = 3e-3
-"""Full angle of the beam, radians (HDL-64E)."""
+"""Full angle d of the beam, radians (HDL-64E)."""
 DIAMETERS = np.linspace(0.05, 10, 400)
 """Of particles, mm; a sensor does not see smaller ones."""
-NEAREST, FARTHEST = 1.0, 40.0
-"""Distances of particles that may return a pulse, metres: beyond, one fills too little of
-the beam."""
+FLAKE = 10 ** (1 / 3)
+"""Diameter of a flake by that of the drop to which it melts, which is Gunn and Marshall's
+D: snow has a tenth of the density of water."""
+_STEP = DIAMETERS[1] - DIAMETERS[0]
+_LEVELS = (np.arange(1024) + 0.5) / 1024
 
 
-def count_drops(rate: float) -> NDArray[np.float64]:
-    """Raindrops per m^3 and mm, by ``DIAMETERS``, at a rate in mm / h."""
-    return np.asarray(8000 * np.exp(-4.1 * rate**-0.21 * DIAMETERS))
-
-
-def count_flakes(rate: float) -> NDArray[np.float64]:
-    """Snowflakes per m^3 and mm, by ``DIAMETERS``, at a rate in mm of water / h."""
-    density = 7600 * rate**-0.87
-    return np.asarray(density * np.exp(-2.55 * rate**-0.48 * DIAMETERS))
-
-
-def extinction_of(counts: NDArray[np.float64]) -> float:
-    """The extinction (1 / m) of particles per m^3 and mm, by ``DIAMETERS``."""
-    area = np.pi / 4 * (DIAMETERS * 1e-3) ** 2
-    step = DIAMETERS[1] - DIAMETERS[0]
-    return float(EFFICIENCY * (area * counts).sum() * step)
+def extinction_efficiency(diameter: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mie's extinction efficiency Q of particles much larger than the wavelength, of any
+    refractive index (Nussenzveig and Wiscombe 1980); diameters in mm."""
+    size = np.pi * diameter / WAVELENGTH
+    return np.asarray(2 + 1.992 * size ** (-2 / 3))
 
 
 @dataclass(frozen=True)
-class _Particles(Corruption):
-    """Precipitation of a rate in mm of water per hour."""
+class Precipitation(SignalLoss):
+    """Particles that fall at a rate in mm of water per hour."""
 
     rate: float
     reflectance: ClassVar[float]
+    """q."""
 
     def __post_init__(self) -> None:
         require_between("rate", self.rate, 0.1, 200)
 
     @abstractmethod
-    def count(self) -> NDArray[np.float64]:
-        """Particles per m^3 and mm, by ``DIAMETERS``."""
+    def number(self) -> NDArray[np.float64]:
+        """n(D) by ``DIAMETERS``."""
+
+    @cached_property
+    def extinction(self) -> float:
+        """The extinction a, 1 / m."""
+        area = np.pi / 4 * (DIAMETERS * 1e-3) ** 2
+        efficiency = extinction_efficiency(DIAMETERS)
+        return float((efficiency * area * self.number()).sum() * _STEP)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        counts = self.count()
-        loss = 2 * extinction_of(counts)
         distance = ranges_of(scan)
-        place, share = nearest_particles(counts, distance, rng)
-        # What the particle lets pass, and what it returns.
-        hard = signal_of(scan, distance) * np.exp(-loss * distance) * (1 - share)
-        soft = self.reflectance * share / place**2 * np.exp(-loss * place)
-        scattered = (soft > hard) & (place < distance)
-        signal = np.where(scattered, soft, hard)
-        where = np.where(scattered, place, distance)
-        return move_returns(scan, distance, where, signal, scattered, signal > FLOOR)
+        place, filled = self.draw_particles(len(scan), rng)
+        loss = np.float32(-2 * self.extinction)
+        soft = self.reflectance * filled * overlap(place) / place**2
+        soft *= np.exp(loss * place)
+        in_front = place < distance
+        # The strongest particle is in the way of the rest of the pulse, too.
+        left = np.exp(loss * distance) * (1 - filled * in_front)
+        return self.strongest(scan, distance, left, soft * in_front, place)
+
+    def draw_particles(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Values, Values]:
+        """Distances in metres of the strongest particles on ``count`` rays, and the
+        shares of their beams that they fill."""
+        weight = (DIAMETERS * 1e-3) ** 1.5 * self.number()
+        share = np.cumsum(weight) / weight.sum()
+        quantiles = np.float32(np.interp(_LEVELS, share, DIAMETERS) * 1e-3)
+        diameter = quantiles[rng.integers(len(quantiles), size=count)]
+        expected = np.pi / 12 * DIVERGENCE**2 * weight.sum() * _STEP
+        k = rng.standard_exponential(count, np.float32)
+        place = np.sqrt(diameter) * np.cbrt(k / np.float32(expected))
+        place = np.maximum(place, np.float32(0.1))
+        filled = np.minimum((diameter / (place * np.float32(DIVERGENCE))) ** 2, 1)
+        return place, filled
 
 
 @dataclass(frozen=True)
-class Rain(_Particles):
+class Rain(Precipitation):
     """Rain.
 
     Args:
@@ -105,15 +124,16 @@ class Rain(_Particles):
         True
     """
 
+    name = "rain"
     SEVERE = {"rate": 5.0}, {"rate": 20.0}, {"rate": 60.0}
     reflectance = 0.02  # of water, Fresnel at normal incidence
 
-    def count(self) -> NDArray[np.float64]:
-        return count_drops(self.rate)
+    def number(self) -> NDArray[np.float64]:
+        return np.asarray(8000 * np.exp(-4.1 * self.rate**-0.21 * DIAMETERS))
 
 
 @dataclass(frozen=True)
-class Snow(_Particles):
+class Snow(Precipitation):
     """Snow.
 
     Args:
@@ -131,41 +151,11 @@ class Snow(_Particles):
         True
     """
 
+    name = "snow"
     SEVERE = {"rate": 0.5}, {"rate": 1.0}, {"rate": 2.5}
     reflectance = 0.9
 
-    def count(self) -> NDArray[np.float64]:
-        return count_flakes(self.rate)
-
-
-def nearest_particles(
-    counts: NDArray[np.float64],
-    distance: NDArray[np.float64],
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The particle on each ray that returns most of the pulse.
-
-    Args:
-        counts: particles per m^3 and mm, by ``DIAMETERS``.
-        distance: (N,) of the targets, metres.
-        rng: source of the random numbers.
-
-    Returns:
-        (N,) distances of the particles in metres, and the shares of the beam's area that
-        they fill, 0 where there is none.
-    """
-    numbers = counts * (DIAMETERS[1] - DIAMETERS[0])
-    reach = np.clip(distance, NEAREST, FARTHEST)
-    slope = DIVERGENCE / 2
-    # Expected number in the beam's cone, and a place in it by its volume.
-    volume = np.pi / 3 * slope**2 * (reach**3 - NEAREST**3)
-    place = np.cbrt(NEAREST**3 + rng.random(len(distance)) * (reach**3 - NEAREST**3))
-    # Of many particles in the beam, the one that is nearest to the sensor returns most.
-    many = np.maximum(volume * numbers.sum(), 1e-12)
-    found = rng.poisson(many)
-    nearest = NEAREST + (place - NEAREST) / np.maximum(found, 1) ** (1 / 3)
-    shares = np.cumsum(numbers) / numbers.sum()
-    drawn = np.searchsorted(shares, rng.random(len(distance)))
-    diameter = DIAMETERS[np.minimum(drawn, len(DIAMETERS) - 1)] * 1e-3
-    filled = np.minimum((diameter / (2 * slope * nearest)) ** 2, 1)
-    return nearest, np.where(found > 0, filled, 0)
+    def number(self) -> NDArray[np.float64]:
+        density = 7600 * self.rate**-0.87 / FLAKE
+        slope = 2.55 * self.rate**-0.48 / FLAKE
+        return np.asarray(density * np.exp(-slope * DIAMETERS))

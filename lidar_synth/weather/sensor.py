@@ -10,16 +10,13 @@ from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.weather.corruption import (
     CROSSTALK,
-    FLOOR,
     Change,
     Corruption,
     keep_points,
-    move_returns,
-    ranges_of,
     require_between,
     rings_of,
-    signal_of,
 )
+from lidar_synth.weather.signal import SignalLoss, ranges_of
 
 VEHICLES = [
     TRAIN_ID[name]
@@ -48,6 +45,7 @@ class MotionBlur(Corruption):
     """
 
     spread: float
+    name = "motion_blur"
     SEVERE = {"spread": 0.04}, {"spread": 0.08}, {"spread": 0.10}
 
     def __post_init__(self) -> None:
@@ -81,6 +79,7 @@ class MissingBeams(Corruption):
     """
 
     share: float
+    name = "missing_beams"
     SEVERE = {"share": 0.25}, {"share": 0.5}, {"share": 0.75}
 
     def __post_init__(self) -> None:
@@ -113,6 +112,7 @@ class CrossSensor(Corruption):
     """
 
     share: float
+    name = "cross_sensor"
     SEVERE = {"share": 0.75}, {"share": 0.5}, {"share": 0.25}
 
     def __post_init__(self) -> None:
@@ -147,6 +147,7 @@ class Crosstalk(Corruption):
 
     share: float
     spread: float = 3.0
+    name = "crosstalk"
     SEVERE = {"share": 0.006}, {"share": 0.008}, {"share": 0.01}
 
     def __post_init__(self) -> None:
@@ -185,6 +186,7 @@ class IncompleteEcho(Corruption):
     """
 
     share: float
+    name = "incomplete_echo"
     SEVERE = {"share": 0.75}, {"share": 0.85}, {"share": 0.95}
 
     def __post_init__(self) -> None:
@@ -201,7 +203,7 @@ class IncompleteEcho(Corruption):
 
 
 @dataclass(frozen=True)
-class LowPower(Corruption):
+class LowPower(SignalLoss):
     """A laser that has lost power: weak returns are not detected.
 
     Args:
@@ -221,13 +223,11 @@ class LowPower(Corruption):
     """
 
     power: float
+    name = "low_power"
     SEVERE = {"power": 0.5}, {"power": 0.25}, {"power": 0.1}
 
     def __post_init__(self) -> None:
         require_between("power", self.power, 1e-3, 1)
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
-        distance = ranges_of(scan)
-        signal = self.power * signal_of(scan, distance)
-        nowhere = np.zeros(len(scan), bool)
-        return move_returns(scan, distance, distance, signal, nowhere, signal >= FLOOR)
+        return self.attenuate(scan, ranges_of(scan), self.power)

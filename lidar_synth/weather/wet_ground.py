@@ -13,15 +13,8 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.weather.corruption import (
-    FLOOR,
-    Change,
-    Corruption,
-    move_returns,
-    ranges_of,
-    require_between,
-    signal_of,
-)
+from lidar_synth.weather.corruption import Change, require_between
+from lidar_synth.weather.signal import SignalLoss, ranges_of
 
 WATER = 1.33
 """Refractive index."""
@@ -29,13 +22,15 @@ TEXTURE = 1.2
 """Depth of an asphalt's texture, mm: a deeper film is a mirror."""
 CELL = 4.0
 """Side of the squares in which unlabelled ground is found, metres."""
+SIDE = 64
+"""Number of squares on each side of the area in which it is looked for."""
 THICK = 0.3
 """Height above the lowest return of a square below which unlabelled returns are ground,
 metres."""
 
 
 @dataclass(frozen=True)
-class WetGround(Corruption):
+class WetGround(SignalLoss):
     """Wet ground.
 
     Args:
@@ -54,6 +49,7 @@ class WetGround(Corruption):
     """
 
     depth: float
+    name = "wet_ground"
     SEVERE = {"depth": 0.2}, {"depth": 1.0}, {"depth": 1.2}
 
     def __post_init__(self) -> None:
@@ -61,23 +57,22 @@ class WetGround(Corruption):
 
     def change(self, scan: Scan, rng: np.random.Generator) -> Change:
         distance = ranges_of(scan)
-        ground = find_ground(scan)
-        incidence = np.abs(scan.points[:, 2]) / np.maximum(distance, 1e-6)
-        passed = (1 - reflect_from_water(np.clip(incidence, 0, 1))) ** 2
+        left = np.ones(len(scan), np.float32)
+        ground = np.flatnonzero(find_ground(scan))
+        incidence = np.abs(scan.points[ground, 2]) / distance[ground]
+        passed = (1 - reflect_from_water(np.minimum(incidence, 1))) ** 2
         flat = min(self.depth / TEXTURE, 1.0)
-        factor = np.where(ground, 1 - flat + flat * passed, 1)
-        signal = signal_of(scan, distance) * factor
-        nowhere = np.zeros(len(scan), bool)
-        return move_returns(scan, distance, distance, signal, nowhere, signal >= FLOOR)
+        left[ground] = 1 - flat + flat * passed
+        return self.attenuate(scan, distance, left)
 
 
-def reflect_from_water(cosine: NDArray[np.floating]) -> NDArray[np.float64]:
+def reflect_from_water(cosine: NDArray[np.floating]) -> NDArray[np.floating]:
     """Fresnel's reflection of unpolarised light by water, for cosines of the angle of
     incidence."""
     inside = np.sqrt(1 - (1 - cosine**2) / WATER**2)
     across = (cosine - WATER * inside) / (cosine + WATER * inside)
     along = (inside - WATER * cosine) / (inside + WATER * cosine)
-    return np.asarray((across**2 + along**2) / 2, np.float64)
+    return np.asarray((across**2 + along**2) / 2)
 
 
 def find_ground(scan: Scan) -> NDArray[np.bool_]:
@@ -85,8 +80,9 @@ def find_ground(scan: Scan) -> NDArray[np.bool_]:
     around them."""
     if scan.label is not None:
         return np.asarray(GROUND[scan.label])
-    places = np.floor(scan.points[:, :2] / CELL).astype(np.int64)
-    _, cell = np.unique(places, axis=0, return_inverse=True)
-    lowest = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(lowest, cell, scan.points[:, 2])
-    return np.asarray(scan.points[:, 2] < np.minimum(lowest[cell] + THICK, 0))
+    height = scan.points[:, 2]
+    column = np.clip(scan.points[:, :2] / CELL + SIDE / 2, 0, SIDE - 1).astype(np.int64)
+    cell = column[:, 0] * SIDE + column[:, 1]
+    lowest = np.full(SIDE * SIDE, np.inf)
+    np.minimum.at(lowest, cell, height)
+    return np.asarray(height < np.minimum(lowest[cell] + THICK, 0))

@@ -75,6 +75,8 @@ FURTHER = (
     "lidar_synth.weather.sensor.Crosstalk",
     "lidar_synth.weather.sensor.IncompleteEcho",
     "lidar_synth.weather.sensor.LowPower",
+    "lidar_synth.weather.cover.Spray",
+    "lidar_synth.weather.cover.Dirt",
     "lidar_synth.lab.evaluate.metric.Metric",
     "lidar_synth.lab.evaluate.segmentation.load_judge",
     "lidar_synth.lab.train.runs.run",

@@ -1,0 +1,95 @@
+"""The signal of returns: what attenuation leaves of it, and what particles add.
+
+The signal of a surface of reflectance p at range R is p / R^2. Of the surface and of
+the particles in front of it, a sensor reports the stronger one, if it is stronger than
+the noise floor (Rasshofer et al. 2011, Hahner et al. 2021).
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.weather.corruption import (
+    SCATTERED,
+    Change,
+    Corruption,
+    Values,
+    keep_points,
+)
+
+FLOOR = 5e-5
+"""Least signal that a sensor detects, 1 / m^2: the HDL-64E sees 10 % at 50 m and 80 % at
+120 m (Velodyne's data sheet)."""
+DARKEST = 0.05
+"""Reflectance that a return reported as 0 may have had."""
+OVERLAP = 0.9, 12.0
+"""Ranges from which a receiver beside the laser begins to see, and wholly sees, the beam,
+metres. Haze with a visibility of hundreds of metres is then not detected."""
+
+
+def ranges_of(scan: Scan) -> Values:
+    """(N,) distances from the sensor, metres, at least 0.1."""
+    x, y, z = np.ascontiguousarray(scan.points.T)
+    distance: Values = np.sqrt(x * x + y * y + z * z)
+    return np.maximum(distance, np.float32(0.1))
+
+
+def signal_of(scan: Scan, distance: Values) -> Values:
+    """(N,) signals in clear air, at least ``FLOOR``: what was recorded was strong
+    enough."""
+    bright = np.maximum(scan.reflectance, np.float32(DARKEST))
+    return np.maximum(bright / (distance * distance), np.float32(FLOOR))
+
+
+def overlap(ranges: NDArray[Any]) -> NDArray[Any]:
+    """Share of the beam that the receiver sees, by range in metres."""
+    first, whole = OVERLAP
+    return np.clip((ranges - first) / (whole - first), 0, 1)
+
+
+@dataclass(frozen=True)
+class SignalLoss(Corruption):
+    """A corruption that weakens the signal.
+
+    Args:
+        compensated: share, in [0, 1], of a loss in decibels that the sensor's automatic
+            power and gain make up for in the reflectance that it reports; 0 for a sensor
+            that reports the signal. By default as a network that learnt in clear air
+            loses on average in the Robo3D benchmark.
+    """
+
+    compensated: float = field(default=0.7, kw_only=True)
+
+    def attenuate(self, scan: Scan, distance: Values, left: Values | float) -> Change:
+        """What is left of a scan of N points if surfaces return the shares ``left``, (N,)
+        in [0, 1], of their signals."""
+        nothing = np.zeros(len(scan), np.float32)
+        whole = np.broadcast_to(np.float32(left), len(scan))
+        return self.strongest(scan, distance, whole, nothing, nothing)
+
+    def strongest(
+        self, scan: Scan, distance: Values, left: Values, soft: Values, place: Values
+    ) -> Change:
+        """The stronger of two returns on each ray.
+
+        Args:
+            scan: N points.
+            distance: (N,) metres, ``ranges_of``.
+            left: (N,) share of the surface's signal that is left.
+            soft: (N,) signal of particles, 1 / m^2.
+            place: (N,) their distance, metres.
+        """
+        hard = signal_of(scan, distance) * left
+        scattered = soft > hard
+        change = keep_points(scan, np.maximum(soft, hard) >= FLOOR)
+        source = change.source
+        scattered = scattered[source]
+        drops = source[scattered]
+        change.points[scattered] *= (place[drops] / distance[drops])[:, None]
+        change.reflectance[:] *= left[source] ** np.float32(1 - self.compensated)
+        change.reflectance[scattered] = np.minimum(soft[drops] * place[drops] ** 2, 1)
+        change.cause[scattered] = SCATTERED
+        return change
