@@ -15,7 +15,7 @@ from lidar_synth.errors import DataError, LidarSynthError
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.kitti360_boxes import write_boxes
 from lidar_synth.geometry.projection import project
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.scan import CAUSES, Boxes, Scan
 
 LOSSLESS = ("npz", "pcd", "ply", "webdataset")
 """Formats that keep every field of a point."""
@@ -41,7 +41,9 @@ def complete() -> Scan:
     rng = np.random.default_rng(0)
     ring = rng.integers(0, 64, len(scan)).astype(np.int16)
     time, confidence = rng.uniform(-0.1, 0.1, (2, len(scan))).astype(np.float32)
-    return replace(scan, ring=ring, time=time, confidence=np.abs(confidence))
+    cause = rng.integers(0, len(CAUSES), len(scan)).astype(np.uint8)
+    confidence = np.abs(confidence)
+    return replace(scan, ring=ring, time=time, confidence=confidence, cause=cause)
 
 
 def with_value(scan: Scan, name: str, value: Any) -> Scan:

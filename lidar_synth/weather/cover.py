@@ -177,4 +177,5 @@ def draw_dirt(share: float, rng: np.random.Generator) -> Values:
     smooth = np.exp(-2 * (np.pi * SPOT * frequency) ** 2)
     values = np.fft.irfft2(noise * smooth, (rows, columns))
     above = values - np.quantile(values, 1 - share)
-    return np.float32(np.maximum(above, 0) * THICKNESS / values.std())
+    thickness = np.maximum(above, 0) * THICKNESS / values.std()
+    return np.asarray(thickness, np.float32)

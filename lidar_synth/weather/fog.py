@@ -94,4 +94,5 @@ def find_soft_return(
     answer = received @ pulse
     best = np.maximum.accumulate(answer)
     place = np.maximum.accumulate(np.where(answer >= best, ranges, 0))
-    return np.float32(place), np.float32(np.pi * backscatter * best)
+    strength = np.pi * backscatter * best
+    return place.astype(np.float32), strength.astype(np.float32)

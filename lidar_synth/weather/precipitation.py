@@ -95,7 +95,7 @@ class Precipitation(SignalLoss):
         shares of their beams that they fill."""
         weight = (DIAMETERS * 1e-3) ** 1.5 * self.number()
         share = np.cumsum(weight) / weight.sum()
-        quantiles = np.float32(np.interp(_LEVELS, share, DIAMETERS) * 1e-3)
+        quantiles = np.interp(_LEVELS, share, DIAMETERS).astype(np.float32) * 1e-3
         diameter = quantiles[rng.integers(len(quantiles), size=count)]
         expected = np.pi / 12 * DIVERGENCE**2 * weight.sum() * _STEP
         k = rng.standard_exponential(count, np.float32)

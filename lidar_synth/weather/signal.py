@@ -34,7 +34,7 @@ def ranges_of(scan: Scan) -> Values:
     """(N,) distances from the sensor, metres, at least 0.1."""
     x, y, z = np.ascontiguousarray(scan.points.T)
     distance: Values = np.sqrt(x * x + y * y + z * z)
-    return np.maximum(distance, np.float32(0.1))
+    return np.asarray(np.maximum(distance, 0.1), np.float32)
 
 
 def signal_of(scan: Scan, distance: Values) -> Values:
