@@ -41,7 +41,8 @@ def signal_of(scan: Scan, distance: Values) -> Values:
     """(N,) signals in clear air, at least ``FLOOR``: what was recorded was strong
     enough."""
     bright = np.maximum(scan.reflectance, np.float32(DARKEST))
-    return np.maximum(bright / (distance * distance), np.float32(FLOOR))
+    signal: Values = np.maximum(bright / (distance * distance), np.float32(FLOOR))
+    return signal
 
 
 def overlap(ranges: NDArray[Any]) -> NDArray[Any]:
