@@ -179,10 +179,10 @@ def test_extinction_of_precipitation() -> None:
 
 
 def test_the_extinction_efficiency_is_that_of_mie() -> None:
-    """Against miepython 3.3 (efficiencies_mx), averaged over 5 % of the diameter."""
+    """Against miepython 3.3.0 (efficiencies_mx at 905 nm), the mean over 5 % of the diameter."""
     diameter = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 2.0])
-    water = [2.065, 2.042, 2.025, 2.014, 2.009, 2.005]  # m = 1.328
-    ice = [2.072, 2.040, 2.026, 2.014, 2.009, 2.005]  # m = 1.3031
+    water = [2.061, 2.042, 2.026, 2.014, 2.009, 2.005]  # m = 1.328
+    ice = [2.073, 2.040, 2.025, 2.014, 2.008, 2.005]  # m = 1.3031
     found = precipitation.extinction_efficiency(diameter)
     assert found == pytest.approx(water, rel=0.004)
     assert found == pytest.approx(ice, rel=0.005)
