@@ -38,7 +38,7 @@ LIMITS = {
     "docs/how-to/bake.md": 320,
     "docs/how-to/look.md": 130,
     "docs/how-to/prove.md": 225,
-    "docs/how-to/weather.md": 230,
+    "docs/how-to/weather.md": 260,
     "docs/reference/api.md": 40,
     "docs/reference/command-line.md": 30,
     "docs/reference/recipes.md": 80,
@@ -57,7 +57,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8_515
+MAIN_PATH = 8_535
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [
