@@ -57,7 +57,7 @@ LIMITS = {
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8_535
+MAIN_PATH = 8_550
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [

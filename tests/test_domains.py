@@ -8,7 +8,7 @@ import pytest
 import torch
 from streets import street
 
-from lidar_synth import MixedScans, MixedStream, Sources
+from lidar_synth import MixedScans, MixedStream, Sources, mix
 from lidar_synth.errors import ConfigError
 from lidar_synth.labels.augment import drop_reflectance
 from lidar_synth.mixing import ByDomain, EndOnReal, make_schedule, settle
@@ -139,3 +139,28 @@ def test_reflectance_is_dropped_by_chance() -> None:
     assert scan.reflectance.any()
     dropped = [drop_reflectance(scan, rng, 0.5) is not scan for _ in range(200)]
     assert 70 < sum(dropped) < 130
+
+
+def test_the_recipe_for_detectors_has_synthetic_scans_first_and_pastes_objects() -> (
+    None
+):
+    mixed = mix(REAL, SYNTHETIC, task="detection", epochs=8)
+    shares = []
+    boxes = []
+    for epoch in (0, 5, 6, 7):
+        mixed.set_epoch(epoch)
+        shares.append(sum(mixed.domain(i) for i in range(len(mixed))))
+        boxes += [len(mixed[i]["boxes"]) for i in range(len(mixed))]
+    assert shares == [4, 4, 2, 2]
+    own = [len(scan.boxes) for scan in REAL + SYNTHETIC if scan.boxes is not None]
+    assert np.mean(boxes) > np.mean(own)
+    half = mix(REAL, SYNTHETIC, 0.5, task="detection", epochs=8)
+    assert sum(half.domain(i) for i in range(len(half))) == 2
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"task": "tracking"}, {"task": "detection"}, {"epochs": 3}]
+)
+def test_a_recipe_that_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"task|epochs"):
+        mix(REAL, SYNTHETIC, **({"task": "detection"} | wrong))

@@ -7,22 +7,19 @@ All arms have the same network, iterations, batch, augmentation, optimiser and t
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.detection.network import collate, sample
+from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
-from lidar_synth.labels.mix import PasteObjects
 from lidar_synth.mixing import MixedScans
+from lidar_synth.mixing.detection import augment_boxes
 
 PHASES = 4
 BASE = "gt_sampling"
 """The arm with which the others are compared."""
 OWN = "own"
 TOWN = "town"
-PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
-"""Maximum number of objects of a bank that are pasted into a scan."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class DetectionArm:
     budget: str = "none"
 
 
-_TOWN = "boxes of the town, which cost nothing"
+_TOWN = f"boxes of the town; {CALIBRATED_ON}"
 ARMS = {
     "real": DetectionArm("real scans only"),
     "gt_sampling": DetectionArm("GT sampling", (OWN,)),
@@ -86,7 +83,7 @@ def make_mixture(
         count: number of samples in the whole training; an epoch has ``PHASES`` parts of it.
     """
     banks = {OWN: ObjectBank.from_scans(labelled), TOWN: objects}
-    pasting: list[Augmentation] = [paste_from(banks[name]) for name in arm.pasted]
+    pasted = [bank for name in arm.pasted if (bank := banks[name]) is not None]
     synthetic = any(arm.shares)
     return MixedScans(
         None if min(arm.shares) == 1 else labelled,
@@ -96,16 +93,9 @@ def make_mixture(
         seed=seed,
         balanced=True,
         epoch_size=count // PHASES,
-        augment=compose([*pasting, partial(yaw, limit=45), flip_x, flip_y, scale]),
+        augment=augment_boxes(pasted),
         augment_real=True,
         to_sample=sample,
         collate=collate,
         unboxed="keep",  # the town's objects have boxes
     )
-
-
-def paste_from(bank: ObjectBank | None) -> Augmentation:
-    """An augmentation that pastes objects of a bank, turned about the sensor."""
-    assert bank is not None
-    there = {name: most for name, most in PASTED.items() if name in bank.boxes.names}
-    return PasteObjects(bank, there, turn=180.0, clear=False)

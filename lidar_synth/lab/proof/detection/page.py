@@ -26,14 +26,17 @@ def body(values: Values) -> str:
     parts = [f"<p>{escape(describe(values))}</p>"]
     for name, found in values["classes"].items():
         drawn = [
-            {**found["arms"][arm["arm"]], **arm, "synthetic": True, "by_place": {}}
+            {**found["arms"][arm["arm"]], **arm, "synthetic": True}
             for arm in values["arms"]
         ]
+        places = _places(drawn)
+        drawn = [{**row, "by_place": _changes(row, drawn[0])} for row in drawn]
         boxes = " and ".join(map(str, found["boxes"]))
         title = f"{name.capitalize()}, {boxes} boxes by seed"
         parts += [
             make_section(title, differences(drawn), NOTE),
             make_section("Average precision, %", _table(drawn)),
+            make_section("By place: average precision at an overlap of 0.5, %", places),
         ]
     parts.append(make_section("How it was measured", make_list(protocol(values))))
     return "\n".join(parts)
@@ -70,6 +73,24 @@ def _table(rows: list[dict[str, Any]]) -> str:
         cells += [make_cell(_number(row[name])) for name in CRITERIA]
         made.append(f"<tr>{''.join(cells)}</tr>")
     return make_grid(["training", *CRITERIA], made)
+
+
+def _places(rows: list[dict[str, Any]]) -> str:
+    made = []
+    for place in rows[0]["by_place"]:
+        cells = [make_cell(place)]
+        cells += [make_cell(_number(row["by_place"][place])) for row in rows]
+        made.append(f"<tr>{''.join(cells)}</tr>")
+    return make_grid(["place", *(row["title"] for row in rows)], made)
+
+
+def _changes(row: Values, base: Values) -> dict[str, float | None]:
+    """{place: change of the average precision}; None without a box."""
+    there = base["by_place"]
+    return {
+        place: None if value is None else value - there[place]
+        for place, value in row["by_place"].items()
+    }
 
 
 def _number(value: float | None) -> str:

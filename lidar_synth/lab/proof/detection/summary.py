@@ -104,6 +104,7 @@ def _of_class(
             "by_seed": [round(_percent(one), 1) for one in own],
             "difference": round(float(np.mean(by_seed)), 1) if other else None,
             "interval": interval_of(own, base) if other else None,
+            "by_place": _by_place(own, tested),
             **{
                 name: _mean(
                     _groups(
@@ -119,6 +120,15 @@ def _of_class(
         }
     wanted = [sum(one.wanted for place in seed for one in place) for seed in base]
     return {"boxes": wanted, "arms": table}
+
+
+def _by_place(groups: Groups, tested: Tested) -> dict[str, float | None]:
+    """{place: average precision there}, mean over the seeds that test it; None without a box."""
+    values: dict[str, Groups] = {}
+    for seed, places in zip(groups, tested.values(), strict=True):
+        for place, judged in zip(places, seed, strict=True):
+            values.setdefault(place, []).append([judged])
+    return {place: _mean(found) for place, found in values.items()}
 
 
 def _groups(
