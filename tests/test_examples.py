@@ -32,9 +32,13 @@ FURTHER = {
     "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": (
+        "ByDomain",
+        "EndOnReal",
         "MixedScans.batches",
         "MixedScans.domain",
+        "MixedScans.loss_weight",
         "MixedScans.wrap",
+        "settle",
     ),
     "lidar_synth.noise": ("gaussian",),
     "lidar_synth.lab.train": (
