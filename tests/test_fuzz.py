@@ -26,6 +26,7 @@ if not Path("/proc/self/status").exists():
 from fuzzing import mutators
 from fuzzing.cases import Cases, mutable, seed_files
 from fuzzing.checks import fingerprint, flaws
+from fuzzing.containers import gunzip, gzipped_zeros
 from fuzzing.run import FLAWS, fuzz
 from fuzzing.targets import TARGETS, Target, read
 from fuzzing.worker import DIED, EQUAL, FOREIGN, MEMORY, REFUSED, SLOW, UNSOUND, Limits
@@ -260,3 +261,9 @@ def test_the_tool_prints_a_table_and_keeps_what_is_wrong(
     )
     with pytest.raises(DataError):
         tool.main()
+
+
+def test_mutators_unpack_no_bomb() -> None:
+    assert gunzip(gzipped_zeros(1)) == bytes(1_000_448)
+    with pytest.raises(ValueError, match="a bomb"):
+        gunzip(gzipped_zeros(70))
