@@ -35,7 +35,7 @@ from lidar_synth.generate.checkpoint import (
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.lab.town import Town
 from lidar_synth.lab.train.config import DistillConfig, load_config
-from lidar_synth.lab.train.plan import make_plan, open_data
+from lidar_synth.lab.train.runs import open_stage
 
 TRANSFORMER = {
     "architecture": "hdit",
@@ -338,10 +338,11 @@ def test_conditions_reach_the_batches_of_teacher_and_student(
             steps=1,
         ),
     )
-    plan = make_plan(config, accelerator)
-    data = open_data(config, plan, accelerator.device)
+    stage = open_stage(config)
+    data = stage.open_data()
+    stage.prepare(data, accelerator)
     batch = data(range(3))
     assert batch.y0.shape == (3, 4, 4, 8) == batch.y1.shape
     assert batch.cond is not None and batch.cond.shape == (3, 8, 32)
-    example = plan.task(batch)
+    example = stage.task(batch)
     assert example.cond is batch.cond

@@ -37,7 +37,7 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.lab.train.config import DistillConfig, load_config
-from lidar_synth.lab.train.teaching import target_flow
+from lidar_synth.lab.train.student import target_flow
 
 STILL = ("stem", "encode", "merge", "to_latent", "shift", "scale")
 """Parts of names in an autoencoder that belong to its encoder, or to both sides."""

@@ -23,8 +23,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from typer.testing import CliRunner
 
-import lidar_synth.lab.train.plan as plan_module
 import lidar_synth.lab.train.runs as module
+import lidar_synth.lab.train.selection as selection_module
+import lidar_synth.lab.train.teacher as teacher_module
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
@@ -238,7 +239,7 @@ def test_what_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = write_config(scans, tmp_path)
-    task = plan_module.teacher_task()
+    task = teacher_module.teacher_task()
     calls = []
 
     def poisoned(batch: Any) -> Example:
@@ -250,7 +251,7 @@ def test_what_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint(
             example.velocity * (torch.nan if len(calls) == 7 else 1),
         )
 
-    monkeypatch.setattr(plan_module, "teacher_task", lambda timesteps: poisoned)
+    monkeypatch.setattr(teacher_module, "teacher_task", lambda timesteps: poisoned)
     with pytest.raises(
         DataError,
         match=r"step 7: the loss is nan.*last saved state and checkpoint are kept",
@@ -345,7 +346,7 @@ def test_a_student_is_distilled(
         assert header.time_grid == tuple(found["grid"])
         assert found["cost"] <= found["uniform_cost"]
         assert found["per_trajectory"].shape == (3, 3)
-    monkeypatch.delattr(plan_module, "select_timesteps")  # it is not called again
+    monkeypatch.delattr(selection_module, "sum_costs")  # it is not called again
     call("distill", config, "--resume", "recipe.iterations=14")
     assert (
         read_header(tmp_path / "run" / "run.safetensors")[0].time_grid

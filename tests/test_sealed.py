@@ -33,7 +33,7 @@ from lidar_synth.lab.train.state import (
     STATE,
     Recipe,
     Training,
-    _checksum,
+    checksum_of,
     read_progress,
 )
 
@@ -166,7 +166,7 @@ def test_a_state_with_other_names_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / STATE
     tensors = {name: torch.ones(3)}
     facts = {"step": "1", "seconds": "0"}
-    save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
+    save_file(tensors, path, facts | {"checksum": checksum_of(facts, tensors)})
     with pytest.raises(DataError, match=r"is the state of another network"):
         training().load(path)
     save_file({"network.weight": torch.ones(3)}, path)
@@ -254,7 +254,7 @@ def test_moments_that_the_next_step_could_not_use_are_refused(
         "steps": {"optimizer.0.0.exp_avg": weight, "optimizer.0.0.step": torch.ones(2)},
     }[change]
     facts = {"step": "1", "seconds": "0"}
-    save_file(tensors, path, facts | {"checksum": _checksum(facts, tensors)})
+    save_file(tensors, path, facts | {"checksum": checksum_of(facts, tensors)})
     with pytest.raises(DataError, match="is the state of another network"):
         training().load(path)
 

@@ -13,14 +13,14 @@ from lidar_synth.generate.checkpoint import load_checkpoint
 from lidar_synth.generate.loading import find_model
 from lidar_synth.lab.evaluate.leakage import overlap, town
 from lidar_synth.lab.train import TrainConfig, load_config, precision, run
-from lidar_synth.lab.train.start import start_networks
+from lidar_synth.lab.train.start import open_networks
 
 
 def test_a_shipped_model_is_a_start_by_its_name(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    networks, header = start_networks(
+    networks, header = open_networks(
         load_config(TrainConfig, "town_teacher", ["init=town", "codec=null"])
     )
     shipped = load_checkpoint(find_model("town"))
@@ -28,7 +28,7 @@ def test_a_shipped_model_is_a_start_by_its_name(
         shipped.networks
     )
     with pytest.raises(ConfigError, match="expected a shipped one"):
-        start_networks(
+        open_networks(
             load_config(TrainConfig, "town_teacher", ["init=towns", "codec=null"])
         )
 

@@ -12,10 +12,17 @@ from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.lab.train import TrainConfig, cache_scans, load_config, run, runs
+from lidar_synth.lab.train import (
+    Record,
+    TrainConfig,
+    cache_scans,
+    load_config,
+    run,
+    runs,
+)
 from lidar_synth.lab.train.schedules import PLATEAU
 from lidar_synth.lab.train.staged import train_for
-from lidar_synth.lab.train.start import start_networks
+from lidar_synth.lab.train.start import open_networks
 from lidar_synth.lab.train.state import read_progress
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
@@ -83,12 +90,13 @@ def test_the_rate_falls_after_a_plateau_that_patience_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rates: list[float] = []
-    add = runs._Log.add
-    monkeypatch.setattr(
-        runs._Log,
-        "add",
-        lambda self, record: rates.append(record.rate) or add(self, record),
-    )
+    keep = runs._Keeper.keep
+
+    def watched(self: Any, record: Record, last: bool) -> None:
+        rates.append(record.rate)
+        keep(self, record, last)
+
+    monkeypatch.setattr(runs._Keeper, "keep", watched)
     # At this rate the loss goes up and down, so that patience ends soon.
     given = config(
         tmp_path / "run", HELD, "recipe.rate=0.05", "recipe.schedule=trapezoid"
@@ -119,7 +127,7 @@ def test_a_conditional_start_keeps_its_condition_and_takes_other_shares(
             f"init={start}",
             f"condition={condition}",
         )
-        return start_networks(config(tmp_path / "next", *more))[1]
+        return open_networks(config(tmp_path / "next", *more))[1]
 
     assert header("{kind: semantic, dropout: 0.5}").conditioning == {
         "semantic": {"dropout": 0.5}

@@ -33,7 +33,7 @@ from lidar_synth import ObjectBank, Town, load_layout, load_skin
 from lidar_synth.files.parsing import seal
 from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
-from lidar_synth.generate.flow.timesteps import Selection
+from lidar_synth.generate.flow.timesteps import TrajectoryCosts
 from lidar_synth.geometry.layout import layout_image
 from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import Sensor
@@ -51,8 +51,8 @@ from lidar_synth.lab.train import (
     cache_scans,
     load_config,
 )
-from lidar_synth.lab.train.selection import load_selection, save_selection
-from lidar_synth.lab.train.state import STATE, Recipe, Training, _checksum
+from lidar_synth.lab.train.selection import load_costs, save_costs
+from lidar_synth.lab.train.state import STATE, Recipe, Training, checksum_of
 
 SMALL = Sensor("tiny", 32, 1.0, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 
@@ -222,9 +222,9 @@ def make_states(root: Path) -> None:
     )
     (root / "outcome.json").write_bytes(seal(to_values(outcome)))
     costs = np.triu(np.ones((5, 5)), 1)
-    times = (1.0, 0.75, 0.5, 0.25, 0.0)
-    chosen = Selection((1.0, 0.5, 0.0), 0.5, 1.0, times, costs, np.full((2, 1), 0.5))
-    save_selection(root / "selection.npz", chosen, SETTINGS)
+    costs = np.where(costs > 0, costs, np.inf)
+    chosen = TrajectoryCosts(2 * costs, np.array([[0, 2, 4], [0, 1, 4]]))
+    save_costs(root / "selection.npz", chosen, SETTINGS)
 
 
 def cached(root: Path) -> list[Any]:
@@ -244,13 +244,14 @@ def read_states(root: Path) -> list[Any]:
     training.load(root / STATE)
     take_step(training)
     outcome = read_outcome(root / "outcome.json")
-    chosen = load_selection(root / "selection.npz", SETTINGS)
+    chosen = load_costs(root / "selection.npz", SETTINGS)
     return [
         training.network,
         training.average,
         training.step,
         asdict(outcome),
-        asdict(chosen),
+        asdict(chosen.selection)["grid"],
+        chosen.optima,
         *cached(root),
     ]
 
@@ -275,7 +276,7 @@ def mend_metadata(path: Path) -> None:
         facts = dict(file.metadata())
     facts.pop("checksum", None)
     whole = safetensors.torch.save(
-        tensors, facts | {"checksum": _checksum(facts, tensors)}
+        tensors, facts | {"checksum": checksum_of(facts, tensors)}
     )
     path.write_bytes(in_order(whole))
 

@@ -22,11 +22,11 @@ from lidar_synth.lab.train.config import (
     Data,
     DistillConfig,
     ModelConfig,
+    ModelStage,
     NetworkSection,
     Run,
     Samples,
     SelectionSettings,
-    Stage,
     TrainConfig,
     published,
     published_models,
@@ -98,7 +98,7 @@ SECTIONS: dict[str, tuple[type, ...]] = {
     "distill": (DistillConfig,),
     "selection": (SelectionSettings,),
     "models": (ModelConfig,),
-    "stages": (Stage,),
+    "stages": (ModelStage,),
 }
 """Keys of a recipe that hold further keys; "" = the keys on top, "distill" = those of a student
 besides, "models" = those of a model of several stages."""

@@ -13,7 +13,8 @@ by all trajectories: C is averaged first, then dynamic programming in O(N M^2) f
 streamed, so that only C is kept in memory.
 """
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -64,6 +65,37 @@ class Selection:
         return tuple(self.candidates[i] for i in best_path(self.costs, intervals))
 
 
+@dataclass(frozen=True)
+class TrajectoryCosts:
+    """The costs of the first trajectories of a selection, and their own best paths.
+
+    Args:
+        total: (M + 1, M + 1) sum of the cost matrices.
+        optima: (trajectories, N + 1) candidate indices.
+    """
+
+    total: Costs
+    optima: NDArray[np.int64]
+
+    @property
+    def selection(self) -> Selection:
+        """The selection on these trajectories."""
+        intervals = self.optima.shape[1] - 1
+        candidates = len(self.total) - 1
+        costs = self.total / len(self.optima)
+        times = uniform_grid(candidates)
+        path = best_path(costs, intervals)
+        uniform = np.round(np.linspace(0, candidates, intervals + 1)).astype(np.int64)
+        return Selection(
+            grid=tuple(times[i] for i in path),
+            cost=path_cost(costs, path),
+            uniform_cost=path_cost(costs, uniform),
+            candidates=times,
+            costs=costs,
+            per_trajectory=np.asarray(times)[self.optima[:, 1:-1]],
+        )
+
+
 def select_timesteps(
     velocity: Velocity,
     shape: tuple[int, ...],
@@ -80,7 +112,41 @@ def select_timesteps(
     """Select the time grid of N steps on which a teacher's trajectories are straightest.
 
     Peak memory is that of ``batch`` trajectories (states and velocities: 105 MB each for 2x64x1024
-    and M = 100), independent of the number of trajectories.
+    and M = 100), independent of the number of trajectories. The arguments and errors are those of
+    ``sum_costs``.
+    """
+    every = sum_costs(
+        velocity,
+        shape,
+        intervals,
+        candidates,
+        trajectories,
+        metric,
+        seed,
+        batch,
+        device,
+        condition,
+        progress,
+    )
+    [costs] = deque(every, maxlen=1)
+    return costs.selection
+
+
+def sum_costs(
+    velocity: Velocity,
+    shape: tuple[int, ...],
+    intervals: int = 4,
+    candidates: int = 100,
+    trajectories: int = 256,
+    metric: str | Metric = "pseudo_huber",
+    seed: int = 0,
+    batch: int = 1,
+    device: torch.device | str = "cpu",
+    condition: Callable[[range], Any] | None = None,
+    progress: bool = True,
+    done: TrajectoryCosts | None = None,
+) -> Iterator[TrajectoryCosts]:
+    """The costs of a selection, batch by batch.
 
     Args:
         velocity: the teacher.
@@ -95,6 +161,10 @@ def select_timesteps(
         device: device of the teacher.
         condition: gives the conditions of a range of trajectories; None = unconditional.
         progress: whether to show a progress bar.
+        done: what an earlier call yielded last, which this one continues.
+
+    Yields:
+        The costs of all trajectories up to now, after each batch.
 
     Raises:
         ConfigError: on an unknown metric or impossible numbers.
@@ -110,37 +180,25 @@ def select_timesteps(
         raise ConfigError(f"metric {metric!r}", f"one of {', '.join(METRICS)}")
     m = METRICS[metric] if isinstance(metric, str) else metric
     times = uniform_grid(candidates)
-    total = np.zeros((candidates + 1, candidates + 1))
-    optima = []
-    with (
-        torch.inference_mode(),
-        tqdm(total=trajectories, desc="trajectories", disable=not progress) as bar,
-    ):
-        for first in range(0, trajectories, batch):
-            part = range(first, min(first + batch, trajectories))
-            start = gaussian(seed, part, shape, device)
-            costs = cost_matrix(
-                velocity, start, times, m, condition(part) if condition else None
-            )
-            total += costs.sum(0)
-            optima.append(best_path(costs, intervals))
-            bar.update(len(part))
-    return _selection(total / trajectories, times, intervals, np.concatenate(optima))
-
-
-def _selection(
-    costs: Costs, times: tuple[float, ...], intervals: int, optima: NDArray[np.int64]
-) -> Selection:
-    path = best_path(costs, intervals)
-    uniform = np.round(np.linspace(0, len(times) - 1, intervals + 1)).astype(np.int64)
-    return Selection(
-        grid=tuple(times[i] for i in path),
-        cost=path_cost(costs, path),
-        uniform_cost=path_cost(costs, uniform),
-        candidates=times,
-        costs=costs,
-        per_trajectory=np.asarray(times)[optima[:, 1:-1]],
+    if done is None:
+        size = candidates + 1
+        nothing = np.zeros((0, intervals + 1), np.int64)
+        done = TrajectoryCosts(np.zeros((size, size)), nothing)
+    count = len(done.optima)
+    bar = tqdm(
+        total=trajectories, initial=count, desc="trajectories", disable=not progress
     )
+    with bar:
+        for first in range(count, trajectories, batch):
+            part = range(first, min(first + batch, trajectories))
+            cond = condition(part) if condition else None
+            with torch.inference_mode():
+                start = gaussian(seed, part, shape, device)
+                costs = cost_matrix(velocity, start, times, m, cond)
+            optima = np.concatenate((done.optima, best_path(costs, intervals)))
+            done = TrajectoryCosts(done.total + costs.sum(0), optima)
+            bar.update(len(part))
+            yield done
 
 
 def cost_matrix(

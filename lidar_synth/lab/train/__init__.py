@@ -16,21 +16,17 @@ from lidar_synth.lab.train.autoencoder import (
 from lidar_synth.lab.train.cache import ImageCache, Other, cache_latents, cache_scans
 from lidar_synth.lab.train.config import DistillConfig, TrainConfig, load_config
 from lidar_synth.lab.train.data import Batch, Batches, Conditioning, micro_batches
-from lidar_synth.lab.train.decoding import Decoding, decoding_loss, decoding_task
-from lidar_synth.lab.train.loop import (
-    Loss,
-    Record,
-    Task,
-    steps,
-    student_task,
-    teacher_task,
-)
+from lidar_synth.lab.train.decoder import Decoding, decoding_loss, decoding_task
+from lidar_synth.lab.train.loop import Record, steps
 from lidar_synth.lab.train.model_plan import ModelPlan, plan_model
 from lidar_synth.lab.train.models import train_model
 from lidar_synth.lab.train.optimizers import OPTIMIZERS
-from lidar_synth.lab.train.runs import run
+from lidar_synth.lab.train.runs import open_stage, run
 from lidar_synth.lab.train.schedules import SCHEDULES
+from lidar_synth.lab.train.stage import Loss, Stage, Task
 from lidar_synth.lab.train.state import Recipe, Training
+from lidar_synth.lab.train.student import student_task
+from lidar_synth.lab.train.teacher import teacher_task
 
 __all__ = [
     "OPTIMIZERS",
@@ -48,6 +44,7 @@ __all__ = [
     "Other",
     "Recipe",
     "Record",
+    "Stage",
     "Task",
     "TrainConfig",
     "Training",
@@ -58,6 +55,7 @@ __all__ = [
     "decoding_task",
     "load_config",
     "micro_batches",
+    "open_stage",
     "plan_model",
     "reconstruct",
     "reconstruction_figures",

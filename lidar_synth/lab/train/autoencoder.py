@@ -6,20 +6,25 @@ patches is trained in every step too (Esser et al., "Taming Transformers for Hig
 Synthesis", CVPR 2021).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
+from lidar_synth.generate.checkpoint import CODEC, Header
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.flow.path import Example, Metric
+from lidar_synth.generate.flow.path import METRICS, Example, Metric
 from lidar_synth.generate.models.convolution import Norm, WrapConv
 from lidar_synth.generate.models.network import Autoencoder
 from lidar_synth.generate.models.objective import Losses, Objective
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.lab.train.config import TrainConfig
 from lidar_synth.lab.train.data import Batch, Batches
+from lidar_synth.lab.train.stage import Stage, Task
+from lidar_synth.lab.train.start import open_networks
 
 MEASURED = 8
 """Scans on which the noise of cells is measured."""
@@ -56,16 +61,19 @@ class Autoencoding(nn.Module):
         self.losses = losses
         self.metric = metric
         self.weights = weights
-        self.discriminator = (
-            Discriminator(tensors.size, losses.discriminator_width)
-            if losses.adversarial
-            else None
-        )
-        directions = (
-            torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0)
-            / sensor.range_max
-        )
-        self.register_buffer("rays", directions, persistent=False)
+        self.discriminator = None
+        if losses.adversarial:
+            self.discriminator = Discriminator(tensors.size, losses.discriminator_width)
+        directions = torch.from_numpy(sensor.ray_directions().copy()).movedim(-1, 0)
+        self.register_buffer("rays", directions / sensor.range_max, persistent=False)
+
+    @classmethod
+    def of(cls, config: TrainConfig, network: nn.Module, header: Header) -> Self:
+        """The module of a configuration."""
+        made: Any = network
+        metric = METRICS[config.recipe.metric]
+        weights = config.recipe.weights
+        return cls(made, header.tensors, header.sensor, config.losses, metric, weights)
 
     @property
     def objective(self) -> Objective:
@@ -106,10 +114,10 @@ class Discriminator(nn.Module):
         for i in range(depth):
             inputs = channels if i == 0 else width << (i - 1)
             outputs = width << i
-            layers += [WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2))]
-            layers += (
-                [Norm(outputs, 1e-6), nn.LeakyReLU(0.2)] if i else [nn.LeakyReLU(0.2)]
-            )
+            layers.append(WrapConv(inputs, outputs, (4, 4), (2, 2), (1, 2, 1, 2)))
+            if i:
+                layers.append(Norm(outputs, 1e-6))
+            layers.append(nn.LeakyReLU(0.2))
         self.layers = nn.Sequential(*layers, WrapConv(width << (depth - 1), 1))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -129,9 +137,55 @@ def autoencoder_loss(network: nn.Module, example: Example, metric: Metric) -> Te
     return loss
 
 
+class AutoencoderStage(Stage):
+    """The training of an autoencoder; raises as ``open_networks``."""
+
+    kind = "autoencoder"
+    task: Task = staticmethod(reconstruction_task)
+    loss = staticmethod(autoencoder_loss)
+
+    def __init__(self, config: TrainConfig, device: torch.device | str) -> None:
+        networks, header = open_networks(config)
+        trained = Autoencoding.of(config, networks[CODEC], header)
+        super().__init__(config, trained, header, {}, device)
+
+    def finish(self, network: Any, data: Batches) -> None:
+        """Measure the noise of cells."""
+        network.finish(data)
+
+    def parts(self, network: Any) -> dict[str, nn.Module]:
+        """The autoencoder, and what stands still."""
+        return {CODEC: network.network, **self.frozen}
+
+    def figures(self, network: Any, data: Batches, count: int) -> dict[str, float]:
+        """Errors of the first scans' reconstructions."""
+        codec = Latent(network.network, self.header.tensors)
+        x = data(range(count)).y0
+        found = reconstruction_figures(codec, x, self.header.sensor)
+        return {f"reconstruction/{name}": value for name, value in found.items()}
+
+    def samples(self, network: Any, data: Batches, count: int) -> Sequence[RangeImage]:
+        """The first scans, each followed by its reconstruction."""
+        codec = Latent(network.network, self.header.tensors)
+        x = data(range(count)).y0
+        sensor = self.header.sensor
+        shown: list[RangeImage] = []
+        for real, made in _pairs(codec, x, sensor):
+            shown += [real, made]
+        return shown
+
+
 def reconstruct(codec: Latent, x: Tensor, sensor: Sensor) -> list[RangeImage]:
     """Reconstructions of tensors (B, C, H, W) as range images."""
     return codec.tensors.to_images(codec.decode(codec.encode(x)), sensor)
+
+
+def _pairs(
+    codec: Latent, x: Tensor, sensor: Sensor
+) -> Iterable[tuple[RangeImage, RangeImage]]:
+    """Range images with their reconstructions."""
+    real = codec.tensors.to_images(x, sensor)
+    return zip(real, reconstruct(codec, x, sensor), strict=True)
 
 
 def reconstruction_figures(
@@ -146,43 +200,49 @@ def reconstruction_figures(
         to 2048 points evenly spaced; with labels ``label_accuracy``, share of cells with a return
         in both whose label is the same.
     """
-    rays = torch.from_numpy(sensor.ray_directions().copy())
-    sums: dict[str, list[float]] = {}
-    for real, made in zip(
-        codec.tensors.to_images(x, sensor), reconstruct(codec, x, sensor), strict=True
-    ):
-        a = torch.from_numpy(real.range)
-        b = torch.from_numpy(made.range)
-        both = (a > 0) & (b > 0)
-        error = (a - b).abs()
-        figures = {
-            "mae": float(error[both].mean()),
-            "within_5cm": float((error[both] <= 0.05).sum() / (a > 0).sum()),
-            "drop_accuracy": float(((a > 0) == (b > 0)).float().mean()),
-            "chamfer": _chamfer(
-                (a[..., None] * rays)[a > 0], (b[..., None] * rays)[b > 0]
-            ),
-        }
-        if real.label is not None and made.label is not None:
-            figures["label_accuracy"] = float(
-                (real.label == made.label)[both.numpy()].mean()
-            )
-        for name, value in figures.items():
-            sums.setdefault(name, []).append(value)
-    return {name: sum(values) / len(values) for name, values in sums.items()}
+    rows = [_compare(real, made) for real, made in _pairs(codec, x, sensor)]
+    names = dict.fromkeys(name for row in rows for name in row)
+    means = {}
+    for name in names:
+        values = [row[name] for row in rows if name in row]
+        means[name] = sum(values) / len(values)
+    return means
+
+
+def _compare(real: RangeImage, made: RangeImage) -> dict[str, float]:
+    """The errors of one image."""
+    a = torch.from_numpy(real.range)
+    b = torch.from_numpy(made.range)
+    both = (a > 0) & (b > 0)
+    error = (a - b).abs()
+    figures = {
+        "mae": float(error[both].mean()),
+        "within_5cm": float((error[both] <= 0.05).sum() / (a > 0).sum()),
+        "drop_accuracy": float(((a > 0) == (b > 0)).float().mean()),
+        "chamfer": _chamfer(_points(real), _points(made)),
+    }
+    if real.label is not None and made.label is not None:
+        same = real.label == made.label
+        figures["label_accuracy"] = float(same[both.numpy()].mean())
+    return figures
+
+
+def _points(image: RangeImage) -> Tensor:
+    """(N, 3) points of the returns."""
+    directions = image.sensor.ray_directions()[image.mask]
+    return torch.from_numpy(image.range[image.mask][:, None] * directions)
 
 
 def _chamfer(a: Tensor, b: Tensor) -> float:
     """Chamfer distance of clouds (N, 3) and (M, 3): the mean of both directions, metres."""
     if not len(a) or not len(b):
         return float("nan")
-    means = []
-    for some, others in ((a, b), (b, a)):
-        queries = some[
-            torch.linspace(0, len(some) - 1, min(len(some), _QUERIES)).long()
-        ]
-        nearest = [
-            torch.cdist(part, others).amin(1) for part in torch.split(queries, 64)
-        ]
-        means.append(float(torch.cat(nearest).mean()))
-    return sum(means) / 2
+    return (_distance(a, b) + _distance(b, a)) / 2
+
+
+def _distance(some: Tensor, others: Tensor) -> float:
+    """Mean distance of points to the nearest other one."""
+    count = min(len(some), _QUERIES)
+    queries = some[torch.linspace(0, len(some) - 1, count).long()]
+    nearest = [torch.cdist(part, others).amin(1) for part in torch.split(queries, 64)]
+    return float(torch.cat(nearest).mean())

@@ -2,7 +2,6 @@
 same noise."""
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,11 +11,11 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.generate.flow.path import METRICS
-from lidar_synth.lab.train.config import Run
+from lidar_synth.lab.train.config import HeldOut
 from lidar_synth.lab.train.data import Batches
 from lidar_synth.lab.train.loop import weigh_metric
-from lidar_synth.lab.train.plan import TrainingPlan, open_data
 from lidar_synth.lab.train.schedules import ENDLESS, PLATEAU
+from lidar_synth.lab.train.stage import Stage
 from lidar_synth.lab.train.state import Training
 
 if TYPE_CHECKING:
@@ -61,23 +60,33 @@ def read_history(folder: Path) -> list[Measured]:
         ) from error
 
 
-@dataclass
 class Watch:
     """Measures the loss of a run on held-out scans, and knows when it stops falling.
 
     Args:
-        config: of the run.
-        plan: of the run.
-        data: the held-out batches.
+        stage: the training.
+        held_out: the scans, and how they are used.
+        training: its state; what was measured after it was saved is measured again.
         accelerator: of the run.
-        measured: measurements up to now.
+
+    Raises:
+        DataError: on a damaged history in the folder of the run.
     """
 
-    config: Run
-    plan: TrainingPlan
-    data: Batches
-    accelerator: "Accelerator"
-    measured: list[Measured] = field(default_factory=list)
+    def __init__(
+        self,
+        stage: Stage,
+        held_out: HeldOut,
+        training: Training,
+        accelerator: "Accelerator",
+    ) -> None:
+        self.stage = stage
+        self.held_out = held_out
+        self.accelerator = accelerator
+        self.folder = stage.config.output
+        history = read_history(self.folder)
+        self.measured = [m for m in history if m.step <= training.step]
+        self.data: Batches = stage.open_data(held_out.data, "held_out")
 
     @property
     def least(self) -> float:
@@ -89,19 +98,15 @@ class Watch:
         """Whether the loss has not fallen for as many measurements as the run has patience. Those
         before the learning rate begins to fall do not count where a plateau ended, or the rate
         would never fall."""
-        assert self.config.held_out is not None
-        recipe = self.config.recipe
-        begin = (
-            PLATEAU * recipe.iterations
-            if recipe.schedule == "trapezoid" and recipe.iterations < ENDLESS
-            else 0
-        )
+        recipe = self.stage.config.recipe
+        begin = 0.0
+        if recipe.schedule == "trapezoid" and recipe.iterations < ENDLESS:
+            begin = PLATEAU * recipe.iterations
         losses = [m.loss for m in self.measured if m.step >= begin]
-        return (
-            bool(losses)
-            and len(losses) - 1 - losses.index(min(losses))
-            >= self.config.held_out.patience
-        )
+        if not losses:
+            return False
+        since = len(losses) - 1 - losses.index(min(losses))
+        return since >= self.held_out.patience
 
     def measure(self, training: Training) -> bool:
         """Measure the averaged weights, write the history, and return whether they are the best up
@@ -111,35 +116,19 @@ class Watch:
         loss = self._loss(training)
         best = not self.measured or loss < self.least
         self.measured.append(Measured(training.step, loss, training.seconds))
-        write_file(self.config.output / HISTORY, json.dumps(self.measured).encode())
+        write_file(self.folder / HISTORY, json.dumps(self.measured).encode())
         return best
 
     @torch.no_grad()
     def _loss(self, training: Training) -> float:
-        assert self.config.held_out is not None
         recipe = training.recipe
         metric = weigh_metric(METRICS[recipe.metric], recipe.weights, self.data.tensors)
         total = 0.0
-        count = self.config.held_out.samples
+        count = self.held_out.samples
         for start in range(0, count, recipe.batch):
             positions = range(start, min(start + recipe.batch, count))
             with self.accelerator.autocast():
-                example = self.plan.task(self.data(positions))
-                loss = self.plan.loss(training.average, example, metric)
+                example = self.stage.task(self.data(positions))
+                loss = self.stage.loss(training.average, example, metric)
             total += float(loss) * len(positions)
         return total / count
-
-
-def open_watch(
-    config: Run, plan: TrainingPlan, training: Training, accelerator: "Accelerator"
-) -> Watch:
-    """The watch of a run, which continues the history in its folder.
-
-    Raises:
-        DataError: on a damaged history.
-    """
-    assert config.held_out is not None
-    # What was measured after the last saved state is measured again.
-    known = [m for m in read_history(config.output) if m.step <= training.step]
-    data = open_data(config, plan, accelerator.device, config.held_out.data, "held_out")
-    return Watch(config, plan, data, accelerator, known)

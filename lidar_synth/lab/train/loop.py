@@ -7,70 +7,23 @@ resumes with the same losses.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from torch import Tensor, nn
+from torch import Tensor
+from torch.optim import Optimizer
 
 from lidar_synth.errors import DataError
-from lidar_synth.generate.flow.distill import STRATEGIES, every_piece
-from lidar_synth.generate.flow.path import (
-    METRICS,
-    TIMESTEPS,
-    Example,
-    Metric,
-    Velocity,
-    flow_matching,
-    velocity_loss,
-)
+from lidar_synth.generate.flow.path import METRICS, Metric, velocity_loss
 from lidar_synth.geometry.normalize import CHANNELS, TensorFormat
-from lidar_synth.lab.train.data import Batch, Batches, InTurns, micro_batches
+from lidar_synth.lab.train.data import Batches, InTurns, micro_batches
 from lidar_synth.lab.train.schedules import SCHEDULES
+from lidar_synth.lab.train.stage import Loss, Task
 from lidar_synth.lab.train.state import Training
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
-
-Task = Callable[[Batch], Example]
-"""Makes the example of a batch: the state and time at which the network is trained, and the target
-velocity."""
-
-Loss = Callable[[nn.Module, Example, Metric], Tensor]
-"""The scalar loss of a network on an example, with the recipe's metric."""
-
-
-def teacher_task(timesteps: str = "uniform") -> Task:
-    """Flow matching with t from one of ``TIMESTEPS`` (Eq. 1)."""
-    return lambda batch: replace(
-        flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u)),
-        cond=batch.cond,
-    )
-
-
-def student_task(
-    strategy: str, teacher: Velocity, grid: Sequence[float], steps: int
-) -> Task:
-    """Distillation of ``teacher`` by one of ``STRATEGIES`` on the student's ``grid`` with ``steps``
-    Euler steps of the teacher per piece (Algorithm 1)."""
-
-    def task(batch: Batch) -> Example:
-        example = STRATEGIES[strategy](
-            teacher, batch.y0, batch.y1, batch.u, grid, steps, batch.cond
-        )
-        return replace(example, cond=batch.cond)
-
-    return task
-
-
-def several_steps_task(
-    teacher: Velocity, grids: Sequence[Sequence[float]], steps: int
-) -> Task:
-    """Distillation of ``teacher`` for several numbers of steps (``every_piece``)."""
-    return lambda batch: every_piece(
-        teacher, batch.y0, batch.y1, grids, steps, batch.cond
-    )
 
 
 class Record(NamedTuple):
@@ -140,30 +93,13 @@ def steps(
     training.network.train()
     while training.step < recipe.iterations:
         rate = recipe.rate * schedule(training.step, recipe.warmup, recipe.iterations)
-        for group in (
-            group for optimizer in optimizers for group in optimizer.param_groups
-        ):
-            group["lr"] = rate
-        parts = list(
-            micro_batches(
-                training.step,
-                recipe.batch,
-                recipe.accumulate,
-                accelerator.process_index,
-                accelerator.num_processes,
-            )
-        )
         total = 0.0
         evaluations = 0
-        for positions in parts:
-            with (
-                nullcontext()
-                if positions is parts[-1]
-                else accelerator.no_sync(network)
-            ):
+        for positions, last in _positions(training, accelerator):
+            with nullcontext() if last else accelerator.no_sync(network):
                 with accelerator.autocast():
                     example = task(batches(positions))
-                    part = loss(network, example, metric) / len(parts)
+                    part = loss(network, example, metric) / recipe.accumulate
                 accelerator.backward(part)
             total += accelerator.reduce(part.detach(), "mean").item()
             evaluations += example.teacher_evaluations * accelerator.num_processes
@@ -177,10 +113,34 @@ def steps(
                 "The last saved state and checkpoint are kept. Lower the rate, or train without "
                 "bf16.",
             )
-        for optimizer in optimizers:
-            optimizer.step()
-            optimizer.zero_grad()
+        _move(optimizers, rate)
         training.step += 1
         if training.step % recipe.ema_every == 0:
             training.update_average()
         yield Record(training.step, total, gradient, rate, evaluations)
+
+
+def _positions(
+    training: Training, accelerator: "Accelerator"
+) -> Iterator[tuple[range, bool]]:
+    """The positions of this process in one step, micro-batch by micro-batch, and whether they are
+    the last ones."""
+    recipe = training.recipe
+    parts = micro_batches(
+        training.step,
+        recipe.batch,
+        recipe.accumulate,
+        accelerator.process_index,
+        accelerator.num_processes,
+    )
+    for number, positions in enumerate(parts, 1):
+        yield positions, number == recipe.accumulate
+
+
+def _move(optimizers: Iterable[Optimizer], rate: float) -> None:
+    """Move the weights by their gradients, at this learning rate."""
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        optimizer.step()
+        optimizer.zero_grad()

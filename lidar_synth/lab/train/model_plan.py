@@ -11,8 +11,8 @@ from lidar_synth.lab.train.config import (
     PARENTS,
     DistillConfig,
     ModelConfig,
+    ModelStage,
     Run,
-    Stage,
     TrainConfig,
     command_of,
     find_model_file,
@@ -214,7 +214,7 @@ def _split(
 
 
 def _planned(
-    name: str, stage: Stage, path: Path, runs: StagedRuns, overrides: Sequence[str]
+    name: str, stage: ModelStage, path: Path, runs: StagedRuns, overrides: Sequence[str]
 ) -> PlannedStage:
     """The run of a stage, with all that it needs."""
     beside = path.parent / stage.recipe

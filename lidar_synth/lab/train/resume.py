@@ -1,6 +1,6 @@
 """What a run may be resumed with: the settings that it began with, and more iterations."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from lidar_synth.errors import ConfigError
@@ -36,18 +36,15 @@ def check_resumed(config: Run) -> None:
         FileError: where there is no ``config.yaml``, or the state cannot be read.
         DataError: on a file that is not a state.
     """
-    began = began_with(config)
-    before = flat(began.model_dump(mode="json"))
-    now = flat(config.model_dump(mode="json"))
+    began = read_beginning(config)
+    before = flatten(began.model_dump(mode="json"))
+    now = flatten(config.model_dump(mode="json"))
     if now[MORE] > before[MORE] or _same_steps(config, began.recipe.iterations):
         before[MORE] = now[MORE]
-    if differs := [
-        k for k in before | now if before.get(k) != now.get(k) and k not in HARMLESS
-    ]:
-        raise _other(config, differs, before, now)
+    _refuse_others(config, (before | now).keys() - HARMLESS, before, now)
 
 
-def began_with(config: Config) -> Config:
+def read_beginning(config: Config) -> Config:
     """The configuration with which the run in the output folder of ``config`` was started or
     resumed last.
 
@@ -82,25 +79,27 @@ def check_parents(config: Run, header: Header) -> None:
     Raises:
         ConfigError: naming what is another one.
     """
-    path = config.output / f"{config.output.name}.safetensors"
-    if not path.exists():  # killed before its first checkpoint
-        return
-    before, now = (
-        {k: str(h.provenance.get(k)) for k in PARENTS}
-        for h in (read_header(path)[0], header)
-    )
-    if differs := [k for k in PARENTS if before[k] != now[k]]:
-        raise _other(config, differs, before, now)
+    if config.checkpoint.exists():  # else killed before its first checkpoint
+        before = read_header(config.checkpoint)[0].provenance
+        _refuse_others(config, PARENTS, before, header.provenance)
 
 
-def _other(
-    config: Run, differs: list[str], before: Mapping[str, Any], now: Mapping[str, Any]
-) -> ConfigError:
+def _refuse_others(
+    config: Run,
+    keys: Container[str],
+    before: Mapping[str, Any],
+    now: Mapping[str, Any],
+) -> None:
+    """Refuse other values than before of these keys, in the order of the configuration."""
     named = [
-        f"{key}={now.get(key)!r} (it began with {before.get(key)!r})" for key in differs
+        f"{key}={now.get(key)!r} (it began with {before.get(key)!r})"
+        for key in {**before, **now}
+        if key in keys and now.get(key) != before.get(key)
     ]
+    if not named:
+        return
     more = f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else ""
-    return ConfigError(
+    raise ConfigError(
         f"--resume of {config.output} with {', '.join(named[:_SHOWN])}{more}",
         "the settings that it began with; more recipe.iterations, or fewer before the rate "
         "falls, are allowed",
@@ -108,14 +107,13 @@ def _other(
     )
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested mappings as one, with dots between the levels of a key."""
     result: dict[str, Any] = {}
     for key, value in values.items():
         # An empty mapping is a value: nothing else would stand for it.
-        result |= (
-            flat(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping) and value
-            else {f"{prefix}{key}": value}
-        )
+        if isinstance(value, Mapping) and value:
+            result |= flatten(value, f"{prefix}{key}.")
+        else:
+            result[f"{prefix}{key}"] = value
     return result

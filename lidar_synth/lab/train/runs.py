@@ -4,7 +4,7 @@ The folder holds::
 
     config.yaml              the configuration, overrides included
     cache/                   the projected scans
-    selection.npz            a student's timesteps and how they were selected
+    selection.npz            a student's timesteps, or how far their selection has come
     state.safetensors        the state from which an interrupted run resumes
     held_out.json            losses on held-out scans, if there are any
     <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are held-out scans
@@ -14,7 +14,7 @@ The folder holds::
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,22 +28,18 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.files.disk import unwritable, write_file
 from lidar_synth.files.lock import one_writer
 from lidar_synth.generate.checkpoint import save_checkpoint
-from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.generator import Generator
-from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.lab.train.autoencoder import (
-    Autoencoding,
-    reconstruct,
-    reconstruction_figures,
-)
+from lidar_synth.lab.train.autoencoder import AutoencoderStage
 from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.data import Batches, InTurns
-from lidar_synth.lab.train.held_out import Watch, open_watch
+from lidar_synth.lab.train.decoder import DecoderStage
+from lidar_synth.lab.train.held_out import Watch
 from lidar_synth.lab.train.loop import Record, steps
-from lidar_synth.lab.train.plan import TrainingPlan, make_plan, open_data
 from lidar_synth.lab.train.precision import choose_precision
 from lidar_synth.lab.train.resume import check_parents, check_resumed
+from lidar_synth.lab.train.stage import Stage
 from lidar_synth.lab.train.state import STATE, Training, set_damaged_aside
+from lidar_synth.lab.train.student import StudentStage
+from lidar_synth.lab.train.teacher import TeacherStage
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
@@ -84,34 +80,77 @@ def run(
     """
     state = config.output / STATE
     if state.exists():
-        if not resume:
-            raise ConfigError(
-                f"{config.output} holds a run",
-                "--resume to continue it, or another output=FOLDER",
-            )
-        set_damaged_aside(config.output)
-    if state.exists():
-        check_resumed(config)
-    with (
-        _accelerator(config) as accelerator,
-        _lock(config, accelerator.is_main_process),
-    ):
-        plan = make_plan(config, accelerator)
-        training = Training(plan.network.to(accelerator.device), config.recipe)
+        _check_resumable(config, resume)
+    with _accelerator(config) as accelerator, _lock(config, accelerator):
+        stage = open_stage(config, accelerator.device)
+        training = Training(stage.network, config.recipe)
         if state.exists():
-            check_parents(config, plan.header)
+            check_parents(config, stage.header)
             training.load(state)
         if accelerator.is_main_process:  # after all checks
-            write_file(
-                config.output / "config.yaml",
-                yaml.safe_dump(config.model_dump(mode="json")).encode(),
-            )
-        if config.compile:
-            plan.network.compile()
-        for module in plan.network.modules():
-            if hasattr(module, "gradient_checkpointing"):
-                module.gradient_checkpointing = config.gradient_checkpointing  # type: ignore[assignment]
-        return _train(config, plan, training, accelerator, minutes)
+            values = yaml.safe_dump(config.model_dump(mode="json"))
+            write_file(config.output / "config.yaml", values.encode())
+        with accelerator.main_process_first():
+            data = stage.open_data()
+            stage.prepare(data, accelerator)
+            batches = _add_rehearsal(stage, data)
+        _compile(stage)
+        training.began = time.monotonic()  # preparing the data is no training
+        keeper = None
+        if accelerator.is_main_process:
+            keeper = _Keeper(stage, training, data, accelerator, minutes is not None)
+        _train(stage, training, batches, accelerator, keeper, minutes)
+        accelerator.wait_for_everyone()
+    return config.checkpoint
+
+
+def open_stage(
+    config: TrainConfig | DistillConfig, device: torch.device | str = "cpu"
+) -> Stage:
+    """The training of a configuration; nothing is computed or written.
+
+    Raises:
+        ConfigError: where the configuration does not fit the checkpoints that it names.
+        FileError, DataError: where they, or the scans, cannot be read.
+    """
+    if isinstance(config, DistillConfig):
+        return StudentStage(config, device)
+    if config.decoder:
+        return DecoderStage(config, device)
+    if config.autoencodes:
+        return AutoencoderStage(config, device)
+    return TeacherStage(config, device)
+
+
+def _check_resumable(config: Run, resume: bool) -> None:
+    """Refuse a folder that holds a run, unless it is to be resumed with the same settings."""
+    if not resume:
+        raise ConfigError(
+            f"{config.output} holds a run",
+            "--resume to continue it, or another output=FOLDER",
+        )
+    set_damaged_aside(config.output)
+    if (config.output / STATE).exists():
+        check_resumed(config)
+
+
+def _add_rehearsal(stage: Stage, data: Batches) -> Batches | InTurns:
+    """The data in turns with the scans that are rehearsed, if any."""
+    config = stage.config
+    if config.rehearsal is None:
+        return data
+    others = stage.open_data(config.rehearsal, "rehearsal")
+    return InTurns(data, replace(others, seed=config.seed + 1))
+
+
+def _compile(stage: Stage) -> None:
+    """Let the network compute as the configuration says."""
+    if stage.config.compile:
+        stage.network.compile()
+    saves_memory: Any = stage.config.gradient_checkpointing
+    for module in stage.network.modules():
+        if hasattr(module, "gradient_checkpointing"):
+            module.gradient_checkpointing = saves_memory
 
 
 def require_accelerate() -> None:
@@ -168,14 +207,14 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
 
 
 @contextmanager
-def _lock(config: Run, main: bool) -> Iterator[None]:
+def _lock(config: Run, accelerator: "Accelerator") -> Iterator[None]:
     """Let one run at a time write to the output folder, and remove what a killed one was writing.
 
     Raises:
         ConfigError: if another run writes there.
         FileError: if the folder cannot be written.
     """
-    if not main:
+    if not accelerator.is_main_process:
         yield
         return
     with ExitStack() as held:
@@ -194,157 +233,128 @@ def _lock(config: Run, main: bool) -> Iterator[None]:
         yield
 
 
-def checkpoint_path(config: Run) -> Path:
-    """Path of a run's checkpoint; its name becomes a part of the ids of generated scans."""
-    return config.output / f"{config.output.name}.safetensors"
-
-
 def _train(
-    config: Run,
-    plan: TrainingPlan,
+    stage: Stage,
     training: Training,
+    batches: Batches | InTurns,
     accelerator: "Accelerator",
+    keeper: "_Keeper | None",
     minutes: float | None,
-) -> Path:
-    """The loop with logs and saved states."""
-    with accelerator.main_process_first():
-        data = open_data(config, plan, accelerator.device)
-        batches: Batches | InTurns = data
-        if config.rehearsal is not None:
-            others = open_data(
-                config, plan, accelerator.device, config.rehearsal, "rehearsal"
-            )
-            batches = InTurns(data, replace(others, seed=config.seed + 1))
-    training.began = time.monotonic()  # preparing the data is no training
-    log = (
-        _Log(config, training.step, minutes is not None)
-        if accelerator.is_main_process
-        else None
-    )
-    watch = (
-        open_watch(config, plan, training, accelerator)
-        if config.held_out and log is not None
-        else None
-    )
-    if watch is not None and not watch.measured:
-        _save_checkpoint(config, plan, training, data, watch)
-        training.save(config.output / STATE)
+) -> None:
+    """The steps of a stage, of any kind, until the end of the recipe, of the time or of patience."""
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    for record in steps(training, plan.task, batches, accelerator, plan.loss):
+    for record in steps(training, stage.task, batches, accelerator, stage.loss):
+        stops = time.monotonic() > end or (keeper is not None and keeper.exhausted)
         # All processes stop at the same step, whose clock ever is ahead.
-        stops = time.monotonic() > end or (watch is not None and watch.exhausted)
-        late = (
-            accelerator.reduce(
-                torch.tensor(float(stops), device=accelerator.device)
-            ).item()
-            > 0
-        )
-        last = late or record.step == config.recipe.iterations
-        if log is not None:
-            log.add(record)
-            saves = last or record.step % config.save_every == 0
-            if saves:
-                _save_checkpoint(config, plan, training, data, watch)
-            if config.samples.every and (
-                last or record.step % config.samples.every == 0
-            ):
-                with accelerator.autocast():
-                    log.picture(plan, training, data)
-            if saves:
-                training.save(config.output / STATE)
+        stops_here = torch.tensor(float(stops), device=accelerator.device)
+        late = accelerator.reduce(stops_here).item() > 0
+        if keeper is not None:
+            keeper.keep(record, late or record.step == training.recipe.iterations)
         if late:
             break
-    if log is not None:
-        log.close()
-    accelerator.wait_for_everyone()
-    return checkpoint_path(config)
+    if keeper is not None:
+        keeper.close()
 
 
-def _save_checkpoint(
-    config: Run,
-    plan: TrainingPlan,
-    training: Training,
-    data: Batches,
-    watch: Watch | None,
-) -> None:
-    """Write the checkpoint, if it is the best. The state is written behind it and behind the
-    picture: what is lost in between is trained again."""
-    if watch is None or watch.measure(training):
-        if isinstance(training.average, Autoencoding):
-            training.average.finish(data)
-        facts = {"iterations": training.step} | (
-            {} if watch is None else {"held_out_loss": watch.least}
-        )
-        header = replace(plan.header, provenance=plan.header.provenance | facts)
-        save_checkpoint(checkpoint_path(config), header, plan.parts(training.average))
+class _Keeper:
+    """What the main process keeps of a run: checkpoints, states, a bar, numbers and pictures."""
 
-
-class _Log:
-    """A bar, TensorBoard's numbers, pictures."""
-
-    def __init__(self, config: Run, step: int, limited: bool) -> None:
+    def __init__(
+        self,
+        stage: Stage,
+        training: Training,
+        data: Batches,
+        accelerator: "Accelerator",
+        limited: bool,
+    ) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self.config = config
-        self.board: Any = SummaryWriter(config.output / "logs", purge_step=step + 1)
-        total = None if limited else config.recipe.iterations
-        self.bar = tqdm(total=total, initial=step, desc=config.output.name, unit="step")
+        self.stage = stage
+        self.config = stage.config
+        self.training = training
+        self.data = data
+        self.accelerator = accelerator
+        self.watch = None
+        if self.config.held_out is not None:
+            self.watch = Watch(stage, self.config.held_out, training, accelerator)
+            if not self.watch.measured:
+                self.save_checkpoint()
+                self.save_state()
+        logs = self.config.output / "logs"
+        self.board: Any = SummaryWriter(logs, purge_step=training.step + 1)
+        self.bar = tqdm(
+            total=None if limited else self.config.recipe.iterations,
+            initial=training.step,
+            desc=self.config.output.name,
+            unit="step",
+        )
         self.records: list[Record] = []
 
-    def add(self, record: Record) -> None:
+    @property
+    def exhausted(self) -> bool:
+        """Whether the loss on held-out scans has stopped falling."""
+        return self.watch is not None and self.watch.exhausted
+
+    def keep(self, record: Record, last: bool) -> None:
+        """Keep what is due after a step."""
         self.records.append(record)
         self.bar.update()
-        if record.step % _LOG_EVERY and record.step != self.config.recipe.iterations:
-            return
-        mean = sum(r.loss for r in self.records) / len(self.records)
-        evaluations = sum(r.teacher_evaluations for r in self.records)
-        self.records.clear()
-        for name, value in (
-            ("loss", mean),
-            ("gradient", record.gradient),
-            ("rate", record.rate),
-        ):
-            self.board.add_scalar(name, value, record.step)
+        every = self.config.samples.every
+        if last or record.step % _LOG_EVERY == 0:
+            self.log()
+        saves = last or record.step % self.config.save_every == 0
+        if saves:
+            self.save_checkpoint()
+        if every and (last or record.step % every == 0):
+            with self.accelerator.autocast():
+                self.draw()
+        if saves:  # behind all else: what is lost in between is trained again
+            self.save_state()
+
+    def log(self) -> None:
+        """Write the numbers since the last call."""
+        *_, last = self.records
+        mean = sum(record.loss for record in self.records) / len(self.records)
+        values = {"loss": mean, "gradient": last.gradient, "rate": last.rate}
+        evaluations = sum(record.teacher_evaluations for record in self.records)
         if evaluations:
-            self.board.add_scalar("teacher_evaluations", evaluations, record.step)
+            values["teacher_evaluations"] = evaluations
+        self._add(values)
         self.bar.set_postfix(loss=f"{mean:.4f}", refresh=False)
+        self.records.clear()
+
+    def _add(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            self.board.add_scalar(name, value, self.training.step)
+
+    def save_state(self) -> None:
+        """Write the state from which an interrupted run resumes."""
+        self.training.save(self.config.output / STATE)
+
+    def save_checkpoint(self) -> None:
+        """Write the checkpoint, if it is the best."""
+        average = self.training.average
+        if self.watch is None or self.watch.measure(self.training):
+            self.stage.finish(average, self.data)
+            facts: dict[str, Any] = {"iterations": self.training.step}
+            if self.watch is not None:
+                facts["held_out_loss"] = self.watch.least
+            header = self.stage.header
+            header = replace(header, provenance=header.provenance | facts)
+            save_checkpoint(self.config.checkpoint, header, self.stage.parts(average))
+
+    def draw(self) -> None:
+        """Draw samples, and write their figures."""
+        shown = (self.training.average, self.data, self.config.samples.count)
+        self._add(self.stage.figures(*shown))
+        step = self.training.step
+        write_view(
+            self.config.output / "samples" / f"{step:07d}.png",
+            self.stage.samples(*shown),
+            title=f"{self.config.output.name}, {step} iterations",
+        )
 
     def close(self) -> None:
+        """End the bar and the logs."""
         self.bar.close()
         self.board.close()
-
-    def picture(self, plan: TrainingPlan, training: Training, data: Batches) -> None:
-        """Samples of a flow, from the first scans' conditions; of an autoencoder what went in and
-        what came out."""
-        name = self.config.output.name
-        some = range(self.config.samples.count)
-        given: list[Scan] | list[RangeImage]
-        if isinstance(training.average, Autoencoding):
-            given = self._reconstructions(plan, training.average, data)
-        else:
-            generator = Generator(
-                name, training.average, plan.header, autoencoder=plan.autoencoder
-            )
-            given = generator.scans(0, some, data.conditions(some))
-        write_view(
-            self.config.output / "samples" / f"{training.step:07d}.png",
-            given,
-            title=f"{name}, {training.step} iterations",
-        )
-
-    def _reconstructions(
-        self, plan: TrainingPlan, trained: Autoencoding, data: Batches
-    ) -> list[RangeImage]:
-        """Real range images, each followed by its reconstruction; figures go to the logs."""
-        codec = Latent(trained.network, plan.header.tensors)
-        images = data(range(self.config.samples.count)).y0
-        for name, value in reconstruction_figures(
-            codec, images, plan.header.sensor
-        ).items():
-            self.board.add_scalar(f"reconstruction/{name}", value, self.bar.n)
-        pairs = zip(
-            plan.header.tensors.to_images(images, plan.header.sensor),
-            reconstruct(codec, images, plan.header.sensor),
-            strict=True,
-        )
-        return [image for both in pairs for image in both]

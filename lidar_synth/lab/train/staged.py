@@ -14,8 +14,8 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import write_file
 from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.config.load import Config
-from lidar_synth.lab.train.resume import began_with
-from lidar_synth.lab.train.runs import checkpoint_path, run
+from lidar_synth.lab.train.resume import read_beginning
+from lidar_synth.lab.train.runs import run
 from lidar_synth.lab.train.schedules import ENDLESS, PLATEAU
 from lidar_synth.lab.train.state import STATE, read_progress
 
@@ -73,7 +73,7 @@ def iterations_of(config: Run) -> int:
     """The iterations of the run in a folder; ``ENDLESS`` before its rate falls, or if there is
     none."""
     return (
-        began_with(config).recipe.iterations
+        read_beginning(config).recipe.iterations
         if (config.output / STATE).is_file()
         else ENDLESS
     )
@@ -116,4 +116,4 @@ def train_for(config: TrainConfig | DistillConfig, minutes: float) -> Path:
             )
         iterations = math.ceil(steps / PLATEAU)
     run(set_iterations(config, iterations), resume=True)
-    return checkpoint_path(config)
+    return config.checkpoint

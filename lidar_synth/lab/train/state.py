@@ -162,7 +162,9 @@ class Training:
             name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()
         }
         facts = {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}
-        write_file(path, save(tensors, facts | {"checksum": _checksum(facts, tensors)}))
+        write_file(
+            path, save(tensors, facts | {"checksum": checksum_of(facts, tensors)})
+        )
 
     def load(self, path: Path) -> None:
         """Restore the state that ``save`` wrote.
@@ -277,12 +279,13 @@ def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
     with _opened(path) as file:
         facts = dict(file.metadata())
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
-        if facts.pop("checksum") != _checksum(facts, tensors):
+        if facts.pop("checksum") != checksum_of(facts, tensors):
             raise ValueError("its checksum differs")
         return _progress(file), tensors
 
 
-def _checksum(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+def checksum_of(facts: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    """The checksum of what is kept to resume: SHA-256, in hexadecimal."""
     return hashlib.sha256(
         f"{sorted(facts.items())} {weights_hash(tensors)}".encode()
     ).hexdigest()

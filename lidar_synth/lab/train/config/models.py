@@ -26,7 +26,7 @@ PARENTS = ("teacher", "weaker", "init", "codec")
 """Keys of a recipe that name checkpoints; a provenance holds their hashes under the same names."""
 
 
-class Stage(Section):
+class ModelStage(Section):
     """A run of a recipe.
 
     Args:
@@ -48,7 +48,7 @@ class ModelConfig(Section):
         stages: {name: recipe, minutes and needs}, in order; the last one makes the model.
     """
 
-    stages: Annotated[dict[str, Stage], Field(min_length=1)]
+    stages: Annotated[dict[str, ModelStage], Field(min_length=1)]
 
 
 def find_model_file(given: str | Path) -> Path | None:

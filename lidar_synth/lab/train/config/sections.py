@@ -159,6 +159,11 @@ class Run(Section):
     held_out: HeldOut | None = None
     rehearsal: Data | None = None
 
+    @property
+    def checkpoint(self) -> Path:
+        """Path of the checkpoint; its name becomes a part of the ids of generated scans."""
+        return self.output / f"{self.output.name}.safetensors"
+
 
 class NetworkSection(Section):
     """The network to train.

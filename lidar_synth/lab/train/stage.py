@@ -1,0 +1,204 @@
+"""A stage: a training of one kind, from its configuration to the parts of its checkpoint.
+
+Each kind is a class in a file of its own: ``TeacherStage``, ``AutoencoderStage``, ``DecoderStage``,
+``StudentStage``. Opening one reads the configuration and the checkpoints that it names; it computes
+nothing and writes nothing. Then come, for every kind, ``open_data`` (scans are projected and kept),
+``prepare`` (the timesteps of a student), the steps of ``task`` and ``loss``, and ``finish`` and
+``parts`` for the checkpoint.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lidar_synth.generate.checkpoint import (
+    CODEC,
+    ENCODER,
+    Header,
+    network_hash,
+    split,
+)
+from lidar_synth.generate.codec import Codec, make_codec
+from lidar_synth.generate.conditions import CONDITIONS, resize_image
+from lidar_synth.generate.flow.path import Example, Metric, velocity_loss
+from lidar_synth.generate.generator import Generator
+from lidar_synth.geometry.scan import RangeImage, Scan, Source
+from lidar_synth.lab.town.town import Town
+from lidar_synth.lab.train.cache import Other, cache_latents, cache_scans
+from lidar_synth.lab.train.config import Data, Run
+from lidar_synth.lab.train.data import Batch, Batches, Conditioning
+from lidar_synth.lab.train.provenance import recordings_known
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+Task = Callable[[Batch], Example]
+"""Makes the example of a batch: the state and time at which the network is trained, and the target
+velocity."""
+
+Loss = Callable[[nn.Module, Example, Metric], Tensor]
+"""The scalar loss of a network on an example, with the recipe's metric."""
+
+
+class Stage:
+    """A training before its first step.
+
+    Args:
+        config: of the run.
+        network: the trained module.
+        header: of the checkpoint.
+        frozen: parts of the checkpoint that are not trained, such as the autoencoder of a latent
+            model.
+        device: of the training.
+
+    Attributes:
+        kind: what is trained, in one word.
+        task: makes training examples of batches.
+        loss: what is lowered.
+
+    Raises:
+        FileError, DataError: where the scans cannot be opened.
+    """
+
+    kind: str
+    task: Task
+    loss: Loss = staticmethod(velocity_loss)
+
+    def __init__(
+        self,
+        config: Run,
+        network: nn.Module,
+        header: Header,
+        frozen: Mapping[str, nn.Module],
+        device: torch.device | str,
+    ) -> None:
+        self.config = config
+        self.network = network.to(device)
+        self.frozen = {
+            name: part.requires_grad_(False).to(device) for name, part in frozen.items()
+        }
+        self.device = device
+        self.header = header
+        known = recordings_known(config, header.provenance, header.sensor)
+        self.add_facts(seen=known.to_list())
+
+    def __str__(self) -> str:
+        """The training in words."""
+        sensor = self.header.sensor
+        rows, columns = sensor.shape
+        trained = sum(p.numel() for p in self.network.parameters() if p.requires_grad)
+        recipe = self.config.recipe
+        data = self.config.data
+        scans = data.path if data.town is None else f"{data.town} scans of the town"
+        lines = [
+            f"{self.kind} -> {self.config.checkpoint}",
+            f"sensor {sensor.name}: {rows} x {columns} cells of "
+            f"{', '.join(self.header.channels)}",
+            f"{trained / 1e6:.2f} M trained parameters",
+            f"{recipe.iterations} steps of {recipe.batch} samples from {scans}",
+        ]
+        return "\n".join(lines)
+
+    def add_facts(self, **facts: Any) -> None:
+        """Add to the provenance in the header."""
+        provenance = self.header.provenance | facts
+        self.header = replace(self.header, provenance=provenance)
+
+    @property
+    def codec(self) -> Codec:
+        """The codec between tensors and states."""
+        header = self.header
+        return make_codec(self.frozen.get(CODEC), header.tensors, header.sensor.shape)
+
+    def open_data(self, data: Data | None = None, folder: str = "cache") -> Batches:
+        """The batches of the run, or of other ``data``; the scans are projected once and cached, in
+        a ``folder`` of the run where the data names none."""
+        given = self.config.data if data is None else data
+        sensor = self.header.sensor
+        source = given.open(sensor)
+        channels = set(self.header.channels)
+        others: dict[str, Other] = {}
+        conditioning = None
+        for name in self.header.conditioning:
+            conditioning, other = self._condition(name, source)
+            field = CONDITIONS[name].field
+            if field == "label":  # a channel of the range image
+                channels.add(field)
+            else:
+                others[field] = other
+        kept = given.cache or self.config.output / folder
+        cache = cache_scans(
+            source, sensor, channels, kept, given.describe(), others=others
+        )
+        batches = Batches(
+            cache,
+            self.header.tensors,
+            self.config.seed,
+            given.flip,
+            given.roll,
+            self.device,
+            conditioning=conditioning,
+        )
+        if CODEC not in self.frozen:
+            return batches
+        codec = self.codec
+        if not given.latents:
+            return replace(batches, codec=codec)
+        made_by = network_hash(self.frozen[CODEC])
+        latents = cache_latents(
+            cache, batches.tensors, codec, self.device, kept, made_by
+        )
+        return replace(batches, latents=latents)
+
+    def _condition(self, name: str, source: Source) -> tuple[Conditioning, Other]:
+        """How samples get their conditions, and how a cache gets them from the scans."""
+        options = self.header.conditioning[name]
+        encoder = self.parts(self.network)[ENCODER]
+        less = options.get("view_dropout", 0.0) or options.get("outline_dropout", 0.0)
+        conditioning = Conditioning(
+            name, options.get("dropout", 0.0), less, getattr(encoder, "views", 1)
+        )
+        shape = CONDITIONS[name].shape(encoder)
+        sensor = self.header.sensor
+
+        def read(i: int, scan: Scan) -> NDArray[np.uint8]:
+            if name == "camera" and isinstance(source, Town):  # rendered when needed
+                from PIL import Image
+
+                image = Image.fromarray(source.image(i))
+                return resize_image(image, shape, options, "the town's image")
+            return CONDITIONS[name].read(scan, sensor, shape, options)
+
+        return conditioning, Other(shape, read)
+
+    def prepare(self, data: Batches, accelerator: "Accelerator") -> None:
+        """Compute what the first step needs, and keep it in the run's folder; most kinds need
+        nothing."""
+
+    def finish(self, network: nn.Module, data: Batches) -> None:
+        """Set what is not trained but measured, before a checkpoint is written."""
+
+    def parts(self, network: nn.Module) -> dict[str, nn.Module]:
+        """The parts of the checkpoint, from the network or its averaged copy."""
+        return {**split(network), **self.frozen}
+
+    def figures(
+        self, network: nn.Module, data: Batches, count: int
+    ) -> dict[str, float]:
+        """Figures of the first scans, for the logs."""
+        return {}
+
+    def samples(
+        self, network: nn.Module, data: Batches, count: int
+    ) -> Sequence[Scan | RangeImage]:
+        """What a picture shows: generated scans, from the conditions of the first ones."""
+        name = self.config.output.name
+        generator = Generator(
+            name, network, self.header, autoencoder=self.frozen.get(CODEC)
+        )
+        return generator.scans(0, range(count), data.conditions(range(count)))

@@ -1,0 +1,33 @@
+"""Training of a teacher: flow matching, from random weights or from those of a checkpoint."""
+
+from dataclasses import replace
+
+import torch
+
+from lidar_synth.generate.checkpoint import CODEC, join, load_checkpoint
+from lidar_synth.generate.flow.path import TIMESTEPS, flow_matching
+from lidar_synth.lab.train.config import TrainConfig
+from lidar_synth.lab.train.stage import Stage, Task
+from lidar_synth.lab.train.start import open_networks
+
+
+def teacher_task(timesteps: str = "uniform") -> Task:
+    """Flow matching with t from one of ``TIMESTEPS`` (Eq. 1)."""
+    return lambda batch: replace(
+        flow_matching(batch.y0, batch.y1, TIMESTEPS[timesteps](batch.u)),
+        cond=batch.cond,
+    )
+
+
+class TeacherStage(Stage):
+    """The training of a rectified flow; raises as ``open_networks``."""
+
+    kind = "teacher"
+
+    def __init__(self, config: TrainConfig, device: torch.device | str) -> None:
+        networks, header = open_networks(config)
+        if config.codec is not None and CODEC not in networks:
+            networks[CODEC] = load_checkpoint(config.codec).networks[CODEC]
+        frozen = {name: part for name, part in networks.items() if name == CODEC}
+        super().__init__(config, join(networks), header, frozen, device)
+        self.task = teacher_task(config.timesteps)
