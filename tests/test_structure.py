@@ -168,8 +168,8 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (152_650, 6.0, 141),
-    "laboratory": (118_200, 6.0, 154),
+    "plugin": (152_800, 6.0, 141),
+    "laboratory": (119_100, 6.0, 154),
     "tools": (37_450, 6.0, 128),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
