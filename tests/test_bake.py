@@ -391,6 +391,8 @@ def test_shards_of_small_banks_are_small(
             ["--shard-index", "3", "--num-shards", "3"],
             "--shard-index 3 of --num-shards 3",
         ),
+        (["--shard-index", "auto"], "--shard-index auto outside an array job"),
+        (["--shard-index", "two"], "--shard-index 'two' of --num-shards '1'"),
         (["--slurm", "partition"], "--slurm 'partition'; expected KEY=VALUE"),
         (["--model", "city"], "model 'city'; expected a shipped one"),
     ],
@@ -402,6 +404,40 @@ def test_invalid_options_are_refused(
     with pytest.raises(ConfigError, match=message):
         CliRunner().invoke(app, call, catch_exceptions=False)
     assert not (tmp_path / "bank").exists()
+
+
+@pytest.mark.parametrize(
+    ("index", "size"),
+    [
+        ("JOB_COMPLETION_INDEX", None),
+        ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE"),
+        ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT"),
+        ("CLOUD_RUN_TASK_INDEX", "CLOUD_RUN_TASK_COUNT"),
+        ("SKYPILOT_NODE_RANK", "SKYPILOT_NUM_NODES"),
+    ],
+)
+def test_an_array_job_bakes_its_share(
+    index: str,
+    size: str | None,
+    model: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "bank"
+    call = ["bake", str(out), "--model", str(model), "--count", "3"]
+    call += ["--shard-size", "1", "--shard-index", "auto"]
+    monkeypatch.setenv(index, "1")
+    if size is None:
+        with pytest.raises(ConfigError, match="--shard-index '1' of --num-shards ''"):
+            CliRunner().invoke(app, call, catch_exceptions=False)
+        call += ["--num-shards", "3"]
+    else:
+        monkeypatch.setenv(size, "3")
+    CliRunner().invoke(app, call, catch_exceptions=False)
+    assert [path.name for path in out.glob("*.h5")] == ["shard-00001.h5"]
+    monkeypatch.setenv(index, "3")  # an array numbered from 1
+    with pytest.raises(ConfigError, match="--shard-index 3 of --num-shards 3"):
+        CliRunner().invoke(app, call, catch_exceptions=False)
 
 
 def test_unsuitable_models_are_refused(tmp_path: Path) -> None:

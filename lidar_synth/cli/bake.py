@@ -10,7 +10,16 @@ from lidar_synth.bake.options import BakeJob
 from lidar_synth.cli.options import options_from
 
 if TYPE_CHECKING:
-    from lidar_synth.bake import BakePlan, Resources
+    from lidar_synth.bake import BakePlan, Resources, Share
+
+# The index and the size of an array job; a Kubernetes Indexed Job does not tell its size.
+_ARRAYS = {
+    "JOB_COMPLETION_INDEX": "",
+    "AWS_BATCH_JOB_ARRAY_INDEX": "AWS_BATCH_JOB_ARRAY_SIZE",
+    "SLURM_ARRAY_TASK_ID": "SLURM_ARRAY_TASK_COUNT",
+    "CLOUD_RUN_TASK_INDEX": "CLOUD_RUN_TASK_COUNT",
+    "SKYPILOT_NODE_RANK": "SKYPILOT_NUM_NODES",
+}
 
 
 @options_from(BakeJob, after="config")
@@ -42,12 +51,19 @@ def bake(
         ),
     ] = None,
     shard_index: Annotated[
-        int, typer.Option(help="write only every n-th shard, starting with this one")
-    ] = 0,
+        str,
+        typer.Option(
+            help="write only every n-th shard, starting with this one; 'auto' reads the index of "
+            "an array job"
+        ),
+    ] = "0",
     num_shards: Annotated[
-        int,
-        typer.Option(help="the n of --shard-index: number of runs that share the work"),
-    ] = 1,
+        int | None,
+        typer.Option(
+            help="the n of --shard-index: number of runs that share the work "
+            "[1, or the size of the array job]"
+        ),
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -71,13 +87,13 @@ def bake(
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
       torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
     """
-    from lidar_synth.bake import Share, make_plan
     from lidar_synth.bake import bake as run
+    from lidar_synth.bake import make_plan
     from lidar_synth.files.recipes import find_recipe, read_recipe, validate
 
     values = {} if config is None else read_recipe(find_recipe(config))
     values |= {name: value for name, value in settings.items() if value is not None}
-    share = Share(shard_index, num_shards)
+    share = _share(shard_index, num_shards)
     plan = make_plan(
         out, validate(BakeJob, values, "bake" if config is None else str(config))
     )
@@ -109,6 +125,31 @@ def bake(
             f"{out}: {index.scans} scans in {len(index.shards)} shards, {index.size / 1e6:.3g} MB"
         )
         _report_unboxed(out)
+
+
+def _share(index: str, number: int | None) -> "Share":
+    """The shards of this run, with 'auto' by the environment of an array job."""
+    from lidar_synth.bake import Share
+    from lidar_synth.errors import ConfigError
+
+    size = "1" if number is None else str(number)
+    if index == "auto":
+        found = [name for name in _ARRAYS if name in os.environ]
+        if not found:
+            raise ConfigError(
+                "--shard-index auto outside an array job",
+                f"one of {', '.join(_ARRAYS)}",
+            )
+        index = os.environ[found[0]]
+        if number is None:
+            size = os.environ.get(_ARRAYS[found[0]], "")
+    if not (index.isdigit() and size.lstrip("-").isdigit()):
+        raise ConfigError(
+            f"--shard-index {index!r} of --num-shards {size!r}",
+            "two whole numbers",
+            "--shard-index auto --num-shards 16",
+        )
+    return Share(int(index), int(size))
 
 
 def _report_unboxed(bank: Path, scans: int = 8) -> None:
