@@ -110,7 +110,7 @@ def mix(
             any source of synthetic scans.
         ratio, labels: as for ``MixedScans``; by default 0.25 and "generated", or those of the
             task.
-        task: ``"detection"`` takes the recipe that was best on few real scans with boxes, unless
+        task: ``"detection"`` takes the recipe that beat GT sampling with few real scans, unless
             an argument says otherwise: synthetic scans with boxes alone in three quarters of the
             epochs, then half; objects of the real scans pasted into all; turned, mirrored, scaled.
         epochs: of the training, for ``"detection"``.
