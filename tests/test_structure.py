@@ -168,7 +168,7 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (152_900, 6.0, 141),
+    "plugin": (152_950, 6.0, 141),
     "laboratory": (119_100, 6.05, 154),
     "tools": (37_450, 6.0, 128),
 }

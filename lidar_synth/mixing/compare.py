@@ -424,6 +424,7 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
         "ring": np.broadcast_to(np.arange(rows, dtype=np.int16)[:, None], sensor.shape),
         "confidence": (label != IGNORE).astype(np.float32),
         "time": np.zeros(sensor.shape, np.float32),
+        "cause": np.zeros(sensor.shape, np.uint8),
     }
     image = RangeImage(
         np.ascontiguousarray(np.broadcast_to(distance, (rows, columns))),
