@@ -30,7 +30,8 @@ from lidar_synth.bake import (
     bake,
     make_plan,
 )
-from lidar_synth.bake.folder import SETTINGS, finish, prepare, write_bank_files
+from lidar_synth.bake.folder import finish, prepare, write_bank_files
+from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import regenerate
 from lidar_synth.bank import INDEX, Bank, Encoding, Entry, Index

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from servers import Served, serve
 from torch.utils.data import DataLoader
 
+import lidar_synth.bank.retries as retries
 import lidar_synth.bank.storage as storage
 import lidar_synth.bank.writer as writer
 from lidar_synth.bank import Bank
@@ -133,6 +134,7 @@ def test_a_silent_server_is_left_after_the_time_limit(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(storage, "PATIENCE", 0.5)
+    monkeypatch.setattr(retries, "PATIENCE", 0.5)
     served.silent.add("index.json")
     start = time.monotonic()
     with pytest.raises(FileError, match=r"index.json cannot be read"):
@@ -176,7 +178,7 @@ def test_a_failed_request_is_not_reported_as_damage(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A network failure must not suggest a repair."""
-    monkeypatch.setattr(storage, "WAITS", (0.0,))
+    monkeypatch.setattr(retries, "WAITS", (0.0,))
     bank = Bank(f"{served.url}/bank")
     served.broken.add("shard-00000.h5")
     with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):

@@ -27,10 +27,37 @@ def test_control_c_gives_one_message(
 
     monkeypatch.setattr(cli, "app", app)
     monkeypatch.setattr(sys, "argv", ["lidar-synth"])
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     with pytest.raises(SystemExit) as stop:
         cli.main()
     assert stop.value.code == 130
     assert capsys.readouterr().err == "lidar-synth: interrupted\n"
+
+
+HALF_MADE = """
+from lidar_synth import cli
+
+class Half:
+    def __del__(self):
+        self.made
+
+def work():
+    global half
+    half = Half()
+    raise KeyboardInterrupt
+
+cli.app = work
+cli.main()
+"""
+
+
+def test_control_c_while_an_object_is_made() -> None:
+    """As in numba's compiler, whose half-made objects fail when the interpreter deletes them."""
+    ended = subprocess.run(
+        [sys.executable, "-c", HALF_MADE], capture_output=True, text=True
+    )
+    assert ended.returncode == 130
+    assert ended.stderr == "lidar-synth: interrupted\n"
 
 
 def children(process: int) -> list[str]:

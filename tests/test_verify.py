@@ -20,7 +20,8 @@ from typer.testing import CliRunner
 import lidar_synth.bake.repair as repair_module
 from lidar_synth.bake import BakeJob, bake, make_plan
 from lidar_synth.bake.edit import head, merge, split
-from lidar_synth.bake.folder import SETTINGS, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
+from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.repair import repair
 from lidar_synth.bake.verify import AGREE, regenerate, verify
 from lidar_synth.bank import INDEX, Bank, Index
@@ -384,6 +385,7 @@ def test_a_repair_with_different_bytes_is_recorded(
         def __init__(self, generator: Any) -> None:
             self.generator = generator
             self.batch = generator.batch
+            self.sensor = generator.sensor
 
         def range_images(self, *arguments: Any, **options: Any) -> list[RangeImage]:
             images: list[RangeImage] = self.generator.range_images(

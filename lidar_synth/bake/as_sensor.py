@@ -12,11 +12,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import sync_folder, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.files.disk import part_of, sha256
+from lidar_synth.files.disk import part_of, sha256, sync_folder
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.transfer import Transfer

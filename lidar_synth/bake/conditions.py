@@ -8,15 +8,17 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.disk import hash_of_names, read_file
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
 from lidar_synth.geometry.layout import Layout
 from lidar_synth.geometry.layout.files import load_layout
 from lidar_synth.geometry.scan import Scan
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.labels.bank import ObjectBank
 
 FOCAL_TOLERANCE = 0.02
 """Relative difference that is allowed between a camera's focal length and that of the training
@@ -126,6 +128,7 @@ def conditions_for(
         raise ConfigError(
             f"condition {path} for model {generator.name!r}, which takes {needs}",
             "a dataset whose scans have them" if generator.condition else "none",
+            "--condition ROOT (condition=...)" if generator.condition else "",
         )
     source = open_conditions(path, layout, split)
     if isinstance(source, LayoutFiles) and generator.condition != "layout":
@@ -159,6 +162,32 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
             "Crop and resize the images to that field of view, and change the dataset's "
             "calibration files accordingly.",
         )
+
+
+def refuse_objects(generator: Generator, name: str | None) -> None:
+    """Refuse objects for a model that takes no layouts.
+
+    Raises:
+        ConfigError: then.
+    """
+    if name is not None and generator.condition != "layout":
+        raise ConfigError(
+            f"objects {name} for model {generator.name!r}",
+            "a model of layouts, such as town-layout",
+        )
+
+
+@lru_cache(maxsize=1)
+def open_objects(name: str | None, sensor: Sensor) -> Any:
+    """The objects of this name, which are cast into the scans of layouts; None without a name.
+
+    Raises:
+        ConfigError: on an unknown name.
+        LibraryError: if embreex is missing.
+    """
+    if name is None:
+        return None
+    return choose("objects", name, {"town": ObjectBank.from_town})(sensor)
 
 
 def fingerprint(source: ConditionSource | None) -> str | None:

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
 from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.bank.folder import LocalFolder, copy_shard
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.files.disk import hash_of_names, part_of, sha256
 
@@ -166,7 +167,7 @@ def _link_kept(
             entries.append(
                 replace(entry, file=_name(len(entries), True), dropped=dropped)
             )
-            _link(Path(bank.root) / entry.file, out / entries[-1].file)
+            _link(bank, entry, out / entries[-1].file)
     index = replace(
         bank.index, shards=tuple(entries), curation=(*bank.index.curation, why)
     )
@@ -222,7 +223,7 @@ def _copy_part(
     another bank."""
     path = out / entry.file
     if (first, last) == (0, entry.kept):
-        _link(Path(bank.root) / bank.index.shards[number].file, path)
+        _link(bank, bank.index.shards[number], path)
         return entry
     # A file holds consecutive scans: dropped ones in between are copied too, and stay dropped.
     start = entry.position(first)
@@ -246,20 +247,26 @@ def _copy_part(
     return entry
 
 
-def _link(source: Path, path: Path) -> None:
-    """Hard-link a file; copy it where the file system has no hard links."""
-    part = part_of(path)
+def _link(bank: Bank, entry: Entry, path: Path) -> None:
+    """Hard-link a shard; copy it where the file system has no hard links, or from a URL."""
+    with LocalFolder(path.parent).making(path.name) as part:
+        if isinstance(bank.root, str):
+            copy_shard(bank.root, entry, part)
+        else:
+            _link_file(bank.root / entry.file, part)
+        part.replace(path)
+
+
+def _link_file(source: Path, path: Path) -> None:
     try:
-        os.link(source, part)
+        os.link(source, path)
     except OSError:
         try:
-            shutil.copyfile(source, part)
+            shutil.copyfile(source, path)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise FileError(
                 f"{path} cannot be written ({error.strerror})", "a disk with free space"
             ) from error
-    part.replace(path)
 
 
 @contextmanager

@@ -11,26 +11,25 @@ files are removed only after the last one has ended.
 
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+from lidar_synth.bake import remote
 from lidar_synth.bake.job import BakePlan, settings_of
+from lidar_synth.bake.remote import SETTINGS, refuse_others
 from lidar_synth.bank import INDEX, Entry, Index
-from lidar_synth.bank.card import CARD, CROISSANT, card_files
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.bank.card import card_files
+from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.reader import read_index
+from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.claims import claim
-from lidar_synth.files.disk import read_file, sha256, write_file
+from lidar_synth.files.disk import read_file, sha256, sync_folder, write_file
 from lidar_synth.files.lock import lock_shared, try_lock
 from lidar_synth.formats.writer import NOTES
-
-SETTINGS = ".bake.json"
-"""File in the bank's folder with the settings of the bake; runs that fill the folder hold a lock on
-it."""
 
 LOGS = ".slurm"
 """Folder with the logs of Slurm's jobs, in the bank's folder until the bank is finished."""
@@ -44,28 +43,13 @@ def prepare(plan: BakePlan) -> None:
             or files that the bake would replace.
         FileError: if it cannot be written.
     """
+    if isinstance(plan.out, str):
+        remote.prepare(plan, plan.out)
+        return
     if not (plan.out / SETTINGS).exists():
         refuse_others(plan.out)
     claim(plan.out / SETTINGS, plan.settings)
     _clear_up(plan.out, finished=False)
-
-
-def refuse_others(root: Path) -> None:
-    """Refuse a folder with a bank, or with files of the names that a bank has.
-
-    Raises:
-        ConfigError: naming the file.
-    """
-    if (root / INDEX).exists() or any(root.glob("*.h5")):
-        raise ConfigError(
-            f"{root} holds another bank", "an empty folder for the new one"
-        )
-    for name in (CARD, CROISSANT):
-        if (root / name).exists():
-            raise ConfigError(
-                f"{root} holds a {name}, which the bank's own would replace",
-                "a new or an empty folder",
-            )
 
 
 @contextmanager
@@ -76,16 +60,29 @@ def at_work(plan: BakePlan) -> Iterator[None]:
     Raises:
         FileError: if the folder is not, or is no longer, the one that ``prepare`` claimed.
     """
-    check_folder(plan)
+    if isinstance(plan.out, str):
+        yield
+        return
+    check_folder(plan.out)
     with lock_shared(plan.out / SETTINGS):
         yield
+
+
+def find_missing(plan: BakePlan, numbers: Iterable[int]) -> list[int]:
+    """The numbers of the shards that are not finished. At a URL a shard is finished that has a
+    record and the size in it; ``verify`` reads it."""
+    if isinstance(plan.out, str):
+        there = remote.list_finished(plan, plan.out)
+        return [number for number in numbers if plan.shards[number].file not in there]
+    return [number for number in numbers if find_finished(plan, number) is None]
 
 
 def read_record(plan: BakePlan, number: int) -> Entry | None:
     """The recorded size and hash of a shard, from its own record or from the index."""
     wanted = plan.shards[number]
+    assert isinstance(plan.out, Path)
     with suppress(FileError, ValueError, TypeError):
-        entry = Entry(**json.loads(read_file(_note(plan, number))))
+        entry = Entry(**json.loads(read_file(_note(plan.out, wanted))))
         if replace(entry, bytes=0, sha256="") == wanted:
             return entry
     index = _index(plan.out)
@@ -99,6 +96,8 @@ def read_record(plan: BakePlan, number: int) -> Entry | None:
 
 def find_finished(plan: BakePlan, number: int) -> Entry | None:
     """The shard, if its file exists and has the recorded hash."""
+    if isinstance(plan.out, str):
+        return remote.list_finished(plan, plan.out).get(plan.shards[number].file)
     entry = read_record(plan, number)
     if entry is None:
         return None
@@ -115,16 +114,17 @@ def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     Raises:
         FileError: if the folder has vanished or cannot be written.
     """
-    check_folder(
-        plan
-    )  # first, because writing the record would create a vanished folder again
+    if isinstance(plan.out, str):
+        return remote.publish(plan, plan.out, number, part)
+    # First, because writing the record would create a vanished folder again.
+    check_folder(plan.out)
     path = plan.out / plan.shards[number].file
     try:
         entry = replace(
             plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part)
         )
         write_file(
-            _note(plan, number), json.dumps(entry.to_dict()).encode(), durable=True
+            _note(plan.out, entry), json.dumps(entry.to_dict()).encode(), durable=True
         )
         part.replace(path)
     except OSError as error:
@@ -144,26 +144,34 @@ def finish(plan: BakePlan) -> Index | None:
         FileError: if they cannot be written.
     """
     with at_work(plan):
-        entries = []
-        for number in range(len(plan.shards)):
-            entry = read_record(plan, number)
-            if entry is None or not (plan.out / entry.file).is_file():
-                return None
-            entries.append(entry)
+        entries = _recorded(plan)
+        if len(entries) < len(plan.shards):
+            return None
         index = Index((plan.facts,), tuple(entries))
         there = _index(plan.out)
         if there is not None and there.shards == index.shards:
             index = there  # it may list repairs
         index = write_bank_files(plan.out, index, baked=True)
-    _clear_up(plan.out, finished=True)
+    if isinstance(plan.out, str):
+        remote.remove_records(plan.out)
+    else:
+        _clear_up(plan.out, finished=True)
     return index
 
 
-def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
+def _recorded(plan: BakePlan) -> list[Entry]:
+    """The shards that are recorded and exist, in order."""
+    if isinstance(plan.out, str):
+        return list(remote.list_finished(plan, plan.out).values())
+    entries = (read_record(plan, number) for number in range(len(plan.shards)))
+    return [e for e in entries if e is not None and (plan.out / e.file).is_file()]
+
+
+def write_bank_files(root: str | Path, index: Index, baked: bool = False) -> Index:
     """Write the card, the settings of a bake, and last the index, which completes the bank.
 
     Args:
-        root: the bank's folder.
+        root: the bank's folder or URL.
         index: index of its shards.
         baked: whether a bake filled the folder and may resume there.
 
@@ -173,68 +181,57 @@ def write_bank_files(root: Path, index: Index, baked: bool = False) -> Index:
     Raises:
         FileError: if they cannot be written.
     """
-    files = card_files(root.resolve().name, index) | (
-        _settings_file(root, index) if baked else {}
-    )
+    folder = open_folder(root)
+    title = root.resolve().name if isinstance(root, Path) else root.rpartition("/")[2]
+    files = card_files(title, index)
+    if baked:
+        files[SETTINGS] = _settings_file(folder, index)
     for name, content in files.items():
-        if not _holds(
-            root / name, content
-        ):  # do not replace a file that others hold a lock on
-            write_file(root / name, content)
+        if not _holds(folder, name, content):  # others may hold a lock on it
+            folder.write(name, content)
     index = replace(
         index,
         files={
             name: hashlib.sha256(content).hexdigest() for name, content in files.items()
         },
     )
-    write_file(root / INDEX, index.to_json(), durable=True)
-    sync_folder(root)
+    folder.write(INDEX, index.to_json())
     return index
 
 
-def _settings_file(root: Path, index: Index) -> dict[str, bytes]:
+def _settings_file(folder: BankFolder, index: Index) -> bytes:
     """The settings file of a bake, as ``claim`` writes it; an older file with another order of keys
     is kept."""
     wanted = json.dumps(settings_of(index.sources[0]), indent=1).encode()
     with suppress(FileError, ValueError, RecursionError):
-        there = read_file(root / SETTINGS)
+        there = folder.read(SETTINGS)
         values = json.loads(there)
         if (
             values == json.loads(wanted)
             and json.dumps(values, indent=1).encode() == there
         ):
-            return {SETTINGS: there}
-    return {SETTINGS: wanted}
+            return there
+    return wanted
 
 
-def _holds(path: Path, content: bytes) -> bool:
+def _holds(folder: BankFolder, name: str, content: bytes) -> bool:
     try:
-        return read_file(path) == content
+        return folder.read(name) == content
     except FileError:
         return False
 
 
-def sync_folder(path: Path) -> None:
-    """Sync a folder's entries to the disk, where the system supports it."""
-    with suppress(OSError):  # Windows cannot open folders
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def check_folder(plan: BakePlan) -> None:
+def check_folder(root: Path) -> None:
     """Refuse a folder that is not, or is no longer, the one that ``prepare`` claimed.
 
     Raises:
         FileError: if it has vanished.
     """
     with suppress(OSError):  # a network folder that has vanished, or without permission
-        if (plan.out / SETTINGS).is_file():
+        if (root / SETTINGS).is_file():
             return
     raise FileError(
-        f"{plan.out} has vanished or lost its {SETTINGS}",
+        f"{root} has vanished or lost its {SETTINGS}",
         "the folder in which the bake started",
         "Restore it, or run the same command to start over.",
     )
@@ -256,8 +253,12 @@ def _clear_up(root: Path, finished: bool) -> None:
             shutil.rmtree(root / folder, ignore_errors=True)
 
 
-def _index(root: Path) -> Index | None:
+def _index(root: str | Path) -> Index | None:
     """The existing index, if it can be read; parsed again only after its file has changed."""
+    if isinstance(root, str):
+        with suppress(FileError, DataError):
+            return read_index(root)
+        return None
     try:
         there = (root / INDEX).stat()
     except OSError:
@@ -273,5 +274,5 @@ def _parsed(path: Path, *version: int) -> Index | None:
         return None
 
 
-def _note(plan: BakePlan, number: int) -> Path:
-    return plan.out / NOTES / f"{plan.shards[number].file}.json"
+def _note(root: Path, entry: Entry) -> Path:
+    return root / NOTES / f"{entry.file}.json"

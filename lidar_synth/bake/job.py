@@ -9,6 +9,7 @@ refused.
 import platform
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,15 @@ import h5py
 import numpy as np
 import torch
 
-import lidar_synth
-from lidar_synth.bake.conditions import conditions_for, fingerprint
-from lidar_synth.bake.options import BakeJob
+from lidar_synth.bake.conditions import conditions_for, fingerprint, refuse_objects
+from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
+from lidar_synth.bank.storage import bank_root
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.generate.flow.solvers import SOLVERS
 from lidar_synth.generate.generator import BATCH
-from lidar_synth.generate.loading import load_generator
+from lidar_synth.generate.loading import load_generator, settle_model
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """Data types of the network's computation, by name."""
@@ -37,13 +38,13 @@ class BakePlan:
     any process.
 
     Args:
-        out: the bank's folder.
+        out: the bank's folder, or its URL.
         job: the settings, with ``batch``, ``fields`` and ``shard_size`` resolved and the path of a
             checkpoint file made absolute.
         facts: the facts of the bank.
     """
 
-    out: Path
+    out: str | Path
     job: BakeJob
     facts: Facts
 
@@ -111,9 +112,11 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     source = conditions_for(
         generator, job.condition, job.condition_layout, job.condition_split
     )
+    refuse_objects(generator, job.objects)
     fields = _fields(job, generator.fields)
     software = {
-        "lidar_synth": lidar_synth.__version__,
+        # Its names are at home here too: a plain import would be a circle.
+        "lidar_synth": import_module("lidar_synth").__version__,
         "torch": torch.__version__,
         "numpy": np.__version__,
         "h5py": h5py.__version__,
@@ -121,25 +124,15 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         "deflate": deflate.__version__,
         "machine": platform.machine(),
     }
-    model = Path(job.model)
     resolved = job.model_copy(
         update={
-            "model": str(model.resolve())
-            if model.suffix == ".safetensors"
-            else job.model,
+            "model": settle_model(job.model),
             "fields": fields,
             "batch": job.batch or BATCH[job.device],
-            "shard_size": job.shard_size or min(1024, max(64, job.count // 8)),
+            "shard_size": job.shard_size or default_shard_size(job.count),
         }
     )
-    # Banks of earlier versions do not name the columns.
-    elsewhere = {
-        "model",
-        "fields",
-        "compression",
-        "layout",
-        *(["columns"] if job.columns is None else []),
-    }
+    elsewhere = {"model", "fields", "compression", "layout"}
     header = generator.header
     labelled = "generated" if "label" in header.channels else "condition"
     reference = {
@@ -164,7 +157,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         compression=job.compression,
         layout=job.layout,
     )
-    return BakePlan(Path(out), resolved, facts)
+    return BakePlan(bank_root(out), resolved, facts)
 
 
 def _fields(job: BakeJob, generated: frozenset[str]) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lidar_synth.bake.folder import refuse_others
+from lidar_synth.bake.remote import refuse_others
 from lidar_synth.files.claims import claim, hold_writing
 
 NOTE = ".made.json"

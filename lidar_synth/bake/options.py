@@ -11,6 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field
 Count = Annotated[int, Field(ge=1)]
 
 
+def default_shard_size(count: int) -> int:
+    """Scans per file of a bank of ``count`` scans."""
+    return min(1024, max(64, count // 8))
+
+
 class BakeJob(BaseModel):
     """Settings of a bake; unknown keys are refused. ``BakeJob.model_fields`` describes each of
     them.
@@ -52,6 +57,12 @@ class BakeJob(BaseModel):
     )
     condition_split: str | None = Field(
         None, description="split of that dataset, for instance r2flow/train"
+    )
+    objects: Literal["town"] | None = Field(
+        None,
+        description=(
+            "objects that are cast into the boxes of layouts: town [the model draws them]"
+        ),
     )
     guidance: float = Field(
         1.0,

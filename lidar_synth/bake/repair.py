@@ -8,23 +8,26 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import SETTINGS, sync_folder, write_bank_files
+from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.job import BakePlan
+from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.shard import load_checked, write_shard
 from lidar_synth.bake.verify import (
     check_scans,
     check_shard,
     check_side_files,
     job_of,
-    read_index,
 )
 from lidar_synth.bank import INDEX, Entry, Facts, Index, ShardReader
-from lidar_synth.errors import DataError, FileError, LidarSynthError
-from lidar_synth.files.disk import part_of, sha256, unwritable
+from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.reader import read_index
+from lidar_synth.bank.storage import bank_root, open_storage
+from lidar_synth.errors import DataError, FileError
+from lidar_synth.files.disk import remove_file, sha256
 
 
 def repair(
-    root: Path, model: str | None = None, progress: bool = True
+    root: str | Path, model: str | None = None, progress: bool = True
 ) -> dict[str, str]:
     """Regenerate damaged and missing shards, and rewrite a damaged or missing index, card or
     settings file.
@@ -33,7 +36,7 @@ def repair(
     scans are equal up to rounding; the index then gets the new hashes and an entry in ``repairs``.
 
     Args:
-        root: the bank's folder.
+        root: the bank's folder or URL.
         model: the checkpoint, if it is not a shipped model.
         progress: show a bar.
 
@@ -46,22 +49,21 @@ def repair(
         FileError: if a file cannot be read or written.
     """
     done: dict[str, str] = {}
-    for part in root.glob(".*.part"):
-        try:
-            part.unlink(missing_ok=True)
-        except OSError as error:
-            raise unwritable(part, error) from error
+    place = bank_root(root)
+    folder = open_folder(place)
+    for part in place.glob(".*.part") if isinstance(place, Path) else ():
+        remove_file(part)
         done[part.name] = "removed: a killed repair left it"
     try:
-        index = read_index(root)
-        baked = SETTINGS in index.files or (root / SETTINGS).is_file()
+        index = read_index(place)
+        baked = SETTINGS in index.files or _holds_settings(folder)
     except (DataError, FileError) as error:
-        index = _index_from_shards(root, error)
+        index = _index_from_shards(place, folder, error)
         baked = True
         done[INDEX] = "rebuilt from the shards"
     done |= {
         problem.file: "rewritten from the index"
-        for problem in check_side_files(root, index)
+        for problem in check_side_files(folder, index)
     }
     shards = list(index.shards)
     repairs = list(index.repairs)
@@ -69,10 +71,10 @@ def repair(
     with tqdm(total=total, desc="repair", unit="scan", disable=not progress) as bar:
         for number, entry in enumerate(shards):
             facts = index.sources[entry.source]
-            if entry.sha256 and next(check_shard(root, facts, entry), None) is None:
+            if entry.sha256 and next(check_shard(folder, facts, entry), None) is None:
                 bar.update(entry.scans)
                 continue
-            shards[number] = new = _regenerate(root, facts, entry, model, bar.update)
+            shards[number] = new = _regenerate(folder, facts, entry, model, bar.update)
             same = entry.sha256 in ("", new.sha256)
             done[entry.file] = "regenerated" + (
                 "" if same else ", with different bytes"
@@ -84,13 +86,13 @@ def repair(
                 )
     if done:
         write_bank_files(
-            root, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked
+            place, replace(index, shards=tuple(shards), repairs=tuple(repairs)), baked
         )
     return done
 
 
 def _regenerate(
-    root: Path,
+    folder: BankFolder,
     facts: Facts,
     entry: Entry,
     model: str | None,
@@ -98,36 +100,39 @@ def _regenerate(
 ) -> Entry:
     """Generate a shard and replace its file."""
     job = job_of(facts, model)
-    part = part_of(root / entry.file)
-    try:
+    with folder.making(entry.file) as part:
         write_shard(load_checked(job, facts), part, job, facts, entry, progress)
         new = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
-        part.replace(root / entry.file)
-    except OSError as error:
-        if isinstance(error, LidarSynthError):
-            raise
-        raise FileError(
-            f"{root / entry.file} cannot be written ({error.strerror})",
-            "a writable folder",
-        ) from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-    sync_folder(root)
+        folder.put(part, entry.file)
     return new
 
 
-def _index_from_shards(root: Path, damage: Exception) -> Index:
+def _holds_settings(folder: BankFolder) -> bool:
+    """Whether a bake filled the folder."""
+    try:
+        folder.read(SETTINGS)
+    except FileError:
+        return False
+    return True
+
+
+def _index_from_shards(
+    root: str | Path, folder: BankFolder, damage: Exception
+) -> Index:
     """Rebuild the lost index of a bake from its shards; an entry without a hash marks a shard to
     regenerate.
 
     Raises:
         DataError: if no shard can be read, or the readable ones come from different bakes.
     """
+    sizes = {name: n for name, n in folder.sizes().items() if name.endswith(".h5")}
     found: dict[str, tuple[Facts, Entry]] = {}
-    for path in sorted(root.glob("*.h5")):
-        with suppress(DataError, FileError), ShardReader(path, str(path)) as shard:
-            found[path.name] = shard.facts, shard.entry
+    for name, size in sorted(sizes.items()):
+        with (
+            suppress(DataError, FileError),
+            ShardReader(open_storage(root, name, size), name) as shard,
+        ):
+            found[name] = shard.facts, shard.entry
     if not found:
         raise DataError(
             f"{damage}, and no shard of {root} can be read", "at least one intact shard"
@@ -141,18 +146,23 @@ def _index_from_shards(root: Path, damage: Exception) -> Index:
             f"{damage}, and the shards of {root} are of different bakes",
             "a copy of the index",
         ) from damage
-    absent = [entry.file for entry in shards if not (root / entry.file).exists()]
-    if (
-        absent and not (root / SETTINGS).is_file()
-    ):  # the part of a split, too, has the first shards of a bake
+    absent = [entry.file for entry in shards if entry.file not in sizes]
+    if absent and not _holds_settings(folder):
+        # The part of a split, too, has the first shards of a bake.
         raise DataError(
             f"{damage}, and {absent[0]} is not there, nor {SETTINGS}, which a bake leaves",
             "a copy of the index",
         ) from damage
-    entries = []
-    for entry in shards:
-        path = root / entry.file
-        if entry.file in found and next(check_scans(path, facts, entry), None) is None:
-            entry = replace(entry, bytes=path.stat().st_size, sha256=sha256(path))
-        entries.append(entry)
-    return Index((facts,), tuple(entries))
+    return Index((facts,), tuple(_measured(folder, facts, e, sizes) for e in shards))
+
+
+def _measured(
+    folder: BankFolder, facts: Facts, entry: Entry, sizes: dict[str, int]
+) -> Entry:
+    """An entry with its size and hash, if its file is there and intact."""
+    if entry.file in sizes:
+        with folder.local(entry.file, sizes[entry.file]) as path:
+            if next(check_scans(path, facts, entry), None) is None:
+                digest = sha256(path)
+                return replace(entry, bytes=path.stat().st_size, sha256=digest)
+    return entry

@@ -13,7 +13,7 @@ from types import FrameType
 
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import at_work, find_finished, finish, prepare
+from lidar_synth.bake.folder import at_work, find_missing, finish, prepare
 from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.local import bake_local
 from lidar_synth.bake.processes import bake_in_processes
@@ -103,9 +103,7 @@ def bake(
                 disable=not progress,
                 delay=2,
             )
-            missing = [
-                number for number in checked if find_finished(plan, number) is None
-            ]
+            missing = find_missing(plan, checked)
             scans = sum(plan.shards[number].scans for number in missing)
             if missing:
                 with tqdm(

@@ -4,7 +4,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,13 +16,14 @@ from lidar_synth.bake.conditions import (
     conditions,
     fingerprint,
     open_conditions,
+    open_objects,
 )
 from lidar_synth.bake.folder import at_work, find_finished, publish
 from lidar_synth.bake.job import DTYPES, BakePlan
 from lidar_synth.bake.options import BakeJob
 from lidar_synth.bank import Entry, Facts, ShardWriter
+from lidar_synth.bank.folder import open_folder
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files.disk import part_of
 from lidar_synth.generate.generator import BATCH, Generator
 from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import RangeImage
@@ -59,16 +60,11 @@ def bake_shard(
         progress(there.scans)
         return there
     entry = plan.shards[number]
-    part = part_of(plan.out / entry.file)
-    with at_work(plan):
-        _check_space(plan, entry)
+    with at_work(plan), open_folder(plan.out).making(entry.file) as part:
+        _check_space(plan, part.parent, entry)
         generator = load_checked(plan.job, plan.facts)
-        try:
-            write_shard(generator, part, plan.job, plan.facts, entry, progress)
-            return publish(plan, number, part)
-        finally:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
+        write_shard(generator, part, plan.job, plan.facts, entry, progress)
+        return publish(plan, number, part)
 
 
 def write_shard(
@@ -117,6 +113,7 @@ def generate(
         job.seed,
         indices,
         given,
+        open_objects(job.objects, generator.sensor),
         steps=job.steps,
         solver=job.solver,
         guidance=job.guidance,
@@ -184,12 +181,12 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
     return generator
 
 
-def _check_space(plan: BakePlan, entry: Entry) -> None:
+def _check_space(plan: BakePlan, folder: Path, entry: Entry) -> None:
     need = int(entry.scans * plan.scan_bytes * _PACKED)
-    free = shutil.disk_usage(plan.out).free
+    free = shutil.disk_usage(folder).free
     if free < need:
         raise FileError(
-            f"{plan.out} has {free / 1e6:.1f} MB free",
+            f"{folder} has {free / 1e6:.1f} MB free",
             f"{math.ceil(need / 1e5) / 10:.1f} MB for the next shard",
             "Free some space and run the same command again: finished shards are kept.",
         )

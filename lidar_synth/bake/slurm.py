@@ -8,6 +8,7 @@ without Slurm.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from lidar_synth.bake.folder import LOGS
@@ -62,7 +63,7 @@ def bake_on_slurm(
     except submitit.core.utils.UncompletedJobError as error:
         raise FileError(
             f"Slurm job {job.job_id} failed ({error})",
-            f"jobs that finish; their logs are in {plan.out / LOGS}",
+            f"jobs that finish; their logs are in {_logs(plan)}",
             "Run the same command again: finished shards are kept.",
         ) from error
     finally:
@@ -82,7 +83,7 @@ def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> A
     cluster = values.pop("cluster")
     try:
         executor = submitit.AutoExecutor(
-            plan.out / LOGS, cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
+            _logs(plan), cluster, **{f"{cluster}_max_num_timeout": _TIMEOUTS}
         )
         executor.update_parameters(name="lidar-synth-bake", **values)
     except (RuntimeError, ValueError, NameError, TypeError) as error:
@@ -91,6 +92,11 @@ def _executor(submitit: Any, plan: BakePlan, options: dict[str, str | int]) -> A
             "a machine that submits to Slurm, and options of submitit",
         ) from error
     return executor
+
+
+def _logs(plan: BakePlan) -> Path:
+    """The folder of the jobs' logs: in the bank's folder, or, for a URL, in this one."""
+    return Path(LOGS) if isinstance(plan.out, str) else plan.out / LOGS
 
 
 def _import_submitit() -> Any:

@@ -1,5 +1,6 @@
 """Verification of banks: whether all files are intact, and whether the scans match their seeds."""
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,13 +8,16 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lidar_synth.bake.folder import SETTINGS
 from lidar_synth.bake.options import BakeJob
+from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.bake.shard import generate, load_checked, torch_threads
-from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader
+from lidar_synth.bank import Bank, Entry, Facts, Index, ShardReader
 from lidar_synth.bank.card import CARD, CROISSANT
+from lidar_synth.bank.folder import BankFolder, open_folder
+from lidar_synth.bank.reader import read_index
+from lidar_synth.bank.storage import bank_root
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.files.disk import read_file, sha256
+from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.scan import RangeImage
 
 AGREE = 0.9
@@ -40,13 +44,13 @@ class Problem:
     what: str
 
 
-def verify(root: Path, progress: bool = True) -> list[Problem]:
+def verify(root: str | Path, progress: bool = True) -> list[Problem]:
     """Check every shard's presence, size and hash, its attributes against the index, and the CRC of
     every scan; then the hashes of the card and the other files that the index lists (indices of
     older versions list none).
 
     Args:
-        root: the bank's folder.
+        root: the bank's folder or URL.
         progress: show a bar.
 
     Returns:
@@ -56,35 +60,36 @@ def verify(root: Path, progress: bool = True) -> list[Problem]:
         FileError: if the index is missing.
         DataError: if the index is damaged or of another version.
     """
-    index = read_index(root)
+    folder = open_folder(root)
+    index = read_index(bank_root(root))
     problems = []
     total = sum(entry.scans for entry in index.shards)
     with tqdm(total=total, desc="verify", unit="scan", disable=not progress) as bar:
         for entry in index.shards:
             problems += [
                 Problem(entry.file, what)
-                for what in check_shard(root, index.sources[entry.source], entry)
+                for what in check_shard(folder, index.sources[entry.source], entry)
             ]
             bar.update(entry.scans)
-    known = {entry.file for entry in index.shards}
-    unlisted = sorted(path.name for path in root.glob("*.h5") if path.name not in known)
+    shards = {name for name in folder.sizes() if name.endswith(".h5")}
     return (
         problems
-        + [Problem(name, "is not in the index") for name in unlisted]
-        + check_side_files(root, index)
+        + [
+            Problem(name, "is not in the index")
+            for name in sorted(shards - index.by_file.keys())
+        ]
+        + check_side_files(folder, index)
     )
 
 
-def check_side_files(root: Path, index: Index) -> list[Problem]:
+def check_side_files(folder: BankFolder, index: Index) -> list[Problem]:
     """The problems of the files beside the shards."""
     problems = []
     for name in filter(index.files.get, SIDE_FILES):
         try:
-            actual = sha256(root / name)
-        except OSError as error:
-            problems.append(
-                Problem(name, f"cannot be read ({error.strerror or error})")
-            )
+            actual = hashlib.sha256(folder.read(name)).hexdigest()
+        except (DataError, FileError) as error:
+            problems.append(Problem(name, str(error)))
             continue
         if actual != index.files[name]:
             what = (
@@ -95,24 +100,27 @@ def check_side_files(root: Path, index: Index) -> list[Problem]:
     return problems
 
 
-def check_shard(root: Path, facts: Facts, entry: Entry) -> Iterator[str]:
+def check_shard(folder: BankFolder, facts: Facts, entry: Entry) -> Iterator[str]:
     """Descriptions of a shard's problems."""
-    path = root / entry.file
     try:
-        size = path.stat().st_size
-        digest = sha256(path)
+        with folder.local(entry.file, entry.bytes) as path:
+            size = path.stat().st_size
+            digest = sha256(path)
+            if (size, digest) != (entry.bytes, entry.sha256):
+                yield (
+                    f"has {size} bytes and sha256 {digest[:12]}, the index lists "
+                    f"{entry.bytes} and {entry.sha256[:12]}"
+                )
+            yield from check_scans(path, facts, entry)
     except OSError as error:
         yield f"cannot be read ({error.strerror or error})"
-        return
-    if (size, digest) != (entry.bytes, entry.sha256):
-        yield f"has {size} bytes and sha256 {digest[:12]}, the index lists {entry.bytes} and {entry.sha256[:12]}"
-    yield from check_scans(path, facts, entry)
 
 
 def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterator[str]:
     """Descriptions of the problems of a shard's attributes and scans."""
+    name = path.name if entry is None else entry.file
     try:
-        with ShardReader(path, str(path), facts, entry) as shard:
+        with ShardReader(path, name, facts, entry) as shard:
             for position in range(shard.entry.scans):
                 try:
                     shard.read(position)
@@ -123,7 +131,7 @@ def check_scans(path: Path, facts: Facts | None, entry: Entry | None) -> Iterato
 
 
 def regenerate(
-    root: Path,
+    root: str | Path,
     model: str | None = None,
     sample: int = 16,
     progress: bool = True,
@@ -133,7 +141,7 @@ def regenerate(
     """Regenerate some scans from their seeds and compare them with the bank.
 
     Args:
-        root: the bank's folder.
+        root: the bank's folder or URL.
         model: the checkpoint, if it is not a shipped model.
         sample: number of scans, sampled from the bank.
         progress: show a bar.
@@ -204,13 +212,3 @@ def job_of(facts: Facts, model: str | None = None) -> BakeJob:
         raise DataError(
             f"settings {facts.settings} of a bank", "the settings of a bake"
         ) from error
-
-
-def read_index(root: Path) -> Index:
-    """The index of a bank on disk.
-
-    Raises:
-        FileError: if it is missing.
-        DataError: if it is damaged or of another version.
-    """
-    return Index.from_json(read_file(root / INDEX), str(root / INDEX))

@@ -19,9 +19,10 @@ stored directly, everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
     fields         what is stored beside the range: reflectance, label, confidence; in /2 instance, boxes
-    model          the checkpoint's name; checkpoint: its hash; provenance: its header's provenance
+    model          the checkpoint's name, or that of a data set; checkpoint: its hash, empty for recorded scans
+    provenance     its header's provenance; of recorded scans their data, and their terms if there are any
     settings       of the bake: everything else that determines the scans
-    label_policy   "generated", or "none"
+    label_policy   "generated", "condition", "annotated" (recorded scans), or "none"
     condition      the dataset that the scans are conditioned on, or null
     licence        of the weights; data_licence: of the training data
     software       versions of the libraries that made the scans
@@ -98,6 +99,11 @@ class Facts:
     def encoding(self) -> Encoding:
         """The encoding of the scans."""
         return Encoding(self.sensor, self.fields)
+
+    @property
+    def recorded(self) -> bool:
+        """Whether a sensor recorded the scans: no checkpoint made them."""
+        return not self.checkpoint
 
     @property
     def format(self) -> str:

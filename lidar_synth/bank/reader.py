@@ -1,6 +1,7 @@
 """A bank as a source of scans."""
 
 import os
+import weakref
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -8,12 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
+from lidar_synth.bank.cache import ShardCache
 from lidar_synth.bank.index import INDEX, REPAIR, Facts, Index
 from lidar_synth.bank.shard import ShardReader
-from lidar_synth.bank.storage import RemoteFile, is_url, open_storage
-from lidar_synth.errors import DataError, FileError
+from lidar_synth.bank.storage import RemoteFile, bank_root, open_storage
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.geometry.projection import unproject
-from lidar_synth.geometry.scan import SYNTHETIC, RangeImage, Scan, model_provenance
+from lidar_synth.geometry.scan import (
+    REAL,
+    SYNTHETIC,
+    RangeImage,
+    Scan,
+    model_provenance,
+)
 from lidar_synth.geometry.sensor import Sensor
 
 _OPEN = 64  # files kept open at a time
@@ -29,6 +37,9 @@ class Bank:
 
     Args:
         root: the bank's folder, or a URL that fsspec supports ("s3://bucket/bank").
+        cache: a folder on this machine for copies of the shards of a bank at a URL, which all
+            processes share. In a mixture they are fetched ahead in the order of the plan.
+        limit: the most bytes of the copies, such as "200GB"; by default all shards are kept.
 
     Attributes:
         index: the list of shards and sources.
@@ -39,6 +50,7 @@ class Bank:
     Raises:
         FileError: if there is no bank, a shard is missing, or a file cannot be read.
         DataError: on an index that is damaged or of another version, or a shard of another size.
+        ConfigError: on a cache for a bank in a folder, or a limit below the size of a shard.
         LibraryError: on a URL whose file system is not installed.
 
     Example:
@@ -50,9 +62,14 @@ class Bank:
         (64, 2048)
     """
 
-    def __init__(self, root: str | Path) -> None:
-        self.root = str(root) if is_url(root) else Path(root)
-        self.index = Index.from_json(_read_index(self.root), f"{self.root}/{INDEX}")
+    def __init__(
+        self,
+        root: str | Path,
+        cache: str | Path | None = None,
+        limit: int | str | None = None,
+    ) -> None:
+        self.root = _settle(bank_root(root))
+        self.index = read_index(self.root)
         if isinstance(self.root, Path):
             self._check_files(self.root)
         largest = max((entry.scans for entry in self.index.shards), default=0)
@@ -60,6 +77,10 @@ class Bank:
         self._shards: OrderedDict[int, ShardReader] = OrderedDict()
         self._open: OrderedDict[int, ShardReader] = OrderedDict()
         self._process = os.getpid()
+        self._cache = _open_cache(self.root, cache, limit, self.index)
+        if self._cache is not None:
+            self.expect = self._cache.expect  # a mixture announces what it reads next
+            weakref.finalize(self, self._cache.close)
 
     @property
     def facts(self) -> Facts:
@@ -75,6 +96,11 @@ class Bank:
         return frozenset(self.facts.fields)
 
     @property
+    def recorded(self) -> bool:
+        """Whether a sensor recorded its scans; see ``Facts.recorded``."""
+        return self.facts.recorded
+
+    @property
     def identity(self) -> str:
         return self.index.checksum
 
@@ -82,6 +108,11 @@ class Bank:
     def length(self) -> int:
         """Number of scans."""
         return self.index.scans
+
+    @property
+    def shard_size(self) -> int:
+        """Number of scans of its largest shard."""
+        return max(entry.kept for entry in self.index.shards)
 
     @property
     def ids(self) -> Sequence[str]:
@@ -106,7 +137,8 @@ class Bank:
         image = self.facts.encoding.decode(self.shard(shard).read(position))
         name = _name(self.index, shard, position)
         made = _provenance(self.index, shard)
-        return replace(unproject(image), id=name, domain=SYNTHETIC, provenance=made)
+        domain = SYNTHETIC if made else REAL
+        return replace(unproject(image), id=name, domain=domain, provenance=made)
 
     def image(self, number: int) -> RangeImage:
         """The range image of a scan; raises as ``__getitem__``."""
@@ -132,6 +164,8 @@ class Bank:
             self._shards = OrderedDict()
             self._open = OrderedDict()
             self._process = os.getpid()
+        if self._cache is not None:
+            self._cache.note(number)
         shard = self._shards.get(number)
         if shard is None or not shard.reopen():
             shard = self._shards[number] = self._new_reader(number)
@@ -140,17 +174,61 @@ class Bank:
         _touch(self._open, number, _OPEN)
         return shard
 
+    def push_to_hub(
+        self, name: str, *, licence: str | None = None, private: bool = False
+    ) -> str:
+        """Upload the bank to the Hugging Face hub, in one commit; its shards are checked before.
+
+        Args:
+            name: ``user/bank``, new or existing.
+            licence: of the scans, an identifier of the hub such as "cc-by-4.0"; by default the
+                one that the bank states.
+            private: whether a new repository is private.
+
+        Returns:
+            What ``open_scans`` takes, ``hf://datasets/user/bank@COMMIT``.
+
+        Raises:
+            ConfigError: on a bank whose licence the hub does not know, or one at a URL.
+            DataError: if a shard is damaged.
+            FileError: if the hub refuses it or does not answer.
+            LibraryError: without the extra ``hub``.
+        """
+        from lidar_synth.bank.hub import push_bank
+
+        return push_bank(self.root, self.index, name, licence, private)
+
     def close(self) -> None:
-        """Close the open shards; reading opens them again."""
+        """Close the open shards, and fetch none ahead; reading opens them again."""
+        if self._cache is not None:
+            self._cache.close()
         while self._open and self._process == os.getpid():
             self._open.popitem()[1].close()
+
+    def clear_cache(self) -> None:
+        """Remove the copies of the bank's shards, and the cache's folder if it is empty then. After
+        that this bank reads from its URL.
+
+        Raises:
+            FileError: if they cannot be removed.
+        """
+        self.close()
+        self._shards.clear()
+        if self._cache is not None:
+            self._cache.clear()
+            self._cache = None
+            del self.expect
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_shards": OrderedDict(), "_open": OrderedDict()}
 
     def _new_reader(self, number: int) -> ShardReader:
         entry = self.index.shards[number]
-        file = open_storage(self.root, entry.file, entry.bytes)
+        file = (
+            open_storage(self.root, entry.file, entry.bytes)
+            if self._cache is None
+            else self._cache.open(number)
+        )
         return ShardReader(
             file, f"{self.root}/{entry.file}", self.index.sources[entry.source], entry
         )
@@ -171,6 +249,29 @@ class Bank:
                     f"{entry.bytes}, by the index",
                     REPAIR,
                 )
+
+
+def _settle(root: str | Path) -> str | Path:
+    """The root of a bank, at one commit if it is on the hub: others may push meanwhile."""
+    if isinstance(root, Path) or not root.startswith("hf://datasets/"):
+        return root
+    from lidar_synth.files.hub import pin_revision
+
+    return pin_revision(root)
+
+
+def _open_cache(
+    root: str | Path, cache: str | Path | None, limit: int | str | None, index: Index
+) -> ShardCache | None:
+    if cache is None:
+        return None
+    if isinstance(root, Path):
+        raise ConfigError(
+            f"cache={str(cache)!r} for a bank in the folder {root}",
+            "the URL of a bank",
+            f"file://{root.absolute()} for a folder on a network drive.",
+        )
+    return ShardCache(Path(cache), limit, root, index)
 
 
 def _touch(shards: OrderedDict[int, ShardReader], number: int, most: int) -> None:
@@ -225,15 +326,27 @@ def _name(index: Index, shard: int, position: int) -> str:
 
 
 def _provenance(index: Index, shard: int) -> dict[str, Any]:
-    """What made the scans of a shard, as ``Scan.provenance``."""
+    """What made the scans of a shard, as ``Scan.provenance``; {} for recorded ones."""
     entry = index.shards[shard]
     facts = index.sources[entry.source]
+    if facts.recorded:
+        return {}
     return model_provenance(facts.model, facts.checkpoint, entry.seed)
+
+
+def read_index(root: str | Path) -> Index:
+    """The index of a bank in a folder or at a URL.
+
+    Raises:
+        FileError: if it is missing.
+        DataError: if it is damaged or of another version.
+    """
+    return Index.from_json(_read_index(root), f"{root}/{INDEX}")
 
 
 def _read_index(root: str | Path) -> bytes:
     if isinstance(root, str):
-        return RemoteFile(f"{root.rstrip('/')}/{INDEX}").read_all()
+        return RemoteFile(f"{root}/{INDEX}").read_all()
     try:
         return (root / INDEX).read_bytes()
     except OSError as error:

@@ -1,18 +1,17 @@
 """Access to the bytes of a bank: files on a disk, or URLs that fsspec supports. Only requested
 ranges are read.
 
-A failed request is repeated three times with growing waits, but not once 30 seconds are over; a
-server that is silent for 30 seconds has failed. At most 3 redirects are followed, to any host, but
+At most 3 redirects are followed, to any host, but
 never from https to http. No answer may be longer than what was asked for.
 """
 
 import io
 import os
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
+from lidar_synth.bank.retries import PATIENCE, keep_trying
 from lidar_synth.errors import DataError, FileError, LibraryError
 from lidar_synth.files.disk import refuse_special, unreadable
 
@@ -22,16 +21,11 @@ SCHEMES = frozenset("http https s3 gs gcs az abfs abfss hf file memory".split())
 LONGEST_INDEX = 64 << 20
 """Maximum size of a bank's index at a URL in bytes; that of a million scans takes about 1 MB."""
 
-WAITS = (0.1, 0.5, 2.0)
-"""Seconds before a failed request is repeated."""
-
-PATIENCE = 30.0
-"""Seconds in which a server has to connect, and to send the next bytes."""
-
-_TEMPORARY = frozenset((408, 425, 429, 500, 502, 503, 504))
-"""HTTP's statuses of failures that may pass."""
-
 _REDIRECTS = 3
+
+_SYSTEMS: dict[int, Any] = {}
+"""The file systems of fsspec that were used. A forked process would otherwise free those of its
+parent, and with them the parent's connections, while these are in use."""
 
 
 class Storage(Protocol):
@@ -141,25 +135,7 @@ class RemoteFile:
     def __init__(self, url: str, size: int = 0) -> None:
         self.url = url
         self.size = size
-        scheme = url.partition("://")[0]
-        if scheme not in SCHEMES:  # a chain such as zip::http is not among them either
-            raise FileError(
-                f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}"
-            )
-        try:
-            import fsspec
-
-            self._system, self._path = fsspec.core.url_to_fs(url)
-        except ImportError as error:
-            raise LibraryError(
-                f"{url} cannot be opened ({error})",
-                "fsspec and its package for this kind of URL",
-                "pip install 'lidar_synth[remote]' for http and https, s3fs for s3, gcsfs for gs.",
-            ) from error
-        except (OSError, ValueError) as error:
-            raise FileError(
-                f"{url} cannot be read ({error})", "a URL that fsspec supports"
-            ) from error
+        self._system, self._path = open_system(url)
 
     def read(self, offset: int, size: int) -> bytes:
         if offset + size > self.size:
@@ -197,37 +173,19 @@ class RemoteFile:
         return True
 
     def _fetch(self, start: int, end: int | None, at_most: int = 0) -> bytes:
-        """The bytes of a request, repeated while its failure may pass; a few more than asked for
-        may come."""
-        began = time.monotonic()
-        for wait in (*WAITS, None):
-            try:
-                return self._request(
-                    start, end, at_most if end is None else end - start
-                )
-            except (
-                Exception
-            ) as error:  # each file system of fsspec raises its own classes
-                if (
-                    wait is None
-                    or not _may_pass(error)
-                    or time.monotonic() - began > PATIENCE
-                ):
-                    reason = str(error) or type(error).__name__
-                    raise FileError(
-                        f"{self.url} cannot be read ({reason})", "a file of a bank"
-                    ) from error
-            time.sleep(wait)
-        raise AssertionError
+        """The bytes of a request; a few more than asked for may come."""
+        most = at_most if end is None else end - start
+        return keep_trying(self.url, "read", lambda: self._request(start, end, most))
 
     def _request(self, start: int, end: int | None, at_most: int) -> bytes:
         if self.url.startswith("http"):
             from fsspec.asyn import sync
 
             return bytes(sync(self._system.loop, self._get, start, end, at_most))
-        return bytes(
-            self._system.cat_file(self._path, start=start, end=end or at_most + 1)
-        )
+        # The hub's file system reads ahead by 5 MB otherwise.
+        more = {"cache_type": "none"} if self.url.startswith("hf:") else {}
+        end = end or at_most + 1
+        return bytes(self._system.cat_file(self._path, start=start, end=end, **more))
 
     async def _get(self, start: int, end: int | None, at_most: int) -> bytearray:
         """One byte more than ``at_most`` at most; fsspec itself would read an answer of any
@@ -256,12 +214,29 @@ class RemoteFile:
         return content
 
 
-def _may_pass(error: Exception) -> bool:
-    """Whether a request may succeed when it is repeated."""
-    status = getattr(error, "status", None)
-    if isinstance(status, int) and status:
-        return status in _TEMPORARY
-    return not isinstance(error, FileNotFoundError | PermissionError | ValueError)
+def open_system(url: str) -> tuple[Any, str]:
+    """The file system of fsspec for a URL, and the path there; raises as ``RemoteFile``."""
+    scheme = url.partition("://")[0]
+    if scheme not in SCHEMES:  # a chain such as zip::http is not among them either
+        raise FileError(
+            f"{url} with scheme {scheme!r}", f"one of {', '.join(sorted(SCHEMES))}"
+        )
+    try:
+        import fsspec
+
+        system, path = fsspec.core.url_to_fs(url)
+        _SYSTEMS[id(system)] = system
+    except ImportError as error:
+        raise LibraryError(
+            f"{url} cannot be opened ({error})",
+            "fsspec and its package for this kind of URL",
+            "pip install 'lidar_synth[remote]' for http and https, s3fs for s3, gcsfs for gs.",
+        ) from error
+    except (OSError, ValueError) as error:
+        raise FileError(
+            f"{url} cannot be read ({error})", "a URL that fsspec supports"
+        ) from error
+    return system, path
 
 
 class RangedFile(io.RawIOBase):
@@ -351,6 +326,11 @@ def is_url(path: str | Path) -> bool:
     return isinstance(path, str) and "://" in path
 
 
+def bank_root(root: str | Path) -> str | Path:
+    """The place of a bank: a URL without a slash at its end, or the path of a folder."""
+    return str(root).rstrip("/") if is_url(root) else Path(root)
+
+
 def open_storage(root: str | Path, name: str, size: int) -> Storage:
     """Open a file of a bank, in its folder or at its URL.
 
@@ -365,5 +345,5 @@ def open_storage(root: str | Path, name: str, size: int) -> Storage:
     return (
         LocalFile(root / name)
         if isinstance(root, Path)
-        else RemoteFile(f"{root.rstrip('/')}/{name}", size)
+        else RemoteFile(f"{root}/{name}", size)
     )

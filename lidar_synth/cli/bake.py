@@ -24,7 +24,9 @@ _ARRAYS = {
 
 @options_from(BakeJob, after="config")
 def bake(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder of the bank")],
+    out: Annotated[
+        str, typer.Argument(metavar="OUT", help="folder or URL of the bank")
+    ],
     config: Annotated[
         Path | None,
         typer.Option(
@@ -73,8 +75,8 @@ def bake(
     ] = False,
     **settings: Any,
 ) -> None:
-    """Bakes a bank: a folder of HDF5 files with scans for training. Run it again to resume an
-    interrupted bake.
+    """Bakes a bank: a folder of HDF5 files with scans for training, on a disk or in an object
+    store. Run it again to resume an interrupted bake.
 
     The same settings give the same bytes with every engine, with or without interruptions.
 
@@ -82,6 +84,7 @@ def bake(
     Examples:
       lidar-synth bake bank --count 20000 --seed 1 --engine processes
       lidar-synth bake bank --config bake_town --dry-run
+      lidar-synth bake s3://bucket/bank --count 1000000 --shard-index auto --num-shards 64
       lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
       lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
@@ -152,7 +155,7 @@ def _share(index: str, number: int | None) -> "Share":
     return Share(int(index), int(size))
 
 
-def _report_unboxed(bank: Path, scans: int = 8) -> None:
+def _report_unboxed(bank: str, scans: int = 8) -> None:
     """Print how many objects of the first scans have no box, for those who train a detector."""
     from lidar_synth.bank import Bank
     from lidar_synth.labels.edit import measure

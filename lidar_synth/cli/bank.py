@@ -5,7 +5,9 @@ from typing import Annotated
 
 import typer
 
-BankFolder = Annotated[Path, typer.Argument(metavar="BANK", help="folder of a bank")]
+BankFolder = Annotated[
+    str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
+]
 Model = Annotated[
     str | None, typer.Option(help="checkpoint file, if it is not a shipped model")
 ]
@@ -93,9 +95,7 @@ def repair(bank: BankFolder, model: Model = None) -> None:
 
 
 def info(
-    bank: Annotated[
-        str, typer.Argument(metavar="BANK", help="folder or URL of a bank")
-    ],
+    bank: BankFolder,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Describes a bank: scans, sensor, model, settings, licences.
@@ -121,7 +121,7 @@ def info(
 def merge(
     out: Out,
     banks: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(metavar="BANK...", help="banks with the same sensor and fields"),
     ],
 ) -> None:
@@ -130,7 +130,7 @@ def merge(
 
     \b
     Example:
-      lidar-synth bank merge all part-0 part-1 part-2
+      lidar-synth bank merge all part-0 part-1 s3://bucket/part-2
     """
     from lidar_synth.bake.edit import merge as run
     from lidar_synth.bank import Bank

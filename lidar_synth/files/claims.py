@@ -31,14 +31,20 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     if not path.is_file():
         # Another process may create it at the same time.
         write_file(path, json.dumps(wanted, indent=1).encode(), overwrite=False)
+    compare(read_text(path), wanted, path.parent, path.name)
+
+
+def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) -> None:
+    """Refuse a folder, or a URL, whose file ``name`` records other settings; raises as
+    ``claim``."""
     existing = parse_json(
-        read_text(path),
-        f"{path}, which is damaged,",
+        text,
+        f"{folder}/{name}, which is damaged,",
         "the settings that this package wrote",
     )
     if not isinstance(existing, dict):
         raise DataError(
-            f"{path} is damaged (it holds {type(existing).__name__})",
+            f"{folder}/{name} is damaged (it holds {type(existing).__name__})",
             hint="Choose another output folder.",
         )
     other = {
@@ -48,7 +54,7 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
     }
     if other:
         raise ConfigError(
-            f"{path.parent} was filled with {other}",
+            f"{folder} was filled with {other}",
             f"{ {name: wanted[name] for name in other} }",
             "Use the same options to resume, or choose another folder.",
         )

@@ -204,6 +204,16 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def sync_folder(path: Path) -> None:
+    """Sync a folder's entries to the disk, where the system supports it."""
+    with suppress(OSError):  # Windows cannot open folders
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
 def remove_file(path: Path) -> None:
     """Remove a file, if it is there.
 

@@ -21,6 +21,9 @@ if sys.platform == "win32":
     def _take(file: BinaryIO) -> bool:
         return True
 
+    def _wait(file: BinaryIO, until_free: bool) -> None:
+        pass
+
 else:
     import fcntl
 
@@ -41,6 +44,11 @@ else:
             return not isinstance(error, BlockingIOError)
         return True
 
+    def _wait(file: BinaryIO, until_free: bool) -> None:
+        """Take the lock after waiting, or release it."""
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX if until_free else fcntl.LOCK_UN)
+
 
 @contextmanager
 def one_writer(path: Path) -> Iterator[bool]:
@@ -51,6 +59,22 @@ def one_writer(path: Path) -> Iterator[bool]:
     """
     with path.open("ab") as file:
         yield _take(file)
+
+
+@contextmanager
+def lock_alone(path: Path) -> Iterator[None]:
+    """Make a file and lock it until the block ends; wait while another process or thread holds the
+    lock.
+
+    Raises:
+        OSError: if the file cannot be made.
+    """
+    with path.open("ab") as file:
+        _wait(file, until_free=True)
+        try:
+            yield
+        finally:  # not only by closing: a process that was forked meanwhile has the file open too
+            _wait(file, until_free=False)
 
 
 @contextmanager

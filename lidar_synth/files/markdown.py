@@ -2,6 +2,7 @@
 
 import html
 import re
+from collections.abc import Mapping
 
 
 def escape_markdown(text: object) -> str:
@@ -14,3 +15,14 @@ def escape_markdown(text: object) -> str:
     """
     plain = " ".join(html.escape(str(text), quote=False).split())
     return re.sub(r"([\\|`\[\]])", r"\\\1", plain)
+
+
+def list_facts(facts: Mapping[str, object]) -> list[str]:
+    """The lines of a table with a row for each fact.
+
+    Example:
+        >>> list_facts({"scans": 8})
+        ['| | |', '|---|---|', '| scans | 8 |']
+    """
+    rows = [f"| {name} | {escape_markdown(value)} |" for name, value in facts.items()]
+    return ["| | |", "|---|---|", *rows]

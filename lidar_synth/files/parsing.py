@@ -163,7 +163,9 @@ def parse_yaml(text: str, where: str) -> Any:
         ValueError,
         OverflowError,
     ) as error:  # a date such as 2001-99-99 is a ValueError
-        raise ConfigError(f"{where} is not YAML ({error})") from error
+        raise ConfigError(
+            f"{where} is not YAML ({' '.join(str(error).split())})"
+        ) from error
     if fault:
         raise ConfigError(f"{where} is not YAML of plain values: it has {fault}")
     return values

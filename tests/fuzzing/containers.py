@@ -2,6 +2,7 @@
 (``.tar``, ``.tgz``). A member is mutated as a file of its own suffix."""
 
 import gzip
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -299,3 +300,15 @@ def gzipped_zeros(megabytes: int) -> bytes:
     packer = zlib.compressobj(9, wbits=31)
     body = b"".join(packer.compress(bytes(1_000_000)) for _ in range(megabytes))
     return body + packer.compress(bytes(-megabytes * 1_000_000 % 512)) + packer.flush()
+
+
+@mutates(".mcap")
+def change_record(content: bytes, rng: Random) -> bytes:
+    """The length of a record of an MCAP file, or a number at its beginning, is another one."""
+    starts = [8]
+    while starts[-1] + 9 <= len(content):
+        [length] = struct.unpack_from("<Q", content, starts[-1] + 1)
+        starts.append(starts[-1] + 9 + length)
+    at = rng.choice(starts[:-1] or [0]) + 1 + rng.choice((0, 8, 16, 24, 32))
+    number = rng.choice(INTEGERS) % 2**64
+    return content[:at] + number.to_bytes(8, "little") + content[at + 8 :]

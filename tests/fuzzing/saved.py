@@ -261,7 +261,7 @@ def mend_states(root: Path) -> None:
     for path in (
         root / "outcome.json",
         root / "cache" / "cache.json",
-        root / "cache" / "latents-abc.json",
+        root / "cache" / "latents-abc" / "cache.json",
     ):
         values = json.loads(path.read_text())
         values.pop("checksum", None)

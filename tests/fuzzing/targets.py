@@ -20,6 +20,7 @@ import yaml
 from banks import SENSOR, some_image, write_bank
 from layouts import some_camera, some_scan, write_kitti_raw, write_nuscenes
 from lidar_synth.integrations.mixture import mix_for_trainer, read_settings
+from mcap_files import cloud, record
 from ouster_files import ouster_metadata
 from pandaset_files import write_pandaset
 
@@ -148,6 +149,16 @@ def make_ply(root: Path) -> None:
     (root / "big.ply").write_bytes(
         (head.format("binary_big_endian") + faces).encode() + body
     )
+
+
+def make_mcap(root: Path) -> None:
+    """As the package writes it; and plain, without checksums, so that changes reach the points."""
+    from mcap.writer import CompressionType
+
+    write("mcap", root)
+    messages = [("/points", number, cloud(number, 4, 9)) for number in range(2)]
+    plain = CompressionType.NONE
+    record(root / "driver.mcap", messages, compression=plain, enable_crcs=False)
 
 
 def make_npy(root: Path) -> None:
@@ -394,6 +405,7 @@ TARGETS: dict[str, Target] = {
     "range_npy": Target(make_range_arrays, partial(read, "range", sensor=SENSOR)),
     "png": Target(partial(write, "png"), partial(read, "png")),
     "webdataset": Target(partial(write, "webdataset"), partial(read, "webdataset")),
+    "mcap": Target(make_mcap, partial(read, "mcap")),
     "semantic_kitti": Target(
         partial(write, "semantic_kitti"), partial(read, "semantic_kitti")
     ),

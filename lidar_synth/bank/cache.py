@@ -1,0 +1,376 @@
+"""Copies of a bank's shards on this machine, for a bank at a URL.
+
+A copy is a whole shard, named by its SHA-256, which is checked. One process at a time copies, so
+that all processes of a machine together fetch each shard once, and the limit holds.
+
+What a process and its workers read next, ``MixedScans`` announces for each epoch: a *plan*, a file
+that is locked as long as its process lives. A table has the time when each shard was last read.
+From both every process knows which copies are behind all plans. These make room for what is
+planned, the one that was read last first: plans that go through a bank in the same order come back
+to it last. A shard that is read now also takes the place of one that is not needed until it is
+done. Where there is no room, or only for a shard of which most scans are not planned, scans are
+read one by one from the URL.
+"""
+
+import json
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from math import inf
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.bank.folder import LocalFolder, copy_shard
+from lidar_synth.bank.index import Entry, Index
+from lidar_synth.bank.storage import LocalFile, RemoteFile, Storage
+from lidar_synth.errors import ConfigError, FileError, LidarSynthError
+from lidar_synth.files.disk import remove_file, unwritable
+from lidar_synth.files.lock import lock_alone, one_writer, try_lock
+
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+_PAUSE = 0.2  # seconds until a plan looks for room again
+
+
+class Use(NamedTuple):
+    """What a plan reads of a shard: the positions of the first and last scan, and their number."""
+
+    first: int
+    last: int
+    scans: int
+
+
+class ShardCache:
+    """The copies of a bank's shards in a folder.
+
+    Args:
+        folder: the folder; it is made.
+        limit: most bytes of all copies in it, see ``read_size``; None = no limit.
+        url: URL of the bank.
+        index: its index.
+
+    Raises:
+        ConfigError: if a shard is larger than the limit.
+        FileError: if the folder cannot be written, or its disk has no room.
+    """
+
+    def __init__(
+        self, folder: Path, limit: int | str | None, url: str, index: Index
+    ) -> None:
+        self.folder = folder
+        self.url = url
+        self.index = index
+        self._limit = inf if limit is None else read_size(limit)
+        self._table = folder / f"{index.checksum[:16]}.times"
+        self._plan: _Plan | None = None
+        copies = [self._path(entry).name for entry in index.shards]
+        self._numbers = {name: number for number, name in enumerate(copies)}
+        largest = max(entry.bytes for entry in index.shards)
+        if self._limit < largest:
+            raise ConfigError(
+                f"limit={limit!r} for a bank with a shard of {largest / 1e6:.3g} MB",
+                "room for several of its shards",
+            )
+        with _writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            with self._table.open("ab") as file:
+                file.truncate(8 * len(index.shards))
+            self._times = self._open_table()
+            self._check_space()
+
+    def open(self, number: int) -> Storage:
+        """Open the copy of a shard, which is fetched if there is room, or else its original.
+
+        Raises:
+            FileError: if it cannot be fetched or written.
+            DataError: if it is not the shard of the index.
+        """
+        entry = self.index.shards[number]
+        self.fetch(number, now=True)
+        with suppress(FileError):  # there is no copy, or another process has dropped it
+            return _Copy(self._path(entry))
+        return _Original(f"{self.url}/{entry.file}", entry.bytes, self._path(entry))
+
+    def note(self, number: int) -> None:
+        """Note that a shard is read now."""
+        self._times[number] = time.time_ns()
+
+    def expect(self, numbers: Sequence[int]) -> None:
+        """Announce the scans that this process and its workers will read next, in order. Their
+        shards are fetched ahead from the first read on; before, another call may correct it.
+
+        Raises:
+            FileError: if the folder cannot be written.
+        """
+        self.close()
+        shards = np.searchsorted(self.index.ends, numbers, side="right")
+        with _writing(self.folder):
+            self._plan = _Plan(self, shards)
+        self._plan.start()
+
+    def fetch(self, number: int, now: bool = False) -> bool:
+        """Copy a shard, unless there is a copy or no room; waits while others copy. Raises as
+        ``open``.
+
+        Args:
+            number: number of the shard.
+            now: whether it is read now.
+
+        Returns:
+            False if it is planned, with most of its scans, and there is no room yet.
+        """
+        entry = self.index.shards[number]
+        if self._has(entry):
+            return True
+        with self._alone():
+            if self._has(entry):
+                return True
+            name = self._path(entry).name
+            needed = self._needed()
+            use = needed.get(name)
+            if use is None or 2 * use.scans < entry.kept:
+                use = None  # the shard is not worth what it would displace
+            spare = self._spare(needed, use, now) if use else []
+            if not self._make_room(entry.bytes, spare):
+                return use is None
+            files = LocalFolder(self.folder)
+            with files.making(name) as part:
+                copy_shard(self.url, entry, part)
+                files.put(part, name)
+        return True
+
+    def close(self) -> None:
+        """End the plan of this process."""
+        if self._plan is not None and self._plan.is_alive():  # not in a forked process
+            self._plan.ended.set()
+
+    def clear(self) -> None:
+        """Remove the copies of this bank, and the folder if nothing else is in it.
+
+        Raises:
+            FileError: if a file cannot be removed.
+        """
+        self.close()
+        if self._plan is not None:
+            self._plan.join()
+        with self._alone():
+            self._remove_parts()
+            self._needed()  # removes plans of dead processes
+            for path in (*map(self._path, self.index.shards), self._table):
+                remove_file(path)
+            if {path.name for path in self.folder.iterdir()} == {"lock"}:
+                remove_file(self.folder / "lock")
+        with suppress(OSError):
+            self.folder.rmdir()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_plan": None, "_times": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state
+        with _writing(self.folder):
+            self._times = self._open_table()
+
+    def _open_table(self) -> NDArray[np.int64]:
+        """When each shard was last read, in ns; shared by all processes. It is not opened later,
+        by a thread: a process that is forked meanwhile would wait for that thread."""
+        return np.memmap(self._table, np.int64, "r+")
+
+    def _path(self, entry: Entry) -> Path:
+        return self.folder / f"{entry.sha256}.h5"
+
+    def _has(self, entry: Entry) -> bool:
+        with suppress(OSError):
+            return self._path(entry).stat().st_size == entry.bytes
+        return False
+
+    def _check_space(self) -> None:
+        held = sum(entry.bytes for entry in self.index.shards if self._has(entry))
+        need = min(self._limit, self.index.size) - held
+        free = shutil.disk_usage(self.folder).free
+        if free < need:
+            raise FileError(
+                f"{self.folder} has {free / 1e9:.3g} GB free",
+                f"{need / 1e9:.3g} GB for copies of {self.url}",
+                "Free some space, or give a smaller limit.",
+            )
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        with ExitStack() as held:
+            with _writing(self.folder):
+                held.enter_context(lock_alone(self.folder / "lock"))
+            yield
+
+    def _remove_parts(self) -> None:
+        """Remove what killed processes left; only the one that holds the lock copies."""
+        for part in self.folder.glob(".*.part"):
+            remove_file(part)
+
+    def _spare(self, needed: dict[str, Use], use: Use, now: bool) -> list[str]:
+        """The copies that may be dropped for a planned shard, in this order: those that are not
+        needed; for one that is read now also those that are not needed until it is done."""
+        held = [path.name for path in self.folder.glob("*.h5")]
+        spare = sorted((n for n in held if n not in needed), key=self._last_read)
+        if now:
+            later = [n for n in held if n in needed and needed[n].first > use.last]
+            spare += sorted(later, key=lambda name: -needed[name].first)
+        return spare
+
+    def _make_room(self, size: int, spare: list[str]) -> bool:
+        """Drop copies until there is room for one more."""
+        self._remove_parts()
+        sizes = {path.name: path.stat().st_size for path in self.folder.glob("*.h5")}
+        room = self._limit - sum(sizes.values()) - size
+        for name in spare:
+            if room >= 0:
+                break
+            remove_file(self.folder / name)
+            room += sizes[name]
+        return room >= 0
+
+    def _last_read(self, name: str) -> float:
+        """A key by which copies come first that belong to no shard of this bank, then those that
+        were read last."""
+        number = self._numbers.get(name)
+        return -inf if number is None else -float(self._times[number])
+
+    def _needed(self) -> dict[str, Use]:
+        """The copies that plans of living processes still need."""
+        needed: dict[str, Use] = {}
+        for path in self.folder.glob("*.plan"):
+            with try_lock(path) as dead:
+                if dead:
+                    remove_file(path)
+                else:
+                    for name, use in _read_plan(path).items():
+                        other = needed.get(name, Use(use.first, use.last, 0))
+                        needed[name] = Use(
+                            min(use.first, other.first),
+                            max(use.last, other.last),
+                            use.scans + other.scans,
+                        )
+        return needed
+
+
+class _Plan(Thread):
+    """The shards that a process and its workers read next, published until ``ended``; a thread
+    fetches them ahead.
+
+    Args:
+        cache: the cache.
+        shards: (N,) the shard of each scan, in order.
+
+    Raises:
+        OSError: if it cannot be published.
+    """
+
+    def __init__(self, cache: ShardCache, shards: NDArray[np.intp]) -> None:
+        super().__init__(daemon=True)
+        self.ended = Event()
+        self._cache = cache
+        self._since = time.time_ns()
+        self._held = ExitStack()
+        found, first, scans = np.unique(shards, return_index=True, return_counts=True)
+        last = len(shards) - 1 - np.unique(shards[::-1], return_index=True)[1]
+        order = np.argsort(first)
+        self._order: list[int] = found[order].tolist()
+        names = [cache._path(cache.index.shards[n]).name for n in self._order]
+        values = {
+            "times": cache._table.name,
+            "since": self._since,
+            "names": names,
+            "shards": self._order,
+            "uses": np.transpose((first, last, scans))[order].tolist(),
+        }
+        self._path = cache.folder / f"{secrets.token_hex(8)}.plan"
+        new = self._path.with_suffix(".new")
+        self._held.enter_context(one_writer(new))
+        new.write_text(json.dumps(values))
+        new.replace(self._path)
+
+    def run(self) -> None:
+        with self._held:
+            # Whoever reads a shard that cannot be fetched meets the same error.
+            with suppress(LidarSynthError, RuntimeError):
+                self._fetch_ahead()
+            self.ended.wait()
+            self._path.unlink(missing_ok=True)
+
+    def _fetch_ahead(self) -> None:
+        while self._cache._times.max() < self._since:
+            if self.ended.wait(_PAUSE / 10):
+                return
+        for number in self._order:
+            while not self.ended.is_set() and not self._cache.fetch(number):
+                self.ended.wait(_PAUSE)
+
+
+def _read_plan(path: Path) -> dict[str, Use]:
+    """The copies that a plan still needs: those whose last scan comes after the first one of the
+    last shard up to which all have been read."""
+    with suppress(OSError):  # ended meanwhile
+        plan = json.loads(path.read_text())
+        times = np.fromfile(path.with_name(plan["times"]), np.int64)
+        unread = np.append(times[plan["shards"]] < plan["since"], True)
+        uses = [Use(*use) for use in plan["uses"]]
+        begun = int(unread.argmax()) - 1
+        reached = uses[begun].first if begun >= 0 else 0
+        named = zip(plan["names"], uses, strict=True)
+        return {name: use for name, use in named if use.last >= reached}
+    return {}
+
+
+class _Copy(LocalFile):
+    """A copy of a shard."""
+
+    def reopen(self) -> bool:
+        with suppress(FileError):  # it has been dropped
+            return super().reopen()
+        return False
+
+
+class _Original(RemoteFile):
+    """A shard at a URL, until there is a copy."""
+
+    def __init__(self, url: str, size: int, copy: Path) -> None:
+        super().__init__(url, size)
+        self._copy = copy
+
+    def reopen(self) -> bool:
+        return not self._copy.exists()
+
+
+def read_size(given: int | str) -> int:
+    """A number of bytes: ``"200GB"``, ``"1.5 TB"``, or a whole number.
+
+    Raises:
+        ConfigError: on anything else.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kMGT]?)B", str(given))
+    if isinstance(given, int) and not isinstance(given, bool) and given > 0:
+        return given
+    if match is None:
+        raise ConfigError(f"limit={given!r}", 'a size such as "200GB", or bytes')
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Name the folder in errors of the system.
+
+    Raises:
+        FileError: if it cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, LidarSynthError):
+            raise
+        raise unwritable(folder, error) from error
