@@ -27,6 +27,7 @@ WRITTEN_AS = {
     "npz": "folder",
     "png": "png",
     "webdataset": "webdataset",
+    "mcap": "mcap",
 }
 """Which reader reads what each writer writes."""
 
@@ -197,6 +198,7 @@ MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "range": lambda root: write_all("range", root, [some_scan(i) for i in range(3)]),
     "png": lambda root: write_all("png", root, [some_scan(i) for i in range(3)]),
     "webdataset": write_tars,
+    "mcap": lambda root: write_all("mcap", root, [some_scan(i) for i in range(3)]),
     "nuscenes": write_nuscenes,
     "pandaset": write_pandaset,
     "kitti_raw": write_kitti_raw,

@@ -286,7 +286,7 @@ def test_cells_without_a_return_may_hold_anything(tmp_path: Path) -> None:
         RangeImages(tmp_path, sensor=sensor).image(0)
 
 
-@pytest.mark.parametrize("kind", ["npz", "npy", "pcd", "ply", "png"])
+@pytest.mark.parametrize("kind", ["npz", "npy", "pcd", "ply", "png", "mcap"])
 def test_damaged_files_with_a_header(tmp_path: Path, kind: str) -> None:
     scan = some_scan()
     if kind == "npy":

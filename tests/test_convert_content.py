@@ -188,7 +188,7 @@ def test_five_floats_per_point(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("to", ["kitti", "npz", "pcd", "ply"])
+@pytest.mark.parametrize("to", ["kitti", "npz", "pcd", "ply", "mcap"])
 def test_suffixes_in_capitals(tmp_path: Path, to: str) -> None:
     paths = write_all(to, tmp_path / "in", [some_scan(i) for i in range(3)])
     expected = open_scans(tmp_path / "in")[0]

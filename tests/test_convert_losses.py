@@ -60,7 +60,7 @@ def test_scans_without_labels_gain_none(to: str, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("to", ["pcd", "ply"])
+@pytest.mark.parametrize("to", ["pcd", "ply", "mcap"])
 def test_boxes_stand_beside_clouds(to: str, tmp_path: Path) -> None:
     scan = replace(
         some_scan(),

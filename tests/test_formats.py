@@ -45,7 +45,7 @@ needs_open3d = pytest.mark.skipif(
 POINT_LAYOUTS = [name for name in WRITERS if name not in ("range", "png")]
 
 
-KEEP_FIELDS = ["kitti", "semantic_kitti", "pcd", "ply", "npz", "webdataset"]
+KEEP_FIELDS = ["kitti", "semantic_kitti", "pcd", "ply", "npz", "webdataset", "mcap"]
 """Formats that keep every label and instance bit for bit."""
 
 
@@ -78,7 +78,7 @@ def test_labels_are_read_back_bit_for_bit(tmp_path: Path, to: str) -> None:
         assert getattr(read, name).dtype == getattr(scan, name).dtype
 
 
-@pytest.mark.parametrize("to", ["pcd", "ply", "npz", "webdataset"])
+@pytest.mark.parametrize("to", ["pcd", "ply", "npz", "webdataset", "mcap"])
 def test_every_field_of_a_point_is_read_back(tmp_path: Path, to: str) -> None:
     scan = some_scan()
     scan.ring = np.arange(len(scan), dtype=np.int16) % 64
@@ -484,6 +484,7 @@ def test_names_are_kept_where_a_layout_can_keep_them(tmp_path: Path) -> None:
         "npz": f"{frame}.npz",
         "png": f"range/{frame.replace('/', '_')}.png",
         "webdataset": f".lidar_synth/000000007/{frame}.tar",
+        "mcap": f"{frame}.mcap",
     }
     assert WRITERS["kitti360"](tmp_path).path(7, "03/000042") == WRITERS["kitti360"](
         tmp_path

@@ -107,7 +107,7 @@ def test_a_bank_and_a_tar_with_names_that_lead_out(
             source, WRITERS[to](out / str(number)), on_bad="skip", progress=False
         )
         assert (report.written == 0) == (
-            to in ("kitti", "npz", "range", "pcd", "ply", "png")
+            to in ("kitti", "npz", "range", "pcd", "ply", "png", "mcap")
         ), report
     assert everything(tmp_path, out) == before
 
@@ -159,7 +159,10 @@ COLLISIONS = {
     ],
     "kitti360": [("00/000001", "00/1"), ("other", "00/0")],
     "kitti_object": [("training/1", "training/000001"), ("other", "training/0")],
-} | {to: [("x", "x")] for to in ("kitti", "npz", "range", "pcd", "ply", "webdataset")}
+} | {
+    to: [("x", "x")]
+    for to in ("kitti", "npz", "range", "pcd", "ply", "webdataset", "mcap")
+}
 
 
 @pytest.mark.parametrize("to", WRITERS)

@@ -17,7 +17,7 @@ from lidar_synth.formats.kitti360_boxes import write_boxes
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import CAUSES, Boxes, Scan
 
-LOSSLESS = ("npz", "pcd", "ply", "webdataset")
+LOSSLESS = ("npz", "pcd", "ply", "webdataset", "mcap")
 """Formats that keep every field of a point."""
 
 WRONG: dict[str, list[Any]] = {

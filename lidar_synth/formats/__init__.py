@@ -25,6 +25,7 @@ from lidar_synth.formats.folder import (
 from lidar_synth.formats.kitti360 import KITTI360, KITTI360Writer
 from lidar_synth.formats.kitti_object import KITTIObject, KITTIObjectWriter
 from lidar_synth.formats.kitti_raw import KITTIRaw
+from lidar_synth.formats.mcap import MCAP, MCAPWriter
 from lidar_synth.formats.nuscenes import NuScenes
 from lidar_synth.formats.pandaset import PandaSet
 from lidar_synth.formats.png import PNGWriter, RangePNG
@@ -37,6 +38,7 @@ from lidar_synth.geometry.sensor import Sensor
 
 __all__ = [
     "KITTI360",
+    "MCAP",
     "READERS",
     "WRITERS",
     "BankScans",
@@ -66,6 +68,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "kitti_raw": KITTIRaw,
     "bank": BankScans,
     "webdataset": WebDataset,
+    "mcap": MCAP,
     "png": RangePNG,
     "range": RangeImages,
     "folder": Folder,
@@ -83,6 +86,7 @@ WRITERS: dict[str, type[Writer]] = {
     "npz": NPZWriter,
     "png": PNGWriter,
     "webdataset": WebDatasetWriter,
+    "mcap": MCAPWriter,
 }
 """{format: writer}."""
 

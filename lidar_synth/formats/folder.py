@@ -141,19 +141,40 @@ class Folder(ScanFiles):
             )
             scan = said.origin.apply(scan) if said else drop_empty_firings(scan)
             scan.boxes = read_boxes(path)
-            is_log = said is None and scan.ring is not None
-            if (
-                is_log
-                and self._reflectance_max is None
-                and np.nanmax(scan.reflectance, initial=0) > 1
-            ):
-                scale = LOG_REFLECTANCE
-            check_scan(scan, str(path), scale)
-            if is_log and self._given is not None:
-                scan.ring = rows_of_rings(scan)
+            given = self._given is not None
+            return as_unit_reflectance(
+                scan, said is not None, str(path), self._reflectance_max, given
+            )
         if scale != 1:
             scan.reflectance = scan.reflectance / np.float32(scale)
         return scan
+
+
+def as_unit_reflectance(
+    scan: Scan, described: bool, where: str, most: float | None, given: bool
+) -> Scan:
+    """A checked scan of a cloud with reflectance from 0 to 1, and with the sensor's rings.
+
+    Args:
+        scan: as the file has it.
+        described: whether this package wrote it; other clouds with rings are logs of drivers.
+        where: of the scan, for messages.
+        most: maximum of the reflectance in the file, if it is known.
+        given: whether the user named the sensor.
+
+    Raises:
+        DataError: on a scan with invalid values.
+    """
+    is_log = not described and scan.ring is not None
+    scale = most or 1.0
+    if is_log and most is None and np.nanmax(scan.reflectance, initial=0) > 1:
+        scale = LOG_REFLECTANCE
+    check_scan(scan, where, scale)
+    if is_log and given:
+        scan.ring = rows_of_rings(scan)
+    if scale != 1:
+        scan.reflectance = scan.reflectance / np.float32(scale)
+    return scan
 
 
 def read_boxes(path: Path) -> Boxes | None:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from lidar_synth.errors import ConfigError, DataError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError, suggest
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
 from lidar_synth.formats.points import bad_points_kept, drop_bad_points
@@ -78,7 +78,8 @@ class ScanFiles(ABC):
         stored: Sensor | None = None,
     ) -> None:
         if on_bad not in get_args(OnBad):
-            raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}")
+            hint = suggest(on_bad, get_args(OnBad))
+            raise ConfigError(f"on_bad={on_bad!r}", f"one of {get_args(OnBad)}", hint)
         if not ids:
             raise DataError(
                 f"{root} holds no scan",

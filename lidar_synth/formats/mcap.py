@@ -1,0 +1,348 @@
+"""MCAP files of ROS 2 (https://mcap.dev/spec): each message ``sensor_msgs/msg/PointCloud2`` is a
+scan. Extra ``mcap``.
+
+The package reads what drivers record, with the fields that ``cloud.py`` names, chunk by chunk: a
+scan is found by the file's index. It writes one file for each scan, ``NAME.mcap``, with a message
+on the topic ``/points``, all fields of the scan (lossless), its description in the metadata record
+``lidar_synth``, and its boxes in ``NAME.boxes.json``. ``mcap merge`` joins such files.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
+from lidar_synth.files.disk import open_file, write_file
+from lidar_synth.formats.cloud import WANTED, Field, check_fields, to_arrays, to_records
+from lidar_synth.formats.description import Description, from_comments, to_comments
+from lidar_synth.formats.folder import (
+    as_unit_reflectance,
+    drop_empty_firings,
+    read_boxes,
+    scan_paths,
+    write_boxes,
+)
+from lidar_synth.formats.source import OnBad, ScanFiles
+from lidar_synth.formats.writer import FileWriter
+from lidar_synth.geometry.scan import POINT_FIELDS, Scan
+from lidar_synth.geometry.sensor import Sensor
+
+SUFFIX = ".mcap"
+TOPIC = "/points"
+MESSAGE = "sensor_msgs/msg/PointCloud2"
+METADATA = "lidar_synth"
+"""Name of the record with the description of a file's scan."""
+
+LARGEST = 1 << 30
+"""Most bytes of a record, and of a chunk when it is decompressed."""
+
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Types of ``sensor_msgs/msg/PointField``."""
+
+_RULE = f"\n{80 * '='}\nMSG: "
+DEFINITION = _RULE.join(
+    (
+        "std_msgs/Header header\nuint32 height\nuint32 width\n"
+        "sensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\n"
+        "uint32 row_step\nuint8[] data\nbool is_dense",
+        "std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id",
+        "builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
+        "sensor_msgs/PointField\nstring name\nuint32 offset\nuint8 datatype\nuint32 count",
+    )
+)
+"""ROS 2's definition of the message."""
+
+_CHUNK = 6
+_MESSAGE = 5
+_INDEX = 7
+# Operation codes of records, each of which is followed by a length of 8 bytes.
+
+
+class MessagePlace(NamedTuple):
+    """Where a message is: in the chunk at byte ``chunk`` of a file, ``offset`` bytes from the
+    beginning of the chunk's records."""
+
+    path: Path
+    chunk: int
+    offset: int
+
+
+class MCAP(ScanFiles):
+    """A folder of .mcap files with PointCloud2 messages of ROS 2, or one such file.
+
+    Args:
+        root: the folder or the file.
+        sensor: the sensor that recorded the scans; by default the one that the files name
+            (written by this package), or ``scans.json`` beside them, or else ``hdl64e_kitti``.
+        topic: of the messages; it is needed where a file has several.
+        on_bad: see ``ScanFiles``.
+
+    Raises:
+        FileError: if the path does not exist.
+        ConfigError: if a file has several topics with point clouds.
+        DataError: if there is no scan, or a file is damaged or has no index.
+        LibraryError: without the extra ``mcap``.
+    """
+
+    plain = True
+
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """See ``ScanFiles.recognises``."""
+        return any(path.suffix.lower() == SUFFIX for path in (root, *root.rglob("*")))
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        sensor: str | Path | Sensor | None = None,
+        topic: str | None = None,
+        on_bad: OnBad = "error",
+    ) -> None:
+        root = Path(root)
+        base, paths = scan_paths(root, (SUFFIX,))
+        self._places: list[MessagePlace] = []
+        self._said: dict[Path, Description | None] = {}
+        ids = []
+        for path in paths:
+            places, self._said[path] = _survey(path, topic)
+            name = path.relative_to(base).with_suffix("").as_posix()
+            numbers = range(len(places))
+            ids += [name] if len(places) == 1 else [f"{name}/{n:06d}" for n in numbers]
+            self._places += places
+        said = self._said[paths[0]]
+        stored = None if said is None else said.sensor
+        super().__init__(root, ids, sensor, on_bad, stored=stored)
+
+    def read(self, index: int) -> Scan:
+        place = self._places[index]
+        said = self._said[place.path]
+        sensor = self._given or (said and said.sensor) or self.sensor
+        arrays: dict[str, Any] = _points(
+            _message(place), f"{place.path}: {self.ids[index]}"
+        )
+        scan = Scan(sensor=sensor, **arrays, id=self.ids[index])
+        scan = drop_empty_firings(scan) if said is None else said.origin.apply(scan)
+        scan.boxes = read_boxes(place.path)
+        given = self._given is not None
+        return as_unit_reflectance(scan, said is not None, str(place.path), None, given)
+
+
+class MCAPWriter(FileWriter):
+    """Writes ``NAME.mcap`` with the scan's points and fields, and its boxes to
+    ``NAME.boxes.json``, without pose."""
+
+    suffix = SUFFIX
+    keeps = frozenset({*POINT_FIELDS, "boxes"})
+
+    def _write_file(self, path: Path, scan: Scan) -> None:
+        content = _encode(scan)
+        write_boxes(path, scan.boxes)
+        write_file(path, content)
+
+
+def _encode(scan: Scan) -> bytes:
+    """The file of a scan."""
+    with _library():
+        from mcap_ros2.writer import Writer
+    records = to_records(scan)
+    kinds = {np.dtype(f"<{name}"): number for number, name in TYPES.items()}
+    assert records.dtype.fields is not None
+    fields = [
+        {"name": name, "offset": offset, "datatype": kinds[dtype], "count": 1}
+        for name, (dtype, offset, *_) in records.dtype.fields.items()
+    ]
+    message = {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "lidar"},
+        "height": 1,
+        "width": len(records),
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": records.itemsize,
+        "row_step": records.nbytes,
+        "data": records.tobytes(),
+        "is_dense": True,
+    }
+    out = BytesIO()
+    with Writer(out) as file:
+        schema = file.register_msgdef(MESSAGE, DEFINITION)
+        file.write_message(TOPIC, schema, message, log_time=0)
+        text = "\n".join(to_comments(scan))
+        file.add_metadata(METADATA, {"description": text})
+    return out.getvalue()
+
+
+def _survey(
+    path: Path, topic: str | None
+) -> tuple[list[MessagePlace], Description | None]:
+    """The point clouds of a file in the order of their times, and what it says about them."""
+    with _opened(path) as (file, reader):
+        summary = reader.get_summary()
+        if summary is None or (summary.channels and not summary.chunk_indexes):
+            raise DataError(
+                f"{path} has no index of its messages",
+                "a file that was closed",
+                f"mcap recover {path} makes one.",
+            )
+        topics = {
+            number: channel.topic
+            for number, channel in summary.channels.items()
+            if summary.schemas[channel.schema_id].name == MESSAGE
+            and topic in (None, channel.topic)
+        }
+        if len(set(topics.values())) > 1:
+            raise ConfigError(
+                f"{path} has point clouds on {', '.join(sorted(topics.values()))}",
+                "one topic",
+                "lidar_synth.formats.MCAP(..., topic=...) reads one of them.",
+            )
+        found = [
+            (time, MessagePlace(path, chunk.chunk_start_offset, offset))
+            for chunk in summary.chunk_indexes
+            for number, start in chunk.message_index_offsets.items()
+            if number in topics
+            for time, offset in _index(file, start)
+        ]
+        said = _description(reader, str(path))
+    return [place for _, place in sorted(found)], said
+
+
+def _index(file: BinaryIO, start: int) -> list[tuple[int, int]]:
+    """Time and offset of each message that an index in a file lists."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import MessageIndex
+
+    stream = ReadDataStream(BytesIO(_record(file, start, _INDEX)))
+    records: list[tuple[int, int]] = MessageIndex.read(stream).records
+    return records
+
+
+def _message(place: MessagePlace) -> Any:
+    """A decoded message."""
+    with _opened(place.path) as (file, _):
+        import zstandard
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk, Message, Schema
+        from mcap.stream_reader import get_chunk_data_stream
+        from mcap_ros2.decoder import DecoderFactory
+
+        content = _record(file, place.chunk, _CHUNK)
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+        declared = [chunk.uncompressed_size]
+        if chunk.compression == "zstd":
+            declared.append(zstandard.frame_content_size(chunk.data))
+        if max(declared) > LARGEST:
+            raise ValueError(f"a chunk of {max(declared)} bytes")
+        stream, _ = get_chunk_data_stream(chunk, validate_crc=True)
+        records = BytesIO(stream.read(chunk.uncompressed_size))
+        content = _record(records, place.offset, _MESSAGE)
+        message = Message.read(ReadDataStream(BytesIO(content)), len(content))
+        schema = Schema(1, DEFINITION.encode(), "ros2msg", MESSAGE)
+        decode = DecoderFactory().decoder_for("cdr", schema)
+        assert decode is not None
+        return decode(message.data)
+
+
+def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a message, named as in ``Scan``.
+
+    Raises:
+        DataError: on fields or sizes that do not fit together.
+    """
+    count = message.width * message.height
+    order = ">" if message.is_bigendian else "<"
+    wanted = [f for f in message.fields if f.name in WANTED and f.datatype in TYPES]
+    fields = [Field(f.name, order + TYPES[f.datatype], f.count) for f in wanted]
+    check_fields(fields, count, where)
+    ends = [f.offset + field.width for f, field in zip(wanted, fields, strict=True)]
+    row = message.width * message.point_step
+    if (
+        max(ends) > message.point_step
+        or row > message.row_step
+        or message.row_step * message.height > len(message.data)
+    ):
+        raise DataError(
+            f"{where} has {len(message.data)} bytes for {count} points",
+            f"{message.height} rows of {message.row_step} bytes, with all fields",
+        )
+    names = [field.name for field in fields]
+    types = [field.type for field in fields]
+    layout: Any = {"names": names, "formats": types, "itemsize": message.point_step}
+    layout["offsets"] = [f.offset for f in wanted]
+    data = np.frombuffer(message.data, np.uint8, message.row_step * message.height)
+    rows = data.reshape(message.height, message.row_step)[:, :row]
+    points = np.frombuffer(rows.tobytes(), np.dtype(layout))
+    if not message.is_dense:  # drivers mark firings without return so
+        points = points[np.isfinite([points[axis] for axis in "xyz"]).all(0)]
+    return to_arrays({name: points[name] for name in names})
+
+
+def _description(reader: Any, where: str) -> Description | None:
+    """What a file of this package says about its scan; None for those of others."""
+    for record in reader.iter_metadata():
+        if record.name == METADATA:
+            text = record.metadata.get("description", "")
+            return from_comments(text.splitlines(), where)
+    return None
+
+
+def _record(file: BinaryIO, start: int, kind: int) -> bytes:
+    """The content of a record of a file or a chunk."""
+    size = file.seek(0, 2)
+    file.seek(start)
+    head = file.read(9)
+    length = int.from_bytes(head[1:], "little")
+    if len(head) < 9 or head[0] != kind or start + 9 + length > size:
+        raise ValueError(f"no record of kind {kind} at byte {start}")
+    return file.read(length)
+
+
+class Bounded:
+    """A file that never reads beyond its end: a false length of a record, which the library
+    believes, would take as much memory."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = file.seek(0, 2)
+        self.seek = file.seek
+        self.tell = file.tell
+        self.seek(0)
+
+    def read(self, size: int) -> bytes:
+        return self._file.read(min(size, max(self._size - self.tell(), 0)))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[BinaryIO, Any]]:
+    """An open file and the library's reader of it; errors of the library as ``DataError``."""
+    with _library():
+        import mcap_ros2.decoder  # noqa: F401 - the extra has both
+        from mcap.reader import SeekingReader
+    with open_file(path) as file:
+        try:
+            bounded: Any = Bounded(file)
+            yield bounded, SeekingReader(bounded, record_size_limit=LARGEST)
+        except LidarSynthError:
+            raise
+        except Exception as error:  # each library has its own classes
+            raise DataError(
+                f"{path} is damaged or no MCAP file ({error!r})", "an intact file"
+            ) from error
+
+
+@contextmanager
+def _library() -> Iterator[None]:
+    """A missing library as an error that says what to install."""
+    try:
+        yield
+    except ImportError as error:
+        raise LibraryError(
+            f"an MCAP file, but a library cannot be imported ({error})",
+            "the extra mcap",
+            "pip install 'lidar_synth[mcap]'",
+        ) from error
