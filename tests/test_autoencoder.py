@@ -31,6 +31,7 @@ from lidar_synth.lab.train import (
     decoding_loss,
     decoding_task,
 )
+from lidar_synth.lab.train.stage import hash_encoder
 
 SENSOR = Sensor("small", 64, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
@@ -214,6 +215,19 @@ def test_latents_that_were_made_before_are_those_that_are_made_on_the_way(
         cache_latents(cache, TENSORS, other, "cpu", folder, "b", progress=False),
         latents,
     )
+
+
+def test_the_name_of_latents_tells_their_encoder_alone() -> None:
+    net = network()
+    before = hash_encoder(net)
+    with torch.no_grad():
+        net.get_parameter("head.weight").add_(1)
+    assert hash_encoder(net) == before
+    with torch.no_grad():
+        net.get_parameter("to_latent.bias").add_(1)
+    changed = hash_encoder(net)
+    net.get_buffer("scale").mul_(2)
+    assert len({before, changed, hash_encoder(net)}) == 3
 
 
 def test_latents_that_are_turned_are_those_of_turned_scans() -> None:

@@ -192,7 +192,7 @@ def test_a_camera_model(
         0, [0], replace(random_scan(SENSOR, 400, 0), image_path=images[0])
     )
     assert np.allclose(scan.points, same.points)
-    with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
+    with pytest.raises(ConfigError, match="roll=True with the condition 'camera'"):
         call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
 
 

@@ -24,7 +24,7 @@ from lidar_synth.generate.conditions import (
     bridge_gaps,
     one_view,
 )
-from lidar_synth.generate.flow.path import guide
+from lidar_synth.generate.flow.guidance import guide
 from lidar_synth.generate.models import NETWORKS, build_network, encoders_of
 from lidar_synth.generate.models.encoders.calibrated_camera import SightEncoder
 from lidar_synth.generate.models.encoders.camera_views import split_views
@@ -110,6 +110,48 @@ def test_labels_of_another_sensor_are_projected_onto_the_grid_of_the_model() -> 
     assert np.array_equal(
         labels, bridge_gaps(project(scan, SENSOR, ["label"]).channels["label"])
     )
+
+
+def test_a_model_of_maps_with_gaps_is_given_the_gaps_of_a_scan() -> None:
+    scan = random_scan(SENSOR, 3000)
+    labels = CONDITIONS["semantic"].read(
+        scan, SENSOR, SENSOR.shape, {"keep_gaps": True}
+    )
+    projected = project(scan, SENSOR, ["label"]).channels["label"]
+    assert np.array_equal(labels, projected)
+    assert not np.array_equal(labels, bridge_gaps(projected))
+
+
+def test_views_are_resized_one_by_one_between_their_corners(tmp_path: Path) -> None:
+    """As LiDM does: bicubic, align_corners, no antialiasing."""
+    path = picture(tmp_path / "a.png", (37, 83))
+    scan = replace(random_scan(SENSOR, 10), image_path=path)
+    options = {"image": [37, 83], "views": 4}
+    resized = CONDITIONS["camera"].read(scan, SENSOR, (3, 10, 4 * 12), options)
+    pixels = np.asarray(Image.open(path)).transpose(2, 0, 1)[:, :, :80]
+    given = pixels.reshape(3, 37, 4, 20)
+    made = resized.reshape(3, 10, 4, 12)
+    corners = np.ix_(range(3), [0, -1], range(4), [0, -1])
+    assert np.array_equal(made[corners], given[corners])
+    rows = np.linspace(0, 36, 10)
+    columns = np.linspace(0, 19, 12)
+    view = 2
+    wanted = sum(
+        cubic(rows[:, None], i)[:, 0, None]
+        * cubic(columns[:, None], j)[:, 0][None]
+        * given[0, np.clip(i, 0, 36), view, np.clip(j, 0, 19)]
+        for i in range(-2, 39)
+        for j in range(-2, 22)
+    )
+    assert np.abs(made[0, :, view] - wanted.clip(0, 255)).max() <= 0.51
+
+
+def cubic(at: NDArray[np.float64], place: int) -> NDArray[np.float64]:
+    """Keys' kernel with a = -0.75, which PyTorch's bicubic interpolation uses."""
+    x = np.abs(at - place)
+    near = 1.25 * x**3 - 2.25 * x**2 + 1
+    far = -0.75 * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
 
 
 @pytest.mark.parametrize("method", ["rescale", "patches"])
@@ -379,8 +421,10 @@ def test_camera_images_are_mirrored_with_the_scan_but_not_rotated(
     assert 0 < mirrored.sum() < 16
     for i, is_mirrored in enumerate(mirrored):
         assert torch.equal(b.cond[i], a.cond[i].flip(-1) if is_mirrored else a.cond[i])
-    with pytest.raises(ConfigError, match="roll with the condition 'camera'"):
+    with pytest.raises(ConfigError, match="roll=True with the condition 'camera'"):
         conditioned_batches(tmp_path, "camera", roll=True)
+    with pytest.raises(ConfigError, match="flip=both"):
+        conditioned_batches(tmp_path, "camera", flip="both")
 
 
 @pytest.mark.parametrize("name", CONDITIONS)

@@ -21,7 +21,22 @@ from lidar_synth.generate.flow.distill import (
 )
 from lidar_synth.generate.flow.path import interpolate, per_sample
 from lidar_synth.generate.flow.solvers import solve, uniform_grid
+from lidar_synth.generate.models import build_network
+from lidar_synth.lab.train.precision import convert_products
 from lidar_synth.noise import gaussian, uniform
+
+NETWORKS: dict[str, dict[str, Any]] = {
+    "hdit": {
+        "resolution": (8, 64),
+        "width": 16,
+        "depths": [1, 1],
+        "heads": [2, 2],
+        "angles": torch.linspace(-1, 1, 1024).view(2, 8, 64),
+    },
+    "unet": {"resolution": (8, 64), "width": 32, "multipliers": [1, 2]},
+    "diffusion_unet": {"resolution": (8, 64), "width": 32, "multipliers": [1, 2]},
+}
+"""Small networks by architecture."""
 
 COUNT = 64
 DATA = MEAN + STD * gaussian(0, range(COUNT), (2, 3), dtype=torch.float64)
@@ -232,3 +247,20 @@ def test_zero_teacher_steps_are_refused(name: str) -> None:
         ConfigError, match="0 steps of the teacher; expected at least 1"
     ):
         STRATEGIES[name](gaussian_velocity, DATA, NOISE, U, grid_of(name), 0, None)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_teacher_in_bfloat16_is_that_of_autocast_to_the_bit(name: str) -> None:
+    torch.manual_seed(0)
+    net = build_network(name, NETWORKS[name]).eval().requires_grad_(False)
+    for weight in net.parameters():
+        if not weight.any():
+            torch.nn.init.normal_(weight, std=0.1)
+    y = torch.randn(2, net.channels, 8, 64)
+    with torch.autocast("cpu", torch.bfloat16):
+        before = net(y, torch.tensor([0.3, 0.6]))
+        convert_products(net)
+        after = net(y, torch.tensor([0.3, 0.6]))
+    held = [w.dtype for w in net.parameters() if w.ndim > 1]
+    assert held.count(torch.bfloat16) > 0.7 * len(held)
+    assert torch.equal(before, after)

@@ -13,10 +13,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lidar_synth.errors import DataError
+from lidar_synth.generate.flow.guidance import autoguide
 from lidar_synth.generate.flow.path import (
     METRICS,
     TIMESTEPS,
-    autoguide,
     flow_matching,
     interpolate,
     logit_normal,

@@ -126,6 +126,16 @@ def test_steps_and_solver_replace_the_checkpoints_own_grid(
             assert torch.allclose(
                 tensor, solve(generator.network, noise, grid, solver), atol=1e-5
             )
+    given = (1.0, 0.9, 0.4, 0.0)
+    [tensor] = generator.samples(0, [0], times=given)
+    with torch.inference_mode():
+        wanted = solve(generator.network, noise, given, "euler")
+    assert torch.allclose(tensor, wanted, atol=1e-5)
+    for wrong in ((1, 0.5), (1, 0.2, 0.4, 0), (1, 0.5, 0.5, 0), (), ("1", "a")):
+        with pytest.raises(ConfigError, match=r"descending times from 1 to 0"):
+            list(generator.samples(0, [0], times=wrong))
+    with pytest.raises(ConfigError, match="one of the two"):
+        list(generator.samples(0, [0], times=given, steps=2))
     with pytest.raises(ConfigError, match="0 steps"):
         generator.scans(0, [0], steps=0)
     with pytest.raises(ConfigError, match="solver 'rk4'"):
@@ -285,7 +295,7 @@ def test_models_are_found_by_shipped_name_or_by_path(
     assert load_generator("town").scans(0, [1])[0].id == "town/0/1"
     with pytest.raises(
         ConfigError,
-        match=r"model 'city'; expected a shipped one \(town\) or a .safetensors file",
+        match=r"model 'city'; expected a shipped one \(town\), a .safetensors file or hf:",
     ):
         load_generator("city")
     with pytest.raises(FileError, match="nowhere"):
@@ -464,10 +474,9 @@ def test_a_dense_model_generates_half_of_its_columns(tmp_path: Path) -> None:
         SENSOR.columns,
         SENSOR.columns // 2,
     ]
-    # As in banks of earlier versions.
-    assert ["columns" in plan.facts.settings for plan in plans] == [
-        False,
-        True,
+    assert [plan.facts.settings["columns"] for plan in plans] == [
+        None,
+        SENSOR.columns // 2,
     ]
     with pytest.raises(ConfigError, match="one of"):
         load_generator(path, columns=10)

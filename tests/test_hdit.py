@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -194,6 +195,26 @@ def test_computing_in_pieces_gives_the_same_result(
     monkeypatch.setattr(layers, "PIECE", 2000)
     assert layers.piece_length(y, 100, 300) < 10
     torch.testing.assert_close(net(y, 0.5), whole, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_batch_of_tiles_above_a_gpus_limit_is_divided(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    batches: list[int] = []
+    operator = F.scaled_dot_product_attention
+
+    def watched(q: Tensor, *others: Any, **options: Any) -> Tensor:
+        batches.append(len(q))
+        return operator(q, *others, **options)
+
+    net = network()
+    y = torch.randn(3, 2, 8, 64)
+    whole = net(y, 0.5)
+    monkeypatch.setattr(F, "scaled_dot_product_attention", watched)
+    monkeypatch.setattr(attention, "MOST", 5)
+    torch.testing.assert_close(net(y, 0.5), whole, rtol=1e-5, atol=1e-5)
+    assert max(batches) == 5
 
 
 @torch.no_grad()

@@ -3,15 +3,18 @@
 import copy
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import Golden
 from fuzzing.text import edit
+from PIL import Image
 from releases import CFG, DEPTHS, peer_weights, write_r2flow
 from safetensors.torch import load_file
 from torch import Tensor
@@ -19,6 +22,7 @@ from typer.testing import CliRunner
 
 from lidar_synth.errors import ConfigError, DataError, FileError, LidarSynthError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.generate.models.hdit.hdit import HDiT
 from lidar_synth.lab.importers.r2flow import convert, read_r2flow
 
@@ -179,6 +183,22 @@ def test_the_command_refuses_unknown_peers(released: Path, tmp_path: Path) -> No
     assert isinstance(result.exception, ConfigError)
     assert "one of r2flow" in str(result.exception)
     assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_imported_weights_are_looked_at(released: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    result = run_import(released, out, "--check")
+    assert result.exit_code == 0, result.output
+    images = load_generator(out).range_images(0, range(4), steps=10)
+    filled = np.mean([image.mask.mean() for image in images])
+    assert f"4 scans of 10 steps: {100 * filled:.1f} % of the cells" in result.output
+    shares = re.findall(r" to +[\d.]+ +([\d.]+) ?#*$", result.output, re.M)
+    ranges = np.concatenate([image.range[image.mask] for image in images])
+    first = np.mean(ranges < 1.45 * (80 / 1.45) ** (1 / 8))
+    assert float(shares[0]) == pytest.approx(100 * first, abs=0.06)
+    assert sum(map(float, shares)) == pytest.approx(100, abs=0.5)
+    with Image.open(out.with_suffix(".png")) as picture:
+        assert min(picture.size) > 100
 
 
 # --- invalid files

@@ -281,9 +281,7 @@ def test_the_small_autoencoder_and_a_flow_on_its_latents_held_on_disk(
     values = {"codec": str(tmp_path / "codec" / "codec.safetensors"), "network": hdit}
     data = {"latents": True, "cache": str(tmp_path / "cache")}
     call("train", write_config(scans, tmp_path, "teacher", data=data, **values))
-    assert [p.name[:8] for p in (tmp_path / "cache").glob("latents*.npy")] == [
-        "latents-"
-    ]
+    assert len(list((tmp_path / "cache").glob("latents-*/latents.npy"))) == 1
     generator = load_generator(tmp_path / "teacher" / "teacher.safetensors")
     [scan] = generator.scans(0, [3])
     assert len(scan) and scan.label is not None and scan.confidence is not None

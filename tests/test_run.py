@@ -147,6 +147,19 @@ def test_a_run_leaves_a_checkpoint_that_samples_and_all_else_it_promises(
 
 
 @pytest.mark.slow
+def test_states_that_a_thread_writes_are_those_of_their_steps(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("at once", "behind"):
+        (tmp_path / name).mkdir()
+        call("train", write_config(scans, tmp_path / name, recipe={"iterations": 10}))
+        monkeypatch.setattr(module, "_writes_behind", lambda device: True)
+    one = state(tmp_path / "at once")
+    two = state(tmp_path / "behind")
+    assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+@pytest.mark.slow
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     scans: Path, tmp_path: Path
 ) -> None:

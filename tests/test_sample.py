@@ -194,3 +194,16 @@ def test_sample_refuses_conditions_that_do_not_fit(
     with pytest.raises(error, match=message):
         CliRunner().invoke(app, call, catch_exceptions=False)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_time_grid_is_given_by_hand(path: Path, tmp_path: Path) -> None:
+    from lidar_synth.cli import app
+
+    out = tmp_path / "out"
+    given = ["sample", str(out), "--model", str(path), "--count", "1"]
+    result = CliRunner().invoke(app, [*given, "--times", "1,0.7,0.2,0"])
+    assert result.exception is None, result.exception
+    [made] = load_generator(path).scans(0, [0], times=(1, 0.7, 0.2, 0))
+    assert np.array_equal(open_scans(out)[0].points, made.points)
+    other = CliRunner().invoke(app, [*given, "--times", "1,0.6,0.2,0"])
+    assert isinstance(other.exception, ConfigError)

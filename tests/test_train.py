@@ -1,6 +1,8 @@
 """Training: data that follow from their position, schedules, the state through a kill, the loop."""
 
 import math
+import tracemalloc
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -33,12 +35,14 @@ from lidar_synth.lab.train import (
     Recipe,
     Training,
     cache_scans,
+    loop,
     micro_batches,
     steps,
     student_task,
     teacher_task,
 )
 from lidar_synth.lab.train.data import InTurns
+from lidar_synth.lab.train.loop import Record, read_figures
 
 SENSOR = Sensor("small", 32, 1.45, 80.0, rows=8, fov_up=3.0, fov_down=-25.0)
 TENSORS = TensorFormat(("range", "reflectance", "label"), NORMALISATIONS["r2flow"])
@@ -131,7 +135,7 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
     cache = cache_scans(
         again, SENSOR, ["range"], tmp_path, {"town": 150}, progress=False
     )
-    assert again.reads == 150 - 64  # what was noted as done is kept
+    assert again.reads == 150 - 96  # what was noted as done is kept
     fresh = cache_scans(scans, SENSOR, ["range"], progress=False)
     assert np.array_equal(cache.fields["range"], fresh.fields["range"])
     third = Counted(scans)
@@ -143,6 +147,20 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
         cache_scans(
             scans, SENSOR, ["range", "label"], tmp_path, {"town": 150}, progress=False
         )
+
+
+def test_processes_make_the_cache_that_one_makes(tmp_path: Path) -> None:
+    scans = [SCANS[i % 5] for i in range(40)]
+    caches = [
+        cache_scans(
+            scans, SENSOR, TENSORS.channels, tmp_path / str(jobs), jobs=jobs
+        ).fields
+        for jobs in (1, 2)
+    ]
+    for name, values in caches[0].items():
+        assert np.array_equal(values, caches[1][name])
+    notes = [(tmp_path / str(jobs) / "cache.json").read_bytes() for jobs in (1, 2)]
+    assert notes[0] == notes[1]
 
 
 def test_a_source_that_gives_nothing_or_lacks_a_channel_is_refused() -> None:
@@ -163,6 +181,38 @@ def test_what_stands_at_a_position_does_not_depend_on_the_others(
             torch.equal(a[i], b[0])
             for a, b in zip(together[:3], alone[:3], strict=True)
         )
+
+
+def moves_of(batches: Batches, count: int) -> list[tuple[bool, int]]:
+    """Whether each of the first samples is mirrored, and the columns by which it is turned."""
+    plain = replace(batches, flip=False, roll=False)
+    found = []
+    for i in range(count):
+        x = plain([i]).y0
+        moved = batches([i]).y0
+        [match] = [
+            (mirrored, columns)
+            for mirrored in (False, True)
+            for columns in range(SENSOR.columns)
+            if torch.equal(
+                (x.flip(-1) if mirrored else x).roll(columns, -1),
+                moved,
+            )
+        ]
+        found.append(match)
+    return found
+
+
+def test_samples_are_mirrored_both_ways_and_turned_by_some_degrees(
+    batches: Batches,
+) -> None:
+    """Front to back is left to right, turned round; 45 degrees are 4 of 32 columns."""
+    both = moves_of(replace(batches, flip="both", roll=False), 60)
+    assert set(both) == {(False, 0), (True, 0), (False, 16), (True, 16)}
+    assert min(both.count(move) for move in set(both)) > 5
+    turned = moves_of(replace(batches, flip=False, roll=45.0), 60)
+    assert {columns for _, columns in turned} == {28, 29, 30, 31, 0, 1, 2, 3, 4}
+    assert not any(mirrored for mirrored, _ in turned)
 
 
 def test_two_sequences_take_turns(batches: Batches) -> None:
@@ -254,7 +304,7 @@ def test_a_schedule_warms_up_and_ends_near_zero(name: str) -> None:
     rate = [SCHEDULES[name](step, 10, 1000) for step in range(1000)]
     assert rate[:10] == pytest.approx([(i + 1) / 10 for i in range(10)])
     assert max(rate) == 1
-    assert 0 < rate[-1] < 0.01
+    assert rate[-1] == 1 if name == "constant" else 0 < rate[-1] < 0.01
     assert all(a >= b for a, b in pairwise(rate[10:]))
 
 
@@ -493,3 +543,43 @@ def test_a_recipe_with_an_unknown_name_is_refused() -> None:
             ConfigError, match="numbers above 0 for some of range, reflectance, label"
         ):
             Recipe(iterations=1, weights=weights)
+
+
+def test_a_gpu_is_asked_every_ten_steps_and_stands_still_where_a_step_is_bad(
+    batches: Batches, accelerator: Accelerator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def read(records: Sequence[Record]) -> list[list[float]]:
+        asked.append(len(records))
+        return read_figures(records)
+
+    monkeypatch.setattr(loop, "steps_between_figures", lambda device: loop.EVERY)
+    monkeypatch.setattr(loop, "read_figures", read)
+    training = new_training(iterations=24)
+    for _ in steps(training, teacher_task(), batches, accelerator):
+        pass
+    assert asked == [10, 10, 4]
+
+    def poisoned(batch: Batch) -> Example:
+        example = teacher_task()(batch)
+        bad = torch.nan if training.step >= 2 else 1.0
+        return Example(example.y, example.t, example.velocity * bad)
+
+    training = new_training(iterations=24)
+    run = steps(training, poisoned, batches, accelerator)
+    next(run), next(run)
+    before = [p.clone() for p in training.network.parameters()]
+    with pytest.raises(DataError, match="step 3: the loss is nan"):
+        list(run)
+    after = training.network.parameters()
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_a_state_is_written_from_where_it_lies(tmp_path: Path) -> None:
+    training = Training(nn.Linear(1000, 1000), Recipe(iterations=1))
+    tracemalloc.start()
+    training.save(tmp_path / "state.safetensors")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (tmp_path / "state.safetensors").stat().st_size > 8e6 > 20 * peak

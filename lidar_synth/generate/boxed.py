@@ -3,13 +3,13 @@ points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from lidar_synth.datasets.classes import GROUND
 from lidar_synth.geometry.layout import Layout, select_known_boxes
-from lidar_synth.geometry.projection import unproject
+from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage, Scan
 
 TOLERANCE = 0.1
@@ -17,6 +17,15 @@ TOLERANCE = 0.1
 
 FIELDS = frozenset(("boxes", "instance"))
 """What the scans of a layout have besides those of other models."""
+
+
+@runtime_checkable
+class Drawer(Protocol):
+    """Objects that can be cast into a scan, such as those of ``ObjectBank.from_town``."""
+
+    def draw(self, scan: Scan, boxes: Boxes) -> Scan:
+        """The scan whose objects are those of some boxes, cast there."""
+        ...
 
 
 def boxes_of(given: Any, count: int) -> list[Boxes] | None:
@@ -55,3 +64,13 @@ def add_boxes(image: RangeImage, boxes: Boxes) -> RangeImage:
     if len(kept):
         instance[image.mask] = np.where(inside.any(0), inside.argmax(0) + 1, 0)
     return replace(image, channels={**image.channels, "instance": instance}, boxes=kept)
+
+
+def draw_boxes(image: RangeImage, boxes: Boxes, objects: Drawer) -> RangeImage:
+    """An image whose objects are cast: those of a bank, at boxes; with the boxes that are seen, and
+    the channel ``instance``."""
+    drawn = objects.draw(unproject(image), boxes)
+    made = project(drawn, channels=[*image.channels, "instance"])
+    assert drawn.boxes is not None
+    seen = np.isin(drawn.boxes.instance, made.channels["instance"])
+    return replace(made, boxes=drawn.boxes[seen])

@@ -10,7 +10,7 @@ A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provi
 
 An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of
 that network. A model that was also trained with blank conditions (``dropout``) can be guided: see
-``flow.path.guide``.
+``flow.guidance.guide``.
 
 To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in
     ``models.NETWORKS``.
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -123,8 +124,10 @@ class SemanticMap:
         shape: tuple[int, ...],
         options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
-        """The scan's labels, projected onto ``sensor``, which need not be the scan's own; see
-        ``bridge_gaps``.
+        """The scan's labels, projected onto ``sensor``, which need not be the scan's own.
+
+        Narrow gaps are closed by ``bridge_gaps``, unless ``options["keep_gaps"]`` says that the
+        model was trained on maps like LiDM's, whose gaps stay.
 
         Raises:
             DataError: on a scan without labels.
@@ -133,7 +136,8 @@ class SemanticMap:
             raise DataError(
                 f"scan {scan.id!r} has no labels", "a labelled scan, to condition on"
             )
-        return bridge_gaps(project(scan, sensor, ["label"]).channels["label"])
+        labels = project(scan, sensor, ["label"]).channels["label"]
+        return labels if options.get("keep_gaps") else bridge_gaps(labels)
 
     def check(self, values: Tensor) -> None:
         """Check that all values are train ids or 255.
@@ -213,7 +217,10 @@ def resize_image(
         shape: (3, h, w) of the condition.
         options: of the condition; ``options["image"]`` are the rows and columns that the image must
             have. They identify the camera of the training; an image with another field of view
-            would mislead the model.
+            would mislead the model. ``options["views"]`` is the number of views side by side that
+            are resized one by one, as in LiDM: by bicubic interpolation between the centres of
+            their corner pixels, without antialiasing. Without it, the image is resized as a whole,
+            with antialiasing.
         what: the image, in an error's words.
 
     Returns:
@@ -231,8 +238,26 @@ def resize_image(
             f"{wanted}, those of the camera that the model was trained on",
             "Crop or pad it, by its calibration, to what that camera sees.",
         )
-    small = image.convert("RGB").resize((shape[2], shape[1]), Resampling.BICUBIC)
+    image = image.convert("RGB")
+    if views := options.get("views"):
+        return _resize_views(np.asarray(image, np.uint8), shape, views)
+    small = image.resize((shape[2], shape[1]), Resampling.BICUBIC)
     return np.asarray(small, np.uint8).transpose(2, 0, 1).copy()
+
+
+def _resize_views(
+    pixels: NDArray[np.uint8], shape: tuple[int, ...], views: int
+) -> NDArray[np.uint8]:
+    """(H, W, 3) pixels to ``shape``, each of the views side by side by itself; columns that W has
+    beyond a multiple of ``views`` are left out."""
+    width = pixels.shape[1] // views
+    cut = [pixels[:, i * width : (i + 1) * width] for i in range(views)]
+    given = torch.from_numpy(np.stack(cut)).movedim(-1, 1).float()
+    resized = F.interpolate(
+        given, (shape[1], shape[2] // views), mode="bicubic", align_corners=True
+    )
+    side_by_side = torch.cat(list(resized.round().clamp(0, 255)), -1)
+    return side_by_side.to(torch.uint8).numpy()
 
 
 class LayoutImage:

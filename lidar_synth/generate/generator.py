@@ -7,6 +7,8 @@ of its batch, their order and the device change only float rounding.
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
@@ -16,13 +18,16 @@ from typing_extensions import Unpack
 
 from lidar_synth.datasets.classes import IGNORE
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.files.hub import Repository, push
 from lidar_synth.generate import boxed
-from lidar_synth.generate.checkpoint import Header
+from lidar_synth.generate.card import model_card
+from lidar_synth.generate.checkpoint import Header, read_header
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, batch_of, blank
 from lidar_synth.generate.devices import refuse_worker
-from lidar_synth.generate.flow.path import Velocity, guide
-from lidar_synth.generate.flow.solvers import mean_velocity, solve
+from lidar_synth.generate.flow.guidance import guide
+from lidar_synth.generate.flow.path import Velocity
+from lidar_synth.generate.flow.solvers import mean_velocity, read_grid, solve
 from lidar_synth.geometry.normalize import TensorFormat
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import (
@@ -45,12 +50,15 @@ class SamplingOptions(TypedDict, total=False):
     Attributes:
         steps: number of steps, on the times that the checkpoint has for it, else on a uniform grid;
             None, the default, uses the checkpoint's own number.
+        times: the time grid instead of ``steps``: descending times from 1 to 0, such as
+            (1, 0.86, 0.58, 0.22, 0).
         solver: a key of ``SOLVERS``, by default "euler".
         guidance: scale of classifier-free guidance; 1, the default, is no guidance. A larger scale
             follows the condition more closely; any scale but 1 doubles the computation.
     """
 
     steps: int | None
+    times: Sequence[float] | None
     solver: str
     guidance: float
 
@@ -68,6 +76,7 @@ class Generator:
         autoencoder: the autoencoder of a latent model; None for a pixel model.
         columns: of the scans, where the autoencoder decodes to several widths; None = the
             checkpoint's.
+        path: the checkpoint's file; None for weights without one.
 
     Example:
         >>> from lidar_synth import Generator, load_generator
@@ -86,6 +95,7 @@ class Generator:
     batch: int = 1
     autoencoder: nn.Module | None = None
     columns: int | None = None
+    path: Path | None = None
 
     def __post_init__(self) -> None:
         own = self.header.sensor.columns
@@ -152,6 +162,37 @@ class Generator:
         """The device of the network."""
         return next(self.network.parameters()).device
 
+    def push_to_hub(
+        self, name: str, *, licence: str | None = None, private: bool = False
+    ) -> str:
+        """Upload the checkpoint and a card to the Hugging Face hub, in one commit.
+
+        Args:
+            name: ``user/model``, new or existing.
+            licence: of the weights, an identifier of the hub such as "mit"; by default the one that
+                the checkpoint states.
+            private: whether a new repository is private.
+
+        Returns:
+            What ``load_generator`` takes, ``hf://user/model@COMMIT``.
+
+        Raises:
+            ConfigError: on weights without a checkpoint, or a licence that the hub does not know.
+            FileError: if the hub refuses it or does not answer.
+            LibraryError: without the extra ``hub``.
+        """
+        if self.path is None or read_header(self.path)[1] != self.hash:
+            raise ConfigError(
+                f"generator {self.name!r}, whose checkpoint is not (or no longer) in a file",
+                "one of load_generator",
+            )
+        there = Repository("model", name)
+        parts = [self.network, *filter(None, [self.autoencoder])]
+        size = sum(p.numel() for part in parts for p in part.parameters())
+        card = model_card(str(there), self.header, self.hash, size, licence)
+        files = {self.path.name: self.path}
+        return push(there, card.encode(), files, private)
+
     def as_synthetic(self, seed: int = 0) -> "Generated":
         """The scans of a seed by number, made when they are read."""
         return Generated(self, seed)
@@ -161,6 +202,7 @@ class Generator:
         seed: int,
         indices: Sequence[int],
         condition: Any = None,
+        objects: boxed.Drawer | None = None,
         **options: Unpack[SamplingOptions],
     ) -> list[RangeImage]:
         """Generate range images.
@@ -175,7 +217,10 @@ class Generator:
                 itself: its projected labels, the image at its ``image_path``, or its layout. In a
                 dictionary of conditions, the one with the condition's name is used. See
                 ``conditions``.
-            options: ``steps``, ``solver`` and ``guidance``; see ``SamplingOptions``.
+            objects: such as ``ObjectBank.from_town(generator.sensor)``: the objects of layouts are
+                cast from these, and the model draws the street around them.
+            options: ``steps`` or ``times``, ``solver`` and ``guidance``; see
+                ``SamplingOptions``.
 
         Returns:
             B images: range in metres, 0 = no return; ``reflectance`` in [0, 1], ``label`` and its
@@ -190,11 +235,20 @@ class Generator:
         Raises:
             ConfigError: on an invalid seed, index, number of steps or solver, a condition for an
                 unconditional model, guidance of a model that was trained without blank conditions,
-                or CUDA in a DataLoader worker.
+                objects that cannot be cast or do not have the layout's classes, or CUDA in a
+                DataLoader worker.
             DataError: on a condition of another shape or with invalid values, or if a condition is
                 missing.
         """
         given = self._condition(condition, len(indices))
+        laid = self.condition == "layout"
+        boxes = boxed.boxes_of(condition, len(indices)) if laid else None
+        cast = boxes is not None and isinstance(objects, boxed.Drawer)
+        if objects is not None and not cast:
+            raise ConfigError(
+                f"{objects!r} as objects for {self.name!r}",
+                "ObjectBank.from_town(generator.sensor), for layouts of a model of layouts",
+            )
         images = []
         for tensor in self.samples(seed, indices, given, **options):
             images += self.tensors.to_images(tensor, self.sensor)
@@ -210,22 +264,19 @@ class Generator:
                 image.channels["confidence"] = (
                     image.channels["label"] != IGNORE
                 ).astype(np.float32)
-        boxes = (
-            boxed.boxes_of(condition, len(indices))
-            if self.condition == "layout"
-            else None
-        )
-        return (
-            images
-            if boxes is None
-            else [boxed.add_boxes(*pair) for pair in zip(images, boxes, strict=True)]
-        )
+        if boxes is None:
+            return images
+        add = boxed.add_boxes
+        if objects is not None:
+            add = partial(boxed.draw_boxes, objects=objects)
+        return [add(*pair) for pair in zip(images, boxes, strict=True)]
 
     def scans(
         self,
         seed: int,
         indices: Sequence[int],
         condition: Any = None,
+        objects: boxed.Drawer | None = None,
         **options: Unpack[SamplingOptions],
     ) -> list[Scan]:
         """Generate scans: the returns of ``range_images`` through the centres of their cells.
@@ -233,7 +284,7 @@ class Generator:
         Arguments and errors are those of ``range_images``. The ``id`` of a scan is
         ``<checkpoint>/<seed>/<index>``, and its ``domain`` is ``SYNTHETIC``.
         """
-        images = self.range_images(seed, indices, condition, **options)
+        images = self.range_images(seed, indices, condition, objects, **options)
         made = model_provenance(self.name, self.hash, seed)
         return [
             replace(
@@ -252,6 +303,7 @@ class Generator:
         condition: Any = None,
         *,
         steps: int | None = None,
+        times: Sequence[float] | None = None,
         solver: str = "euler",
         guidance: float = 1.0,
     ) -> Iterator[Tensor]:
@@ -264,7 +316,9 @@ class Generator:
         given = self._condition(condition, len(indices))
         codec = self.codec
         noise_shape = (codec.draws, *self.sensor.shape)
-        grid = self.header.grid(steps)
+        grid = self.header.grid(steps) if times is None else read_grid(times)
+        if times is not None and steps is not None:
+            raise ConfigError(f"steps {steps} and times {grid}", "one of the two")
         if solver != "euler" and getattr(self.network, "ends", False):
             raise ConfigError(
                 f"solver {solver!r} for {self.name!r}",
@@ -331,7 +385,12 @@ class Generator:
                 "a checkpoint with all its parts",
             )
         options = self.header.conditioning[self.condition]
-        shape = CONDITIONS[self.condition].shape(self.network.encoder)
+        encoder = self.network.encoder
+        if isinstance(given, Tensor) and given.shape[1:] == getattr(
+            encoder, "seen", None
+        ):  # a training keeps these instead of images
+            return given.to(self.device)
+        shape = CONDITIONS[self.condition].shape(encoder)
         return batch_of(
             self.condition, given, count, self.header.sensor, shape, options
         ).to(self.device)
@@ -351,7 +410,7 @@ class Generated:
         cache: number of latest scans that each process keeps in memory (about 1 MB each at 64 x
             1024), which saves time if a process accesses a scan again: with ``reuse``, an epoch
             later.
-        sampling: steps, solver and guidance, as for ``Generator.scans``.
+        sampling: objects, steps, solver and guidance, as for ``Generator.scans``.
 
     Raises:
         ConfigError: on a negative cache, a conditional model without conditions, or conditions for

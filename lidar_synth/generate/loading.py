@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from lidar_synth.errors import ConfigError, DataError, suggest
+from lidar_synth.files.hub import fetch_model, is_on_hub, pin_revision
 from lidar_synth.generate.checkpoint import (
     CODEC,
     VELOCITY,
@@ -30,7 +31,8 @@ def load_generator(
     """Load a generator from a shipped model or a checkpoint file.
 
     Args:
-        model: a shipped model's name ("town") or a path to a ``.safetensors`` checkpoint.
+        model: a shipped model's name ("town"), a path to a ``.safetensors`` checkpoint, or a model
+            on the Hugging Face hub: ``hf://user/model``, with ``@REVISION`` for one of its commits.
         device: an available device such as "cpu", "cuda" or "cuda:1"; see ``available_devices``.
         dtype: dtype of the network's computations; states stay float32.
         compile: whether to compile the velocity network and the decoder of a latent model with
@@ -42,6 +44,7 @@ def load_generator(
         ConfigError: on an unknown name, an unavailable device, CUDA in a DataLoader worker, or a
             number of columns that the model cannot generate.
         FileError, DataError: if the checkpoint cannot be read, or a shipped one is damaged.
+        LibraryError: on a model on the hub without the extra ``hub``.
 
     Example:
         >>> from lidar_synth import load_generator
@@ -68,7 +71,14 @@ def load_generator(
     autoencoder = checkpoint.networks.get(CODEC)
     size = batch or BATCH.get(device.type, 1)
     return Generator(
-        path.stem, flow, checkpoint.header, checkpoint.hash, size, autoencoder, columns
+        path.stem,
+        flow,
+        checkpoint.header,
+        checkpoint.hash,
+        size,
+        autoencoder,
+        columns,
+        path,
     )
 
 
@@ -89,17 +99,33 @@ def shipped_models() -> dict[str, Path]:
 
 
 def find_model(model: str | Path) -> Path:
-    """The checkpoint file of a shipped model, or the given path itself.
+    """The checkpoint file of a shipped model or of one on the hub, or the given path itself.
 
     Raises:
         ConfigError: on an unknown name.
+        FileError, DataError, LibraryError: as ``hub.fetch_model``.
     """
+    if is_on_hub(model):
+        return fetch_model(str(model))
     shipped = shipped_models()
     if (name := str(model)) in shipped:
         return shipped[name]
     path = Path(model)
     if path.suffix != ".safetensors":
         names = ", ".join(shipped) or "none in this installation"
-        expected = f"a shipped one ({names}) or a .safetensors file"
+        expected = f"a shipped one ({names}), a .safetensors file or hf://user/model"
         raise ConfigError(f"model {str(model)!r}", expected, suggest(model, shipped))
     return path
+
+
+def settle_model(model: str) -> str:
+    """A name for the same model from any folder and at any time: that of a shipped one, an absolute
+    path, or a commit of the hub.
+
+    Raises:
+        FileError, LibraryError: as ``hub.pin_revision``.
+    """
+    if is_on_hub(model):
+        return pin_revision(model)
+    path = Path(model)
+    return str(path.resolve()) if path.suffix == ".safetensors" else model

@@ -1,11 +1,16 @@
 """Speed of the full HDiT (80.9 M parameters) at 64 x 1024, against a large matrix product.
 
     python tools/bench/networks.py [--rounds N] [--threads N] [--model FILE.safetensors]
+    python tools/bench/networks.py --training hdit|unet [--batch N] [--rounds N]
 
 On a CPU: seconds of one evaluation, its rate relative to the product's, a profile by kind of
 operation, peak memory; ``gpu.py`` measures the network on a GPU. Rates count the operations that
 the network needs, not those of an implementation. The weights are random unless a checkpoint of the
 same size is given.
+
+With --training: a training step of the full HDiT, or of LiDM's U-Net (257.8 M parameters) on
+latents, and the share of its processor time outside the network and its gradient: data, noise,
+optimiser, average. With one thread, which tells the two apart on a busy machine too.
 """
 
 import resource
@@ -14,11 +19,14 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
+from accelerate import Accelerator
 from timing import machine
 from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
@@ -26,8 +34,16 @@ from tqdm import tqdm
 from typer import run
 
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint
+from lidar_synth.generate.flow.path import velocity_loss
+from lidar_synth.generate.models import build_network
 from lidar_synth.generate.models.hdit.hdit import HDiT
+from lidar_synth.geometry.normalize import NORMALISATIONS, TensorFormat
 from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.lab.train.cache import ImageCache
+from lidar_synth.lab.train.data import Batches
+from lidar_synth.lab.train.loop import steps
+from lidar_synth.lab.train.state import Recipe, Training
+from lidar_synth.lab.train.teacher import teacher_task
 
 EVALUATION = 156.4e9
 """Floating point operations of one evaluation: 153.1e9 in linear layers, the rest in attention."""
@@ -137,6 +153,57 @@ def print_rate(
     )
 
 
+def training_of(kind: str, batch: int, rounds: int) -> tuple[Training, Batches]:
+    """A run of the network ``kind`` on random scans, in memory."""
+    sensor = load_sensor("hdl64e_kitti360")
+    rng = np.random.default_rng(0)
+    fields = {
+        "range": rng.integers(0, 65536, (16, *sensor.shape), dtype=np.uint16),
+        "reflectance": rng.integers(0, 256, (16, *sensor.shape), dtype=np.uint8),
+    }
+    tensors = TensorFormat(("range", "reflectance"), NORMALISATIONS["r2flow"])
+    data = Batches(ImageCache(fields, sensor), tensors, flip=True)
+    net = full_network(None)
+    if kind == "unet":
+        net = build_network("unet", {"resolution": (16, 128)})
+        latents = rng.normal(size=(16, 2, 8, 16, 128)).astype(np.float16)
+        data = replace(data, latents=latents)
+    return Training(net, Recipe(iterations=rounds, batch=batch)), data
+
+
+def on_training(kind: str, batch: int, rounds: int) -> None:
+    """Print the time of a step, and its share outside the network."""
+    training, data = training_of(kind, batch, rounds + 1)
+    accelerator = Accelerator(cpu=True)
+    inside = [0.0]
+
+    def timed(call: Callable[..., Any]) -> Callable[..., Any]:
+        def measured(*arguments: Any) -> Any:
+            start = time.thread_time()
+            result = call(*arguments)
+            inside[-1] += time.thread_time() - start
+            return result
+
+        return measured
+
+    accelerator.backward = timed(accelerator.backward)
+    whole = []
+    run = steps(training, teacher_task(), data, accelerator, timed(velocity_loss))
+    start = time.process_time()
+    for _ in tqdm(run, total=rounds + 1, desc="steps", leave=False):
+        whole.append(time.process_time() - start)
+        inside.append(0.0)
+        start = time.process_time()
+    spent = sum(whole[1:])  # the first step makes the moments
+    outside = spent - sum(inside[1:])
+    print(
+        f"\n### A training step of {kind}, batch {batch}, on the CPU, 1 thread, float32\n\n"
+        f"{machine()}; torch {torch.__version__}; {rounds} steps\n\nprocessor time "
+        f"{spent / rounds:.2f} s, of which outside the network {outside / rounds:.3f} s "
+        f"({outside / spent:.1%})"
+    )
+
+
 def print_peak(model: Path | None) -> None:
     """Evaluate once and print the peak memory in GB."""
     net = full_network(model)
@@ -150,9 +217,14 @@ def main(
     threads: int = torch.get_num_threads(),
     model: Path | None = None,
     peak: bool = False,
+    training: str = "",
+    batch: int = 2,
 ) -> None:
     """Prints the tables."""
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1 if training else threads)
+    if training:
+        on_training(training, batch, rounds)
+        return
     torch.set_grad_enabled(False)
     if peak:
         print_peak(model)

@@ -240,7 +240,8 @@ def _times(grid: Sequence[float], like: Tensor) -> Tensor:
     times = check_grid(grid)
     if times[0] != 1 or times[-1] != 0:
         raise ConfigError(f"time grid {times.tolist()}", "one from 1 down to 0")
-    return times.to(like.device, like.dtype)
+    # Without waiting for a GPU, in every step of a training.
+    return times.to(like.device, like.dtype, non_blocking=True)
 
 
 def _slope(

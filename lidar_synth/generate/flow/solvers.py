@@ -80,6 +80,24 @@ def uniform_grid(steps: int, start: float = 1.0, end: float = 0.0) -> tuple[floa
     return tuple((start * (steps - i) + end * i) / steps for i in range(steps + 1))
 
 
+def read_grid(times: Sequence[float | str]) -> tuple[float, ...]:
+    """A time grid that a user gives, as numbers or text.
+
+    Raises:
+        ConfigError: if they are no numbers that descend from 1 to 0.
+    """
+    try:
+        grid = tuple(map(float, times))
+    except ValueError:
+        grid = ()
+    if sorted(set(grid), reverse=True) != list(grid) or grid[:1] + grid[-1:] != (1, 0):
+        raise ConfigError(
+            f"a time grid of {', '.join(map(str, times))}",
+            "descending times from 1 to 0, such as 1, 0.86, 0.58, 0.22, 0",
+        )
+    return grid
+
+
 def trajectory(
     velocity: Velocity, y: Tensor, grid: Grid, solver: str = "euler", cond: Any = None
 ) -> Iterator[State]:
@@ -176,5 +194,6 @@ def _times(grid: Grid, y: Tensor) -> Tensor:
         isinstance(grid, Tensor) and grid.ndim == 2
     ):  # from distillation, already on the device; a check would synchronise
         return grid
-    times = check_grid(grid).to(y.device, torch.promote_types(y.dtype, torch.float32))
+    dtype = torch.promote_types(y.dtype, torch.float32)
+    times = check_grid(grid).to(y.device, dtype, non_blocking=True)
     return times[:, None].expand(-1, len(y))

@@ -145,6 +145,7 @@ def sum_costs(
     condition: Callable[[range], Any] | None = None,
     progress: bool = True,
     done: TrajectoryCosts | None = None,
+    each: Callable[..., Iterator[tuple[Costs, NDArray[np.int64]]]] = map,
 ) -> Iterator[TrajectoryCosts]:
     """The costs of a selection, batch by batch.
 
@@ -162,6 +163,7 @@ def sum_costs(
         condition: gives the conditions of a range of trajectories; None = unconditional.
         progress: whether to show a progress bar.
         done: what an earlier call yielded last, which this one continues.
+        each: a ``map`` that may compute the batches elsewhere; their order decides the rounding.
 
     Yields:
         The costs of all trajectories up to now, after each batch.
@@ -188,16 +190,20 @@ def sum_costs(
     bar = tqdm(
         total=trajectories, initial=count, desc="trajectories", disable=not progress
     )
+
+    def compute(first: int) -> tuple[Costs, NDArray[np.int64]]:
+        part = range(first, min(first + batch, trajectories))
+        cond = condition(part) if condition else None
+        with torch.inference_mode():
+            start = gaussian(seed, part, shape, device)
+            costs = cost_matrix(velocity, start, times, m, cond)
+        return costs.sum(0), best_path(costs, intervals)
+
     with bar:
-        for first in range(count, trajectories, batch):
-            part = range(first, min(first + batch, trajectories))
-            cond = condition(part) if condition else None
-            with torch.inference_mode():
-                start = gaussian(seed, part, shape, device)
-                costs = cost_matrix(velocity, start, times, m, cond)
-            optima = np.concatenate((done.optima, best_path(costs, intervals)))
-            done = TrajectoryCosts(done.total + costs.sum(0), optima)
-            bar.update(len(part))
+        for total, optima in each(compute, range(count, trajectories, batch)):
+            both = np.concatenate((done.optima, optima))
+            done = TrajectoryCosts(done.total + total, both)
+            bar.update(len(optima))
             yield done
 
 

@@ -27,6 +27,10 @@ TILE: Grid = (2, 16)
 copy less; the result is the same."""
 
 
+MOST = 65_535
+"""Most blocks along one side of a GPU's grid: the operator takes no larger batch of tiles."""
+
+
 class NeighbourhoodAttention(nn.Module):
     """softmax(q k^T) v over the window around each token of a grid.
 
@@ -94,7 +98,12 @@ def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Te
     """softmax(q k^T) v of (B, heads, n, D) and (B, heads, m, D), already scaled, where ``mask`` (n,
     m) is true."""
     if q.device.type != "cpu" or not torch.is_grad_enabled():
-        return F.scaled_dot_product_attention(q, k, v, mask, scale=1.0)
+        parts = (torch.split(x, MOST) for x in (q, k, v))
+        done = [
+            F.scaled_dot_product_attention(a, b, c, mask, scale=1.0)
+            for a, b, c in zip(*parts, strict=True)
+        ]
+        return done[0] if len(done) == 1 else torch.cat(done)
     # With so few keys, the backward pass of the fused operator is slower on a CPU, much slower in
     # bfloat16.
     scores = q @ k.transpose(-1, -2)

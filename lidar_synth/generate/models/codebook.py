@@ -89,8 +89,9 @@ class Codebook(nn.Module):
         places = torch.linspace(
             0, len(tokens) - 1, len(self), device=tokens.device
         ).long()
-        self.sums[dead] = tokens[places][dead]
-        self.counts[dead] = 1.0
+        # Without an index by ``dead``, whose number of entries a GPU would have to be asked for.
+        self.sums.copy_(torch.where(dead[:, None], tokens[places], self.sums))
+        self.counts.masked_fill_(dead, 1.0)
         self.codes.copy_(self.sums / self.counts[:, None])
 
 
@@ -98,6 +99,7 @@ class Codebook(nn.Module):
 def follow(z: Tensor, shift: Tensor, scale: Tensor) -> None:
     """Update running mean and standard deviation (K,) by those of z (B, K, h, w), in place."""
     spread, mean = torch.std_mean(z.float(), (0, 2, 3))
-    fresh = bool((scale == 1).all() & (shift == 0).all())
-    shift.lerp_(mean, 1.0 if fresh else 1 - DECAY)
-    scale.lerp_(spread.clamp(min=1e-4), 1.0 if fresh else 1 - DECAY)
+    fresh = (scale == 1).all() & (shift == 0).all()
+    share = torch.where(fresh, 1.0, 1 - DECAY)
+    shift.lerp_(mean, share)
+    scale.lerp_(spread.clamp(min=1e-4), share)

@@ -19,15 +19,28 @@ def import_(
     peer: Annotated[
         str, typer.Option(help="project of the weights: r2flow | lidm")
     ] = "r2flow",
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="generate scans in ten steps, and look at them"),
+    ] = False,
+    condition: Annotated[
+        str | None,
+        typer.Option(help="dataset whose labels or images --check takes"),
+    ] = None,
 ) -> None:
     """Converts the released weights of another project to a checkpoint.
 
     Reading the file runs no code from it. Parameter names, sign and time convention are converted;
     a file with missing or unexpected keys is refused, and the message lists them.
 
+    With --check, four scans are generated: the share of cells with a return, a histogram of ranges
+    and a picture beside the checkpoint show whether weights and conventions fit.
+
     Examples:
 
       lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors
+
+      lidar-synth import r2flow-kitti360-1rf.pth r2flow-1rf.safetensors --check
 
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
 
@@ -35,6 +48,7 @@ def import_(
     """
     from lidar_synth.generate.checkpoint import save_checkpoint
     from lidar_synth.lab.importers import IMPORTERS
+    from lidar_synth.lab.importers.check import check_model
 
     if peer not in IMPORTERS:
         raise ConfigError(f"--peer {peer}", f"one of {', '.join(IMPORTERS)}")
@@ -52,3 +66,5 @@ def import_(
         f"hash {digest}; weights {header.provenance['licence']}; data {header.provenance['data']}, "
         f"{header.provenance['data_licence']}"
     )
+    if check:
+        print(check_model(out, condition))

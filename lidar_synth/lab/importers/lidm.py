@@ -165,7 +165,7 @@ def _parts(
         }
         return parts | {
             ENCODER: NetworkSpec("semantic_map", sizes | {"channels": channels})
-        }, {"semantic": {"dropout": 0.0}}
+        }, {"semantic": {"dropout": 0.0, "keep_gaps": True}}
     if kind == "FrozenClipMultiImageEmbedder":
         given = condition["params"]
         arguments = {
@@ -176,6 +176,7 @@ def _parts(
             "dropout": 0.0,
             "view_dropout": augment.get("camera_drop", 0.0),
             "image": list(CAMERA_SIZE),
+            "views": given["split_per_view"],
         }
         return parts | {ENCODER: NetworkSpec("clip_views", arguments)}, {
             "camera": options

@@ -53,12 +53,15 @@ class Conditioning:
         reduction: share of conditions that tell less: one view of a camera image, a layout without
             outlines.
         views: number of views of a camera image.
+        blank: (views, channels) features of a blank image, where the cache holds features of
+            images, (N, 2, views, channels), as they are and mirrored, in place of pixels.
     """
 
     name: str
     dropout: float = 0.0
     reduction: float = 0.0
     views: int = 1
+    blank: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -69,25 +72,26 @@ class Batches:
         cache: the scans.
         tensors: layout of the network's tensors.
         seed: 0 <= seed < 2^62.
-        flip: mirror every other sample, left to right.
-        roll: turn every sample about the vertical by a random whole number of columns; of columns
-            of the ``latents`` if there are any, by which an autoencoder whose columns wrap around
-            turns them exactly.
+        flip: mirror every other sample, left to right; "both" = front to back too, by a mirror
+            image that is turned round.
+        roll: turn every sample about the vertical by a random whole number of columns, or by as
+            many degrees at most, either way; of columns of the ``latents`` if there are any, by
+            which an autoencoder whose columns wrap around turns them exactly.
         device: on which noise is generated and batches are assembled.
         codec: encodes tensors to states; None = the tensors are the states.
-        latents: (2, N, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place
+        latents: (N, 2, *codec.shape) encoded scans and mirrored scans (``cache_latents``), in place
             of ``codec``.
         conditioning: the field of the cache that is the condition; None = unconditional.
 
     Raises:
-        ConfigError: on ``roll`` with a condition that cannot be turned.
+        ConfigError: on samples that turn, with a condition that cannot be turned.
     """
 
     cache: ImageCache
     tensors: TensorFormat
     seed: int = 0
-    flip: bool = False
-    roll: bool = False
+    flip: bool | str = False
+    roll: bool | float = False
     device: torch.device | str = "cpu"
     codec: Codec | None = None
     conditioning: Conditioning | None = None
@@ -95,14 +99,31 @@ class Batches:
 
     def __post_init__(self) -> None:
         if (
-            self.roll
+            self.turn
             and self.conditioning
             and not CONDITIONS[self.conditioning.name].turns
         ):
             raise ConfigError(
-                f"roll with the condition {self.conditioning.name!r}",
-                "roll=false: it does not turn",
+                f"flip={self.flip}, roll={self.roll} with the condition "
+                f"{self.conditioning.name!r}",
+                "roll=false and no flip=both: it does not turn",
             )
+
+    @property
+    def turn(self) -> bool:
+        """Whether samples are turned about the vertical."""
+        return bool(self.roll) or self.flip == "both"
+
+    def _turns(self, draws: Tensor, columns: int) -> list[int]:
+        """How far each sample is turned, of ``columns``; ``draws`` (B, 5) are uniform."""
+        if self.roll is True:
+            turns = (draws[:, 2] * columns).long()
+        else:
+            most = columns * self.roll / 360
+            turns = ((2 * draws[:, 2] - 1) * most).round().long()
+        if self.flip == "both":  # of the mirrored and of the others, every other one
+            turns += columns // 2 * (2 * draws[:, 1] % 1 < 0.5)
+        return turns.tolist()
 
     def scans_at(self, positions: Sequence[int]) -> list[int]:
         """Index of the scan at each position; every epoch is a permutation of all scans."""
@@ -117,30 +138,34 @@ class Batches:
         seed = self.seed + _TRAINING
         draws = uniform(seed, positions, (5,))
         scans = self.scans_at(positions)
-        mirrored = (draws[:, 1] < 0.5) & self.flip
+        mirrored = (draws[:, 1] < 0.5) & bool(self.flip)
         width = self.cache.sensor.columns
         unit = 1 if self.latents is None else width // self.latents.shape[-1]
-        turns = (draws[:, 2] * (width // unit)).long()
+        turns = self._turns(draws, width // unit)
 
         def augmented(x: Tensor) -> Tensor:
             x = _where(mirrored, x.flip(-1), x)
-            return _rolled(x, (unit * turns).tolist()) if self.roll else x
+            return _rolled(x, [unit * n for n in turns]) if self.turn else x
 
         if self.latents is not None:
-            y0 = torch.from_numpy(self.latents[mirrored.long().numpy(), scans]).to(
-                self.device, torch.float32
-            )
-            y0 = _rolled(y0, turns.tolist()) if self.roll else y0
+            held = torch.from_numpy(self.latents[scans, mirrored.long().numpy()])
+            y0 = self._moved(held).float()
+            y0 = _rolled(y0, turns) if self.turn else y0
         else:
-            y0 = augmented(self.tensors.encode(self.cache.read(scans)).to(self.device))
+            read = {n: self._moved(v) for n, v in self.cache.read(scans).items()}
+            y0 = augmented(self.tensors.encode(read))
             y0 = y0 if self.codec is None else self.codec.encode(y0)
-        cond = None if self.conditioning is None else augmented(self._stored(scans))
-        if cond is not None:
-            cond = self._dropped(cond, draws)
+        about = self.conditioning
+        if about is None:
+            cond = None
+        elif about.blank is None:
+            cond = self._dropped(augmented(self._stored(scans)), draws)
+        else:
+            cond = self._dropped(self._stored(scans, mirrored), draws)
         return Batch(
             y0,
             gaussian(seed, positions, y0.shape[1:], self.device),
-            draws[:, 0].to(self.device),
+            self._moved(draws[:, 0]),
             cond,
         )
 
@@ -153,28 +178,46 @@ class Batches:
             else self._stored(self.scans_at(positions))
         )
 
-    def _stored(self, scans: Sequence[int]) -> Tensor:
-        """The cached conditions (B, ...) of these scans."""
+    def _stored(self, scans: Sequence[int], mirrored: Tensor | None = None) -> Tensor:
+        """The cached conditions (B, ...) of these scans; features of some mirrored images."""
         assert self.conditioning is not None
-        values = self.cache.fields[CONDITIONS[self.conditioning.name].field][
-            np.asarray(scans, np.int64)
-        ]
-        return torch.from_numpy(values).to(self.device)
+        field = self.cache.fields[CONDITIONS[self.conditioning.name].field]
+        values = field[np.asarray(scans, np.int64)]
+        if self.conditioning.blank is not None:
+            sides = 0 if mirrored is None else mirrored.long().numpy()
+            values = values[np.arange(len(values)), sides]
+        return self._moved(torch.from_numpy(values))
+
+    def _moved(self, values: Tensor) -> Tensor:
+        """Values on the device; from pinned memory, the processor does not wait for a GPU."""
+        if torch.device(self.device).type == "cuda":
+            return values.pin_memory().to(self.device, non_blocking=True)
+        return values.to(self.device)
 
     def _dropped(self, cond: Tensor, draws: Tensor) -> Tensor:
         """Conditions (B, ...) with dropout: some blank, some reduced."""
         assert self.conditioning is not None
         about = self.conditioning
+        nothing = blank(about.name, cond)
+        if about.blank is not None:
+            nothing = about.blank.to(cond).expand_as(cond)
         if about.reduction:
-            less = CONDITIONS[about.name].reduced(
-                cond, draws[:, 4] / about.reduction, about.views
-            )
+            less = self._reduced(cond, nothing, draws[:, 4] / about.reduction)
             cond = _where(draws[:, 4] < about.reduction, less, cond)
-        return (
-            _where(draws[:, 3] < about.dropout, blank(about.name, cond), cond)
-            if about.dropout
-            else cond
-        )
+        if about.dropout:
+            cond = _where(draws[:, 3] < about.dropout, nothing, cond)
+        return cond
+
+    def _reduced(self, cond: Tensor, nothing: Tensor, u: Tensor) -> Tensor:
+        """Conditions (B, ...) that tell less."""
+        about = self.conditioning
+        assert about is not None
+        if about.blank is None:
+            return CONDITIONS[about.name].reduced(cond, u, about.views)
+        less = nothing.clone()
+        kept = about.views // 2  # as ``one_view`` of pixels
+        less[:, kept] = cond[:, kept]
+        return less
 
 
 @dataclass(frozen=True)

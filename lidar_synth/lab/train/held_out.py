@@ -65,7 +65,8 @@ class Watch:
 
     Args:
         stage: the training.
-        held_out: the scans, and how they are used.
+        held_out: how the scans are used.
+        data: the scans.
         training: its state; what was measured after it was saved is measured again.
         accelerator: of the run.
 
@@ -77,6 +78,7 @@ class Watch:
         self,
         stage: Stage,
         held_out: HeldOut,
+        data: Batches,
         training: Training,
         accelerator: "Accelerator",
     ) -> None:
@@ -86,7 +88,7 @@ class Watch:
         self.folder = stage.config.output
         history = read_history(self.folder)
         self.measured = [m for m in history if m.step <= training.step]
-        self.data: Batches = stage.open_data(held_out.data, "held_out")
+        self.data = data
 
     @property
     def least(self) -> float:

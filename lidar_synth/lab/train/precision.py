@@ -4,6 +4,7 @@ import time
 from functools import cache
 
 import torch
+from torch import nn
 
 _SIDE = 512
 _ROUNDS = 3
@@ -43,3 +44,14 @@ def _seconds(dtype: torch.dtype) -> float:
         matrix @ matrix.T
         times.append(time.process_time() - start)
     return min(times)
+
+
+def convert_products(velocity: nn.Module) -> None:
+    """Convert the weights of a frozen network's products to bfloat16, once.
+
+    Autocast would convert them in each of a teacher's evaluations; under it, the result is the
+    same, to the bit. The first layer of a transformer stays: it tells the precision of all else.
+    """
+    for name, layer in velocity.named_modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d) and name != "tokenize":
+            layer.to(torch.bfloat16)

@@ -65,6 +65,14 @@ def recordings_known(
 
 
 def _recordings(data: Data, sensor: Sensor) -> Recordings:
+    first, *more = data.parts()
+    known = _recordings_of_one(first, sensor)
+    for one in more:
+        known |= _recordings(one, sensor)
+    return known
+
+
+def _recordings_of_one(data: Data, sensor: Sensor) -> Recordings:
     if data.seen is not None:
         return Recordings.from_list(data.seen)
     if data.path is None:

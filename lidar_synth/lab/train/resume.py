@@ -18,6 +18,7 @@ HARMLESS = {
     "compile",
     "gradient_checkpointing",
     "data.cache",
+    "data.jobs",
 }
 """Keys that change where things lie, how much is written and how fast it goes, and not what is
 learned."""

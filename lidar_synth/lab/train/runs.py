@@ -15,6 +15,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -33,19 +34,24 @@ from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.data import Batches, InTurns
 from lidar_synth.lab.train.decoder import DecoderStage
 from lidar_synth.lab.train.held_out import Watch
-from lidar_synth.lab.train.loop import Record, steps
+from lidar_synth.lab.train.loop import EVERY, Record, read_figures, steps
+from lidar_synth.lab.train.norms import share_norms
 from lidar_synth.lab.train.precision import choose_precision
+from lidar_synth.lab.train.ranks import Ranks
 from lidar_synth.lab.train.resume import check_parents, check_resumed
 from lidar_synth.lab.train.stage import Stage
-from lidar_synth.lab.train.state import STATE, Training, set_damaged_aside
+from lidar_synth.lab.train.state import (
+    STATE,
+    Training,
+    set_damaged_aside,
+    write_state,
+)
 from lidar_synth.lab.train.student import StudentStage
 from lidar_synth.lab.train.teacher import TeacherStage
 from lidar_synth.viz import write_view
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
-
-_LOG_EVERY = 10  # steps between two numbers in the logs
 
 
 def run(
@@ -90,15 +96,21 @@ def run(
         if accelerator.is_main_process:  # after all checks
             values = yaml.safe_dump(config.model_dump(mode="json"))
             write_file(config.output / "config.yaml", values.encode())
-        with accelerator.main_process_first():
-            data = stage.open_data()
-            stage.prepare(data, accelerator)
-            batches = _add_rehearsal(stage, data)
+        ranks = Ranks(accelerator.process_index, accelerator.num_processes)
+        data = stage.open_data(ranks=ranks)
+        stage.prepare(data, accelerator, ranks)
+        batches = _add_rehearsal(stage, data, ranks)
+        held = None
+        if config.held_out is not None:
+            held = stage.open_data(config.held_out.data, "held_out", ranks)
+        if ranks.size > 1:
+            share_norms(training.network)
         _compile(stage)
         training.began = time.monotonic()  # preparing the data is no training
         keeper = None
         if accelerator.is_main_process:
-            keeper = _Keeper(stage, training, data, accelerator, minutes is not None)
+            limited = minutes is not None
+            keeper = _Keeper(stage, training, data, held, accelerator, limited)
         _train(stage, training, batches, accelerator, keeper, minutes)
         accelerator.wait_for_everyone()
     return config.checkpoint
@@ -134,12 +146,12 @@ def _check_resumable(config: Run, resume: bool) -> None:
         check_resumed(config)
 
 
-def _add_rehearsal(stage: Stage, data: Batches) -> Batches | InTurns:
+def _add_rehearsal(stage: Stage, data: Batches, ranks: Ranks) -> Batches | InTurns:
     """The data in turns with the scans that are rehearsed, if any."""
     config = stage.config
     if config.rehearsal is None:
         return data
-    others = stage.open_data(config.rehearsal, "rehearsal")
+    others = stage.open_data(config.rehearsal, "rehearsal", ranks)
     return InTurns(data, replace(others, seed=config.seed + 1))
 
 
@@ -178,6 +190,7 @@ def _accelerator(config: Run) -> Iterator["Accelerator"]:
     require_accelerate()
     from accelerate import Accelerator
     from accelerate.state import AcceleratorState, is_initialized
+    from torch.utils import tensorboard  # noqa: F401  # by all processes at once: it takes seconds
 
     by_caller = is_initialized()
     precision = choose_precision(config.precision)
@@ -245,15 +258,28 @@ def _train(
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
     for record in steps(training, stage.task, batches, accelerator, stage.loss):
         stops = time.monotonic() > end or (keeper is not None and keeper.exhausted)
-        # All processes stop at the same step, whose clock ever is ahead.
-        stops_here = torch.tensor(float(stops), device=accelerator.device)
-        late = accelerator.reduce(stops_here).item() > 0
+        late = _all_stop(stops, record.step, accelerator)
         if keeper is not None:
             keeper.keep(record, late or record.step == training.recipe.iterations)
         if late:
             break
     if keeper is not None:
         keeper.close()
+
+
+def _all_stop(stops: bool, step: int, accelerator: "Accelerator") -> bool:
+    """Whether all processes stop: at the same step, whose clock ever is ahead."""
+    if accelerator.num_processes == 1:
+        return stops
+    if step % EVERY:  # it would wait for the device
+        return False
+    here = torch.tensor(float(stops), device=accelerator.device)
+    return bool(accelerator.reduce(here).item() > 0)
+
+
+def _writes_behind(device: torch.device) -> bool:
+    """Whether states are copied, and written by a thread."""
+    return device.type != "cpu"
 
 
 class _Keeper:
@@ -264,6 +290,7 @@ class _Keeper:
         stage: Stage,
         training: Training,
         data: Batches,
+        held: Batches | None,
         accelerator: "Accelerator",
         limited: bool,
     ) -> None:
@@ -274,9 +301,12 @@ class _Keeper:
         self.training = training
         self.data = data
         self.accelerator = accelerator
+        self.thread = ThreadPoolExecutor(1)
+        self.writing: Future[None] | None = None
         self.watch = None
-        if self.config.held_out is not None:
-            self.watch = Watch(stage, self.config.held_out, training, accelerator)
+        if self.config.held_out is not None and held is not None:
+            given = self.config.held_out
+            self.watch = Watch(stage, given, held, training, accelerator)
             if not self.watch.measured:
                 self.save_checkpoint()
                 self.save_state()
@@ -300,10 +330,11 @@ class _Keeper:
         self.records.append(record)
         self.bar.update()
         every = self.config.samples.every
-        if last or record.step % _LOG_EVERY == 0:
-            self.log()
         saves = last or record.step % self.config.save_every == 0
+        if saves or record.step % EVERY == 0:
+            self.log()
         if saves:
+            self.wait()
             self.save_checkpoint()
         if every and (last or record.step % every == 0):
             with self.accelerator.autocast():
@@ -312,10 +343,14 @@ class _Keeper:
             self.save_state()
 
     def log(self) -> None:
-        """Write the numbers since the last call."""
-        *_, last = self.records
-        mean = sum(record.loss for record in self.records) / len(self.records)
-        values = {"loss": mean, "gradient": last.gradient, "rate": last.rate}
+        """Write the numbers since the last call, which are finite, or nothing is saved."""
+        figures = read_figures(self.records)
+        mean = sum(loss for loss, _ in figures) / len(figures)
+        values = {
+            "loss": mean,
+            "gradient": figures[-1][1],
+            "rate": self.records[-1].rate,
+        }
         evaluations = sum(record.teacher_evaluations for record in self.records)
         if evaluations:
             values["teacher_evaluations"] = evaluations
@@ -328,8 +363,18 @@ class _Keeper:
             self.board.add_scalar(name, value, self.training.step)
 
     def save_state(self) -> None:
-        """Write the state from which an interrupted run resumes."""
-        self.training.save(self.config.output / STATE)
+        """Write the state from which an interrupted run resumes; from a GPU, while it goes on."""
+        path = self.config.output / STATE
+        if _writes_behind(self.accelerator.device):
+            held = self.training.held(copy=True)
+            self.writing = self.thread.submit(write_state, path, *held)
+        else:  # a copy would take as much memory again
+            self.training.save(path)
+
+    def wait(self) -> None:
+        """Wait until the last state is written; raises what it has raised."""
+        if self.writing is not None:
+            self.writing.result()
 
     def save_checkpoint(self) -> None:
         """Write the checkpoint, if it is the best."""
@@ -355,6 +400,7 @@ class _Keeper:
         )
 
     def close(self) -> None:
-        """End the bar and the logs."""
+        """End the bar and the logs, and what is still written."""
+        self.wait()
         self.bar.close()
         self.board.close()

@@ -29,7 +29,13 @@ def trapezoid(
     )
 
 
+def constant(step: int, warmup: int, iterations: int) -> float:
+    """Linear from 0 over ``warmup`` steps, then constant."""
+    return min(1.0, (step + 1) / max(1, warmup))
+
+
 SCHEDULES: dict[str, Callable[[int, int, int], float]] = {
+    "constant": constant,
     "cosine": cosine,
     "trapezoid": trapezoid,
 }

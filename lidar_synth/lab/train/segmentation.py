@@ -8,7 +8,6 @@ on the town or on your own dataset.
 from collections.abc import Callable, Iterable, Iterator
 from itertools import count
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -67,7 +66,7 @@ def train_segmenter(
     Args:
         network: a ``RangeSegmenter``, changed in place and left in evaluation mode.
         batches: at least ``steps`` of them.
-        height: (H, W) sine of each cell's elevation.
+        height: (H, W) sine of each cell's elevation, on the network's device.
         steps: optimiser steps.
         rate: the highest learning rate.
         progress: show a bar.
@@ -87,7 +86,7 @@ def train_segmenter(
     network.train()
     if half:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    losses: list[float] = []
+    losses: list[Tensor] = []
     bar = tqdm(total=steps, desc="segmenter", unit="step", disable=not progress)
     for _, batch in zip(range(steps), batches, strict=False):
         target = batch["label"].long()
@@ -99,21 +98,25 @@ def train_segmenter(
         inputs = segmenter_input(batch["range"], batch["reflectance"], height)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=half):
             logits = network(inputs)
+        target = target.to(logits.device)
         loss = F.cross_entropy(logits.float(), target, ignore_index=IGNORE)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
-        losses.append(loss.item())
+        losses.append(loss.detach())
         if watch is not None:
             watch(len(losses))
             network.train()
         bar.update()
-        bar.set_postfix(loss=f"{np.mean(losses[-20:]):.3f}", refresh=False)
+        if progress:  # it waits for a GPU
+            recent = torch.stack(losses[-20:]).mean()
+            bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
     bar.close()
     network.eval()
     if len(losses) < steps:
         raise DataError(
             f"{len(losses)} batches for {steps} steps", "as many batches as steps"
         )
-    return losses
+    values: list[float] = torch.stack(losses).tolist()
+    return values

@@ -25,6 +25,7 @@ from lidar_synth.generate.flow.path import Velocity
 from lidar_synth.generate.flow.timesteps import Selection, TrajectoryCosts, sum_costs
 from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.data import Batches
+from lidar_synth.lab.train.ranks import ALONE, Ranks
 from lidar_synth.lab.train.resume import flatten
 from lidar_synth.lab.train.state import checksum_of
 
@@ -62,7 +63,11 @@ class TimestepSelection:
                 )
 
     def run(
-        self, velocity: Velocity, shape: tuple[int, ...], data: Batches
+        self,
+        velocity: Velocity,
+        shape: tuple[int, ...],
+        data: Batches,
+        ranks: Ranks = ALONE,
     ) -> Selection:
         """Select the timesteps, as far as they are not; a bar shows the trajectories.
 
@@ -70,6 +75,7 @@ class TimestepSelection:
             velocity: the teacher.
             shape: of a state.
             data: the training data, whose conditions the trajectories have.
+            ranks: the processes that share the trajectories.
 
         Raises:
             ConfigError, DataError: as ``sum_costs``.
@@ -86,19 +92,23 @@ class TimestepSelection:
             metric=self.config.recipe.metric,
             device=data.device,
             condition=data.conditions if self.conditional else None,
+            progress=ranks.first,
             done=self.done,
+            each=ranks.map,
             **given.model_dump(),
         ):
             self.done = costs
             last = len(costs.optima) == given.trajectories
-            if last or time.monotonic() >= saved + SAVE_SECONDS:
+            due = last or time.monotonic() >= saved + SAVE_SECONDS
+            if due and ranks.first:
                 save_costs(self.path, costs, self.settings)
                 saved = time.monotonic()
         assert self.done is not None
         found = self.done.selection
-        tqdm.write(
-            f"timesteps {found.grid}: cost {found.cost:.4g}, uniform {found.uniform_cost:.4g}"
-        )
+        if ranks.first:
+            tqdm.write(
+                f"timesteps {found.grid}: cost {found.cost:.4g}, uniform {found.uniform_cost:.4g}"
+            )
         return found
 
 

@@ -22,17 +22,21 @@ from lidar_synth.generate.checkpoint import (
     Header,
     network_hash,
     split,
+    weights_hash,
 )
 from lidar_synth.generate.codec import Codec, make_codec
 from lidar_synth.generate.conditions import CONDITIONS, resize_image
 from lidar_synth.generate.flow.path import Example, Metric, velocity_loss
 from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.models.bounded_latent import BoundedAutoencoder
+from lidar_synth.generate.models.encoders.clip_views import ClipViewEncoder, find_clip
 from lidar_synth.geometry.scan import RangeImage, Scan, Source
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.train.cache import Other, cache_latents, cache_scans
 from lidar_synth.lab.train.config import Data, Run
 from lidar_synth.lab.train.data import Batch, Batches, Conditioning
 from lidar_synth.lab.train.provenance import recordings_known
+from lidar_synth.lab.train.ranks import ALONE, Ranks
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -62,7 +66,7 @@ class Stage:
         loss: what is lowered.
 
     Raises:
-        FileError, DataError: where the scans cannot be opened.
+        FileError, DataError: where the scans cannot be opened, or weights of CLIP are missing.
     """
 
     kind: str
@@ -84,6 +88,8 @@ class Stage:
         }
         self.device = device
         self.header = header
+        if isinstance(self.parts(network).get(ENCODER), ClipViewEncoder):
+            find_clip(device)  # missing weights are noticed before scans are read
         known = recordings_known(config, header.provenance, header.sensor)
         self.add_facts(seen=known.to_list())
 
@@ -115,25 +121,37 @@ class Stage:
         header = self.header
         return make_codec(self.frozen.get(CODEC), header.tensors, header.sensor.shape)
 
-    def open_data(self, data: Data | None = None, folder: str = "cache") -> Batches:
-        """The batches of the run, or of other ``data``; the scans are projected once and cached, in
-        a ``folder`` of the run where the data names none."""
+    def open_data(
+        self,
+        data: Data | None = None,
+        folder: str = "cache",
+        ranks: Ranks = ALONE,
+    ) -> Batches:
+        """The batches of the run, or of other ``data``; the scans are projected once, by all
+        ``ranks`` together, and cached, in a ``folder`` of the run where the data names none."""
         given = self.config.data if data is None else data
         sensor = self.header.sensor
+        conditions = [self._condition(name) for name in self.header.conditioning]
         source = given.open(sensor)
         channels = set(self.header.channels)
         others: dict[str, Other] = {}
         conditioning = None
-        for name in self.header.conditioning:
-            conditioning, other = self._condition(name, source)
-            field = CONDITIONS[name].field
+        for conditioning in conditions:
+            field = CONDITIONS[conditioning.name].field
             if field == "label":  # a channel of the range image
                 channels.add(field)
             else:
-                others[field] = other
+                others[field] = self._other(conditioning, source)
         kept = given.cache or self.config.output / folder
         cache = cache_scans(
-            source, sensor, channels, kept, given.describe(), others=others
+            source,
+            sensor,
+            channels,
+            kept,
+            given.describe(),
+            others=others,
+            ranks=ranks,
+            jobs=given.jobs,
         )
         batches = Batches(
             cache,
@@ -149,20 +167,35 @@ class Stage:
         codec = self.codec
         if not given.latents:
             return replace(batches, codec=codec)
-        made_by = network_hash(self.frozen[CODEC])
+        made_by = hash_encoder(self.frozen[CODEC])
         latents = cache_latents(
-            cache, batches.tensors, codec, self.device, kept, made_by
+            cache, batches.tensors, codec, self.device, kept, made_by, ranks=ranks
         )
         return replace(batches, latents=latents)
 
-    def _condition(self, name: str, source: Source) -> tuple[Conditioning, Other]:
-        """How samples get their conditions, and how a cache gets them from the scans."""
+    def _condition(self, name: str) -> Conditioning:
+        """How samples get their conditions."""
         options = self.header.conditioning[name]
         encoder = self.parts(self.network)[ENCODER]
         less = options.get("view_dropout", 0.0) or options.get("outline_dropout", 0.0)
-        conditioning = Conditioning(
-            name, options.get("dropout", 0.0), less, getattr(encoder, "views", 1)
+        blank = None
+        if isinstance(encoder, ClipViewEncoder):
+            black = torch.zeros(1, 3, *encoder.resolution, dtype=torch.uint8)
+            blank = encoder.look(black.to(self.device))[0].cpu()
+        return Conditioning(
+            name,
+            options.get("dropout", 0.0),
+            less,
+            getattr(encoder, "views", 1),
+            blank,
         )
+
+    def _other(self, about: Conditioning, source: Source) -> Other:
+        """How a cache gets the conditions from the scans: as pixels, or as features of CLIP, which
+        take a fiftieth of the space and are those of every epoch."""
+        name = about.name
+        options = self.header.conditioning[name]
+        encoder = self.parts(self.network)[ENCODER]
         shape = CONDITIONS[name].shape(encoder)
         sensor = self.header.sensor
 
@@ -174,9 +207,20 @@ class Stage:
                 return resize_image(image, shape, options, "the town's image")
             return CONDITIONS[name].read(scan, sensor, shape, options)
 
-        return conditioning, Other(shape, read)
+        if not isinstance(encoder, ClipViewEncoder):
+            return Other(shape, read)
 
-    def prepare(self, data: Batches, accelerator: "Accelerator") -> None:
+        def look(i: int, scan: Scan) -> NDArray[np.float16]:
+            image = torch.from_numpy(read(i, scan)).to(self.device)
+            made = encoder.look(torch.stack((image, image.flip(-1))))
+            return made.cpu().numpy().astype(np.float16)
+
+        maker = network_hash(find_clip(self.device))[:16]
+        return Other((2, *encoder.seen), look, np.float16, maker)
+
+    def prepare(
+        self, data: Batches, accelerator: "Accelerator", ranks: Ranks = ALONE
+    ) -> None:
         """Compute what the first step needs, and keep it in the run's folder; most kinds need
         nothing."""
 
@@ -202,3 +246,13 @@ class Stage:
             name, network, self.header, autoencoder=self.frozen.get(CODEC)
         )
         return generator.scans(0, range(count), data.conditions(range(count)))
+
+
+def hash_encoder(autoencoder: nn.Module) -> str:
+    """Hash of what decides an autoencoder's latents: the same for decoders trained further."""
+    if not isinstance(autoencoder, BoundedAutoencoder):
+        return network_hash(autoencoder)
+    chosen = set(map(id, autoencoder.encoder()))
+    kept: dict[str, Tensor] = dict(autoencoder.named_buffers())
+    kept |= {n: p for n, p in autoencoder.named_parameters() if id(p) in chosen}
+    return weights_hash({name: value.detach().cpu() for name, value in kept.items()})

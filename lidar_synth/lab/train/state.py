@@ -13,11 +13,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, DataError, FileError
@@ -55,6 +55,8 @@ class Recipe:
         clip: maximum norm of the gradient.
         ema_decay: decay of the averaged weights at each update; smaller in the first updates.
         ema_every: steps between these updates.
+        ema_after: steps until averaging begins, up to which the averaged weights are the network's
+            own; 0 = from the first step.
 
     Raises:
         ConfigError: on an unknown name or a number below 1.
@@ -76,6 +78,7 @@ class Recipe:
     clip: float = 1.0
     ema_decay: float = 0.995
     ema_every: int = 10
+    ema_after: int = 0
 
     def __post_init__(self) -> None:
         for key, table in (
@@ -102,6 +105,20 @@ class Recipe:
                 f"{self}",
                 "iterations, batch, accumulate, ema_every of at least 1 and a rate above 0",
             )
+
+
+def kept_share(recipe: Recipe, step: int) -> float:
+    """The share of the averaged weights that an update after ``step`` steps keeps.
+
+    Early averages have a short memory, so that they forget the initial weights: it grows as in
+    LiDM, or after ``ema_after`` steps as in R2Flow.
+    """
+    updates = step // recipe.ema_every
+    share = (1 + updates) / (10 + updates)
+    if recipe.ema_after:
+        since = max(1, step - recipe.ema_after)
+        share = 1 - since ** (-2 / 3)
+    return min(recipe.ema_decay, share)
 
 
 class Training:
@@ -131,9 +148,7 @@ class Training:
     def update_average(self) -> None:
         """Move the averaged weights towards the network's, and copy its buffers (statistics of
         norms, codebooks)."""
-        updates = self.step // self.recipe.ema_every
-        # Early averages have a short memory, so that they forget the initial weights.
-        keep = min(self.recipe.ema_decay, (1 + updates) / (10 + updates))
+        keep = kept_share(self.recipe, self.step)
         with torch.no_grad():
             torch._foreach_lerp_(
                 list(self.average.parameters()),
@@ -151,6 +166,11 @@ class Training:
         Raises:
             FileError: where it cannot be written.
         """
+        write_state(path, *self.held(copy=False))
+
+    def held(self, copy: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+        """What is saved: facts, and tensors in the processor's memory; those that lie there are
+        copied only if asked, and change in the next step."""
         tensors = {f"network.{n}": p for n, p in self.network.state_dict().items()}
         tensors |= {f"average.{n}": p for n, p in self.average.state_dict().items()}
         for k, optimizer in enumerate(self.optimizers):
@@ -158,13 +178,11 @@ class Training:
                 tensors |= {
                     f"optimizer.{k}.{i}.{n}": value for n, value in moments.items()
                 }
-        tensors = {
-            name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()
-        }
         facts = {"step": str(self.step), "seconds": f"{self.seconds:.3f}"}
-        write_file(
-            path, save(tensors, facts | {"checksum": checksum_of(facts, tensors)})
-        )
+        return facts, {
+            name: tensor.detach().to("cpu", copy=copy).contiguous()
+            for name, tensor in tensors.items()
+        }
 
     def load(self, path: Path) -> None:
         """Restore the state that ``save`` wrote.
@@ -212,6 +230,23 @@ class Training:
             ) from error
         self.step, self.earlier = progress
         self.began = time.monotonic()
+
+
+def write_state(path: Path, facts: dict[str, str], tensors: dict[str, Tensor]) -> None:
+    """Write what ``Training.held`` returns, from where it lies in memory.
+
+    Raises:
+        FileError: where it cannot be written.
+    """
+    sealed = facts | {"checksum": checksum_of(facts, tensors)}
+
+    def write(file: BinaryIO) -> None:
+        try:
+            save_file(tensors, file.name, sealed)
+        except SafetensorError as error:  # a full disk
+            raise OSError(str(error)) from error
+
+    write_file(path, write)
 
 
 def _check_moments(optimizer: torch.optim.Optimizer) -> None:

@@ -20,19 +20,21 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.conditions import CONDITIONS, Conditioned, blank
 from lidar_synth.generate.flow.distill import STRATEGIES, every_piece
+from lidar_synth.generate.flow.guidance import autoguide, guide
 from lidar_synth.generate.flow.path import (
     Example,
     Velocity,
-    autoguide,
     balanced_velocity_loss,
-    guide,
 )
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
+from lidar_synth.generate.models.encoders.clip_views import ClipViewEncoder
 from lidar_synth.lab.train.config import DistillConfig
 from lidar_synth.lab.train.data import Batch, Batches
+from lidar_synth.lab.train.precision import choose_precision, convert_products
 from lidar_synth.lab.train.provenance import provenance_of
+from lidar_synth.lab.train.ranks import ALONE, Ranks
 from lidar_synth.lab.train.selection import TimestepSelection
 from lidar_synth.lab.train.stage import Stage, Task
 
@@ -102,12 +104,14 @@ class StudentStage(Stage):
         if selects and config.init is None:
             self.selection = TimestepSelection(config, self.header)
 
-    def prepare(self, data: Batches, accelerator: "Accelerator") -> None:
+    def prepare(
+        self, data: Batches, accelerator: "Accelerator", ranks: Ranks = ALONE
+    ) -> None:
         """Select the timesteps, unless they are given, uniform or selected already."""
         config = self.config
         if self.selection is not None:
             with accelerator.autocast():
-                found = self.selection.run(self.flow, self.codec.shape, data)
+                found = self.selection.run(self.flow, self.codec.shape, data, ranks)
             others = tuple(found.grid_of(intervals) for intervals in config.also)
             self.header = replace(self.header, time_grid=found.grid, other_grids=others)
             self.add_facts(
@@ -211,20 +215,22 @@ def target_flow(
             weaker model of other data.
     """
     made = {"teacher": teacher.hash, "teacher_provenance": teacher.header.provenance}
-    velocity = _frozen_flow(teacher, config.compile)
+    velocity = _frozen_flow(teacher, config)
     if config.weaker is None:
         return _from_blank(config, teacher, velocity), made
     weaker = load_checkpoint(config.weaker, device)
     _check_weaker(config, teacher, weaker)
     made |= {"weaker": weaker.hash, "weaker_provenance": weaker.header.provenance}
-    other = _frozen_flow(weaker, config.compile)
+    other = _frozen_flow(weaker, config)
     return autoguide(velocity, other, config.guidance, config.within), made
 
 
-def _frozen_flow(checkpoint: Checkpoint, compiled: bool) -> nn.Module:
+def _frozen_flow(checkpoint: Checkpoint, config: DistillConfig) -> nn.Module:
     """The flow of a checkpoint, with frozen weights."""
     velocity = join(checkpoint.networks).requires_grad_(False)
-    if compiled:
+    if choose_precision(config.precision) == "bf16":
+        convert_products(checkpoint.networks[VELOCITY])
+    if config.compile:
         velocity.compile()
     return velocity
 
@@ -246,8 +252,13 @@ def _from_blank(
             f"{given} of a teacher that was trained without dropout of its condition",
             "1",
         )
-    empty = torch.zeros(CONDITIONS[name].shape(velocity.encoder), dtype=torch.uint8)
-    return guide(velocity, config.guidance, blank(name, empty))
+    encoder = velocity.encoder
+    empty = torch.zeros(CONDITIONS[name].shape(encoder), dtype=torch.uint8)
+    nothing = blank(name, empty)
+    if isinstance(encoder, ClipViewEncoder):  # it is trained on features
+        place = encoder.view_embedding.device
+        nothing = encoder.look(nothing[None].to(place))[0]
+    return guide(velocity, config.guidance, nothing)
 
 
 def _check_weaker(

@@ -42,23 +42,33 @@ class ClipViewEncoder(Encoder):
         nn.init.normal_(self.view_embedding, std=CLIP_WIDTH**-0.5)
         self.project = nn.Linear(CLIP_WIDTH, channels)
 
-    def forward(self, image: Tensor) -> Tensor:
-        """(B, 3, 224, 224 views) uint8 to (B, views, channels).
+    def forward(self, given: Tensor) -> Tensor:
+        """(B, 3, 224, 224 views) uint8, or what ``look`` makes of it, to (B, views, channels);
+        raises as ``look``."""
+        features = given if given.shape[1:] == self.seen else self.look(given)
+        out: Tensor = self.project(
+            features.to(self.project.weight.dtype) + self.view_embedding
+        )
+        return out
+
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Views and channels of what ``look`` returns for an image."""
+        return self.views, CLIP_WIDTH
+
+    @torch.no_grad()
+    def look(self, image: Tensor) -> Tensor:
+        """(B, 3, 224, 224 views) uint8 to CLIP's features (B, views, 768), which never change.
 
         Raises:
             DataError: on another size.
             FileError, LibraryError: if CLIP or its weights are missing.
         """
         check_shape(image, (3, *self.resolution), "a camera image")
-        with torch.no_grad():
-            x = split_views(image, self.views).float() / 255
-            mean, std = (x.new_tensor(v).view(3, 1, 1) for v in (_CLIP_MEAN, _CLIP_STD))
-            tower = load_frozen_clip(os.environ.get(CLIP_VARIABLE, ""), str(x.device))
-            features = tower((x - mean) / std).reshape(-1, self.views, CLIP_WIDTH)
-        out: Tensor = self.project(
-            features.to(self.project.weight.dtype) + self.view_embedding
-        )
-        return out
+        x = split_views(image, self.views).float() / 255
+        mean, std = (x.new_tensor(v).view(3, 1, 1) for v in (_CLIP_MEAN, _CLIP_STD))
+        out: Tensor = find_clip(x.device)((x - mean) / std)
+        return out.reshape(-1, *self.seen)
 
 
 class _Tower(nn.Module):
@@ -76,6 +86,12 @@ class _Tower(nn.Module):
             else self.model.encode_image(x)
         )
         return cast(Tensor, out)
+
+
+def find_clip(device: torch.device | str) -> nn.Module:
+    """The tower that the environment names; raises as ``load_frozen_clip``."""
+    place = torch.empty(0, device=device).device  # "cuda:0" for "cuda"
+    return load_frozen_clip(os.environ.get(CLIP_VARIABLE, ""), str(place))
 
 
 @lru_cache(maxsize=1)

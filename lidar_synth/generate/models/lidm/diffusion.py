@@ -15,6 +15,7 @@ below 0.037 and above 0.988 for LiDM), the network is evaluated at that step on 
 state, as samplers of diffusion models do at their start.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -58,13 +59,11 @@ class DiffusionUNet(UNet):
     ) -> Tensor:
         """The velocity dy/dt at y and t; arguments and result are those of ``UNet``."""
         t = torch.as_tensor(t, dtype=torch.float32, device=y.device)
-        times = schedule_times(*self.schedule).to(y.device)
+        times = _times_on(y.device, *self.schedule)
         time = t.double().reshape(-1, *[1] * (y.ndim - 1))
         x = y.double() / ((1 - time) ** 2 + time**2).sqrt()
         noise = self.evaluate(x.to(y.dtype), step_of(t, times), cond).double()
-        known = time.clamp(
-            float(times[0]), float(times[-1])
-        )  # the range of the schedule
+        known = time.clamp(times[0], times[-1])  # the range of the schedule
         data = (x * ((1 - known) ** 2 + known**2).sqrt() - known * noise) / (1 - known)
         return torch.where(time < 0.5, (noise - y) / (1 - time), (y - data) / time).to(
             y.dtype
@@ -79,6 +78,12 @@ def schedule_times(beta_start: float, beta_end: float, steps: int) -> Tensor:
     ).square()
     signal = (1 - betas).cumprod(0)
     return (1 - signal).sqrt() / (signal.sqrt() + (1 - signal).sqrt())
+
+
+@lru_cache
+def _times_on(device: torch.device, *schedule: Any) -> Tensor:
+    """``schedule_times`` on a device, which is not asked to wait for them at every evaluation."""
+    return schedule_times(*schedule).to(device)
 
 
 def step_of(t: Tensor, times: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ patches of 2 x 8 cells and predicts what the cells of a patch can show (``surfac
 linear layer knows single cells, which makes it cheap.
 """
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
@@ -201,11 +202,13 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         """Set the noise of cells from images (1, C, H, W), whose latents get ``noise`` of this
         standard deviation, as in training."""
         generator = torch.Generator().manual_seed(0)
+        network = copy.deepcopy(self).cpu()  # the same figures on every device
 
         def measured(x: Tensor) -> Seen:
-            z = self.squeeze(x)
+            x = x.cpu()
+            z = network.squeeze(x)
             z = z + noise * torch.randn(z.shape, generator=generator)
-            return Seen(x, _codes_of(x), self.expand(z))
+            return Seen(x, _codes_of(x), network.expand(z))
 
         found = measure_noise(
             map(measured, images), self.codes, self.normalisation, generator

@@ -10,6 +10,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import parse_yaml
 from lidar_synth.files.recipes import find_recipe, merge, read_recipe, validate
 from lidar_synth.generate.conditions import CONDITIONS
+from lidar_synth.generate.flow.solvers import read_grid
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.lab.train.config.sections import Run
 from lidar_synth.lab.train.config.training import DistillConfig, TrainConfig
@@ -80,17 +81,15 @@ def check(config: Run) -> None:
             )
     if isinstance(config, TrainConfig):
         _check_train(config)
-    if isinstance(config, DistillConfig) and config.grid is not None:
-        grid = config.grid
-        if (
-            len(grid) != config.intervals + 1
-            or (grid[0], grid[-1]) != (1, 0)
-            or sorted(set(grid))[::-1] != list(grid)
-        ):
-            raise ConfigError(
-                f"grid {list(grid)}",
-                f"{config.intervals + 1} descending times from 1 to 0",
-            )
+    if (
+        isinstance(config, DistillConfig)
+        and config.grid is not None
+        and len(read_grid(config.grid)) != config.intervals + 1
+    ):
+        raise ConfigError(
+            f"grid {list(config.grid)}",
+            f"{config.intervals + 1} descending times from 1 to 0",
+        )
 
 
 def _check_train(config: TrainConfig) -> None:
@@ -105,12 +104,14 @@ def _check_train(config: TrainConfig) -> None:
             "init: a latent model, with its own condition",
         )
     if (
-        config.data.roll
+        (config.data.roll or config.data.flip == "both")
         and config.condition
         and not CONDITIONS[config.condition.kind].turns
     ):
         raise ConfigError(
-            f"data.roll with the condition {config.condition.kind!r}", "data.roll=false"
+            f"data.flip={config.data.flip}, data.roll={config.data.roll} with the condition "
+            f"{config.condition.kind!r}",
+            "data.roll=false and no data.flip=both",
         )
     if config.codec is not None and config.recipe.weights:
         raise ConfigError(

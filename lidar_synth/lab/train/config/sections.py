@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from torch.utils.data import ConcatDataset
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.formats import open_scans
@@ -37,11 +38,14 @@ class Data(Section):
         layout, split: as for ``open_scans``.
         on_bad: "error", or "skip" to leave out scans that cannot be read.
         cache: folder of the projected scans; by default ``cache`` in the output folder.
-        flip: mirror every other sample.
-        roll: rotate every sample by a random number of columns.
+        jobs: processes that project the scans for the cache, without images.
+        flip: mirror every other sample, left to right; "both" = front to back too.
+        roll: rotate every sample by a random number of columns, or by as many degrees at most.
         latents: cache the latents of the autoencoder too.
         seen: recordings behind the scans, where ``path`` has copies of them
             (``Recordings.to_list``); by default they follow from the layout.
+        more: further scans, which follow these; of their keys, only those that say which scans they
+            are count.
     """
 
     licence: str
@@ -54,10 +58,12 @@ class Data(Section):
     split: str | None = None
     on_bad: Literal["error", "skip"] = "error"
     cache: Path | None = None
-    flip: bool = False
-    roll: bool = False
+    jobs: Count = 1
+    flip: bool | Literal["both"] = False
+    roll: bool | Annotated[float, Field(gt=1, le=180)] = False
     latents: bool = False
     seen: list[dict[str, Any]] | None = None
+    more: "tuple[Data, ...]" = ()
 
     def open(self, sensor: Sensor) -> Source:
         """The scans.
@@ -65,6 +71,9 @@ class Data(Section):
         Raises:
             ConfigError: on a path with a variable that is not set, or what the source refuses.
         """
+        if self.more:
+            sources: list[Any] = [one.open(sensor) for one in self.parts()]
+            return ConcatDataset(sources)
         if self.town is not None:
             return Town(self.seed, sensor, self.town, self.interval, motion=self.motion)
         path = os.path.expandvars(self.path or "")
@@ -78,6 +87,10 @@ class Data(Section):
             path, layout=self.layout, split=self.split, on_bad=self.on_bad
         )
 
+    def parts(self) -> "list[Data]":
+        """These scans without ``more``, then those."""
+        return [self.model_copy(update={"more": ()}), *self.more]
+
     def describe(self) -> dict[str, Any]:
         """What tells these scans from others, plain values."""
         keys = (
@@ -88,9 +101,11 @@ class Data(Section):
         keys |= (
             {"motion"} if self.motion else set()
         )  # caches of earlier versions do not name it
-        return self.model_dump(
-            mode="json", exclude=keys | {"cache", "flip", "roll", "latents", "seen"}
-        )
+        keys |= {"cache", "jobs", "flip", "roll", "latents", "seen", "more"}
+        facts = self.model_dump(mode="json", exclude=keys)
+        if self.more:
+            facts["more"] = [one.describe() for one in self.more]
+        return facts
 
 
 class Samples(Section):
@@ -192,6 +207,9 @@ class ConditionSection(Section):
         height: metres of the sensor above the ground, which a layout has to confirm.
         image: rows and columns of the camera's images.
         focal: focal length of the camera in pixels, which the dataset's calibration has to confirm.
+        views: views side by side in the image that are resized one by one, as in LiDM.
+        keep_gaps: whether narrow gaps in label maps are kept when a scan is generated, as they are
+            in training.
     """
 
     kind: Literal["semantic", "camera", "layout"]
@@ -203,6 +221,8 @@ class ConditionSection(Section):
     height: Annotated[float, Field(gt=0)] | None = None
     image: tuple[Count, Count] | None = None
     focal: Annotated[float, Field(gt=0)] | None = None
+    views: Count | None = None
+    keep_gaps: bool = False
 
     def part(self, resolution: tuple[int, int], target: tuple[int, int]) -> NetworkSpec:
         """The encoder, for a sensor's ``resolution`` and a state of ``target`` rows and columns.
@@ -236,6 +256,8 @@ class ConditionSection(Section):
                 "height",
                 "image",
                 "focal",
+                "views",
+                "keep_gaps",
             },
         )
         return {key: value for key, value in values.items() if value}

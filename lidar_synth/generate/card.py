@@ -1,0 +1,63 @@
+"""The card of a model on the Hugging Face hub."""
+
+from lidar_synth.datasets.recordings import seen_by
+from lidar_synth.files.hub import front_matter
+from lidar_synth.files.markdown import escape_markdown, list_facts
+from lidar_synth.generate.checkpoint import Header
+
+TASKS = {
+    "semantic": "image-to-3d",
+    "camera": "image-to-3d",
+    "layout": "other",
+}
+"""{condition: the hub's category of the task}; without one, "unconditional-image-generation"."""
+
+
+def model_card(
+    place: str, header: Header, digest: str, parameters: int, licence: str | None
+) -> str:
+    """The card: Markdown with the hub's metadata as a header.
+
+    Args:
+        place: where the model will be, ``hf://user/model``.
+        header: of its checkpoint.
+        digest: hash of its checkpoint.
+        parameters: number of them.
+        licence: an identifier of the hub; None = that of the header.
+    """
+    made = header.provenance
+    condition = next(iter(header.conditioning), None)
+    rows, columns = header.sensor.shape
+    name = place.rpartition("/")[2]
+    facts = {
+        "sensor": f"{header.sensor.name}, {rows} x {columns}",
+        "channels": ", ".join(header.channels),
+        "condition": condition or "none",
+        "steps": len(header.time_grid) - 1,
+        "parameters": f"{parameters / 1e6:.1f} M",
+        "licence": licence or made["licence"],
+        "data": made["data"],
+        "data licence": made["data_licence"],
+        "recordings": seen_by(made) or "none known",
+        "checkpoint": digest,
+    }
+    lines = [
+        *front_matter(
+            [licence or str(made["licence"])],
+            library_name="lidar_synth",
+            pipeline_tag=TASKS.get(str(condition), "unconditional-image-generation"),
+            tags=["lidar", "point-cloud", "range-image"],
+        ),
+        f"# {escape_markdown(name)}",
+        "",
+        "A generative model of LiDAR scans.",
+        "",
+        "```python",
+        "from lidar_synth import load_generator",
+        "",
+        f'generator = load_generator("{place}")',
+        "```",
+        "",
+        *list_facts(facts),
+    ]
+    return "\n".join(lines) + "\n"

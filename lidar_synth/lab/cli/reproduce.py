@@ -1,0 +1,81 @@
+"""``lidar-synth reproduce``: a table of the LiDAR-Flow paper, from the data to the figures."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def reproduce(
+    table: Annotated[
+        str, typer.Argument(metavar="TABLE", help="table1 to table6 of the paper")
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder with KITTI-360 and SemanticKITTI, or one of them; by default "
+            "KITTI360_ROOT and SEMANTICKITTI_ROOT"
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="folder of runs, scans and features")
+    ] = Path("runs/paper"),
+    use: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TASK.STAGE=FILE",
+            help="a checkpoint or released weights (.pth, .ckpt) instead of a training",
+        ),
+    ] = None,
+    tenth: Annotated[
+        bool, typer.Option("--tenth", help="a tenth of the iterations and of the scans")
+    ] = False,
+    tiny: Annotated[
+        bool,
+        typer.Option("--tiny", help="small networks on scans of the town, in a minute"),
+    ] = False,
+    estimate: Annotated[
+        bool,
+        typer.Option("--estimate", help="print hours by stage, from a minute of each"),
+    ] = False,
+    weights: Annotated[
+        Path | None, typer.Option(help="folder with published weights of extractors")
+    ] = None,
+    device: Annotated[str, typer.Option(help="device of sampling: cpu | cuda")] = "cpu",
+) -> None:
+    """Trains what a table needs (autoencoder, teacher, student on timesteps selected for it),
+    generates, compares by the paper's protocol and prints the figures below the paper's.
+
+    Run it again to resume; tables share their runs. The tasks are pixel (table 1), latent (2),
+    camera (3) and semantic (5); table 4 compares strategies, table 6 times.
+
+    \b
+    Examples:
+      lidar-synth reproduce table1 --tiny
+      lidar-synth reproduce table1 --data DATASETS --estimate
+      lidar-synth reproduce table1 --data DATASETS --weights metrics --device cuda
+      lidar-synth reproduce table1 --data DATASETS --use pixel.teacher=r2flow-kitti360-1rf.pth
+    """
+    from lidar_synth.lab.reproduce import report
+    from lidar_synth.lab.reproduce.tables import find_table
+    from lidar_synth.lab.reproduce.work import TaskRun, find_data, write_town
+
+    if tenth and tiny:
+        raise typer.BadParameter("give one of the two", param_hint="--tenth, --tiny")
+    spec = find_table(table)
+    scale = "tiny" if tiny else "tenth" if tenth else "full"
+    folder = out / scale / "estimate" if estimate else out / scale
+    given = report.given_weights(use or (), spec.tasks)
+    limit = 1.0 if estimate else None
+    works = {
+        task: TaskRun(task, folder, scale, given[task], device, weights, limit)
+        for task in spec.tasks
+    }
+    find_data(data)
+    if tiny:
+        write_town(works)
+    lines = report.estimate(spec, works)
+    if not estimate:
+        lines = report.reproduce(table, spec, works)
+    for line in lines:
+        typer.echo(line)
