@@ -19,9 +19,9 @@ from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.evaluate import PROTOCOLS, Metric, Score, evaluate, lidm
 from lidar_synth.lab.evaluate.cache import Cached, extract_all, weights_hash
 from lidar_synth.lab.evaluate.extractors import EXTRACTORS
-from lidar_synth.lab.evaluate.leaderboard import compare_published, leaderboard
 from lidar_synth.lab.evaluate.measures import KINDS
 from lidar_synth.lab.evaluate.protocols import FEATURES, alike, parse_protocol
+from lidar_synth.lab.evaluate.published import compare_published, read_published
 
 SENSOR = presets()["town"]
 REAL = [random_scan(SENSOR, 1500, seed) for seed in range(6)]
@@ -399,7 +399,7 @@ def test_a_protocol_that_cannot_be_is_refused(text: str, message: str) -> None:
 
 
 def test_published_figures_name_their_protocol_and_source() -> None:
-    tables, sources = leaderboard()
+    tables, sources = read_published()
     for table in tables:
         names = {m.table for m in PROTOCOLS[table.protocol].measures.values()}
         assert table.source in sources and table.rows
@@ -431,6 +431,9 @@ def test_own_figures_stand_in_the_scale_of_the_table() -> None:
         shown.splitlines()[-1]
         == "| **these scans** (1000 real, 2000 generated) | |  |  |  |  |  | 8.72 [8, 9] |"
     )
+    outside = Score("x", 0.319, "lidm", 64, 64, "", 1.0, 0.247, 0.273, 0.26)
+    assert outside.shown() == "0.319 (corrected 0.26) [0.247, 0.273]"
+    assert replace(outside, value=0.25).shown() == "0.25 [0.247, 0.273]"
     assert (
         "| R3DPA |  | 8.46 | 6.34 | 9.83 | 11.0 | 5.67 | 8.72 |" in shown
         and "LiDAR-Flow" not in shown

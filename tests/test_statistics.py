@@ -207,6 +207,15 @@ def test_an_interval_narrows_with_more_samples_and_repeats_with_its_seed() -> No
     )
 
 
+def test_the_corrected_value_is_nearer_to_the_truth_than_one_of_few_samples() -> None:
+    """The Frechet distance of two sets from the same distribution is 0."""
+    rng = np.random.default_rng(0)
+    pairs = [frechet(*rng.normal(size=(2, 40, 4))) for _ in range(20)]
+    values = np.mean([statistic.value for statistic in pairs])
+    corrected = np.mean([bootstrap(one, 100).corrected for one in pairs])
+    assert abs(corrected) < 0.3 * values
+
+
 def test_intervals_refuse_what_cannot_give_one() -> None:
     one = smallest_of_pairs(np.ones((1, 5)))
     with pytest.raises(
@@ -256,8 +265,8 @@ def test_neighbours_tell_fidelity_from_diversity() -> None:
     assert narrow.precision.value > 0.95 and narrow.recall.value < 0.2
     assert wide.precision.value < 0.4 and wide.coverage.value < good.coverage.value / 2
     assert [s.value for s in manifold(real, real)][:2] == [1, 1]
-    low, high = bootstrap(good.precision, 100)
-    assert 0 < high - low < 0.2
+    low, high, corrected = bootstrap(good.precision, 100)
+    assert 0 < high - low < 0.2 and low <= corrected <= high
     with pytest.raises(
         DataError,
         match="3 real and 300 generated samples; expected more than k = 5 of each",

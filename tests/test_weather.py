@@ -20,6 +20,7 @@ from lidar_synth.weather import (
     Fog,
     IncompleteEcho,
     MissingBeams,
+    MotionBlur,
     Rain,
     Snow,
     Spray,
@@ -292,6 +293,26 @@ def test_beams_go_whole(clear: Scan) -> None:
     assert len(CrossSensor(0.25)(bare, keyed_rng(0))) == pytest.approx(
         len(few), rel=0.02
     )
+
+
+def test_half_of_the_returns_of_every_beam_stay(clear: Scan) -> None:
+    """Every other one in the order of the azimuth."""
+    whole = CrossSensor(1.0)(clear, keyed_rng(0))
+    assert len(whole) == len(clear)
+    half = CrossSensor(1.0, along=0.5)(clear, keyed_rng(0))
+    assert clear.ring is not None and half.raw_label is not None
+    turn = np.arctan2(clear.points[:, 1], clear.points[:, 0])
+    for ring in np.unique(clear.ring):
+        on = np.flatnonzero(clear.ring == ring)
+        on = on[np.argsort(turn[on], kind="stable")]
+        kept = np.flatnonzero(np.isin(clear.raw_label[on], half.raw_label))
+        assert abs(len(kept) - len(on) / 2) <= 1
+        assert (np.diff(kept) == 2).mean() > 0.99
+
+
+def test_motion_blur_is_horizontal(clear: Scan) -> None:
+    moved = MotionBlur(0.08)(clear, keyed_rng(0)).points - clear.points
+    assert moved.std(axis=0) == pytest.approx([0.08, 0.08, 0], rel=0.02)
 
 
 def test_a_box_without_returns_is_flagged() -> None:

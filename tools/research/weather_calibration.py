@@ -6,57 +6,25 @@ JUDGE is a folder of lidar-bonnetal's archive, LABELLED a root of SemanticKITTI.
 published shares are those of SqueezeSeg in the Robo3D benchmark.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from tqdm import tqdm
 from typer import run
 
 from lidar_synth import SemanticKITTI
-from lidar_synth.geometry.scan import Scan
-from lidar_synth.lab.evaluate.segmentation import mean_iou
-from lidar_synth.lab.evaluate.street_judge import StreetJudge, load_archive
-from lidar_synth.weather import CORRUPTIONS, SEVERITIES
-
-PUBLISHED = {
-    "fog": 59.6,
-    "wet_ground": 86.4,
-    "snow": 71.8,
-    "motion_blur": 56.7,
-    "missing_beams": 79.1,
-    "crosstalk": 68.5,
-    "incomplete_echo": 87.5,
-    "cross_sensor": 24.8,
-}
-"""Share of the clean mIoU that is left, %, mean of the severities."""
-
-
-def score(judge: StreetJudge, scans: Sequence[Scan]) -> float:
-    """mIoU of the classes that occur in the scans, %."""
-    return 100 * mean_iou(judge.confusion(scans))
+from lidar_synth.lab.evaluate.robustness import open_model, published, stress
 
 
 def main(judge: Path, labelled: Path, every: int = 1) -> None:
-    """Prints the table of every Nth scan."""
-    archive = load_archive(judge, 2048)
+    """Prints the card of every Nth scan, and the published shares."""
     source = SemanticKITTI(labelled)
     scans = [source[i] for i in range(0, len(source), every)]
-    clean = score(archive, scans)
-    print(f"{len(scans)} scans, clean mIoU {clean:.1f} %\n")
-    print(
-        f"| % of it | published | mean | {' | '.join(SEVERITIES)} |\n|---|{'---:|' * 5}"
-    )
-    for name, kind in tqdm(CORRUPTIONS.items()):
-        shares = []
-        for severity in SEVERITIES:
-            change = kind.at(severity)
-            rngs = map(np.random.default_rng, range(len(scans)))
-            changed = [change(s, r) for s, r in zip(scans, rngs, strict=True)]
-            shares.append(100 * score(archive, changed) / clean)
-        cells = [PUBLISHED.get(name, ""), f"{np.mean(shares):.1f}"]
-        cells += [f"{share:.0f}" for share in shares]
-        tqdm.write(f"| {name} | {' | '.join(map(str, cells))} |")
+    card = stress(scans, open_model(str(judge)))
+    print(f"{len(scans)} scans\n\n{card.to_text()}\n\n| % | published RR | RR | off |")
+    print("|---|---:|---:|---:|")
+    for name, share in published("SqueezeSeg").resilience.items():
+        own = card.resilience[name]
+        row = f"{100 * share:.1f} | {100 * own:.1f} | {100 * (own - share):+.1f}"
+        print(f"| {name} | {row} |")
 
 
 if __name__ == "__main__":

@@ -36,6 +36,12 @@ def evaluate(
             help="archive of lidar-bonnetal: how well its network recognises both sets"
         ),
     ] = None,
+    objects: Annotated[
+        bool,
+        typer.Option(
+            help="how well a small classifier tells the cars and persons of both sets apart"
+        ),
+    ] = False,
     columns: Annotated[
         int | None, typer.Option(help="width of the judge's grid; its own by default")
     ] = None,
@@ -87,6 +93,9 @@ def evaluate(
     With --judge, a segmentation network that was trained on real streets predicts the classes of
     both sets: accuracy, IoU by class, the most frequent confusions and feature distances.
 
+    With --objects, cars and persons of both sets are compared at the same distance and seen width:
+    AUC of a classifier at real places that it has not seen, returns, surfaces, roughness.
+
     Papers define metrics of the same name differently: scores of two protocols are not comparable.
     Fewer scans than the protocol's paper compares, and other sensors than its own, are refused. A
     reference that shares frames with the model's training data is refused, because it flatters the
@@ -98,26 +107,28 @@ def evaluate(
       lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics --beside
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
+      lidar-synth evaluate SemanticKITTI town --objects
     """
     from lidar_synth.errors import suggest
     from lidar_synth.formats import open_scans
     from lidar_synth.lab.evaluate import PROTOCOLS
     from lidar_synth.lab.evaluate import evaluate as compare
     from lidar_synth.lab.evaluate.features import describe_missing
-    from lidar_synth.lab.evaluate.leaderboard import compare_published as published
     from lidar_synth.lab.evaluate.leakage import refuse_training_data
+    from lidar_synth.lab.evaluate.published import compare_published as published
     from lidar_synth.lab.evaluate.segmentation import load_judge
 
-    if beside and (as_json or judge is not None):
+    if beside and (as_json or objects or judge is not None):
         raise typer.BadParameter(
             "goes with --protocol and prints tables: leave out --json",
             param_hint="--beside",
         )
-    if (protocol is None) == (judge is None):
+    if (protocol is not None) + (judge is not None) + objects != 1:
         raise typer.BadParameter(
-            "give --protocol or --judge, one of them", param_hint="--protocol"
+            "give --protocol, --judge or --objects, one of them",
+            param_hint="--protocol",
         )
-    if judge is None and protocol not in PROTOCOLS:
+    if protocol is not None and protocol not in PROTOCOLS:
         known = f"{protocol!r} is none of {', '.join(PROTOCOLS)}. {suggest(protocol, PROTOCOLS)}"
         raise typer.BadParameter(known, param_hint="--protocol")
     sources = (
@@ -128,6 +139,9 @@ def evaluate(
         typer.echo(note, err=True)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
+        return
+    if objects:
+        _objects(sources, as_json)
         return
     rules = PROTOCOLS[str(protocol)]
     extractors = {"the town segmenter": load_judge().features} if segmenter else {}
@@ -155,6 +169,14 @@ def evaluate(
         typer.echo(note, err=True)
     if beside and not as_json:
         typer.echo(f"\n{published(scores)}")
+
+
+def _objects(sources: "tuple[Source, Source]", as_json: bool) -> None:
+    """Print how well objects of both sets can be told apart."""
+    from lidar_synth.lab.evaluate.objects import as_text, compare_objects
+
+    figures = compare_objects(*sources)
+    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
 
 
 def _recognition(

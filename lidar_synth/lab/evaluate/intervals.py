@@ -16,10 +16,11 @@ _BATCH = 50  # resamples that are evaluated at a time
 
 
 class Interval(NamedTuple):
-    """A confidence interval, both ends included."""
+    """A confidence interval, both ends included, and the value without the bias of its resamples."""
 
     low: float
     high: float
+    corrected: float
 
     def __str__(self) -> str:
         return f"[{self.low:.4g}, {self.high:.4g}]"
@@ -78,8 +79,8 @@ def bootstrap(
     if not np.isfinite(together := np.concatenate(values)).all():
         return None
     tails = np.quantile(together, [(1 - level) / 2, (1 + level) / 2])
-    low, high = np.clip(2 * statistic.value - tails[::-1], smallest, largest)
-    return Interval(float(low), float(high))
+    ends = 2 * statistic.value - np.array([*tails[::-1], together.mean()])
+    return Interval(*np.clip(ends, smallest, largest).tolist())
 
 
 def extrapolated_frechet(

@@ -31,6 +31,8 @@ from lidar_synth.files.parsing import read_facts
 from lidar_synth.formats import BankScans, layout_of
 from lidar_synth.formats.models import models_of
 from lidar_synth.formats.source import ScanFiles
+from lidar_synth.generate.generator import Generator
+from lidar_synth.generate.loading import load_generator
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.town.export import SETTINGS
 
@@ -146,6 +148,39 @@ def refuse_training_data(
             "frames is not known"
         )
     return ""
+
+
+def refuse_leaks(
+    model: str, tested: Recordings, scans: Iterable[Scan] = ()
+) -> Generator:
+    """Load a generator, and refuse one that was trained on the places that are tested.
+
+    Args:
+        model: its name or path.
+        tested: the recordings of the tested scans.
+        scans: those of them that are known by their content only; read if the generator has learnt
+            from such scans.
+
+    Raises:
+        ConfigError: if it was; the message names drives and frames. On a model that needs camera
+            images.
+    """
+    generator = load_generator(model)
+    if generator.condition == "camera":
+        raise ConfigError(
+            f"generator {model!r}, which needs camera images",
+            "one that needs none, such as town",
+        )
+    seen = seen_by(generator.header.provenance)
+    if any(dataset == CONTENT for dataset, _ in seen.drives):
+        tested = tested | contents(map(content_of, scans))
+    if shared := overlap(seen, tested):
+        raise ConfigError(
+            f"generator {model!r}, which was trained on places that are tested: {shared}",
+            "a generator that has never seen them",
+            "Choose another --model, or leave out the arm: --arm with the names of the others.",
+        )
+    return generator
 
 
 def content_of(scan: Scan) -> str:

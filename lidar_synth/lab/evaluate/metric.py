@@ -55,6 +55,7 @@ class Score:
         table: what the paper's tables call it; "" where no paper reports it.
         times: the factor by which the tables show it.
         low, high: its 95 % interval, if one was asked for and can be had.
+        corrected: then, the value without the bias of few scans, which the interval is around.
     """
 
     metric: str
@@ -66,9 +67,19 @@ class Score:
     times: float = 1.0
     low: float | None = None
     high: float | None = None
+    corrected: float | None = None
+
+    def shown(self, times: float = 1.0, digits: int = 4) -> str:
+        """The value times a factor, with its interval; beside a value that the interval does not
+        contain, the corrected one."""
+        text = f"{self.value * times:.{digits}g}"
+        if self.low is None or self.high is None:
+            return text
+        if self.corrected and not self.low <= self.value <= self.high:
+            text += f" (corrected {self.corrected * times:.4g})"
+        return f"{text} [{self.low * times:.4g}, {self.high * times:.4g}]"
 
     def __str__(self) -> str:
-        interval = "" if self.low is None else f" [{self.low:.4g}, {self.high:.4g}]"
         setting = (
             f"{self.protocol} protocol, {self.real} real, {self.generated} generated"
         )
@@ -77,7 +88,7 @@ class Score:
             if self.table
             else ""
         )
-        return f"{self.metric} = {self.value:.6g}{interval} ({setting}){table}"
+        return f"{self.metric} = {self.shown(digits=6)} ({setting}){table}"
 
 
 @dataclass
@@ -315,9 +326,7 @@ class Metric:
     def _made(
         self, measure: Measure, value: float, statistic: Any, real: int, fake: int
     ) -> Score:
-        low, high = self._interval(
-            statistic, (-np.inf if measure.least is None else measure.least, np.inf)
-        )
+        least = -np.inf if measure.least is None else measure.least
         return Score(
             measure.title,
             value,
@@ -326,8 +335,7 @@ class Metric:
             fake,
             measure.table,
             measure.times,
-            low,
-            high,
+            *self._interval(statistic, (least, np.inf)),
         )
 
     def _of_figures(
@@ -336,24 +344,28 @@ class Metric:
         real, fake = (kept[side].count for side in SIDES)
         scores = []
         for title, value, statistic, limits in figures:
-            low, high = self._interval(
-                statistic() if self._replicates else None, limits
-            )
-            scores.append(
-                Score(
-                    title, value(), self.protocol.name, real, fake, low=low, high=high
-                )
-            )
+            made = statistic() if self._replicates else None
+            interval = self._interval(made, limits)
+            name = self.protocol.name
+            scores.append(Score(title, value(), name, real, fake, "", 1.0, *interval))
         return scores
 
     def _interval(
         self, statistic: Any, limits: tuple[float, float]
-    ) -> tuple[float | None, float | None]:
+    ) -> tuple[float | None, ...]:
+        """Low, high and corrected value, where they are asked for and can be had."""
         if statistic is None or not self._replicates:
-            return None, None
-        return bootstrap(
-            statistic, self._replicates, LEVEL, smallest=limits[0], largest=limits[1]
-        ) or (None, None)
+            return ()
+        return (
+            bootstrap(
+                statistic,
+                self._replicates,
+                LEVEL,
+                smallest=limits[0],
+                largest=limits[1],
+            )
+            or ()
+        )
 
     def _gathered(self) -> dict[str, _Kept]:
         """Both sets of all processes, in the order of their ranks."""

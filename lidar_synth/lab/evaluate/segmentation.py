@@ -43,12 +43,11 @@ def confusion(
     table = torch.zeros(count * count, dtype=torch.int64)
     with torch.inference_mode():
         for batch in batches:
-            predicted = network(
-                segmenter_input(batch["range"], batch["reflectance"], height)
-            ).argmax(1)
+            seen = segmenter_input(batch["range"], batch["reflectance"], height)
+            predicted = network(seen).argmax(1).cpu()
             valid = batch["label"] != IGNORE
             pairs = batch["label"][valid].long() * count + predicted[valid]
-            table += torch.bincount(pairs.cpu(), minlength=count * count)
+            table += torch.bincount(pairs, minlength=count * count)
     return table.reshape(count, count).numpy()
 
 
@@ -57,10 +56,10 @@ def class_ious(table: NDArray[np.int64]) -> NDArray[np.float64]:
     predicted.
 
     Args:
-        table: (19, 19) the result of ``confusion``.
+        table: (19, 19) the result of ``confusion``; a 20th column counts predictions of no class.
     """
     hit = np.diagonal(table)
-    union = table.sum(0) + table.sum(1) - hit
+    union = table.sum(0)[: len(hit)] + table.sum(1) - hit
     return np.where(union > 0, hit / np.maximum(union, 1), np.nan)
 
 

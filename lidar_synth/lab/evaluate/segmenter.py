@@ -109,11 +109,14 @@ def segmenter_input(distance: Tensor, reflectance: Tensor, height: Tensor) -> Te
     Args:
         distance: (B, H, W) metres, 0 = no return.
         reflectance: (B, H, W) in [0, 1].
-        height: (H, W) sine of each cell's elevation, z of the sensor's rays.
+        height: (H, W) sine of each cell's elevation, z of the sensor's rays; on the device of the
+            input.
 
     Returns:
         (B, 4, H, W): log2(1 + d) / 6, z / 2, reflectance, and 1 where there is a return.
     """
+    distance = distance.to(height.device)
+    reflectance = reflectance.to(height.device)
     returned = (distance > 0).to(distance.dtype)
     return torch.stack(
         [

@@ -1,0 +1,309 @@
+"""Robustness of a segmentation network: its mIoU under weather and failing sensors, in the measures
+of the Robo3D benchmark (Kong et al., ICCV 2023).
+
+For a corruption, RR = mean mIoU of its severities / clean mIoU, and CE = mean error (1 - mIoU) of its
+severities / that of a baseline. mRR and mCE are their means over the benchmark's corruptions.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lidar_synth.datasets.classes import IGNORE, NAMES, SEMANTIC_KITTI
+from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.files.disk import read_values
+from lidar_synth.files.parsing import read_facts
+from lidar_synth.formats.point_labels import decode_labels
+from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.segmentation import load_judge, mean_iou
+from lidar_synth.lab.evaluate.street_judge import load_archive
+from lidar_synth.noise import keyed_rng
+from lidar_synth.weather import BENCHMARK, CORRUPTIONS, SEVERITIES
+
+Table = NDArray[np.int64]
+Model = Callable[[Iterable[Scan], str], Table]
+"""Counts labelled points by label (row, 19) and prediction (column; a 20th one is no class) over the
+scans of a case, "clean" or such as "fog/heavy"."""
+
+NAMES_OF_BENCHMARK = tuple(kind.name for kind in BENCHMARK)
+PUBLISHED = {
+    "MinkUNet-18": (62.76, 55.87, 53.99, 53.28, 32.92, 56.32, 58.34, 54.43, 46.05),
+    "SqueezeSeg": (31.61, 18.85, 27.30, 22.70, 17.93, 25.01, 21.65, 27.66, 7.85),
+}
+"""The benchmark's mIoU on SemanticKITTI, %: clean, then each of ``NAMES_OF_BENCHMARK``, mean of the
+severities. The first is its baseline."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a network scores on clean and on corrupted scans.
+
+    Args:
+        clean: mIoU of the scans as they are, in [0, 1].
+        scores: {corruption: mIoU of each severity}, in [0, 1].
+        baseline: {corruption: mean mIoU of another network, in [0, 1]}, for CE.
+    """
+
+    clean: float
+    scores: Mapping[str, Sequence[float]]
+    baseline: Mapping[str, float]
+
+    @property
+    def means(self) -> dict[str, float]:
+        """mIoU of each corruption, mean of its severities."""
+        return {name: float(np.mean(values)) for name, values in self.scores.items()}
+
+    @property
+    def resilience(self) -> dict[str, float]:
+        """RR of each corruption."""
+        return {name: score / self.clean for name, score in self.means.items()}
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """CE of each corruption that the baseline has."""
+        return {
+            name: (1 - score) / (1 - self.baseline[name])
+            for name, score in self.means.items()
+            if name in self.baseline
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """All figures as plain values; the means are those of the benchmark's corruptions."""
+        figures = {"RR": self.resilience, "CE": self.errors}
+        means = {f"m{key}": _mean_of(values) for key, values in figures.items()}
+        scores = {name: list(values) for name, values in self.scores.items()}
+        return {"clean": self.clean, "scores": scores, **figures, **means}
+
+    def to_text(self) -> str:
+        """The figures as a table in Markdown, per cent."""
+        every = self.to_dict()
+        rows: dict[str, list[float | None]] = {}
+        rows["clean"] = [None, None, None, self.clean, 1.0, None]
+        for name, values in self.scores.items():
+            rates = [self.means[name], self.resilience[name], self.errors.get(name)]
+            rows[name] = [*values, *rates]
+        rows["mean"] = [None, None, None, None, every["mRR"], every["mCE"]]
+        lines = [
+            f"| % | {' | '.join(SEVERITIES)} | mIoU | RR | CE |",
+            "|---|" + 6 * "---:|",
+        ]
+        for name, cells in rows.items():
+            shown = ["" if c is None else f"{100 * c:.1f}" for c in cells]
+            lines.append(f"| {name} | {' | '.join(shown)} |")
+        return "\n".join(lines)
+
+
+def published(model: str) -> Card:
+    """The card of a network of ``PUBLISHED``; each severity has the mean."""
+    shares = {
+        name: dict(
+            zip(NAMES_OF_BENCHMARK, np.divide(row[1:], 100).tolist(), strict=True)
+        )
+        for name, row in PUBLISHED.items()
+    }
+    scores = {name: [score] * 3 for name, score in shares[model].items()}
+    return Card(PUBLISHED[model][0] / 100, scores, next(iter(shares.values())))
+
+
+def read_means(path: Path) -> dict[str, float]:
+    """The baseline of a file of ``Card.to_dict``.
+
+    Raises:
+        FileError: if it cannot be read.
+        DataError: if it is something else.
+    """
+    expected = "a card that lidar-synth stress --json printed"
+    facts = read_facts(path, expected)
+    try:
+        return Card(facts["clean"], facts["scores"], {}).means
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{path} ({error!r})", expected) from error
+
+
+def stress(
+    scans: Source,
+    model: Model,
+    corruptions: Sequence[str] = NAMES_OF_BENCHMARK,
+    baseline: Mapping[str, float] | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> Card:
+    """Score a network on labelled scans, as they are and under every severity of corruptions.
+
+    Args:
+        scans: labelled scans; they are read anew for every severity.
+        model: see ``open_model``.
+        corruptions: names of ``CORRUPTIONS``.
+        baseline: as for ``Card``; by default the benchmark's.
+        seed: of the corruptions.
+        progress: whether to show a progress bar.
+
+    Raises:
+        ConfigError: on an unknown corruption.
+        DataError: on scans without labels.
+    """
+    scores = {}
+    for case in tqdm(cases(corruptions), unit="case", disable=not progress):
+        scores[case] = mean_iou(model(corrupt(scans, case, seed), case))
+    by_name = {
+        name: [scores[f"{name}/{severity}"] for severity in SEVERITIES]
+        for name in corruptions
+    }
+    if baseline is None:
+        baseline = published(next(iter(PUBLISHED))).means
+    return Card(scores["clean"], by_name, baseline)
+
+
+def write_cases(
+    scans: Source, out: Path, corruptions: Sequence[str], seed: int = 0
+) -> int:
+    """Write the scans of every case, as they are and corrupted, to a folder of its name in
+    SemanticKITTI's layout, numbered in sequence 00; a rerun writes what is missing.
+
+    Returns:
+        Number of scans written.
+
+    Raises:
+        ConfigError, DataError: as ``stress``.
+        FileError: if a folder cannot be written.
+    """
+    written = 0
+    for case in tqdm(cases(corruptions), unit="case", disable=None):
+        writer = SemanticKITTIWriter(out / case)
+        for number, scan in enumerate(corrupt(scans, case, seed)):
+            if not writer.complete(number):
+                writer.write(scan, number)
+                written += 1
+        writer.finish()
+    return written
+
+
+def cases(corruptions: Sequence[str]) -> list[str]:
+    """ "clean", and every severity of corruptions, such as "fog/heavy"."""
+    for name in corruptions:
+        choose("corruption", name, CORRUPTIONS)
+    return ["clean", *(f"{name}/{s}" for name in corruptions for s in SEVERITIES)]
+
+
+def corrupt(scans: Source, case: str, seed: int = 0) -> Iterator[Scan]:
+    """The scans of a case; the same for the same seed.
+
+    Raises:
+        DataError: on a scan without labels.
+    """
+    name, _, severity = case.partition("/")
+    change = CORRUPTIONS[name].at(severity) if severity else None
+    for number in range(len(scans)):
+        scan = scans[number]
+        if scan.label is None:
+            raise DataError(f"scan {scan.id!r} without labels", "labelled scans")
+        yield scan if change is None else change(scan, keyed_rng(seed, number))
+
+
+def show_cases(scan: Scan, corruptions: Sequence[str], seed: int = 0) -> list[Scan]:
+    """A labelled scan in every case, named by it."""
+    return [
+        replace(one, id=case)
+        for case in cases(corruptions)
+        for one in corrupt([scan], case, seed)
+    ]
+
+
+def open_model(given: str) -> Model:
+    """The network that a text names.
+
+    Args:
+        given: ``"town"``, the small segmenter that ships with the package; the folder of an
+            archive of lidar-bonnetal; a folder of predictions, ``CASE/.../*.label`` in the order
+            of the scans that ``write_cases`` wrote, with SemanticKITTI's class ids; or
+            ``module:function``, which is imported and called with each ``Scan`` of N points and
+            returns (N,) train ids, 0 to 18, or 255 for none.
+
+    Raises:
+        ConfigError: if it names nothing of these.
+        FileError, DataError: if an archive cannot be read.
+    """
+    if given == "town":
+        judge = load_judge()
+        return lambda scans, case: judge.agreement(scans)
+    folder = Path(given)
+    if (folder / "arch_cfg.yaml").is_file():
+        street = load_archive(folder)
+        return lambda scans, case: street.confusion(scans)
+    if folder.is_dir():
+        return partial(_compare_files, folder)
+    module, _, name = given.partition(":")
+    sys.path.insert(0, "")  # a command has the working folder not on its path
+    try:
+        function = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"model {given!r} ({error})",
+            "town, a folder of predictions, an archive of lidar-bonnetal, or module:function",
+        ) from error
+    finally:
+        sys.path.remove("")
+    return lambda scans, case: sum_tables(count_points(s, function(s)) for s in scans)
+
+
+def count_points(scan: Scan, predicted: Any) -> Table:
+    """(19, 20) labelled points by label and prediction, the last column = none of the classes.
+
+    Raises:
+        DataError: unless there is a whole number for every point.
+    """
+    values = np.asarray(predicted)
+    if values.shape != (len(scan),) or values.dtype.kind not in "iu":
+        raise DataError(
+            f"predictions of shape {values.shape} and type {values.dtype} for scan {scan.id!r}",
+            f"({len(scan)},), a train id for each point",
+        )
+    count = len(NAMES)
+    assert scan.label is not None
+    valid = scan.label != IGNORE
+    known = (values >= 0) & (values < count)
+    pairs = (
+        scan.label[valid] * np.int64(count + 1) + np.where(known, values, count)[valid]
+    )
+    return np.bincount(pairs, minlength=count * (count + 1)).reshape(count, count + 1)
+
+
+def sum_tables(tables: Iterable[Table]) -> Table:
+    """The sum of the tables of several scans."""
+    total = np.zeros((len(NAMES), len(NAMES) + 1), np.int64)
+    for table in tables:
+        total += table
+    return total
+
+
+def _compare_files(folder: Path, scans: Iterable[Scan], case: str) -> Table:
+    """The table of a case from its files of predictions."""
+    files = sorted((folder / case).rglob("*.label"))
+    tables = []
+    for number, scan in enumerate(scans):
+        if number < len(files):
+            raw = read_values(files[number], "<u4")
+            predicted = decode_labels(raw, SEMANTIC_KITTI, str(files[number]))
+            tables.append(count_points(scan, predicted["label"]))
+    if len(tables) != len(files) or number + 1 != len(files):
+        raise DataError(
+            f"{folder / case} with {len(files)} predictions for {number + 1} scans",
+            "a file NNNNNN.label for each scan that --out wrote",
+        )
+    return sum_tables(tables)
+
+
+def _mean_of(values: Mapping[str, float]) -> float | None:
+    """The mean over the benchmark's corruptions; None without all of them."""
+    if not set(NAMES_OF_BENCHMARK) <= set(values):
+        return None
+    return float(np.mean([values[name] for name in NAMES_OF_BENCHMARK]))
