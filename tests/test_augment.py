@@ -18,11 +18,11 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels import augment
 from lidar_synth.labels.augment import (
     Augmentation,
-    compose,
     mirror_scan,
     rotate_scan,
     scale_scan,
 )
+from lidar_synth.labels.compose import Compose
 from lidar_synth.noise import keyed_rng
 
 STEPS: dict[str, Augmentation] = {
@@ -34,7 +34,7 @@ STEPS: dict[str, Augmentation] = {
     "beam_drop": augment.beam_drop,
     "range_drop": augment.range_drop,
 }
-STEPS["all"] = compose(list(STEPS.values()))
+STEPS["all"] = Compose(list(STEPS.values()))
 
 seeds = st.integers(0, 2**32)
 

@@ -177,9 +177,23 @@ def test_scans_without_boxes_are_refused(tmp_path: Path) -> None:
         prove_detection(bare, tmp_path)
 
 
+def test_a_dry_run_says_what_would_be_trained(places: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--labelled", "2", "--arm", "first", "--dry-run", "--out", str(out)]
+    result = CliRunner().invoke(
+        app, ["prove", str(places), "--task", "detection", *options]
+    )
+    assert result.exit_code == 0, result.output
+    assert "4 scans in 4 places: place0 (1), place1 (1)" in result.output
+    assert "4 trainings of 1000 iterations of 2:" in result.output
+    assert "seed 1: 2 labelled scans, tested on place" in result.output
+    assert "the town first, then half, GT sampling" in result.output
+    assert not out.exists()
+
+
 def test_options_of_the_other_task_are_refused(places: Path, tmp_path: Path) -> None:
     command = ["prove", str(places), "--task", "detection", "--only", "car"]
     result = CliRunner().invoke(app, [*command, "--out", str(tmp_path)])
-    assert isinstance(result.exception, ConfigError) and "--only" in str(
-        result.exception
-    )
+    assert isinstance(result.exception, ConfigError)
+    message = str(result.exception)
+    assert "--only" in message and "Did you mean" not in message

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.bodywork import GLASS
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.ground import KINDS, NAMES, TownGround
@@ -20,7 +21,6 @@ from lidar_synth.lab.town.meshes import (
     merge,
     tube,
 )
-from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.plants import (
     CORE,
     LEAF,

@@ -99,7 +99,7 @@ def test_mixtures_close_unboxed_objects_of_boxed_scans(labels: str) -> None:
     ):
         mixed(with_boxes(BOTH, [0]), labels=labels, unboxed="error")
     with pytest.raises(
-        ConfigError, match="unboxed='drop'; expected one of 'close', 'keep', 'error'"
+        ConfigError, match="unboxed 'drop'; expected one of 'close', 'keep', 'error'"
     ):
         mixed(with_boxes(BOTH, [0]), unboxed="drop")
 

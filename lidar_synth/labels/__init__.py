@@ -11,6 +11,7 @@ _HOME = {
     "LabelPolicy": "policies",
     "Object": "objects",
     "ObjectBank": "bank",
+    "draw_objects": "draw",
     "instances_of": "objects",
     "make_policy": "policies",
     "objects_of": "objects",
@@ -24,6 +25,7 @@ __all__ = list(_HOME)
 
 if TYPE_CHECKING:
     from lidar_synth.labels.bank import ObjectBank as ObjectBank
+    from lidar_synth.labels.draw import draw_objects as draw_objects
     from lidar_synth.labels.exchange import swap_bands as swap_bands
     from lidar_synth.labels.exchange import swap_sector as swap_sector
     from lidar_synth.labels.exchange import thin_scan as thin_scan

@@ -1,7 +1,7 @@
 """Augmentations of a scan: points, labels and boxes together.
 
 An augmentation is ``(scan, rng) -> scan``: a pure function of its two arguments, which never
-changes its input. ``functools.partial`` sets its options, and ``compose`` makes one augmentation of
+changes its input. ``functools.partial`` sets its options, and ``Compose`` makes one augmentation of
 several.
 
 ``yaw``, the flips and ``scale`` move points and boxes together, and remove the scan's pose and
@@ -17,9 +17,8 @@ Example:
     (True, False)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -34,50 +33,27 @@ from lidar_synth.labels.own import check_share
 Augmentation = Callable[[Scan, np.random.Generator], Scan]
 
 
-def compose(steps: Sequence[Augmentation]) -> Augmentation:
-    """Make one augmentation that applies several in this order, with one random generator.
-
-    Example:
-        >>> from functools import partial
-        >>> from lidar_synth import Town
-        >>> from lidar_synth.labels.augment import beam_drop, compose, flip_y, scale, yaw
-        >>> from lidar_synth.noise import keyed_rng
-        >>> augment = compose([partial(yaw, limit=45), flip_y, scale, beam_drop])  # as MixedScans' augment
-        >>> scan = Town(seed=0, scans=1)[0]
-        >>> 0 < len(augment(scan, keyed_rng(0, 3, 17))) <= len(scan)  # the key: seed, epoch, position
-        True
-    """
-    return partial(_each, tuple(steps))
-
-
-def _each(
-    steps: tuple[Augmentation, ...], scan: Scan, rng: np.random.Generator
-) -> Scan:
-    for step in steps:
-        scan = step(scan, rng)
-    return scan
-
-
 def yaw(scan: Scan, rng: np.random.Generator, limit: float = 180.0) -> Scan:
     """Rotate the scan about the vertical axis by a random angle of up to ``limit`` degrees to
     either side."""
     if not 0 <= limit <= 180:
         raise ConfigError(f"limit={limit}", "0..180 degrees")
-    return rotate_scan(scan, float(np.radians(rng.uniform(-limit, limit))))
+    angle = float(rng.uniform(-limit, limit))
+    return rotate_scan(scan, float(np.radians(angle))).noted("yaw", degrees=angle)
 
 
 def flip_x(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror front and back with probability ``chance``."""
-    return (
-        mirror_scan(scan, "x") if rng.random() < check_share("chance", chance) else scan
-    )
+    if rng.random() >= check_share("chance", chance):
+        return scan
+    return mirror_scan(scan, "x").noted("flip_x")
 
 
 def flip_y(scan: Scan, rng: np.random.Generator, chance: float = 0.5) -> Scan:
     """Mirror left and right with probability ``chance``."""
-    return (
-        mirror_scan(scan, "y") if rng.random() < check_share("chance", chance) else scan
-    )
+    if rng.random() >= check_share("chance", chance):
+        return scan
+    return mirror_scan(scan, "y").noted("flip_y")
 
 
 def scale(
@@ -86,7 +62,8 @@ def scale(
     """Multiply all lengths by a random factor between ``low`` and ``high``."""
     if not 0 < low <= high < np.inf:
         raise ConfigError(f"low={low}, high={high}", "0 < low <= high")
-    return scale_scan(scan, float(rng.uniform(low, high)))
+    factor = float(rng.uniform(low, high))
+    return scale_scan(scan, factor).noted("scale", factor=factor)
 
 
 def jitter(
@@ -115,7 +92,7 @@ def jitter(
         points[crossed] = scan.points[crossed]
     brightness = np.clip(scan.reflectance + reflectance * noise[1], 0, 1)
     return replace(
-        scan,
+        scan.noted("jitter", spread=spread, reflectance=reflectance),
         points=points.astype(np.float32),
         reflectance=brightness.astype(np.float32),
     )
@@ -128,7 +105,8 @@ def drop_reflectance(scan: Scan, rng: np.random.Generator, chance: float = 1.0) 
     """
     if rng.random() >= check_share("chance", chance):
         return scan
-    return replace(scan, reflectance=np.zeros_like(scan.reflectance))
+    dark = np.zeros_like(scan.reflectance)
+    return replace(scan.noted("drop_reflectance"), reflectance=dark)
 
 
 def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan:
@@ -144,6 +122,7 @@ def beam_drop(scan: Scan, rng: np.random.Generator, share: float = 0.25) -> Scan
         if scan.ring is None
         else scan.ring
     )
+    scan = scan.noted("beam_drop", beams=sorted(dropped.tolist()))
     return _subset(scan, ~np.isin(row, dropped))
 
 
@@ -161,9 +140,8 @@ def range_drop(
     if not power >= 0:
         raise ConfigError(f"power={power}", "0 or more")
     far = np.minimum(np.linalg.norm(scan.points, axis=1) / scan.sensor.range_max, 1)
-    return _subset(
-        scan, rng.random(len(scan)) >= check_share("share", share) * far**power
-    )
+    kept = rng.random(len(scan)) >= check_share("share", share) * far**power
+    return _subset(scan.noted("range_drop", share=share, power=power), kept)
 
 
 def rotate_scan(scan: Scan, angle: float) -> Scan:

@@ -22,7 +22,7 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     the first scan. Labels, confidence (1 for labels of scans without confidence) and instances
     (those of their boxes, if points have none) are always set; instances of the other scans are
     renumbered. Rings are set if the first scan has them, as lasers of its sensor; boxes if any scan
-    has them; times are dropped, as each scan has its own moment.
+    has them, and so causes; times are dropped, as each scan has its own moment.
     """
     parts = [_complete(scan)]
     used = _last_instance(parts[0])
@@ -33,6 +33,9 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     if scan.ring is not None:
         parts = [_with_rings(p, scan.sensor) for p in parts]
         names.append("ring")
+    if any(p.cause is not None for p in parts):
+        parts = [_with_causes(p) for p in parts]
+        names.append("cause")
     together: dict[str, Any] = {
         n: np.concatenate([getattr(p, n) for p in parts]) for n in ("points", *names)
     }
@@ -58,6 +61,13 @@ def _with_rings(part: Scan, sensor: Sensor) -> Scan:
     if part.ring is not None and same_lasers(part.sensor, sensor):
         return part
     return replace(part, ring=assign_beams(part, sensor).ring)
+
+
+def _with_causes(part: Scan) -> Scan:
+    """The scan with causes; those of a scan without any are surfaces."""
+    if part.cause is not None:
+        return part
+    return replace(part, cause=np.zeros(len(part), np.uint8))
 
 
 def _complete(scan: Scan) -> Scan:

@@ -61,13 +61,29 @@ def paste(
         if fitted is not None:
             placed.append(fitted)
     placed.sort(key=lambda o: float(np.hypot(o.box[0], o.box[1])))
+    seen, pasted = show_objects(scan, placed, least)
+    return merge_scans(_own(scan, seen, least), pasted)
+
+
+def show_objects(
+    scan: Scan, placed: list[Object], least: int
+) -> tuple[NDArray[np.bool_], list[Scan]]:
+    """What a sensor sees of a scan and of objects in it.
+
+    Args:
+        scan: N points.
+        placed: objects where they stand, from near to far.
+        least: minimum number of visible returns of an object.
+
+    Returns:
+        (N,) True for points that are still visible, and the visible returns of each object that is
+        seen, with its box and its occlusion.
+    """
     view = Composition(scan)
     shown = [o for o in placed if view.add(o, least)]
-    own = _own(scan, view.parts[0].seen, least)
-    pasted = [
-        _as_seen(o.scan, part) for o, part in zip(shown, view.parts[1:], strict=True)
-    ]
-    return merge_scans(own, [p for p in pasted if len(p) >= least])
+    parts = zip(shown, view.parts[1:], strict=True)
+    visible = [_as_seen(o.scan, part) for o, part in parts]
+    return view.parts[0].seen, [v for v in visible if len(v) >= least]
 
 
 def _fit(scan: Scan, candidate: Object, placed: list[Object]) -> Object | None:

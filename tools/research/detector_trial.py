@@ -25,7 +25,7 @@ import typer
 from torch import nn
 from tqdm import tqdm
 
-from lidar_synth import MixedScans, ObjectBank, Source, load_generator, make_policy
+from lidar_synth import MixedScans, ObjectBank, Source, load_generator
 from lidar_synth.files.disk import write_file
 from lidar_synth.lab.proof.detection.bev import view
 from lidar_synth.lab.proof.detection.boxes import CLASSES
@@ -41,7 +41,6 @@ from lidar_synth.lab.proof.detection.network import (
 from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
-from lidar_synth.labels.augment import Augmentation, compose, flip_x, flip_y, scale, yaw
 from lidar_synth.mixing import Sources, settle
 
 LABELLED = 30
@@ -213,10 +212,9 @@ def mixture(
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
     options = {"bank": objects, "count": there, "turn": 180.0, "clear": False}
-    steps: list[Augmentation] = [partial(yaw, limit=45), flip_x, flip_y, scale]
+    steps: list[Any] = [{"yaw": {"limit": 45}}, "flip_x", "flip_y", "scale"]
     if arm.pasted:
-        fields = frozenset({"label", "boxes"})
-        steps.insert(0, make_policy("paste", fields=fields, **options))
+        steps.insert(0, {"paste": options})
     share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
     return MixedScans(
         labelled,
@@ -226,7 +224,7 @@ def mixture(
         seed=seed,
         balanced=True,
         epoch_size=count // PHASES if arm.first else count,
-        augment=compose(steps),
+        augment=steps,
         augment_real=True,
         to_sample=sample,
         collate=collate,

@@ -27,6 +27,7 @@ from lidar_synth.lab.town.returns import measure, see_through
 from lidar_synth.lab.town.town import Town
 from lidar_synth.lab.town.world import STRETCH_FRAMES
 from lidar_synth.labels.bank import ObjectBank
+from lidar_synth.labels.draw import draw_objects
 from lidar_synth.labels.objects import Object
 from lidar_synth.noise import keyed_rng
 
@@ -176,6 +177,10 @@ class TownObjects(ObjectBank):
 
     def __getitem__(self, index: int) -> Object:
         return super().__getitem__(index)._replace(cast=self.shapes[index])
+
+    def draw(self, scan: Scan, boxes: Boxes) -> Scan:
+        """See ``draw_objects``."""
+        return draw_objects(scan, boxes, self)
 
     def fit_sizes(self, boxes: Boxes) -> "TownObjects":
         """The objects with the mean size of other boxes, by name; names that the others do not

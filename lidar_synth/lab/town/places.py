@@ -3,11 +3,11 @@ of a square."""
 
 import numpy as np
 
+from lidar_synth.lab.town.bodies import sitter, walker
 from lidar_synth.lab.town.catalogue import Rng, pick, pick_colour, pick_name
 from lidar_synth.lab.town.furniture import stall
 from lidar_synth.lab.town.objects import make_object
 from lidar_synth.lab.town.paving import PLAZA_DEPTH
-from lidar_synth.lab.town.people import sitter, walker
 from lidar_synth.lab.town.plants import random_hedge, random_plant, weeds
 from lidar_synth.lab.town.scene import Scene
 from lidar_synth.lab.town.street import Street

@@ -7,12 +7,12 @@ static obstacle in any frame.
 
 import numpy as np
 
+from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, walker
 from lidar_synth.lab.town.catalogue import RGB, Rng, pick, pick_colour, pick_name
 from lidar_synth.lab.town.meshes import Array
 from lidar_synth.lab.town.movers import Line, Mover, ego_place
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.paving import PLAZA_DEPTH
-from lidar_synth.lab.town.people import PHASES, cyclist, motorcyclist, walker
 from lidar_synth.lab.town.scene import Scene
 from lidar_synth.lab.town.street import SIDES, SideStreet, Street
 from lidar_synth.lab.town.vehicles import vehicles

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import BOXED, GROUND, NAMES
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import DataError, choose
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.labels.boxes import grow_box
 from lidar_synth.labels.edit.redraw import Model
@@ -170,10 +170,7 @@ def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
     Raises:
         ConfigError: on another name.
     """
-    if name not in HANDLING:
-        raise ConfigError(
-            f"unboxed={name!r}", f"one of {', '.join(map(repr, HANDLING))}"
-        )
+    choose("unboxed", name, HANDLING)
     return (
         partial(remove_unboxed, model=model)
         if name == "close" and model is not None

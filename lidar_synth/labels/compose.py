@@ -1,0 +1,246 @@
+"""One augmentation made of several, which plain data such as YAML can name.
+
+A step is an augmentation, its name, or ``{name: {argument: value}}``, where ``[low, high]``
+is drawn from for every scan, ``severity`` names that of a corruption (of a list, one is
+drawn for every scan), and ``p`` is the probability of the step::
+
+    - fog: {visibility: [50, 500], p: 0.3}
+    - snow: {severity: [light, moderate], p: 0.3}
+    - yaw: {limit: 45}
+    - flip_y
+    - polarmix
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from inspect import signature
+from typing import Any, Self
+
+import numpy as np
+
+from lidar_synth.errors import ConfigError, choose
+from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.labels import augment
+from lidar_synth.labels.augment import Augmentation
+from lidar_synth.labels.own import check_share
+from lidar_synth.labels.policies import read_policy
+from lidar_synth.weather import CORRUPTIONS, Corruption
+
+MOVES: dict[str, Callable[..., Scan]] = {
+    "yaw": augment.yaw,
+    "flip_x": augment.flip_x,
+    "flip_y": augment.flip_y,
+    "scale": augment.scale,
+    "jitter": augment.jitter,
+    "beam_drop": augment.beam_drop,
+    "range_drop": augment.range_drop,
+    "drop_reflectance": augment.drop_reflectance,
+}
+MIXES = "polarmix", "lasermix", "polarmix_or_lasermix", "paste"
+"""Label policies that are augmentations too: they draw from the real scans."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a ``Compose``.
+
+    Args:
+        name: of ``MOVES``, ``CORRUPTIONS`` or ``MIXES``; "" for another function.
+        arguments: of it, as in plain data.
+        p: probability in [0, 1].
+        call: what is called; None makes it from name and arguments for every scan.
+
+    Raises:
+        ConfigError: on an unknown name or argument, or an invalid value.
+    """
+
+    name: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    p: float = 1.0
+    call: Augmentation | None = None
+
+    def __post_init__(self) -> None:
+        check_share("p", self.p)
+        if self.call is None:  # all that can be drawn is valid
+            lists = [v for v in self.arguments.values() if isinstance(v, list | tuple)]
+            for n in range(max(map(len, lists), default=1)):
+                self._make(partial(_nth, n))
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        if self.p < 1 and rng.random() >= self.p:
+            return scan
+        call = self.call or self._make(partial(_draw, rng))
+        scan = call(scan, rng)
+        return scan.noted(self.name, **self.arguments) if self.name in MIXES else scan
+
+    def bind(self, real: Source | None, fields: frozenset[str]) -> "Step":
+        """The step with real scans to draw from, if it needs them."""
+        call: Any = self._make(list) if self.name in MIXES else self.call
+        if not hasattr(call, "bind"):
+            return self
+        return replace(self, call=call.bind(real, fields))
+
+    def to_data(self) -> Any:
+        """The step as plain data.
+
+        Raises:
+            ConfigError: for a function without a name.
+        """
+        if not self.name:
+            raise ConfigError(f"{self.call} as plain data", "an augmentation by name")
+        chance = {} if self.p == 1 else {"p": self.p}
+        return {self.name: {**self.arguments, **chance}}
+
+    def _make(self, pick: Callable[[Sequence[Any]], Any]) -> Any:
+        """The augmentation; ``pick`` takes one of the values that a list stands for."""
+        choose("augmentation", self.name, dict.fromkeys((*MOVES, *CORRUPTIONS, *MIXES)))
+        if self.name in MIXES:
+            return read_policy({self.name: self.arguments})
+        arguments = dict(self.arguments)
+        for key, value in arguments.items():
+            if isinstance(value, list | tuple):
+                arguments[key] = pick(_check_choice(key, value))
+        kind = CORRUPTIONS.get(self.name)
+        make: Any = MOVES.get(self.name, kind)
+        if kind is not None and "severity" in arguments:
+            make = kind.at
+        given = () if kind else (None, None)
+        try:
+            signature(make).bind(*given, **arguments)
+            return make(**arguments) if kind else partial(make, **arguments)
+        except TypeError as error:
+            known = [k for k in signature(make).parameters if k not in ("scan", "rng")]
+            raise ConfigError(f"{self.name}: {error}", f"arguments {known}") from error
+
+
+class Compose:
+    """One augmentation that applies several in order, with one random generator.
+
+    ``scan.augmented`` tells what was drawn.
+
+    Args:
+        steps: augmentations, their names, or ``{name: {argument: value, "p": chance}}``.
+
+    Raises:
+        ConfigError: on an unknown name or argument, or an invalid value.
+
+    Example:
+        >>> from functools import partial
+        >>> from lidar_synth import Compose, Town
+        >>> from lidar_synth.labels.augment import yaw
+        >>> from lidar_synth.noise import keyed_rng
+        >>> augment = Compose([{"fog": {"visibility": [50, 500], "p": 0.5}}, partial(yaw, limit=45), "scale"])
+        >>> scan = augment(Town(seed=0, scans=1)[0], keyed_rng(0, 3, 17))  # seed, epoch, position
+        >>> [name for step in scan.augmented for name in step]
+        ['fog', 'yaw', 'scale']
+        >>> Compose.from_dict(augment.to_dict()).to_dict() == augment.to_dict()
+        True
+    """
+
+    def __init__(self, steps: Sequence[Any]) -> None:
+        self.steps = tuple(map(read_step, steps))
+
+    def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        for step in self.steps:
+            scan = step(scan, rng)
+        return scan
+
+    def bind(self, real: Source | None, fields: frozenset[str]) -> Self:
+        """The same with real scans to draw from."""
+        return type(self)([step.bind(real, fields) for step in self.steps])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, from which ``from_dict`` makes the same.
+
+        Raises:
+            ConfigError: on a step that is a function without a name.
+        """
+        return {"compose": [step.to_data() for step in self.steps]}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Make it from ``to_dict``.
+
+        Raises:
+            ConfigError: on anything else.
+        """
+        if not isinstance(values, Mapping) or list(values) != ["compose"]:
+            raise ConfigError(f"{values!r}", "{compose: [steps]}")
+        return cls(values["compose"])
+
+
+def make_augmentation(
+    given: Any, real: Source | None, fields: frozenset[str]
+) -> Augmentation:
+    """An augmentation from what ``MixedScans`` takes: itself, or what a ``Compose`` takes.
+
+    Args:
+        given: an augmentation, a step, a list of steps, or ``Compose.to_dict``.
+        real: labelled scans to draw from.
+        fields: the fields of the synthetic scans.
+
+    Raises:
+        ConfigError: as ``Compose``.
+    """
+    made = given
+    if isinstance(given, Mapping) and "compose" in given:
+        made = Compose.from_dict(given)
+    elif not callable(given) or isinstance(given, type):
+        made = Compose(given if isinstance(given, list | tuple) else [given])
+    augmentation: Augmentation = made
+    return made.bind(real, fields) if hasattr(made, "bind") else augmentation
+
+
+def read_step(given: Any) -> Step:
+    """The step that an augmentation or plain data describe.
+
+    Raises:
+        ConfigError: on anything else.
+    """
+    if isinstance(given, Step):
+        return given
+    if isinstance(given, str):
+        return Step(given.lower())
+    if isinstance(given, Corruption):
+        values = {f: getattr(given, f.name) for f in fields(given)}
+        own = {f.name: v for f, v in values.items() if v != f.default}
+        return Step(given.name, own)
+    if isinstance(given, Mapping) and len(given) == 1:
+        [(name, options)] = given.items()
+        arguments = {str(k).lower(): v for k, v in dict(options or {}).items()}
+        return Step(str(name).lower(), arguments, p=arguments.pop("p", 1.0))
+    if callable(given) and not isinstance(given, type):
+        function = getattr(given, "func", given)
+        for name, move in MOVES.items():
+            if move is function:
+                return Step(name, getattr(given, "keywords", {}))
+        return Step("", call=given)
+    raise ConfigError(
+        f"{given!r} as an augmentation",
+        "a function, a name, or {name: {argument: value}} such as "
+        "{fog: {visibility: 60, p: 0.5}}",
+    )
+
+
+def _check_choice(key: str, values: Sequence[Any]) -> Sequence[Any]:
+    """The values, which are names or [low, high]."""
+    if values and all(isinstance(v, str) for v in values):
+        return values
+    numbers = [v for v in values if type(v) in (int, float)]
+    if len(values) != 2 or len(numbers) != 2 or not values[0] <= values[1]:
+        raise ConfigError(
+            f"{key}: {values!r}", "a number, [low, high], or a list of names"
+        )
+    return values
+
+
+def _nth(n: int, values: Sequence[Any]) -> Any:
+    return values[min(n, len(values) - 1)]
+
+
+def _draw(rng: np.random.Generator, values: Sequence[Any]) -> Any:
+    """Any of several names, or a number between two."""
+    if isinstance(values[0], str):
+        return values[int(rng.integers(len(values)))]
+    return float(rng.uniform(*values))
