@@ -11,7 +11,13 @@ from streets import street
 from lidar_synth import MixedScans, MixedStream, Sources, mix
 from lidar_synth.errors import ConfigError
 from lidar_synth.labels.augment import drop_reflectance
-from lidar_synth.mixing import ByDomain, EndOnReal, make_schedule, settle
+from lidar_synth.mixing import (
+    ByDomain,
+    EndOnReal,
+    SyntheticFirst,
+    make_schedule,
+    settle,
+)
 from lidar_synth.mixing.settings import mix_for_trainer
 
 REAL = [street(i) for i in range(4)]
@@ -87,9 +93,37 @@ def test_a_named_schedule_ends_on_real_scans() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"epochs": 3}, {"epochs": 8, "share": 2}])
-def test_a_schedule_needs_epochs_and_a_share(wrong: dict[str, Any]) -> None:
+@pytest.mark.parametrize("kind", [EndOnReal, SyntheticFirst])
+def test_a_schedule_needs_epochs_and_a_share(
+    kind: type[SyntheticFirst], wrong: dict[str, Any]
+) -> None:
     with pytest.raises(ConfigError):
-        EndOnReal(**wrong)
+        kind(**wrong)
+
+
+def test_a_segmenters_default_takes_synthetic_scans_first(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    mixed = mix(REAL, SYNTHETIC, epochs=8)
+    shares = []
+    for epoch in range(8):
+        mixed.set_epoch(epoch)
+        assert len(mixed) == 100
+        shares.append(sum(mixed.domain(i) for i in range(100)) / 100)
+    assert shares == [1.0] * 6 + [0.5] * 2
+    assert "measured" not in caplog.text
+    given = mix(REAL, SYNTHETIC, 0.25, epochs=8)
+    assert len(given) != 100 and given.mixture.ratio(0) == 0.25
+
+
+def test_a_default_says_where_its_gain_is_not_measured(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
+    assert "more than 24 labelled scans (25 here)" in caplog.text
+    caplog.clear()
+    mix(REAL, SYNTHETIC, epochs=8, as_sensor=REAL[0].sensor)
+    assert "of a sensor that the synthetic ones are not made for" in caplog.text
 
 
 def test_settings_of_trainers_take_a_schedule_by_name() -> None:

@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections import Counter
+from dataclasses import replace
 from fractions import Fraction
 from math import ceil
 
@@ -19,6 +20,7 @@ from lidar_synth.mixing import (
     make_schedule,
 )
 from lidar_synth.mixing.batches import cut_steps, rank_share
+from lidar_synth.mixing.permutation import TOGETHER
 from lidar_synth.mixing.quotas import (
     count_before,
     count_samples,
@@ -570,3 +572,51 @@ def test_a_plan_of_any_length_takes_the_same_memory() -> None:
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
+
+
+# Plans that go through a bank shard by shard
+
+
+@pytest.mark.parametrize("reuse", [1, 2])
+@pytest.mark.parametrize("block", [8, 16])
+def test_a_plan_of_blocks_keeps_the_quotas_and_stays_in_few_blocks(
+    reuse: int, block: int
+) -> None:
+    """Two banks of 480 scans with a quarter and a half of the samples; epochs of 500."""
+    sources = tuple(PlannedSource(480, w, str(w), block) for w in (1.0, 2.0))
+    plain = tuple(replace(source, block=1) for source in sources)
+    mixtures = [
+        Mixture(
+            (PlannedSource(100),),
+            synthetic,
+            make_schedule(0.75),
+            epoch_size=500,
+            reuse=reuse,
+            balanced=True,
+        )
+        for synthetic in (sources, plain)
+    ]
+    for epoch in range(6):
+        plan, other = (MixingPlan(mixture, epoch) for mixture in mixtures)
+        assert np.array_equal(plan.source, other.source)
+        for source in (1, 2):
+            here = plan.index[plan.source == source]
+            assert sorted(here) == sorted(other.index[other.source == source])
+            assert not np.array_equal(here, np.sort(here))
+            # At most so many blocks are in use at a time, and those that the epoch cuts.
+            used = here // block
+            first = {b: np.flatnonzero(used == b)[0] for b in used.tolist()}
+            last = {b: np.flatnonzero(used == b)[-1] for b in used.tolist()}
+            whole = [b for b in first if np.count_nonzero(used == b) == block]
+            for at in range(len(here)):
+                assert sum(first[b] <= at <= last[b] for b in whole) <= TOGETHER
+
+
+def test_blocks_change_the_hash_of_a_plan() -> None:
+    def hash_of(block: int) -> str:
+        bank = PlannedSource(48, identity="bank", block=block)
+        return MixingPlan(
+            Mixture((), (bank,), make_schedule(1.0), balanced=True, epoch_size=9), 0
+        ).hash
+
+    assert len({hash_of(1), hash_of(2), hash_of(3)}) == 3

@@ -11,7 +11,12 @@ from lidar_synth.mixing.items import Item, to_item
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture, PlannedSource
 from lidar_synth.mixing.scans import MixedScans
-from lidar_synth.mixing.schedules import EndOnReal, Linear, make_schedule
+from lidar_synth.mixing.schedules import (
+    EndOnReal,
+    Linear,
+    SyntheticFirst,
+    make_schedule,
+)
 from lidar_synth.mixing.sources import Sources
 from lidar_synth.mixing.stream import MixedStream
 from lidar_synth.mixing.synthetic import Held, Synthetic, make_synthetic
@@ -31,6 +36,7 @@ __all__ = [
     "PlannedSource",
     "Sources",
     "Synthetic",
+    "SyntheticFirst",
     "make_schedule",
     "make_synthetic",
     "settle",

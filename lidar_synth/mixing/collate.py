@@ -13,7 +13,7 @@ from torch.utils.data import default_collate
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lidar_synth.datasets.classes import IGNORE
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, suggest
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -60,10 +60,12 @@ class Collate:
 
     def __post_init__(self) -> None:
         for name, kind in (("form", Form), ("unlabelled", Unlabelled)):
-            if getattr(self, name) not in get_args(kind):
+            given = getattr(self, name)
+            if given not in get_args(kind):
                 raise ConfigError(
-                    f"{name}={getattr(self, name)!r} of batches",
+                    f"{name}={given!r} of batches",
                     f"one of {get_args(kind)}",
+                    suggest(given, get_args(kind)),
                 )
         if self.form == "range" and self.sensor is None:
             raise ConfigError(

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from lidar_synth.noise import key_words
 
+TOGETHER = 4
+"""Number of blocks that ``permute_blocks`` goes through at a time."""
+
 _ROUNDS = 10  # with fewer, the orders of a handful of entries are not equally frequent
 
 
@@ -50,6 +53,41 @@ def permute(
     while len(outside := np.flatnonzero(places >= size)):
         places[outside] = _once(places[outside], size, keys, order[outside])
     return places.astype(np.int64)
+
+
+def permute_blocks(
+    entries: NDArray[np.int64],
+    size: int,
+    block: int,
+    seed: int,
+    stream: int,
+    number: int,
+) -> NDArray[np.int64]:
+    """Apply a keyed permutation that goes through blocks of consecutive places in random order,
+    ``TOGETHER`` at a time, whose places it shuffles with one another. The remaining places, fewer
+    than so many blocks have, come last.
+
+    Args:
+        entries: (N,), 0 <= entry < size.
+        size: length of the permutation.
+        block: number of places in a block.
+        seed, stream, number: as for ``permute``.
+
+    Returns:
+        (N,) 0 <= place < size; a bijection of the entries.
+    """
+    span = TOGETHER * block
+    groups, rest = divmod(size, span)
+    start = size - rest
+    last = entries >= start
+    places = np.empty_like(entries)
+    places[last] = start + permute(entries[last] - start, rest, seed, stream, number)
+    group, place = np.divmod(entries[~last], span)
+    place = permute(place, span, seed, stream, number * groups + group)
+    slot = group * TOGETHER + place // block
+    chosen = permute(slot, groups * TOGETHER, seed, stream, number)
+    places[~last] = chosen * block + place % block
+    return places
 
 
 def _once(

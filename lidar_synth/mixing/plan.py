@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.mixing.permutation import permute
+from lidar_synth.mixing.permutation import permute, permute_blocks
 from lidar_synth.mixing.quotas import (
     Mixture,
     PlannedSource,
@@ -201,11 +201,22 @@ class MixingPlan:
                 here = source == each
                 total = self.reals + each
                 own = number[here] - self.before[total]
-                dealt[here] = start + permute(
-                    own, self.counts[total], seed, _SOURCES + total, self.epoch
-                )
+                dealt[here] = start + self._ordered(total, own)
             rank[synthetic] = dealt
         return rank
+
+    def _ordered(self, source: int, own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The order of a synthetic source's samples in the epoch; blocks begin at multiples of
+        their size."""
+        count = self.counts[source]
+        key = (self.mixture.seed, _SOURCES + source, self.epoch)
+        block = self.mixture.synthetic[source - self.reals].block
+        if block == 1:
+            return permute(own, count, *key)
+        first = self._local(source, np.array([self.before[source]]))
+        return (
+            permute_blocks(own, count, block, *key) + int(-first[0]) % block
+        ) % count
 
     def _synthetic_up_to(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
         """Number of synthetic samples among the first ``positions`` of the epoch: the exact number,
@@ -240,8 +251,9 @@ class MixingPlan:
 
 
 def _facts_of(source: PlannedSource) -> dict[str, Any]:
-    return {
+    facts = {
         "length": source.length,
         "weight": source.weight,
         "identity": source.identity,
     }
+    return facts if source.block == 1 else facts | {"block": source.block}

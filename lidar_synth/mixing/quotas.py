@@ -47,11 +47,14 @@ class PlannedSource:
         weight: the source's share among the sources of its kind is proportional to its weight.
             None: the length of a real source, the same weight for all synthetic ones.
         identity: text that distinguishes it from other sources; part of the plan's hash.
+        block: number of consecutive scans of a synthetic source that a balanced plan uses at about
+            the same time.
     """
 
     length: int | None
     weight: float | None = None
     identity: str = ""
+    block: int = 1
 
 
 @dataclass(frozen=True)

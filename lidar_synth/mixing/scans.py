@@ -5,14 +5,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
+from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.labels.own import RemoveLabels
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
@@ -83,7 +83,10 @@ class MixedScans(Dataset[Any]):
             augmentations.
         balanced: whether to spread synthetic samples evenly, so that every batch in the order of
             the plan holds its exact share (up to one sample if that is not a whole number).
-        augment: ``(scan, rng) -> scan`` for synthetic scans, after the label policy.
+        locality: ``"shard"`` uses the scans of a bank a few shards at a time, so that a bank in an
+            object store can be streamed through a small cache; it is ``balanced`` then.
+        augment: changes synthetic scans, after the label policy: ``(scan, rng) -> scan``, a name
+            as in a ``Compose``, ``{name: {argument: value}}``, or a list of them.
         augment_real: whether to apply ``augment`` to real scans too; otherwise they stay unchanged,
             bit for bit.
         to_sample: ``(scan, rng) -> sample``; by default it makes the plain PyTorch item (items.py).
@@ -139,7 +142,8 @@ class MixedScans(Dataset[Any]):
         epoch_size: EpochSize = "add",
         reuse: int = 1,
         balanced: bool = False,
-        augment: LabelPolicy | None = None,
+        locality: Literal["shard"] | None = None,
+        augment: Any = None,
         augment_real: bool = False,
         to_sample: ToSample = to_item,
         collate: Form | Callable[[Any], Any] = "offsets",
@@ -151,6 +155,8 @@ class MixedScans(Dataset[Any]):
     ) -> None:
         reals = each(real)
         seed = to_integer(seed, "seed")
+        if locality not in (None, "shard"):
+            raise ConfigError(f"locality={locality!r}", '"shard", or None')
         for source, _ in reals:
             if not hasattr(source, "__len__"):
                 raise ConfigError(
@@ -173,14 +179,19 @@ class MixedScans(Dataset[Any]):
                 for source, weight in reals
             ),
             tuple(
-                PlannedSource(source.length, weight, source.identity + suffix)
+                PlannedSource(
+                    source.length,
+                    weight,
+                    source.identity + suffix,
+                    getattr(source, "shard_size", 1) if locality else 1,
+                )
                 for source, weight in synthetics
             ),
             make_schedule(ratio),
             seed,
             epoch_size,
             reuse,
-            balanced,
+            balanced or locality is not None,
         )
         sources = self.synthetic if real_as_is else self.real + self.synthetic
         target = None if self._transfer is None else self._transfer.target
@@ -198,7 +209,14 @@ class MixedScans(Dataset[Any]):
             _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
         )
         self._notices = Notices(images=collate == "range")
-        self._augment = augment
+        self._augment: LabelPolicy | None = None
+        if augment is not None:
+            # It loads the corruptions.
+            from lidar_synth.labels.compose import make_augmentation
+
+            every = frozenset({*POINT_FIELDS, "boxes"})
+            common = every.intersection(*(s.fields | rings for s in self.synthetic))
+            self._augment = make_augmentation(augment, scans, common)
         self._augment_real = augment_real
         self._to_sample = to_sample
         self._real_as_is = real_as_is

@@ -1,7 +1,7 @@
 """The share of synthetic samples, epoch by epoch.
 
 A schedule is a function from the epoch to a share in [0, 1]. The schedules of this module have an
-attribute ``settled``, the epoch from which on the share is constant, so that earlier samples can be
+attribute ``constant_from``, the epoch from which on the share is constant, so that earlier samples can be
 counted without visiting every epoch.
 """
 
@@ -11,14 +11,12 @@ from fractions import Fraction
 from operator import index
 from typing import Any
 
-from lidar_synth.errors import ConfigError, shorten
+from lidar_synth.errors import ConfigError, shorten, suggest
 
 Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
 1]."""
 
-END_ON_REAL = "end_on_real"
-"""Names ``EndOnReal`` in settings."""
 _FINEST = (
     10**6
 )  # largest denominator of a share: products with positions stay within 64 bits
@@ -103,7 +101,45 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class EndOnReal:
+class SyntheticFirst:
+    """Synthetic scans alone in three quarters of the epochs, then beside real ones.
+
+    This schedule gained most where labelled scans are few (docs/research/proof.md,
+    docs/research/detectors.md).
+
+    Args:
+        epochs: number of epochs of the training, at least 4.
+        share: of synthetic samples beside real ones, in [0, 1].
+
+    Raises:
+        ConfigError: on fewer epochs, or another share.
+
+    Example:
+        >>> from lidar_synth.mixing import SyntheticFirst
+        >>> ratio = SyntheticFirst(epochs=8)
+        >>> [ratio(epoch) for epoch in range(8)]
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5]
+    """
+
+    epochs: int
+    share: float = 0.5
+
+    def __post_init__(self) -> None:
+        _checked(self.share, 0)
+        if to_integer(self.epochs, "epochs") < 4:
+            raise ConfigError(f"{self.epochs} epochs of a schedule", "at least 4")
+
+    @property
+    def constant_from(self) -> int:
+        """The epoch from which on the share is constant."""
+        return 3 * self.epochs // 4
+
+    def __call__(self, epoch: int) -> float:
+        return 1.0 if epoch < self.constant_from else self.share
+
+
+@dataclass(frozen=True)
+class EndOnReal(SyntheticFirst):
     """Synthetic scans alone at first, then beside real ones, and real scans alone at the end.
 
     Args:
@@ -120,24 +156,14 @@ class EndOnReal:
         [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
     """
 
-    epochs: int
-    share: float = 0.5
-
-    def __post_init__(self) -> None:
-        _checked(self.share, 0)
-        if to_integer(self.epochs, "epochs") < 4:
-            given = f"{self.epochs} epochs of a schedule that ends on real scans"
-            raise ConfigError(given, "at least 4")
-
-    @property
-    def constant_from(self) -> int:
-        """The epoch from which on the share is constant."""
-        return 3 * self.epochs // 4
-
     def __call__(self, epoch: int) -> float:
-        if epoch < self.epochs // 2:
-            return 1.0
-        return self.share if epoch < self.constant_from else 0.0
+        if epoch >= self.constant_from:
+            return 0.0
+        return 1.0 if epoch < self.epochs // 2 else self.share
+
+
+BY_NAME = {"synthetic_first": SyntheticFirst, "end_on_real": EndOnReal}
+"""Schedules by their names in settings, ``{name: epochs}``."""
 
 
 def make_schedule(
@@ -147,8 +173,9 @@ def make_schedule(
 
     Args:
         ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its
-            epoch on; ``Linear(first, last, epochs)``; ``EndOnReal(epochs)``, in YAML
-            ``{end_on_real: epochs}``; or any function of the epoch.
+            epoch on; ``Linear(first, last, epochs)``; ``SyntheticFirst(epochs)``,
+            ``EndOnReal(epochs)``, in YAML ``{synthetic_first: epochs}``, ``{end_on_real:
+            epochs}``; or any function of the epoch.
 
     Raises:
         ConfigError: on a share outside [0, 1], or no share for epoch 0.
@@ -156,8 +183,12 @@ def make_schedule(
     if callable(ratio):
         return ratio
     named: Any = ratio
-    if isinstance(named, Mapping) and list(named) == [END_ON_REAL]:
-        return EndOnReal(named[END_ON_REAL])
+    if isinstance(named, Mapping) and len(named) == 1:
+        [(name, epochs)] = named.items()
+        if name in BY_NAME:
+            return BY_NAME[name](epochs)
+        if hint := suggest(name, BY_NAME):
+            raise ConfigError(f"ratio={named}", "{epoch: share}", hint)
     if isinstance(ratio, Mapping):
         return Steps(
             tuple(

@@ -76,7 +76,7 @@ def make_synthetic(source: Any, seed: int = 0) -> Synthetic:
     """
     if hasattr(source, "as_synthetic"):
         return cast(Synthetic, source.as_synthetic(seed))
-    if isinstance(source, Synthetic):
+    if isinstance(source, Synthetic) and not getattr(source, "recorded", False):
         return source
     by_index = isinstance(source, Source) and not isinstance(source, Mapping)
     if by_index and len(source) and isinstance(source[0], Scan):

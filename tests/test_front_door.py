@@ -1,0 +1,229 @@
+"""``start``: from a folder of scans to a mixture; and the configurations of trainers."""
+
+import ast
+import importlib
+import json
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from layouts import MAKERS
+from logs import LOGS, ouster, write_log
+from proofs import TOWN_SENSOR
+from typer.testing import CliRunner
+
+import lidar_synth
+from lidar_synth.bank import Bank
+from lidar_synth.cli import app
+from lidar_synth.errors import ConfigError
+from lidar_synth.files.recipes import folder, published, read_recipe
+from lidar_synth.lab.start.look import look
+from lidar_synth.lab.start.trainers import DEFAULTS, TRAINERS, configure, write_files
+from lidar_synth.lab.town import export_town
+from lidar_synth.mixing.settings import OPTIONS, read_settings
+
+TASKS = {
+    "bank": "segmentation",
+    "kitti360": "segmentation",
+    "semantic_kitti": "segmentation",
+    "kitti_object": "detection",
+    "folder": "segmentation",
+    "range": "segmentation",
+    "png": "segmentation",
+    "webdataset": "segmentation",
+    "mcap": "segmentation",
+    "nuscenes": "segmentation",
+    "pandaset": "segmentation",
+    "kitti_raw": "detection",
+}
+
+
+@pytest.mark.parametrize("layout", MAKERS)
+def test_what_lies_in_a_folder_of_each_layout(layout: str, tmp_path: Path) -> None:
+    MAKERS[layout](tmp_path / "scans")
+    found = look(tmp_path / "scans", None, tmp_path / "sensor.yaml", {})
+    assert (found.layout, found.task, found.fit) == (layout, TASKS[layout], None)
+    assert found.lines()[0].startswith(f"scans    3 of layout {layout}")
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of an Ouster without labels, whose folder names no sensor."""
+    root = tmp_path_factory.mktemp("logs")
+    town = lidar_synth.Town(3, "os1_128", scans=4)
+    for index in range(4):
+        write_log(root / f"{index:06d}.pcd", ouster(town[index]))
+    return root
+
+
+@pytest.mark.parametrize("vendor", LOGS)
+def test_the_sensor_of_a_vendors_logs_is_fitted(vendor: str, tmp_path: Path) -> None:
+    sensor, columns = LOGS[vendor]
+    town = lidar_synth.Town(3, sensor, scans=4)
+    for index in range(4):
+        write_log(tmp_path / f"{index:06d}.pcd", columns(town[index]))
+    found = look(tmp_path, None, tmp_path / "none.yaml", {})
+    assert found.fit is not None and found.task == "unlabelled"
+    assert found.source.sensor.shape[0] == lidar_synth.load_sensor(sensor).shape[0]
+
+
+def test_from_logs_without_labels_to_a_mixture(logs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "start"
+    said: list[str] = []
+    made = lidar_synth.start(logs, out, scans=2, jobs=1, say=said.append)
+    assert made is not None
+    assert "labels   none" in made.found[1] and "fitted to 4 scans" in made.found[3]
+    assert said[0].splitlines() == list(made.found) and len(made.found) == 5
+    assert len(made.code.splitlines()) == 6
+    batches: list[dict[str, np.ndarray]] = []
+    short = made.code.replace("range(40)", "range(1)").replace(
+        "...", "batches.append(batch)"
+    )
+    exec(short, {"batches": batches})
+    synthetic = np.concatenate([batch["domain"] for batch in batches])
+    assert set(synthetic.tolist()) == {0, 1}
+    times = {path: path.stat().st_mtime_ns for path in (out / "town").iterdir()}
+    again = lidar_synth.start(logs, out, scans=2, jobs=1, say=said.append)
+    assert again is not None and "as fitted" in again.found[3]
+    assert again.code == made.code and again.files == made.files
+    assert {p: p.stat().st_mtime_ns for p in (out / "town").iterdir()} == times
+
+
+def test_a_dry_run_says_minutes_and_disk_and_writes_nothing(
+    logs: Path, tmp_path: Path
+) -> None:
+    given = ["start", str(logs), "--out", str(tmp_path / "start"), "--dry-run"]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"200 synthetic scans: [\d.]+ minutes, \d+ MB", result.output)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
+    root = tmp_path / "scans"
+    town = lidar_synth.Town(5, TOWN_SENSOR, 24)
+    export_town(town, root, "semantic_kitti", camera=False, progress=False)
+    for poses in root.rglob("poses.txt"):
+        poses.unlink()  # with them, the streets of the town are two places
+    out = tmp_path / "start"
+    given = ["start", str(root), "--out", str(out), "--scans", "4", "--minutes", "2"]
+    result = CliRunner().invoke(app, [*given, "--trainer", "mmdet3d"])
+    assert result.exit_code == 0, result.output
+    assert "| real scans only |" in result.output
+    assert "| the town first, then half your scans |" not in result.output
+    assert "generated scans first" in result.output
+    assert "Trained and tested on one drive" in result.output
+    assert len(Bank(out / "bank")) == 4
+    assert {"mix.yaml", "lists.py", "mixed.py", "loop.py"} <= {
+        path.name for path in out.iterdir()
+    }
+    settings = read_settings(out / "mix.yaml")
+    assert settings["synthetic"] == str(out / "bank")
+    assert settings["as_sensor"] == str(out / "sensor.yaml")
+    lidar_synth.mix(root, settings.pop("synthetic"), **settings)
+
+
+def test_scans_with_boxes_get_the_town_with_boxes(tmp_path: Path) -> None:
+    MAKERS["kitti_object"](tmp_path / "scans")
+    made = lidar_synth.start(
+        tmp_path / "scans", tmp_path / "out", scans=1, minutes=0, jobs=1
+    )
+    assert made is not None and "your objects pasted" in made.found[4]
+    assert 'task="detection"' in made.code
+    town = lidar_synth.open_scans(tmp_path / "out" / "town")
+    assert len(town) == 1 and town[0].boxes is not None and town[0].label is not None
+
+
+def test_what_start_refuses(tmp_path: Path) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "scans")
+    MAKERS["semantic_kitti"](tmp_path / "others")
+    with pytest.raises(ConfigError, match="a folder outside of it"):
+        lidar_synth.start(tmp_path / "scans", tmp_path / "scans" / "start")
+    quiet = {"scans": 1, "minutes": 0, "jobs": 1, "say": lambda line: None}
+    lidar_synth.start(tmp_path / "scans", tmp_path / "start", **quiet)
+    with pytest.raises(ConfigError, match=r"was filled with .*scans"):
+        lidar_synth.start(tmp_path / "others", tmp_path / "start", **quiet)
+    with pytest.raises(ConfigError, match=r"Did you mean 'openpcdet'"):
+        lidar_synth.start(tmp_path / "scans", tmp_path / "new", trainer="openpcd")
+    with pytest.raises(ConfigError, match=r"--task detection for .*segmentation"):
+        lidar_synth.start(tmp_path / "scans", tmp_path / "new", task="detection")
+    assert not (tmp_path / "new").exists()
+
+
+def test_points_of_no_rotating_sensor_need_its_name(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        points = rng.uniform(-40, 40, (4000, 4)).astype("<f4")
+        points[:, 3] = 0.5
+        points.tofile(tmp_path / f"{index}.bin")
+    with pytest.raises(ConfigError, match=r"cannot be fitted.*--sensor NAME"):
+        look(tmp_path, None, tmp_path / "none.yaml", {})
+
+
+PAIRS = [(trainer, task) for trainer in TRAINERS for task in TRAINERS[trainer]]
+
+
+@pytest.mark.parametrize(("trainer", "task"), PAIRS)
+def test_a_trainers_files_name_what_exists(trainer: str, task: str) -> None:
+    settings = {"synthetic": "/data/bank", **DEFAULTS[task], "seed": 0}
+    files = configure(trainer, task, settings, "/data/MY_ROOT", "/data/HERE_TOO")
+    assert set(yaml.safe_load(files["mix.yaml"])) <= set(OPTIONS)
+    for name, text in files.items():
+        assert not re.search(r"\b(ROOT|MIX|HERE|OPTIONS)\b", text)
+        for module in re.findall(r"lidar_synth\.integrations\.(\w+)", text):
+            assert (Path("integrations") / f"{module}.py").is_file()
+        if not name.endswith(".py"):
+            continue
+        for node in ast.walk(ast.parse(text)):
+            module = getattr(node, "module", None) or ""
+            if isinstance(node, ast.ImportFrom) and module.startswith("lidar_synth"):
+                home = importlib.import_module(module)
+                assert all(hasattr(home, alias.name) for alias in node.names)
+    assert any("/data/MY_ROOT" in text for text in files.values())
+    assert any("/data/HERE_TOO/mix.yaml" in text for text in files.values())
+
+
+def test_the_lists_of_mmdetection3d_are_written(tmp_path: Path) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "scans")
+    MAKERS["bank"](tmp_path / "bank")
+    settings = {"synthetic": str(tmp_path / "bank"), **DEFAULTS["segmentation"]}
+    files = configure(
+        "mmdet3d", "segmentation", settings, f"{tmp_path}/scans", str(tmp_path)
+    )
+    write_files(files, tmp_path)
+    before = sorted((tmp_path / "scans").rglob("*"))
+    runpy.run_path(str(tmp_path / "lists.py"))
+    infos = json.loads((tmp_path / "mixed" / "infos.json").read_text())
+    assert len(infos["data_list"]) > 3
+    assert sorted((tmp_path / "scans").rglob("*")) == before
+
+
+def test_the_recipes_command_writes_a_trainers_files(tmp_path: Path) -> None:
+    given = f"recipes --trainer openpcdet --root KITTI --synthetic town --out {tmp_path / 'mixed'}"
+    result = CliRunner().invoke(app, given.split())
+    assert result.exit_code == 0, result.output
+    settings = read_settings(tmp_path / "mixed" / "mix.yaml")
+    assert (
+        settings["ratio"] == {"synthetic_first": 40} and settings["labels"] == "boxes"
+    )
+    text = (tmp_path / "mixed" / "train.sh").read_text()
+    assert f"LIDAR_SYNTH_MIX={tmp_path}/mixed/mix.yaml" in text
+    assert "DATA_CONFIG.DATA_PATH KITTI" in text
+    wrong = CliRunner().invoke(
+        app, "recipes --trainer openpcdet --task segmentation".split()
+    )
+    assert "one of mmdet3d, pointcept" in str(wrong.exception)
+
+
+def test_the_schema_of_a_recipe_knows_the_keys_of_published_ones() -> None:
+    schemas = {}
+    for command in ("train", "distill", "bake"):
+        said = CliRunner().invoke(app, ["recipes", "--schema", command]).output
+        schemas[command] = set(json.loads(said)["properties"])
+    for recipe in published():
+        keys = set(read_recipe(folder() / f"{recipe.name}.yaml"))
+        assert keys <= schemas[recipe.command], recipe.name
