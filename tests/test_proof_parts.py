@@ -159,6 +159,19 @@ def test_the_reference_trainer_learns_and_repeats_itself(
     )
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_trains_as_the_processor_does(tmp_path: Path) -> None:
+    here = job("pretrain-generator", tmp_path)
+    there = replace(here, device="cuda", half=False)
+    losses = [reference(one)["left out"].losses for one in (here, there)]
+    assert np.allclose(*losses, rtol=0.05)
+
+
+def test_a_device_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ConfigError, match="device 'cuda:99'; expected an available"):
+        make_plan(drives(), SMALL, None, 1, device="cuda:99")
+
+
 def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) -> None:
     whole = job("pretrain", tmp_path, iterations=20)
     pretrain(whole, tmp_path / "start.safetensors")

@@ -5,7 +5,12 @@ from typing import Annotated, Any
 
 import typer
 
-_ARMS = "a training to compare, repeatable [exchange, pretrain, pretrain-generator]"
+_ARMS = (
+    "a training to compare, repeatable: real | longer | staged | exchange | town | skin | "
+    "generator | pretrain | pretrain-skin | pretrain-generator | pretrain-generator-real | "
+    "pretrain-learnt | paste [exchange, pretrain, pretrain-generator]; of detectors: "
+    "real | gt_sampling | objects | half | first | recipe | town"
+)
 
 
 def prove(
@@ -41,7 +46,9 @@ def prove(
     seeds: Annotated[int, typer.Option(min=1, help="repetitions of each training")] = 2,
     places: Annotated[
         str,
-        typer.Option(help="how places are told apart: auto | drive | pose | stretch"),
+        typer.Option(
+            help="how places are told apart: auto | drive | pose | stretch | stretch:N"
+        ),
     ] = "auto",
     model: Annotated[
         str, typer.Option(help="of the arms with a generator: a name or a file")
@@ -86,6 +93,9 @@ def prove(
         str,
         typer.Option(help="segmentation | detection: cars and persons, by boxes"),
     ] = "segmentation",
+    device: Annotated[
+        str, typer.Option(help="of the small network: cpu | cuda | cuda:1 | ...")
+    ] = "cpu",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the plan and do nothing")
     ] = False,
@@ -117,7 +127,6 @@ def prove(
             "--tests": tests,
             "--ratio": ratio,
             "--only": only,
-            "--dry-run": dry_run,
         }
         _check_task(task, [name for name, given in further.items() if given])
         options = {
@@ -130,7 +139,7 @@ def prove(
             "synthetic": synthetic,
         }
         source = open_scans(root, sensor=sensor, split=split)
-        _prove_detection(source, out, options, minutes, pools)
+        _prove_detection(source, out, options, minutes, pools, device, dry_run)
         return
     settings = ProofSettings(
         labelled=labelled,
@@ -150,7 +159,9 @@ def prove(
     others = open_scans(tests, sensor=sensor) if tests else None
     if dry_run:
         jobs = jobs or os.cpu_count() or 1
-        plan, _ = make_plan(source, settings, minutes, jobs, tests=others)
+        plan, _ = make_plan(
+            source, settings, minutes, jobs, tests=others, device=device
+        )
         typer.echo(describe(plan))
         return
     chosen = CommandTrainer(trainer) if trainer else reference
@@ -163,17 +174,19 @@ def prove(
         trainer=chosen,
         pools=pools,
         tests=others,
+        device=device,
     )
     typer.echo(f"{proof}\n\nThe page is {(out / 'index.html').resolve()}")
 
 
 def _check_task(task: str, further: list[str]) -> None:
-    from lidar_synth.errors import ConfigError
+    from lidar_synth.errors import ConfigError, choose
 
-    if task != "detection" or further:
+    choose("--task", task, dict.fromkeys(("segmentation", "detection")))
+    if further:
         raise ConfigError(
-            f"--task {task} {' '.join(further)}".strip(),
-            "segmentation, or detection without options of segmentation",
+            f"--task {task} with {', '.join(further)}",
+            "--task detection without options of segmentation",
         )
 
 
@@ -183,17 +196,25 @@ def _prove_detection(
     options: dict[str, Any],
     minutes: float | None,
     pools: Path | None,
+    device: str,
+    dry_run: bool,
 ) -> None:
     from lidar_synth.lab.proof.detection import DetectionSettings, prove_detection
     from lidar_synth.lab.proof.detection.page import format_table
+    from lidar_synth.lab.proof.detection.study import DetectionWork, describe
 
     given = {name: value for name, value in options.items() if value}
+    settings = DetectionSettings(**given)
+    if dry_run:
+        typer.echo(describe(DetectionWork(source, settings, out, pools or out)))
+        return
     values = prove_detection(
         source,
         out,
-        DetectionSettings(**given),
+        settings,
         minutes=float("inf") if minutes is None else minutes,
         pools=pools,
+        device=device,
     )
     page = (out / "index.html").resolve()
     typer.echo(f"{format_table(values)}\n\nThe page is {page}")

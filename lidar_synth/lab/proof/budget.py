@@ -95,9 +95,9 @@ def _most_iterations(plan: ProofPlan, pairs: Sequence[Pair], minutes: float) -> 
 
 
 def measure_step(
-    scans: list[Scan], settings: ProofSettings, half: bool | None
+    scans: list[Scan], settings: ProofSettings, half: bool | None, device: str = "cpu"
 ) -> tuple[bool, float]:
-    """Whether bfloat16 is faster on this machine, and the seconds of an iteration."""
+    """Whether bfloat16 is faster on this device, and the seconds of an iteration."""
     if settings.columns is None:
         return False, 0.0
     from lidar_synth.lab.proof.trial import images
@@ -105,19 +105,25 @@ def measure_step(
     sensor = scans[0].sensor
     parts = images(scans, sensor)
     batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
+    height = torch.from_numpy(np.sin(sensor.ray_angles()[0])).to(device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    half = faster_in_bfloat16() if half is None else half
+    if half is None:
+        half = height.device.type != "cpu" or faster_in_bfloat16()
     times: list[float] = []
+
+    def watch(step: int) -> None:
+        height.max().item()  # waits for a GPU
+        times.append(time.perf_counter())
+
     train_segmenter(
-        RangeSegmenter(widths=settings.widths),
+        RangeSegmenter(widths=settings.widths).to(device),
         [batch] * 4,
         height,
         4,
         progress=False,
         half=half,
-        watch=lambda step: times.append(time.perf_counter()),
+        watch=watch,
     )
     torch.set_num_threads(threads)
     return half, float(np.diff(times).min())

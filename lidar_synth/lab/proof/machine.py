@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 
-def machine() -> str:
-    """The processor, its cores, and the version of torch."""
+def machine(device: str = "cpu") -> str:
+    """The processor, its cores, the GPU if ``device`` is one, and the version of torch."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [
@@ -19,7 +19,11 @@ def machine() -> str:
         if line.startswith("model name")
     ]
     name = names[0] if names else platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores, no GPU used, torch {torch.__version__.partition('+')[0]}"
+    card = "no GPU used"
+    if torch.device(device).type == "cuda":
+        card = torch.cuda.get_device_name(device)
+    version = torch.__version__.partition("+")[0]
+    return f"{name}, {os.cpu_count()} cores, {card}, torch {version}"
 
 
 def command_line() -> str:

@@ -47,6 +47,7 @@ class ProofPlan:
         step: seconds of one of its iterations.
         minutes: expected for all pairs, with ``jobs`` processes.
         jobs: processes.
+        device: on which the reference network computes.
     """
 
     settings: ProofSettings
@@ -67,6 +68,7 @@ class ProofPlan:
     step: float
     minutes: float
     jobs: int
+    device: str = "cpu"
 
     @property
     def budget(self) -> int:

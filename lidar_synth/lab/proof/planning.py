@@ -13,6 +13,7 @@ from lidar_synth.datasets.recordings import PLACES, TOWN, Recordings, frames_of
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import layout_of
 from lidar_synth.formats.source import ScanFiles
+from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
@@ -40,6 +41,7 @@ def make_plan(
     jobs: int,
     earlier: Mapping[str, Any] | None = None,
     tests: Source | None = None,
+    device: str = "cpu",
 ) -> tuple[ProofPlan, dict[int, Scan]]:
     """Plan a comparison.
 
@@ -51,17 +53,19 @@ def make_plan(
         earlier: ``ProofPlan.identity`` of the comparison that is resumed. It computed in bfloat16
             or not, as the machine was faster then, and had fewer iterations if the time was short.
         tests: labelled scans of other places to test on; None leaves out each place in turn.
+        device: on which the reference network computes.
 
     Returns:
         The plan, and {index: scan on the grid} of all labelled and tested scans. The indices of
         ``tests`` follow those of ``source``.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, too short a time, or tests of another
-            sensor or of scans that are trained on.
+        ConfigError: on settings that do not fit the scans, too short a time, a device that is not
+            there, or tests of another sensor or of scans that are trained on.
         DataError: on one place only, on scans without labels, or on a class that nothing is
             labelled as.
     """
+    check_device(device)
     arms = rows(settings.arms, settings.ratios)
     groups = groups_of(_classes(source, settings.classes), settings.only)
     sensor = sensor_of(source)
@@ -92,7 +96,8 @@ def make_plan(
             raise _shared(str(shared))
     absent = require_labels(_counts(scans), groups, settings.only)
     batch = [scans[i] for i in needed[: settings.batch]]
-    half, step = measure_step(batch, settings, earlier.get("half") if earlier else None)
+    half = earlier.get("half") if earlier else None
+    half, step = measure_step(batch, settings, half, device)
     if earlier and minutes is not None:
         settings = replace(
             settings, iterations=min(settings.iterations, earlier["iterations"])
@@ -116,6 +121,7 @@ def make_plan(
         step,
         0.0,
         jobs,
+        device,
     )
     return within(plan, minutes, resumed=bool(earlier)), scans
 

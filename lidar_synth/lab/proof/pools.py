@@ -15,19 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.datasets.recordings import CONTENT, Recordings, seen_by
+from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.claims import claim
 from lidar_synth.files.disk import hash_of_names, read_text, write_file
 from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.generate.checkpoint import read_header
-from lidar_synth.generate.generator import Generator
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
-from lidar_synth.lab.evaluate.leakage import content_of, contents, overlap, town
+from lidar_synth.lab.evaluate.leakage import town
 from lidar_synth.lab.proof.arms import RARE
 from lidar_synth.lab.proof.places import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
@@ -189,39 +188,6 @@ def read_pool(folder: Path) -> list[Scan]:
 def read_objects(folder: Path) -> ObjectBank | None:
     """The objects to paste; None if the scans of the pool have none."""
     return ObjectBank.load(folder / OBJECTS) if (folder / OBJECTS).is_file() else None
-
-
-def refuse_leaks(
-    model: str, tested: Recordings, scans: Iterable[Scan] = ()
-) -> Generator:
-    """Load a generator, and refuse one that was trained on the places that are tested.
-
-    Args:
-        model: its name or path.
-        tested: the recordings of the tested scans.
-        scans: those of them that are known by their content only; read if the generator has learnt
-            from such scans.
-
-    Raises:
-        ConfigError: if it was; the message names drives and frames. On a model that needs camera
-            images.
-    """
-    generator = load_generator(model)
-    if generator.condition == "camera":
-        raise ConfigError(
-            f"generator {model!r}, which needs camera images",
-            "one that needs none, such as town",
-        )
-    seen = seen_by(generator.header.provenance)
-    if any(dataset == CONTENT for dataset, _ in seen.drives):
-        tested = tested | contents(map(content_of, scans))
-    if shared := overlap(seen, tested):
-        raise ConfigError(
-            f"generator {model!r}, which was trained on places that are tested: {shared}",
-            "a generator that has never seen them",
-            "Choose another --model, or leave out the arm: --arm with the names of the others.",
-        )
-    return generator
 
 
 def town_seed(recordings: Recordings) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NAMES, TRAIN_ID
-from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.errors import ConfigError, DataError, choose, suggest
 
 Groups = Mapping[str, Sequence[str]]
 """{name: classes that count as one}; labels of other classes do not count."""
@@ -69,13 +69,12 @@ def groups_of(classes: str, only: Sequence[str] = ()) -> Groups:
     Raises:
         ConfigError: on an unknown name.
     """
-    if classes not in GROUPS:
-        raise ConfigError(f"classes {classes!r}", f"one of {', '.join(GROUPS)}")
-    groups = GROUPS[classes]
+    groups = choose("classes", classes, GROUPS)
     if unknown := [name for name in only if name not in groups]:
         raise ConfigError(
             f"class {', '.join(map(repr, unknown))} of {classes}",
             f"some of {', '.join(groups)}",
+            suggest(unknown[0], groups),
         )
     return {
         name: members for name, members in groups.items() if not only or name in only

@@ -24,6 +24,7 @@ from lidar_synth.files.parsing import parse_json, read_sealed, seal
 from lidar_synth.files.processes import map_in_processes
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.leakage import refuse_leaks
 from lidar_synth.lab.proof.arms import Row
 from lidar_synth.lab.proof.page import write_page
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
@@ -34,7 +35,6 @@ from lidar_synth.lab.proof.pools import (
     make_pool,
     read_objects,
     read_pool,
-    refuse_leaks,
     seconds_of,
     town_seed,
 )
@@ -159,6 +159,7 @@ class Trainings:
             folder=self.out / JOBS / row.key / self.path(row, pairs[0]).stem,
             pool_folders=folders,
             start=self.start(row, pairs[0]),
+            device=plan.device,
         )
 
 
@@ -197,6 +198,7 @@ def prove(
     trainer: Trainer = reference,
     pools: str | Path | None = None,
     tests: str | Path | Source | None = None,
+    device: str = "cpu",
     progress: bool = True,
 ) -> Proof:
     """Measure what synthetic scans add to your labelled scans, on places that no training has seen.
@@ -220,14 +222,15 @@ def prove(
         tests: labelled scans of other places to test on, such as a dataset's validation split; one
             training is tested on all of them. By default each place of ``scans`` is left out in
             turn.
+        device: on which the small network computes, such as "cuda"; all jobs share it.
         progress: whether to show progress bars.
 
     Returns:
         The result; ``print`` shows its table.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, a folder with another comparison, or a
-            generator that was trained on places that are tested.
+        ConfigError: on settings that do not fit the scans, a folder with another comparison, a
+            device that is not there, or a generator that was trained on places that are tested.
         DataError: on one place only, on scans without labels, or a class that nothing is labelled
             as.
 
@@ -246,7 +249,7 @@ def prove(
         tests = open_scans(tests)
     jobs = jobs or os.cpu_count() or 1
     plan, loaded = make_plan(
-        source, settings or ProofSettings(), minutes, jobs, _earlier(out), tests
+        source, settings or ProofSettings(), minutes, jobs, _earlier(out), tests, device
     )
     seen = ""
     if any(OF_GENERATOR & row.arm.pools() for row in plan.rows):

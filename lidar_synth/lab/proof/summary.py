@@ -129,7 +129,7 @@ def summarise(
         "iterations": plan.settings.iterations,
         "batch": plan.settings.batch,
         "precision": "bfloat16" if plan.half else "float32",
-        "machine": machine(),
+        "machine": machine(plan.device),
         "date": time.strftime("%Y-%m-%d"),
         "command": command_line(),
     }
@@ -313,8 +313,8 @@ def headline(values: Mapping[str, Any]) -> str:
     elif ends is None:
         text = (
             f"{start}, “{best['title']}” changes the mIoU by {change}, from {base['miou']:.1f} %; "
-            f"{len(values['tested_places'])} places are too few for an interval ({FEWEST_PLACES} "
-            "are needed)."
+            f"an interval needs {FEWEST_PLACES} tested places, and there are "
+            f"{len(values['tested_places'])}."
         )
     else:
         text = (

@@ -60,6 +60,7 @@ class Job:
         folder: where a trainer may write files.
         pool_folders: {name: folder} of the pools, in SemanticKITTI's layout.
         start: the reference network after the first stage, if ``pretrain`` has written it.
+        device: on which the reference network computes.
     """
 
     row: Row
@@ -75,6 +76,7 @@ class Job:
     folder: Path
     pool_folders: dict[str, Path] = field(default_factory=dict)
     start: Path | None = None
+    device: str = "cpu"
 
     @property
     def sensor(self) -> Sensor:
@@ -257,7 +259,7 @@ def pretrain(job: Job, path: Path) -> None:
     stage, count = next(job.stages())
     mixed, _ = next(job.mixtures(collate="range"))
     _learn(network, job, stage, mixed, count, height)
-    state = {name: value.contiguous() for name, value in network.state_dict().items()}
+    state = {n: value.cpu().contiguous() for n, value in network.state_dict().items()}
     facts = {SECONDS: str(time.monotonic() - start), "weights": weights_hash(state)}
     write_file(path, save(state, facts))
 
@@ -285,9 +287,8 @@ def pretraining_seconds(path: Path) -> float:
 def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
     """A network that has learnt nothing, and the (H, W) sine of the elevations of the grid."""
     torch.manual_seed(job.seed)
-    return RangeSegmenter(widths=job.widths), torch.from_numpy(
-        np.sin(job.sensor.ray_angles()[0])
-    )
+    network = RangeSegmenter(widths=job.widths).to(job.device)
+    return network, torch.from_numpy(np.sin(job.sensor.ray_angles()[0])).to(job.device)
 
 
 def _learn(
@@ -333,7 +334,7 @@ def _test(
     network: nn.Module, held_out: Sequence[Images], height: Tensor, half: bool
 ) -> NDArray[np.int64]:
     network.eval()
-    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+    with torch.autocast(height.device.type, torch.bfloat16, enabled=half):
         return confusion(network, held_out, height)
 
 
@@ -359,5 +360,5 @@ def _settled(
     def forward(model: nn.Module, batch: Images) -> Any:
         return model(segmenter_input(batch["range"], batch["reflectance"], height))
 
-    with torch.autocast("cpu", torch.bfloat16, enabled=job.half):
+    with torch.autocast(height.device.type, torch.bfloat16, enabled=job.half):
         return settle(network, some, forward)

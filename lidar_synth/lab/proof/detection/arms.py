@@ -13,7 +13,7 @@ from lidar_synth.lab.proof.detection.network import collate, sample
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
-from lidar_synth.mixing.detection import augment_boxes
+from lidar_synth.mixing.defaults import augment_boxes
 
 PHASES = 4
 BASE = "gt_sampling"

@@ -28,6 +28,8 @@ PIXEL = 0.8
 WIDTHS = (32, 64, 96)
 DEPTHS = (1, 2, 3)
 """Channels and additional layers of the three levels."""
+SHOWN_EVERY = 20
+"""Iterations between two losses on the bar, each the mean of as many."""
 RARE_HEAT = -4.6
 """Initial logit of the heat: few pixels hold a centre."""
 
@@ -113,21 +115,14 @@ def answer(
     network: nn.Module,
     views: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The network on views (B, 2n, 2n, CHANNELS) uint8. The first layer is normalised, so that the
-    scale of its input does not matter."""
-    with _precision():
-        logits, values = network(_input(views))
+    """The network on views (B, 2n, 2n, CHANNELS) uint8, which are moved to its device. The first
+    layer is normalised, so that the scale of its input does not matter."""
+    device = next(network.parameters()).device
+    half = device.type != "cpu" or faster_in_bfloat16()
+    seen = views.to(device, torch.bfloat16 if half else torch.float32)
+    with torch.autocast(device.type, torch.bfloat16, enabled=half):
+        logits, values = network(seen.permute(0, 3, 1, 2))
     return logits, values
-
-
-def _input(views: Tensor) -> Tensor:
-    return views.to(torch.bfloat16 if faster_in_bfloat16() else torch.float32).permute(
-        0, 3, 1, 2
-    )
-
-
-def _precision() -> torch.autocast:
-    return torch.autocast("cpu", torch.bfloat16, enabled=faster_in_bfloat16())
 
 
 def loss_of(
@@ -164,20 +159,25 @@ def train(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, rate, total_steps=iterations
     )
-    losses: list[float] = []
+    losses: list[Tensor] = []
     bar = tqdm(
         islice(batches, iterations), name, iterations, mininterval=5, unit="iteration"
     )
     for views, target in bar:
-        loss = loss_of(*answer(network, views), target)
+        logits, values = answer(network, views)
+        expected = Target(*(part.to(logits.device) for part in target))
+        loss = loss_of(logits, values, expected)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         optimizer.step()
         schedule.step()
-        losses.append(loss.item())
-        bar.set_postfix(loss=f"{np.mean(losses[-20:]):.3f}", refresh=False)
-    return losses
+        losses.append(loss.detach())
+        if len(losses) % SHOWN_EVERY == 0:  # it waits for a GPU
+            recent = torch.stack(losses[-SHOWN_EVERY:]).mean()
+            bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
+    found: list[float] = torch.stack(losses).tolist()
+    return found
 
 
 def detect(
@@ -190,5 +190,5 @@ def detect(
     with torch.no_grad():
         for i in range(count):
             logits, values = answer(network, views(i)[None])
-            every.append(decode(logits[0].sigmoid(), values[0]))
+            every.append(decode(logits[0].sigmoid().cpu(), values[0].cpu()))
     return every

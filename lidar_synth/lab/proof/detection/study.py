@@ -20,6 +20,7 @@ from lidar_synth.files.disk import hash_of_names, write_file
 from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import write_scan
+from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.detection.arms import (
     ARMS,
@@ -121,12 +122,14 @@ class DetectionWork:
         settings: what is compared.
         out: the folder of results.
         pool: the folder of the town's scans.
+        device: on which the detector computes.
     """
 
     source: Source
     settings: DetectionSettings
     out: Path
     pool: Path
+    device: str = "cpu"
 
     @cached_property
     def places(self) -> Places:
@@ -189,7 +192,7 @@ class DetectionWork:
         arm = ARMS[name]
         start = time.monotonic()
         torch.manual_seed(seed)
-        network = Detector()
+        network = Detector().to(self.device)
         labelled = self.labelled(seed)
         count = self.settings.iterations * self.settings.batch
         town = self.town if any(arm.shares) else None
@@ -280,6 +283,7 @@ def prove_detection(
     *,
     minutes: float = float("inf"),
     pools: str | Path | None = None,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Measure what the town adds to a few real scans with boxes, for a small detector.
 
@@ -292,19 +296,22 @@ def prove_detection(
         settings: of the comparison.
         minutes: no training begins after so many.
         pools: folder of the town's scans, which several comparisons may share.
+        device: on which the detector computes, such as "cuda".
 
     Returns:
         The values of ``results.json``.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, or a folder with another comparison.
+        ConfigError: on settings that do not fit the scans, a device that is not there, or a folder
+            with another comparison.
         DataError: on one place only, or scans without boxes.
     """
+    check_device(device)
     start = time.monotonic()
     out = Path(out)
     settings = settings or DetectionSettings()
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
-    work = DetectionWork(source, settings, out, Path(pools or out / "town"))
+    work = DetectionWork(source, settings, out, Path(pools or out / "town"), device)
     truths = {i: Truth.of(source[i]) for i in range(len(source))}
     claim(out / "study.json", _identity(work))
     for seed in range(settings.seeds):
@@ -314,6 +321,30 @@ def prove_detection(
                 continue
             write_file(path, seal(work.run(arm, seed)))
     return report(work, truths)
+
+
+def describe(work: DetectionWork) -> str:
+    """What would be trained and tested, in words.
+
+    Raises:
+        ConfigError, DataError: as ``prove_detection``.
+    """
+    settings = work.settings
+    for index in range(len(work.source)):
+        Truth.of(work.source[index])
+    counts = [f"{name} ({len(part)})" for name, part in work.places.items()]
+    trainings = settings.seeds * len(settings.compared)
+    lines = [
+        f"{len(work.source)} scans in {len(counts)} places: {', '.join(counts)}",
+        *(
+            f"seed {seed}: {len(work.labelled(seed))} labelled scans, "
+            f"tested on {', '.join(work.tested(seed))}"
+            for seed in range(settings.seeds)
+        ),
+        f"{trainings} trainings of {settings.iterations} iterations of {settings.batch}:",
+        *(f"  {name:<12}{ARMS[name].title}" for name in settings.compared),
+    ]
+    return "\n".join(lines)
 
 
 def _identity(work: DetectionWork) -> dict[str, Any]:
@@ -347,7 +378,7 @@ def report(
         "labelled": work.settings.labelled,
         "settings": asdict(work.settings),
         "sensor": work.source[0].sensor.name,
-        "machine": machine(),
+        "machine": machine(work.device),
         "date": time.strftime("%Y-%m-%d"),
         "command": command_line(),
     }
