@@ -14,7 +14,7 @@ PARALLEL ?= -n 2 --dist loadfile
 
 .PHONY: demo test quick test-lowest lint types lock docs notebooks bench clean
 
-demo: $(READY)  ## scans mixed with synthetic ones, a comparison of trainings, a page to look at
+demo: $(READY)  ## scans mixed with synthetic ones, a recorded scan changed, a page to look at
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
 test: $(READY)  ## all tests

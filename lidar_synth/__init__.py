@@ -25,6 +25,7 @@ _HOME = {
     "Bank": "bank",
     "BatchMixer": "mixing.service",
     "Boxes": "geometry.scan",
+    "Compose": "labels.compose",
     "Generator": "generate.generator",
     "IgnoreLabels": "labels.own",
     "KITTI360": "formats",
@@ -76,6 +77,8 @@ _HOME = {
     "project": "geometry.projection",
     "prove": "lab.proof",
     "reskew": "geometry.deskew",
+    "sample_scans": "bank.sample",
+    "start": "lab.start",
     "unfold": "geometry.projection",
     "unproject": "geometry.projection",
 }
@@ -84,6 +87,7 @@ __all__ = ["__version__", *_HOME]
 
 if TYPE_CHECKING:
     from lidar_synth.bank import Bank as Bank
+    from lidar_synth.bank.sample import sample_scans as sample_scans
     from lidar_synth.errors import LidarSynthError as LidarSynthError
     from lidar_synth.formats import KITTI360 as KITTI360
     from lidar_synth.formats import KITTIObject as KITTIObject
@@ -115,6 +119,7 @@ if TYPE_CHECKING:
     from lidar_synth.lab.fitting import fit_sensor as fit_sensor
     from lidar_synth.lab.proof import ProofSettings as ProofSettings
     from lidar_synth.lab.proof import prove as prove
+    from lidar_synth.lab.start import start as start
     from lidar_synth.lab.town import Skin as Skin
     from lidar_synth.lab.town import Town as Town
     from lidar_synth.lab.town import fit_skin as fit_skin
@@ -122,6 +127,7 @@ if TYPE_CHECKING:
     from lidar_synth.lab.train.adaptation import adapt as adapt
     from lidar_synth.labels import ObjectBank as ObjectBank
     from lidar_synth.labels import make_policy as make_policy
+    from lidar_synth.labels.compose import Compose as Compose
     from lidar_synth.labels.mix import LaserMix as LaserMix
     from lidar_synth.labels.mix import PasteObjects as PasteObjects
     from lidar_synth.labels.mix import PolarMix as PolarMix
@@ -143,7 +149,10 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
-        raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}")
+        from lidar_synth.errors import suggest
+
+        hint = f". {suggest(name, _HOME)}".rstrip(". ")
+        raise AttributeError(f"module 'lidar_synth' has no attribute {name!r}{hint}")
     return getattr(import_module(f"lidar_synth.{_HOME[name]}"), name)
 
 

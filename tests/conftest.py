@@ -24,6 +24,13 @@ settings.register_profile(
 settings.load_profile("untimed")
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests of every format take MCAP where its extra is installed."""
+    values = getattr(item, "callspec", None)
+    if values is not None and "mcap" in map(str, values.params.values()):
+        pytest.importorskip("mcap_ros2")
+
+
 def _folder(variable: str) -> Path:
     value = os.environ.get(variable)
     if not value:

@@ -1,13 +1,18 @@
 """Every benchmark of tools/bench runs, with the arguments that make it shortest."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 from project import ROOT
 from small_models import write
+
+from lidar_synth.generate.models.hdit.hdit import HDiT
+from lidar_synth.geometry.sensor import load_sensor
 
 BENCH = ROOT / "tools" / "bench"
 SHARED = {"timing", "untrained"}
@@ -31,6 +36,22 @@ SMALLEST = {
     "weather": "--rounds 1",
 }
 """{script: arguments}, with the names of ``models``."""
+
+
+def test_a_training_step_is_divided(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCH))
+    import networks
+
+    angles = torch.from_numpy(load_sensor("hdl64e_kitti360").ray_angles())
+    small = {"width": 16, "depths": [1], "heads": [2], "patch": [8, 16]}
+    net = HDiT((64, 1024), angles=angles, **small)
+    monkeypatch.setattr(networks, "full_network", lambda model: net)
+    networks.on_training("hdit", batch=2, rounds=2)
+    found = re.search(r"time (\S+) s, .* network (\S+) s", capsys.readouterr().out)
+    assert found is not None
+    assert 0 < float(found[2]) < float(found[1])
 
 
 @pytest.fixture(scope="module")

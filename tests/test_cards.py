@@ -37,6 +37,52 @@ def test_a_card_names_the_sizes_and_the_licence_of_its_weights(name: str) -> Non
     assert len(re.findall(r"^[^|\n]+ \| [^|\n]+ \|.*$", card, re.M)) == 1 + 10
 
 
+def quality() -> dict[tuple[str, str, str], str]:
+    """{(model, steps, figure): value} of the quality page's table of the shipped models."""
+    text = (ROOT / "docs/research/quality.md").read_text()
+    [head] = [line for line in text.splitlines() if "| `town`, 4 steps |" in line]
+    columns = []
+    model = ""
+    for cell in head.split("|")[2:-1]:
+        named = re.match(r" `([\w-]+)`, (.*) ", cell)
+        model, steps = named.groups() if named else (model, cell.strip())
+        columns.append((model, steps))
+    found = {}
+    for line in text[text.index(head) :].splitlines()[2:]:
+        if not line.startswith("|"):
+            return found
+        title, *cells = (cell.strip() for cell in line.split("|")[1:-1])
+        for (model, steps), cell in zip(columns, cells, strict=True):
+            found[model, steps, title] = cell.partition(" ")[0]
+    raise AssertionError("the table has no end")
+
+
+FRECHET = "Fréchet distance, segmenter"
+SHARED = {
+    "Fréchet distance of features": ("", "4 steps", FRECHET),
+    "in 1 step": ("", "1 step", FRECHET),
+    "that of `town`": ("town", "4 steps", FRECHET),
+    "bird's-eye JSD": ("", "4 steps", "bird's-eye JSD"),
+    "mIoU, town segmenter, %": ("", "4 steps", "mIoU with the segmenter, %"),
+}
+"""Rows of cards whose figure stands on the page of quality: (model, its own if empty; steps; row)."""
+
+
+@pytest.mark.parametrize("name", ["town-camera", "town-layout", "town-semantic"])
+def test_a_card_and_the_page_of_quality_say_the_same(name: str) -> None:
+    figures = quality()
+    card = (CARD / f"{name}.md").read_text()
+    rows = dict(re.findall(r"^([^|\n]+) \| ([\d.]+) \|", card, re.M))
+    shared = rows.keys() & SHARED.keys()
+    assert {"Fréchet distance of features"} < shared
+    for row in shared:
+        model, steps, title = SHARED[row]
+        value = rows[row]
+        decimals = len(value.partition(".")[2])
+        page = float(figures[model or name, steps, title])
+        assert float(value) == pytest.approx(page, abs=0.5001 * 10**-decimals), row
+
+
 def test_the_method_has_the_timesteps_of_the_shipped_student() -> None:
     text = (ROOT / "docs/explanation/method.md").read_text()
     row = re.findall(r"`town`, selected here \| (.*)", text)[0]

@@ -378,7 +378,7 @@ def test_files_that_describe_themselves_may_differ(tmp_path: Path, to: str) -> N
     )
 
 
-@pytest.mark.parametrize("to", ["npz", "pcd", "ply", "webdataset"])
+@pytest.mark.parametrize("to", ["npz", "pcd", "ply", "webdataset", "mcap"])
 def test_a_folder_may_hold_files_of_several_sensors(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [a_scan(sensor) for sensor in SENSORS.values()])
     assert [scan.sensor for scan in open_scans(tmp_path)] == list(SENSORS.values())

@@ -8,12 +8,15 @@ import pytest
 from project import ROOT
 
 LIMITS = {
-    "README.md": 900,
-    "docs/index.md": 130,
-    "docs/start/install.md": 160,
+    "README.md": 800,
+    "docs/index.md": 150,
+    "docs/start/install.md": 150,
     "docs/start/tutorial.md": 460,
+    "docs/faq.md": 130,
+    "docs/how-to/choose.md": 140,
+    "docs/explanation/comparison.md": 130,
     "docs/how-to/mix.md": 680,
-    "docs/how-to/trainers/index.md": 310,
+    "docs/how-to/trainers/index.md": 315,
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,
     "docs/how-to/trainers/pointcept.md": 125,
@@ -35,11 +38,16 @@ LIMITS = {
     "docs/how-to/train-a-generator.md": 380,
     "docs/how-to/edit.md": 160,
     "docs/how-to/layouts.md": 150,
-    "docs/how-to/bake.md": 320,
+    "docs/how-to/bake.md": 363,
     "docs/how-to/look.md": 130,
     "docs/how-to/prove.md": 225,
-    "docs/how-to/weather.md": 260,
+    "docs/how-to/weather.md": 333,
     "docs/reference/api.md": 40,
+    "docs/reference/api/load.md": 15,
+    "docs/reference/api/mix.md": 15,
+    "docs/reference/api/generate.md": 15,
+    "docs/reference/api/look.md": 15,
+    "docs/reference/api/lab.md": 15,
     "docs/reference/command-line.md": 30,
     "docs/reference/recipes.md": 80,
     "docs/bank-format.md": 350,
@@ -53,11 +61,11 @@ LIMITS = {
     "docs/models/town-camera.md": 190,
     "docs/models/town-layout.md": 160,
     "docs/models/skin-pandar64.md": 140,
-    "docs/gallery.md": 90,
+    "docs/gallery.md": 98,
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 8_550
+MAIN_PATH = 9_167
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [

@@ -219,3 +219,9 @@ def test_the_command_fails_where_the_package_does(
     result = CliRunner().invoke(app, ["--json"])
     assert result.exit_code == 1
     assert json.loads(result.stdout)["works"] is False
+
+
+def test_nothing_that_only_developers_need_is_listed() -> None:
+    names = {finding.name for finding in examine()}
+    assert "pydantic" in names and "submitit" in names
+    assert not names & {"mkdocs-material", "nbclient", "flask", "moto"}

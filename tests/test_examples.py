@@ -29,7 +29,6 @@ FURTHER = {
     "lidar_synth.generate.generator": ("Generated",),
     "lidar_synth.generate.inpaint": ("inpaint",),
     "lidar_synth.integrations.accelerate": ("prepare",),
-    "lidar_synth.labels.augment": ("compose",),
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": (
         "ByDomain",
@@ -38,6 +37,7 @@ FURTHER = {
         "MixedScans.domain",
         "MixedScans.loss_weight",
         "MixedScans.wrap",
+        "SyntheticFirst",
         "settle",
     ),
     "lidar_synth.noise": ("gaussian",),

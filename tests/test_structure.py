@@ -16,7 +16,8 @@ from lidar_synth.labels import POLICIES
 ORDER = """
 errors files datasets noise geometry weather generate.models generate.flow generate labels bank
 formats mixing bake viz cli
-lab lab.importers lab.fitting lab.kitti360 lab.town lab.evaluate lab.curate lab.train lab.proof lab.cli
+lab lab.importers lab.fitting lab.kitti360 lab.town lab.evaluate lab.curate lab.train lab.proof lab.start lab.reproduce
+lab.cli
 """.split()
 """A module may import only from those before it and its own: the plugin (before ``lab``) never imports
 the laboratory."""
@@ -168,9 +169,9 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (152_950, 6.0, 141),
-    "laboratory": (119_100, 6.05, 154),
-    "tools": (37_450, 6.0, 128),
+    "plugin": (168_000, 6.1, 142),
+    "laboratory": (136_000, 6.2, 151),
+    "tools": (41_000, 5.8, 132),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -1,52 +1,211 @@
-"""Misspelt names: the error names the nearest ones."""
+"""75 mistakes of newcomers, on the command line, in Python and in YAML: each is answered in one line
+that names the option or what was expected and, for names, the nearest ones."""
 
+import re
+import warnings
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import pytest
+from layouts import MAKERS
+from typer.core import TyperGroup
+from typer.main import get_command
 from typer.testing import CliRunner
 
+import lidar_synth
+from lidar_synth.bake.run import ENGINES
+from lidar_synth.cli import COMMANDS as COMMAND_NAMES
 from lidar_synth.cli import app
 from lidar_synth.errors import suggest
+from lidar_synth.formats import READERS, WRITERS
 from lidar_synth.formats.description import Description
+from lidar_synth.generate.flow.solvers import SOLVERS
+from lidar_synth.lab.proof import ARMS
+from lidar_synth.lab.proof.detection import ARMS as DETECTION_ARMS
+from lidar_synth.lab.proof.places import SPLITS
+from lidar_synth.lab.proof.scores import GROUPS
+from lidar_synth.lab.start.trainers import TRAINERS
+from lidar_synth.lab.town.export import LAYOUTS
+from lidar_synth.mixing.settings import mix_for_trainer, read_settings
 
-CALLS = {
-    "train twon": "'town'",
-    "train town_tiny recipe.itterations=3": "'iterations'",
+COMMANDS = {
+    "train twon": "Did you mean 'town'",
+    "train town_tiny recipe.itterations=3": "Did you mean 'iterations'",
+    "train town_tiny recipe.iterations=many": "recipe.iterations = 'many'",
+    "train town_tiny recipe.iterations 3": "expected key=value",
+    "train town_tiny --epochs 3": "key=value, such as recipe.iterations=3",
+    "train town_tiny sensor=vlp61": "Did you mean 'vlp16'",
     "distill town_studnt": "'town_student'",
-    "sample OUT --model twon": "'town'",
-    "sample OUT --to kiti": "'kitti'",
-    "bake OUT --engine locl": "'local'",
-    "town OUT --layout kiti360": "'kitti360'",
-    "town OUT --sensor hdl64e_kiti": "'hdl64e_kitti'",
-    "town OUT --skin pandar46": "'pandar64'",
+    "sample OUT --model twon": "Did you mean 'town'",
+    "sample OUT --to kiti": "Did you mean 'kitti'",
+    "sample OUT --dtype fp16": "'float32', 'bfloat16'",
+    "sample OUT --device gpu": "expected an available one: cpu",
+    "sample OUT --count 0": "Invalid value for '--count'",
+    "sample OUT --cout 5": "Did you mean '--count'",
+    "sample OUT --num 5": "Did you mean '--count'",
+    "sample OUT --format kitti": "Did you mean '--to'",
+    "sample OUT --model town-semantic": "--condition ROOT",
+    "bake OUT --engine locl": "Did you mean 'local'",
+    "bake OUT --scans 20": "Did you mean '--count'",
+    "bake OUT --gpu": "Did you mean '--device'",
+    "bake OUT --checkpoint town": "Did you mean '--model'",
+    "bake OUT --output bank": "The folder is the argument OUT",
+    "bake OUT --batch-size 4": "Did you mean '--batch'",
+    "bake OUT --fields intensity": "'reflectance'",
+    "bake OUT --slurm partition": "KEY=VALUE, such as slurm_partition=gpu",
+    "bake BANK --count 5": "an empty folder",
+    "town OUT --layout kiti360": "Did you mean 'kitti360'",
+    "town OUT --sensor hdl64e_kiti": "Did you mean 'hdl64e_kitti'",
+    "town OUT --skin pandar46": "Did you mean 'pandar64'",
+    "town OUT --count 5": "Did you mean '--scans'",
+    "convert SCANS OUT": "Missing option '--to'",
     "convert OUT OUT --to npz --layout semantic_kity": "'semantic_kitti'",
-    "evaluate OUT OUT --protocol r2flo": "'r2flow'",
+    "convert SCANS OUT --to npz --split tain": "Did you mean 'train'",
+    "evaluate OUT OUT --protocol r2flo": "Did you mean 'r2flow'",
+    "prove SCANS --arm pretain": "Did you mean 'pretrain'",
+    "prove SCANS --task detecton": "Did you mean 'detection'",
+    "prove SCANS --classes semantickitti": "Did you mean 'semantic_kitti'",
+    "prove SCANS --only cars": "Did you mean 'car'",
+    "prove SCANS --epochs 4": "Did you mean '--iterations'",
+    "adapt twon --scans SCANS --out m.safetensors": "Did you mean 'town'",
+    "verify SCANS": "holds no bank",
+    "label kiti360 SCANS OUT": "Did you mean 'kitti360'",
+    "labels kitti360 SCANS OUT": "Did you mean 'label'",
+    "metrics lst": "lidar-synth metrics has",
+    "generate OUT": "Did you mean 'sample'",
+    "mix SCANS BANK": "Did you mean 'check-mix'",
+    "help": "Did you mean '--help'",
+    "start SCANS --trainer mmdet": "Did you mean 'mmdet3d'",
+    "sensor fit SCANS --out my.json": "a file that ends in .yaml",
 }
+"""By command line: what the answer says. ``OUT`` is a new folder, ``SCANS`` and ``BANK`` are there."""
+
+PYTHON = {
+    "lidar_synth.Towm": "Did you mean 'Town'",
+    "lidar_synth.open_scans('nowhere')": "nowhere does not exist",
+    "lidar_synth.open_scans(SCANS, on_bad='skp')": "Did you mean 'skip'",
+    "lidar_synth.Bank(SCANS)": "holds no bank",
+    "lidar_synth.load_sensor('os1_12')": "Did you mean 'os1_128'",
+    "lidar_synth.mix(SCANS, BANK, ratio=25)": "a number from 0 to 1",
+    "lidar_synth.mix(SCANS, BANK, ratoi=0.5)": "Did you mean 'ratio'",
+    "lidar_synth.mix(SCANS, BANK, task='detecton')": "Did you mean 'detection'",
+    "lidar_synth.mix(SCANS, BANK, labels='paste')": "ObjectBank.from_scans",
+    "lidar_synth.mix(SCANS, BANK, labels={'paste': {'bnk': 1}})": "Did you mean 'bank'",
+    "lidar_synth.mix(SCANS, BANK, epoch_size='ad')": "'add', 'replace' or a number",
+    "lidar_synth.mix(SCANS, BANK, collate='paded')": "Did you mean 'padded'",
+    "lidar_synth.mix(SCANS, 'twon')": "Did you mean 'town'",
+    "lidar_synth.KeepLabels(threshold=60)": "a number from 0 to 1",
+}
+"""By expression: what the error says."""
+
+YAML = {
+    "{synthetic: BANK, ratoi: 0.5}": "Did you mean 'ratio'",
+    "{synthetic: BANK, ratio: half}": "a number from 0 to 1",
+    "{synthetic: BANK, ratio: {end_on_reel: 40}}": "Did you mean 'end_on_real'",
+    "{synthetic: BANK, labels: generatd}": "Did you mean 'generated'",
+    "{synthetic: BANK, as_sensor: os1_12}": "Did you mean 'os1_128'",
+    "{synthetic: BANK, unboxed: clos}": "Did you mean 'close'",
+    "{synthetic: BANK, reuse: 0}": "at least 1",
+    "{synthetic: BANK, seed: one}": "expected an integer",
+    "{synthetic: twon}": "Did you mean 'town'",
+    "{ratio: 0.5}": "synthetic: a bank's folder",
+    "{synthetic: BANK": "is not YAML",
+    "[synthetic, ratio]": "a dict of synthetic, ratio",
+    "{synthetic: BANK, loss_weight: 0.1}": "Use a smaller ratio",
+}
+"""By file of a mixture: what the error says."""
 
 
-@pytest.mark.parametrize("call", CALLS)
-def test_a_misspelt_name_is_answered_with_the_nearest(
-    call: str, tmp_path: Path
+def test_they_are_75() -> None:
+    assert len(COMMANDS) + len(PYTHON) + len(YAML) == 75
+
+
+@pytest.fixture(scope="module")
+def there(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The folders that are there, by name."""
+    root = tmp_path_factory.mktemp("there")
+    MAKERS["semantic_kitti"](root / "scans")
+    MAKERS["bank"](root / "bank")
+    return {"SCANS": str(root / "scans"), "BANK": str(root / "bank")}
+
+
+@pytest.mark.parametrize("call", COMMANDS)
+def test_a_wrong_command_is_answered(
+    call: str, there: dict[str, str], tmp_path: Path
 ) -> None:
-    given = call.replace("OUT", str(tmp_path / "out")).split()
+    named = there | {"OUT": str(tmp_path / "out")}
+    given = [named.get(word, word) for word in call.split()]
     result = CliRunner().invoke(app, given)
-    said = (
-        result.output
-        if result.exception is None
-        else f"{result.output}{result.exception}"
-    )
-    assert (
-        result.exit_code != 0
-        and "Did you mean" in said
-        and CALLS[call] in said.split("Did you mean")[1]
-    )
+    *_, said = result.output.strip().splitlines() or [""]
+    if result.exception is not None and result.exit_code == 1:
+        said = str(result.exception)
+    assert result.exit_code != 0
+    assert COMMANDS[call] in said and "\n" not in said
+
+
+@pytest.mark.parametrize("call", PYTHON)
+def test_a_wrong_call_is_answered(call: str, there: dict[str, str]) -> None:
+    with pytest.raises(Exception) as caught, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        eval(call, {"lidar_synth": lidar_synth, **there})
+    said = str(caught.value)
+    assert PYTHON[call] in said and "\n" not in said
+
+
+@pytest.mark.parametrize("text", YAML)
+def test_a_wrong_file_is_answered(
+    text: str, there: dict[str, str], tmp_path: Path
+) -> None:
+    path = tmp_path / "mix.yaml"
+    path.write_text(text.replace("BANK", there["BANK"]))
+
+    def mixed() -> Any:
+        return mix_for_trainer(3, read_settings(path), lambda scan, rng: scan)
+
+    with pytest.raises(Exception) as caught:
+        mixed()
+    said = str(caught.value)
+    assert YAML[text] in said and "\n" not in said
+
+
+CHOICES: dict[tuple[str, str], Collection[str]] = {
+    ("prove", "--arm"): {**ARMS, **DETECTION_ARMS},
+    ("prove", "--classes"): GROUPS,
+    ("prove", "--places"): SPLITS,
+    ("start", "--trainer"): TRAINERS,
+    ("recipes", "--trainer"): TRAINERS,
+    ("convert", "--to"): WRITERS,
+    ("sample", "--to"): WRITERS,
+    ("sample", "--solver"): SOLVERS,
+    ("convert", "--layout"): READERS,
+    ("bake", "--engine"): ENGINES,
+    ("town", "--layout"): LAYOUTS,
+}
+"""By command and option: the names that it takes."""
+
+
+@pytest.mark.parametrize(("command", "option"), CHOICES)
+def test_the_help_of_an_option_lists_its_choices(command: str, option: str) -> None:
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    params = [p for p in group.commands[command].params if option in p.opts]
+    said = getattr(params[0], "help", None)
+    assert set(CHOICES[command, option]) <= set(re.findall(r"[\w-]+", said))
+
+
+def test_the_help_of_all_commands_is_whole() -> None:
+    said = CliRunner().invoke(app, ["--help"]).output
+    commands = said.split("Commands:")[1]
+    assert "..." not in commands
+    assert all(re.search(rf"^  {name} ", commands, re.M) for name in COMMAND_NAMES)
 
 
 def test_a_name_like_none_has_no_suggestion() -> None:
     assert suggest("velodyne", ["kitti", "pcd"]) == ""
 
 
-def test_the_sensor_of_a_folder_is_a_preset(tmp_path: Path) -> None:
+def test_the_sensor_of_a_folder_is_a_preset() -> None:
     with pytest.raises(
         ValueError, match=r"sensor 'os1_12' is no preset.*Did you mean 'os1_128'"
     ):

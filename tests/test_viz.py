@@ -23,14 +23,14 @@ from lidar_synth.viz import (
     bird,
     contact_sheet,
     html_page,
+    make_scales,
     picture,
     render,
-    scales,
     sheet,
     write_view,
 )
-from lidar_synth.viz.colour import EMPTY, UNLABELLED, VALUES
 from lidar_synth.viz.render import box_segments
+from lidar_synth.viz.scales import EMPTY, UNLABELLED, VALUES
 
 
 def few_points(
@@ -86,7 +86,7 @@ def test_a_picture_has_the_colour_of_every_cell(sensor: Sensor) -> None:
 
 def test_colours_increase_with_the_values() -> None:
     ranges = np.tile(np.linspace(1, 80, 64, dtype=np.float32), (16, 1))
-    scale = scales([unproject(RangeImage(ranges, SMALL))])["range"]
+    scale = make_scales([unproject(RangeImage(ranges, SMALL))])["range"]
     pixels = picture(RangeImage(ranges, SMALL), "range", scale)
     np.testing.assert_array_equal(pixels[0], scale.table[scale.index(ranges[0])])
     assert (np.diff(scale.index(ranges[0]).astype(int)) >= 0).all()
@@ -102,7 +102,7 @@ def test_colours_increase_with_the_values() -> None:
 
 @pytest.mark.parametrize("name", ["height", "range", "reflectance"])
 def test_lightness_is_monotonic_along_a_colour_table(name: str) -> None:
-    table = scales([random_scan(SMALL)])[name].table.astype(float)
+    table = make_scales([random_scan(SMALL)])[name].table.astype(float)
     lightness = (table / 255) ** 2.2 @ [0.2126, 0.7152, 0.0722]
     step = np.diff(lightness) * np.sign(lightness[-1] - lightness[0])
     assert (step > -0.005).all()

@@ -21,12 +21,12 @@ from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.viz import (
     html_page,
+    make_scales,
     picture,
-    scales,
 )
-from lidar_synth.viz.colour import VALUES
 from lidar_synth.viz.page import SCRIPTS
 from lidar_synth.viz.render import box_segments
+from lidar_synth.viz.scales import VALUES
 
 PANELS = ["<section>one</section>", "<section>two, @data@</section>"]
 
@@ -107,7 +107,7 @@ def test_the_page_contains_the_facts_of_each_scan(page: str, scans: list[Scan]) 
 
 
 def test_the_page_contains_the_range_images(page: str, scans: list[Scan]) -> None:
-    colours = scales(scans)
+    colours = make_scales(scans)
     for scan, packed in zip(scans, page_data(page)["scans"], strict=True):
         image = project(scan)
         channels = ["range", "reflectance"] + ["label"] * (scan.label is not None)
@@ -125,7 +125,7 @@ def test_the_page_uses_the_colour_tables_of_the_pictures(
     page: str, scans: list[Scan]
 ) -> None:
     data = page_data(page)
-    colours = scales(scans)
+    colours = make_scales(scans)
     table = np.frombuffer(base64.b64decode(data["table"]), np.uint8).reshape(
         len(colours), 256, 3
     )

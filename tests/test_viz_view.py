@@ -20,7 +20,7 @@ from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.geometry.sensor import load_sensor
 from lidar_synth.viz import (
-    scales,
+    make_scales,
     window,
 )
 from lidar_synth.viz.render import box_segments
@@ -135,13 +135,15 @@ def test_the_window_draws_points_and_boxes() -> None:
         pytest.skip(str(error))
     boxes = Boxes(np.array([(5, 1, -1, 4, 2, 1.5, 0.3)], np.float32), ("Car",))
     scan = replace(random_scan(SMALL), boxes=boxes)
-    cloud, lines = window.geometries(scan, scales([scan]))
+    cloud, lines = window.geometries(scan, make_scales([scan]))
     np.testing.assert_array_equal(
         np.asarray(cloud.points).astype(np.float32), scan.points
     )
     np.testing.assert_allclose(
-        np.asarray(cloud.colors) * 255, scales([scan])["label"](scan.label), atol=1e-4
+        np.asarray(cloud.colors) * 255,
+        make_scales([scan])["label"](scan.label),
+        atol=1e-4,
     )
     drawn = np.asarray(lines.points)[np.asarray(lines.lines)]
     np.testing.assert_allclose(drawn, box_segments(boxes), atol=1e-6)
-    assert len(window.geometries(replace(scan, boxes=None), scales([scan]))) == 1
+    assert len(window.geometries(replace(scan, boxes=None), make_scales([scan]))) == 1

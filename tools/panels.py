@@ -1,5 +1,4 @@
-"""Panels of the HTML page: the samples of a mixture, a comparison of trainings, and a table of
-classes.
+"""Panels of the HTML page: the samples of a mixture, and a table of classes.
 
 Each function returns HTML for the argument ``panels`` of ``html_page``, whose style sheet it relies
 on.
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import COLOURS, NAMES
-from lidar_synth.viz.colour import DOMAINS
+from lidar_synth.viz.scales import DOMAINS
 
 
 def mixture_panel(
@@ -36,53 +35,9 @@ def mixture_panel(
     )
     text += f"{_swatch(1)}{counts[1]} {html.escape(names[1])} ({share:.0f} %)."
     return _panel(
-        "Samples of the first epoch",
+        "Samples of an epoch",
         f'<div class="samples">{squares}</div><p>{text}</p>',
         notes,
-    )
-
-
-def scores_panel(arms: Mapping[str, Sequence[float]], notes: Sequence[str] = ()) -> str:
-    """mIoU on held-out scans of two trainings, each repeated with several seeds.
-
-    Args:
-        arms: the mIoU in [0, 1] of each seed: first without synthetic scans, then with them, the
-            seeds in one order.
-        notes: paragraphs below: the protocol.
-    """
-    top = 0.05 * np.ceil(20 * 1.15 * max(max(scores) for scores in arms.values()))
-    rows = "".join(
-        _score_row(d, name, scores, top)
-        for d, (name, scores) in enumerate(arms.items())
-    )
-    ends = f'<div class="score"><span></span><div class="ends"><span>0</span><span>{100 * top:.0f} %</span></div></div>'
-    without, with_synthetic = arms.values()
-    body = f'{rows}{ends}<p class="large">{verdict(without, with_synthetic)}</p>'
-    return _panel(
-        "mIoU on held-out scans, without and with synthetic scans", body, notes
-    )
-
-
-def verdict(without: Sequence[float], with_synthetic: Sequence[float]) -> str:
-    """What the scores of two trainings with the same seeds show, in one or two sentences."""
-    gains = 100 * np.subtract(with_synthetic, without)
-    count = len(gains)
-    better = int((gains > 0).sum())
-    change = (
-        f"Synthetic scans changed the mIoU by {gains.mean():+.1f} percentage points"
-    )
-    if count == 1:
-        return f"{change}. One seed cannot tell a difference from chance."
-    change += f" (by seed: {', '.join(f'{gain:+.1f}' for gain in gains)})"
-    if better == count:
-        return (
-            f"{change}. In this comparison they helped with each of the {count} seeds."
-        )
-    if better == 0:
-        return f"{change}. In this comparison they did not help with any of the {count} seeds."
-    return (
-        f"{change}. They helped with {better} of {count} seeds: this comparison shows no clear "
-        "difference."
     )
 
 
@@ -125,23 +80,6 @@ def _colour(domain: int) -> str:
 def _swatch(domain: int, title: str = "") -> str:
     shown = f' title="{html.escape(title)}"' if title else ""
     return f'<i style="background:{_colour(domain)}"{shown}></i>'
-
-
-def _score_row(domain: int, name: str, scores: Sequence[float], top: float) -> str:
-    """A row of the comparison: the name, a dot for each seed, a line for the mean, and mean ±
-    standard deviation."""
-    dots = "".join(
-        f'<span class="seed" style="left:{100 * score / top:.2f}%;background:{_colour(domain)}" '
-        f'title="{100 * score:.1f} %"></span>'
-        for score in scores
-    )
-    mean = float(np.mean(scores))
-    spread = f" ± {100 * np.std(scores, ddof=1):.1f}" if len(scores) > 1 else ""
-    return (
-        f'<div class="score"><span>{html.escape(name)}</span><div class="track">'
-        f'<span class="mean" style="left:{100 * mean / top:.2f}%"></span>{dots}</div>'
-        f'<span class="value">{100 * mean:.1f}{spread} %</span></div>'
-    )
 
 
 def _percent(share: float) -> str:

@@ -20,6 +20,7 @@ from lidar_synth.cli.convert import convert
 from lidar_synth.cli.doctor import doctor
 from lidar_synth.cli.edit import edit
 from lidar_synth.cli.sample import sample
+from lidar_synth.cli.usage import Commands
 from lidar_synth.cli.view import view
 from lidar_synth.errors import ConfigError, LidarSynthError
 
@@ -28,6 +29,7 @@ INTERRUPTED = 130
 without a message."""
 
 COMMANDS: dict[str, Callable[..., None] | str] = {
+    "start": "start",
     "town": "town",
     "convert": convert,
     "label": "label",
@@ -42,7 +44,9 @@ COMMANDS: dict[str, Callable[..., None] | str] = {
     "train": "train",
     "distill": "train",
     "evaluate": "evaluate",
+    "stress": "stress",
     "prove": "prove",
+    "reproduce": "reproduce",
     "adapt": "adapt",
     "check-mix": check_mix,
     "import": "import_",
@@ -55,6 +59,7 @@ GROUPS: list[typer.Typer | str] = [bank, edit, "sensor", "skin", "metrics"]
 """Commands with commands of their own; the laboratory's by name."""
 
 app = typer.Typer(
+    cls=Commands,
     name="lidar-synth",
     help=(
         "Synthetic LiDAR scans for perception training: generate, bake, curate, convert, "
@@ -62,7 +67,7 @@ app = typer.Typer(
     ),
     no_args_is_help=True,
     invoke_without_command=True,
-    add_completion=False,
+    add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -102,5 +107,7 @@ def main() -> None:
     except (KeyboardInterrupt, SystemExit) as stop:
         if isinstance(stop, SystemExit) and stop.code != INTERRUPTED:
             raise
+        # An object that was half made (a compiler's pass of numba, say) fails when it is deleted.
+        sys.unraisablehook = lambda _: None
         print("lidar-synth: interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import Reading, drop_missing, options_from
+from lidar_synth.cli.options import FORMATS, Reading, drop_missing, options_from
 
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
@@ -20,12 +20,7 @@ Source = Annotated[
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 To = Annotated[
     str,
-    typer.Option(
-        help=(
-            "format: kitti | semantic_kitti | kitti_object | kitti360 | range | pcd | ply | npz | "
-            "png | webdataset"
-        )
-    ),
+    typer.Option(help=FORMATS),
 ]
 InputSensor = Annotated[
     str | None,

@@ -42,6 +42,9 @@ class Finding:
     fix: str = ""
 
 
+DEVELOPMENT = ("dev", "docs", "test")
+"""Extras for work on the package itself, of which its users need nothing."""
+
 OPTIONAL = {
     "embreex": "ray casting, for instance in the town",
     "open3d": "the 3-D window of lidar-synth view",
@@ -157,7 +160,7 @@ def _libraries() -> Iterator[Finding]:
         requirement, _, marker = line.partition(";")
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", marker)
         parts = re.match(r"([\w.-]+?)\s*(?:>=\s*([\d.]+))?\s*$", requirement.strip())
-        if parts and not (extra and extra[1] == "dev"):
+        if parts and not (extra and extra[1] in DEVELOPMENT):
             yield _library(parts[1], parts[2] or "0", extra[1] if extra else None)
     yield _geometry()
 

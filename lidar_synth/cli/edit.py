@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lidar_synth.cli.options import FORMATS
+
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
 
@@ -30,9 +32,7 @@ Model = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="seed of the model's noise")]
 Format = Annotated[
     str,
-    typer.Option(
-        help="output format: npz (keeps every field) | kitti_object | semantic_kitti | ..."
-    ),
+    typer.Option(help=FORMATS),
 ]
 ScanNumber = Annotated[int, typer.Option(min=0, help="number of the scan in IN")]
 Place = Annotated[

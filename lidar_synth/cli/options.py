@@ -9,11 +9,21 @@ import typer
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
 
+FORMATS = (
+    "output format: npz (keeps every field) | kitti | semantic_kitti | kitti_object | kitti360 | "
+    "range | pcd | ply | png | webdataset | mcap"
+)
+"""Help of ``--to``; names of ``formats.WRITERS``."""
+
 
 class Reading(BaseModel):
     """How scans are read: the options of every command that opens a path."""
 
-    layout: str | None = Field(None, description="layout of the input [detected]")
+    layout: str | None = Field(
+        None,
+        description="layout of the input: kitti360 | semantic_kitti | kitti_object | nuscenes | "
+        "pandaset | kitti_raw | bank | webdataset | mcap | png | range | folder [detected]",
+    )
     split: str | None = Field(
         None, description="split of the input, for instance r2flow/train"
     )

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from lidar_synth.cli.options import FORMATS
 from lidar_synth.datasets.recordings import NOTE, seen_by
 
 
@@ -20,6 +21,10 @@ def sample(
     ] = 0,
     steps: Annotated[
         int | None, typer.Option(min=1, help="number of steps [the model's own]")
+    ] = None,
+    times: Annotated[
+        str | None,
+        typer.Option(help="time grid instead of --steps, such as 1,0.86,0.58,0.22,0"),
     ] = None,
     solver: Annotated[str, typer.Option(help="ODE solver: euler | heun")] = "euler",
     condition: Annotated[
@@ -38,6 +43,12 @@ def sample(
         str | None,
         typer.Option(help="split of that dataset, for instance r2flow/train"),
     ] = None,
+    objects: Annotated[
+        str | None,
+        typer.Option(
+            help="objects that are cast into the boxes of layouts: town [the model draws them]"
+        ),
+    ] = None,
     guidance: Annotated[
         float,
         typer.Option(
@@ -46,12 +57,7 @@ def sample(
     ] = 1.0,
     to: Annotated[
         str,
-        typer.Option(
-            help=(
-                "output format: npz (keeps every field) | kitti | semantic_kitti | range | pcd | "
-                "..."
-            )
-        ),
+        typer.Option(help=FORMATS),
     ] = "npz",
     device: Annotated[
         str, typer.Option(help="device of the network: cpu | cuda")
@@ -84,10 +90,16 @@ def sample(
     import torch
     from tqdm import tqdm
 
-    from lidar_synth.bake.conditions import conditions, conditions_for
+    from lidar_synth.bake.conditions import (
+        conditions,
+        conditions_for,
+        open_objects,
+        refuse_objects,
+    )
     from lidar_synth.errors import choose
     from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
+    from lidar_synth.generate.flow.solvers import read_grid
     from lidar_synth.generate.loading import load_generator
 
     writer = choose("--to", to, WRITERS)(out)
@@ -97,7 +109,9 @@ def sample(
     generator = load_generator(
         model, device=device, dtype=precision, batch=batch, columns=columns
     )
+    grid = None if times is None else read_grid(times.split(","))
     given = conditions_for(generator, condition, condition_layout, condition_split)
+    refuse_objects(generator, objects)
     settings = {
         "checkpoint": generator.hash,
         "seed": seed,
@@ -109,7 +123,9 @@ def sample(
         "condition_layout": condition_layout,
         "condition_split": condition_split,
         "guidance": guidance,
-        **({} if columns is None else {"columns": columns}),
+        "columns": columns,
+        "times": grid,
+        "objects": objects,
     }
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
@@ -122,7 +138,9 @@ def sample(
                     seed,
                     indices,
                     conditions(given, indices),
+                    open_objects(objects, generator.sensor),
                     steps=steps,
+                    times=grid,
                     solver=solver,
                     guidance=guidance,
                 )

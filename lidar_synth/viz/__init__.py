@@ -10,10 +10,10 @@ from pathlib import Path
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import write_file
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.viz.colour import Scale, scales
 from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.render import Camera, Orbit, bird, render
+from lidar_synth.viz.scales import Scale, make_scales
 from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
 
@@ -25,9 +25,9 @@ __all__ = [
     "contact_sheet",
     "histograms",
     "html_page",
+    "make_scales",
     "picture",
     "render",
-    "scales",
     "sheet",
     "show",
     "view_suffix",

@@ -10,7 +10,7 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.viz.colour import EMPTY, Rgb, Scale, scales
+from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales
 
 CHANNELS = ("range", "reflectance", "label")
 """The channels of a range image that are shown, if it has them."""
@@ -67,5 +67,5 @@ def picture(
     if channel not in available:
         raise ConfigError(f"a picture of {channel!r}", f"one of {', '.join(available)}")
     values = image.range if channel == "range" else image.channels[channel]
-    colours = (scale or scales([unproject(image)])[channel])(values)
+    colours = (scale or make_scales([unproject(image)])[channel])(values)
     return np.where(image.mask[..., None], colours, EMPTY)

@@ -26,9 +26,9 @@ from lidar_synth.datasets.classes import IGNORE, NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_picture
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, available, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Orbit, box_segments, render, ring_segments
+from lidar_synth.viz.scales import DOMAINS, EMPTY, Rgb, Scale, available, make_scales
 
 SCRIPTS = ("camera.js", "draw.js", "page.js")
 """The scripts of the page, in this order."""
@@ -85,7 +85,7 @@ def html_page(
     if not given:
         raise ConfigError("no scans for a page", "at least one scan")
     all_views = views(given)
-    colours = scales([view.scan for view in all_views])
+    colours = make_scales([view.scan for view in all_views])
     content = {
         "by": "label"
         if any(view.scan.label is not None for view in all_views)

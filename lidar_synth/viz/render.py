@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Boxes, Scan
-from lidar_synth.viz.colour import EMPTY, Rgb, Scale, point_values, scales
+from lidar_synth.viz.scales import EMPTY, Rgb, Scale, make_scales, point_values
 
 SAMPLES = 2
 """Samples per pixel along each axis, averaged for antialiasing."""
@@ -283,7 +283,7 @@ def render(
     """
     camera = camera or Orbit().camera()
     values = point_values(scan, by)
-    colours = (scale or scales([scan])[by])(values)
+    colours = (scale or make_scales([scan])[by])(values)
     fine = (size[0] * SAMPLES, size[1] * SAMPLES)
     pixels, depth, per_metre = camera.look(scan.points, fine)
     in_front = depth > 0.1

@@ -20,9 +20,9 @@ from tqdm import tqdm
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import RangeImage, Scan
-from lidar_synth.viz.colour import DOMAINS, EMPTY, Rgb, Scale, scales
 from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render
+from lidar_synth.viz.scales import DOMAINS, EMPTY, Rgb, Scale, make_scales
 
 BACK, INK, DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
 _DPI = 100
@@ -42,7 +42,7 @@ def sheet(
         A figure; write it with ``figure.savefig``.
     """
     [view] = views([given])
-    colours = scales([view.scan])
+    colours = make_scales([view.scan])
     by = "label" if view.scan.label is not None else "height"
     legend = 0.5 if by == "label" else 0.1
     heights = [6.2, *[1.45] * len(view.channels), legend]
@@ -100,7 +100,7 @@ def contact_sheet(
     if not given:
         raise ConfigError("no scans for a sheet", "at least one scan")
     all_views = views(given)
-    colours = scales([view.scan for view in all_views])
+    colours = make_scales([view.scan for view in all_views])
     by = by or (
         "label" if all(view.scan.label is not None for view in all_views) else "height"
     )

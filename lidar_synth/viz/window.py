@@ -11,8 +11,8 @@ import numpy as np
 
 from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.viz.colour import EMPTY, Scale, point_values, scales
 from lidar_synth.viz.render import Orbit, box_segments
+from lidar_synth.viz.scales import EMPTY, Scale, make_scales, point_values
 
 _LEFT, _RIGHT = 263, 262  # GLFW's key codes
 
@@ -84,7 +84,7 @@ def show(scans: Sequence[Scan], title: str = "lidar-synth") -> bool:
     window = open3d.visualization.VisualizerWithKeyCallback()
     if not window.create_window(window_name=title, width=1280, height=720):
         return False
-    colours = scales(scans)
+    colours = make_scales(scans)
     shown = 0
 
     def turn(step: int) -> Any:
@@ -122,7 +122,7 @@ def geometries(scan: Scan, colours: dict[str, Scale]) -> list[Any]:
 
     Args:
         scan: N points.
-        colours: the colour scales, from ``scales``.
+        colours: the colour scales, from ``make_scales``.
 
     Raises:
         LibraryError: if open3d is missing.

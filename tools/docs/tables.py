@@ -7,6 +7,7 @@ what replaces it. mkdocstrings then replaces ``::: NAME`` by the documentation o
 import inspect
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import griffe
@@ -111,18 +112,15 @@ def topic_of(home: str) -> str:
     )
 
 
-def api() -> str:
-    """Every public name under the heading of its topic."""
+def api(topic: str) -> str:
+    """Every public name of a topic."""
     topics: dict[str, list[str]] = {heading: [] for heading in TOPICS.values()}
     for name, home in lidar_synth._HOME.items():
         given = getattr(lidar_synth, name)
         topics[topic_of(home)].append(f"{given.__module__}.{given.__qualname__}")
     for name in FURTHER:
         topics[topic_of(name.removeprefix("lidar_synth."))].append(name)
-    return "\n".join(
-        f"## {topic}\n\n" + "\n".join(f"::: {n}\n" for n in names)
-        for topic, names in topics.items()
-    )
+    return "\n".join(f"::: {name}\n" for name in topics[topic])
 
 
 def command_line() -> str:
@@ -194,7 +192,7 @@ def _default(fields: Any, names: str) -> str:
 
 
 GENERATED: dict[str, Callable[[], str]] = {
-    "api": api,
+    **{f"api-{topic.lower()}": partial(api, topic) for topic in TOPICS.values()},
     "command-line": command_line,
     "recipes": recipes,
     "recipe-keys": recipe_keys,

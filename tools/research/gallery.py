@@ -9,11 +9,14 @@
     layout    scans generated from layouts, with boxes
     paste     a generated scan before and after the town's objects replaced its own
     sensors   one street as three sensors see it
+    weather   a scan in clear air, and in weather of three severities
+    changed   a recorded sweep of PandaSet, and what the demo makes of it
 
 All scans are the first ones of their seed: none is selected. Each picture takes less than a minute
 on one core.
 """
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,11 +29,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from typer import Argument, BadParameter, run
 
-from lidar_synth import Scan, load_generator, project
+from lidar_synth import Scan, load_generator, project, sample_scans
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.labels import ObjectBank, make_policy
 from lidar_synth.viz import Orbit, picture, render, write_view
-from lidar_synth.weather import CORRUPTIONS
+from lidar_synth.weather import CORRUPTIONS, SEVERITIES
+
+sys.path.append(str(Path(__file__).parents[1]))  # the other tools
+import demo
 
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8."""
@@ -170,16 +176,23 @@ def sensors() -> list[list[tuple[str, Picture]]]:
 
 
 def weather() -> list[list[tuple[str, Picture]]]:
-    """A scan in clear air, and in weather of two severities."""
+    """A scan in clear air, and in weather of three severities."""
     scan = street(0, sensor="hdl64e_lasers", motion=False)
     rows = []
     for name in ("fog", "snow", "wet_ground"):
         row = [("clear", near(scan))]
-        for severity in ("light", "heavy"):
+        for severity in SEVERITIES:
             changed = CORRUPTIONS[name].at(severity)(scan, np.random.default_rng(0))
             row.append((f"{name.replace('_', ' ')}, {severity}", near(changed)))
         rows.append(row)
     return rows
+
+
+def changed() -> list[list[tuple[str, Picture]]]:
+    """A recorded sweep, and what weather, another sensor and an edit make of it."""
+    scans = demo.change(sample_scans()[0])
+    views = [(scan.id, near(scan)) for scan in scans]
+    return [views[:3], views[3:]]
 
 
 PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
@@ -190,6 +203,7 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "paste": pasted,
     "sensors": sensors,
     "weather": weather,
+    "changed": changed,
 }
 """Rows of titled images."""
 

@@ -40,7 +40,7 @@ from lidar_synth.files.markdown import escape_markdown
 from lidar_synth.formats import open_scans
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
-from lidar_synth.generate.flow.path import autoguide
+from lidar_synth.generate.flow.guidance import autoguide
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
@@ -297,7 +297,7 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
         if replicates
         else None
     )
-    low, high = interval or (None, None)
+    low, high, corrected = interval or (None, None, None)
     return Score(
         "mIoU with the town segmenter, %",
         statistic.value,
@@ -306,6 +306,7 @@ def _agreement(tables: NDArray[np.int64], real: int, replicates: int) -> Score:
         len(tables),
         low=low,
         high=high,
+        corrected=corrected,
     )
 
 
@@ -316,7 +317,9 @@ def table(sets: Sequence[Measured]) -> str:
     scores = [{f"{s.metric} ({s.protocol})": s for s in one.scores} for one in sets]
     lines = head("figure", names)
     for title in dict.fromkeys(title for own in scores for title in own):
-        lines.append(row(title, [_shown(own.get(title)) for own in scores]))
+        lines.append(
+            row(title, [own[title].shown() if title in own else "" for own in scores])
+        )
     lines += ["", *head("IoU with the segmenter, %", (*CLASSES, BEND))]
     for name, one in zip(names, sets, strict=True):
         values = [f"{one.classes[kind]:.0f}" for kind in CLASSES]
@@ -352,15 +355,6 @@ def head(name: str, columns: Sequence[str]) -> list[str]:
 def row(name: str, cells: Sequence[str]) -> str:
     """A row of a table in Markdown."""
     return f"| {name} | {' | '.join(cells)} |"
-
-
-def _shown(score: Score | None) -> str:
-    """The value with its interval, where it has one."""
-    if score is None:
-        return ""
-    if score.low is None:
-        return f"{score.value:.4g}"
-    return f"{score.value:.4g} [{score.low:.4g}, {score.high:.4g}]"
 
 
 def draw(folder: Path, name: str, made: Sequence[Scan], real: Sequence[Scan]) -> None:

@@ -55,7 +55,8 @@ def curate(
     """Scores every scan of a bank, lists the most unusual ones, and writes a bank without those
     that match a rule.
 
-    Scores are saved in BANK/scores.npz; run it again to resume an interrupted run. The curated bank
+    Scores are saved in BANK/scores.npz, those of a bank at a URL in this folder; run it again to
+    resume an interrupted run. The curated bank
     has its own index and links to the same shards. A rule joins conditions by "and"; each is a
     score, one of < <= > >=, and a number. Run it without --out to see what a rule would drop.
 
@@ -131,13 +132,16 @@ def _check(plot: Path | None, out: Path | None, rules: list[str]) -> None:
 
 def _scores(
     opened: "Bank",
-    bank: Path,
+    bank: str,
     reference: str | None,
     split: str | None,
     jobs: int,
     progress: bool,
 ) -> "Scores":
     """Read the saved scores of this bank and reference, or compute and save them."""
+    from tempfile import TemporaryDirectory
+
+    from lidar_synth.bank import is_url
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import hash_of_names
     from lidar_synth.formats import open_scans
@@ -159,12 +163,16 @@ def _scores(
             [*source.ids, *(scan_hash(source[i]) for i in (0, len(source) // 2, -1))]
         )
         name = f"{len(source)} scans of {' '.join(filter(None, (reference, split)))} ({which[:8]})"
-    path = bank / FILE
+    path = Path(bank) / FILE
+    if is_url(bank):
+        path = Path(f"scores-{opened.identity[:12]}.npz")
     if path.is_file():
         saved = read_scores(path)
         if (saved.bank, saved.reference) == (opened.identity, name):
             return saved
-    with keep_features_in(bank) as folder:
+    keep = TemporaryDirectory() if is_url(bank) else keep_features_in(Path(bank))
+    with keep as place:
+        folder = Path(place)
         scores = score(
             opened, source, name=name, jobs=jobs, progress=progress, folder=folder
         )
@@ -227,12 +235,12 @@ def _table(
 
 
 def _plot(
-    path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: Path
+    path: Path, scores: "Scores", dropped: "NDArray[np.bool_]", bank: str
 ) -> None:
     from lidar_synth.files.disk import write_file
     from lidar_synth.lab.curate import MEANINGS
     from lidar_synth.viz import histograms
 
-    title = f"{bank.resolve().name}: {len(dropped)} scans, {dropped.sum()} match the rules (orange)"
+    title = f"{Path(bank).resolve().name}: {len(dropped)} scans, {dropped.sum()} match the rules (orange)"
     figure = histograms(scores.values, MEANINGS, dropped, title)
     write_file(path, lambda file: figure.savefig(file, format="png"))

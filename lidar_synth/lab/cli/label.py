@@ -54,11 +54,12 @@ def label(
     """
     import json
 
-    from lidar_synth.errors import ConfigError
+    from lidar_synth.errors import ConfigError, suggest
     from lidar_synth.lab.kitti360.labels import label_scans, plan_labels
 
     if dataset != "kitti360":
-        raise ConfigError(f"dataset {dataset!r}", "kitti360")
+        hint = suggest(dataset, ["kitti360"])
+        raise ConfigError(f"dataset {dataset!r}", "kitti360", hint)
     if dry_run:
         plan = plan_labels(root, split)
         print(f"{plan.frames} scans in {len(plan.jobs)} windows would get labels")

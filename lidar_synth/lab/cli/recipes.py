@@ -1,8 +1,10 @@
-"""``lidar-synth recipes``: lists the published training configurations."""
+"""``lidar-synth recipes``: lists the published training configurations, and writes those of
+trainers."""
 
 import json
 from dataclasses import asdict
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +15,30 @@ def recipes(
         typer.Argument(metavar="[NAME]", help="print the file of this recipe"),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    trainer: Annotated[
+        str | None,
+        typer.Option(
+            help="print the files that a trainer needs for a mixture: mmdet3d | "
+            "openpcdet | pointcept | rangenet | cylinder3d | open3d_ml | waffleiron | lightning"
+        ),
+    ] = None,
+    task: Annotated[
+        str | None,
+        typer.Option(help="of the trainer: segmentation | detection [what it can]"),
+    ] = None,
+    root: Annotated[
+        str, typer.Option(help="folder of the real scans, in the trainer's files")
+    ] = "/data/scans",
+    synthetic: Annotated[
+        str, typer.Option(help="bank, model or folder, in the trainer's files")
+    ] = "/data/bank",
+    out: Annotated[
+        Path | None, typer.Option(help="folder to write the trainer's files to")
+    ] = None,
+    schema: Annotated[
+        str | None,
+        typer.Option(help="print the JSON schema of: bake | distill | model | train"),
+    ] = None,
 ) -> None:
     """Lists the recipes and the models of several stages of the package with data, size and
     expected time of each.
@@ -22,21 +48,26 @@ def recipes(
       lidar-synth recipes
       lidar-synth recipes town_teacher > mine.yaml
       lidar-synth recipes town
+      lidar-synth recipes --trainer openpcdet --root KITTI --synthetic town_scans --out mixed
+      lidar-synth recipes --schema train > train.schema.json
       lidar-synth train town_teacher data.path=scans data.town=null output=runs/mine
     """
-    from lidar_synth.lab.train.config import (
-        find_model_file,
-        find_recipe,
-        published,
-        published_models,
-    )
+    from lidar_synth.lab.train.config import find_model_file, find_recipe
 
-    if name is not None:
-        typer.echo(
-            (find_model_file(name) or find_recipe(name)).read_text(encoding="utf-8"),
-            nl=False,
-        )
-        return
+    if trainer is not None:
+        _configure(trainer, task, root, synthetic, out)
+    elif schema is not None:
+        typer.echo(json.dumps(_schema(schema), indent=1))
+    elif name is not None:
+        path = find_model_file(name) or find_recipe(name)
+        typer.echo(path.read_text(encoding="utf-8"), nl=False)
+    else:
+        _list(as_json)
+
+
+def _list(as_json: bool) -> None:
+    from lidar_synth.lab.train.config import published, published_models
+
     listed = [*published_models(), *published()]
     if as_json:
         typer.echo(json.dumps([asdict(one) for one in listed], indent=1))
@@ -50,3 +81,42 @@ def recipes(
                 cell.ljust(width) for cell, width in zip(row, widths, strict=True)
             ).rstrip()
         )
+
+
+def _schema(name: str) -> dict[str, Any]:
+    """The JSON schema of a kind of recipe, by which editors complete and check its keys."""
+    from pydantic import BaseModel
+
+    from lidar_synth.bake import BakeJob
+    from lidar_synth.errors import choose
+    from lidar_synth.lab.train.config import DistillConfig, ModelConfig, TrainConfig
+
+    kinds: dict[str, type[BaseModel]] = {
+        "bake": BakeJob,
+        "distill": DistillConfig,
+        "model": ModelConfig,
+        "train": TrainConfig,
+    }
+    return choose("--schema", name, kinds).model_json_schema()
+
+
+def _configure(
+    trainer: str, task: str | None, root: str, synthetic: str, out: Path | None
+) -> None:
+    """Print or write the files of a trainer."""
+    from lidar_synth.lab.start.trainers import (
+        DEFAULTS,
+        configure,
+        tasks_of,
+        write_files,
+    )
+
+    task = task or tasks_of(trainer)[0]
+    settings = {"synthetic": synthetic, **DEFAULTS.get(task, {}), "seed": 0}
+    folder = Path("." if out is None else out).resolve()
+    files = configure(trainer, task, settings, root, str(folder))
+    if out is None:
+        typer.echo("\n".join(f"# {name}\n{text}" for name, text in files.items()))
+        return
+    write_files(files, out)
+    typer.echo("\n".join(f"{out / name}: written" for name in files))

@@ -95,7 +95,7 @@ VALUES: dict[str, Callable[[Scan], NDArray[Any] | None]] = {
 them."""
 
 
-def scales(scans: Sequence[Scan]) -> dict[str, Scale]:
+def make_scales(scans: Sequence[Scan]) -> dict[str, Scale]:
     """One ``Scale`` for each of ``VALUES``, shared by all scans of a sheet or page.
 
     Heights are scaled between percentiles of all scans, because the height of the sensor above the

@@ -1,0 +1,215 @@
+"""Configurations of trainers for a mixture: the files that a user of each would write.
+
+``ROOT`` stands for the folder of the real scans, ``OPTIONS`` for those of ``open_scans``, ``MIX`` for
+the settings of the mixture, and ``HERE`` for the folder of these files. To add a trainer, enter its
+files in ``TRAINERS``; every one begins with a comment that says where it belongs and what to type.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lidar_synth.errors import ConfigError, choose
+from lidar_synth.files.disk import write_file
+
+_MMDET3D = """# python HERE/lists.py, and then tools/train.py HERE/mixed.py of MMDetection3D
+_base_ = ["BASE"]
+
+custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"], allow_failed_imports=False)
+custom_hooks = [dict(type="SynthEpochHook")]
+
+train_dataloader = dict(
+    sampler=dict(type="SynthSampler"),
+    dataset=DATASET,
+)
+"""
+
+_MMDET3D_SEGMENTATION = {
+    "lists.py": """# once: python HERE/lists.py
+from lidar_synth.integrations.mixture import read_settings
+from lidar_synth.integrations.mmdet3d_infos import write_infos
+from lidar_synth.integrations.mmdet3d_lists import semantic_kitti_list
+
+root = "ROOT"
+train = semantic_kitti_list(root, "HERE/train.json")
+write_infos("HERE/mixed", train, read_settings("MIX"), data_root=root)
+""",
+    "mixed.py": _MMDET3D.replace(
+        "BASE",
+        "mmdet3d::minkunet/minkunet34_w32_spconv_8xb2-laser-polar-mix-3x_semantickitti.py",
+    ).replace("DATASET", 'dict(data_root="", ann_file="HERE/mixed/infos.json")'),
+}
+
+_MMDET3D_DETECTION = {
+    "lists.py": """# once: python HERE/lists.py
+from lidar_synth.integrations.mixture import read_settings
+from lidar_synth.integrations.mmdet3d_infos import write_infos
+from lidar_synth.integrations.mmdet3d_lists import kitti_list
+
+root = "ROOT"
+train = kitti_list(root, "HERE/train.json")
+mix = read_settings("MIX")
+write_infos("HERE/mixed", train, mix, data_root=root, points="training/velodyne_reduced")
+""",
+    "mixed.py": _MMDET3D.replace(
+        "BASE",
+        "mmdet3d::pointpillars/pointpillars_hv_secfpn_8xb6-160e_kitti-3d-3class.py",
+    ).replace(
+        "DATASET",
+        'dict(dataset=dict(type="SynthKittiDataset", data_root="",\n'
+        '        ann_file="HERE/mixed/infos.json", data_prefix=dict(pts=""),\n'
+        "        filter_empty_gt=False))",
+    ),
+}
+
+_OPENPCDET = """# in OpenPCDet/tools: bash HERE/train.sh
+export LIDAR_SYNTH_MIX=MIX
+python -m lidar_synth.integrations.openpcdet train.py \\
+    --cfg_file cfgs/kitti_models/pointpillar.yaml \\
+    --set DATA_CONFIG.DATASET MixedKitti DATA_CONFIG.DATA_PATH ROOT
+"""
+
+_POINTCEPT = """# PYTHONPATH=. python tools/train.py --config-file configs/semantic_kitti/mixed.py
+# Save this as configs/semantic_kitti/mixed.py of Pointcept.
+_base_ = ["semseg-spunet-v1m1-0-base.py"]
+custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
+hooks = [dict(type="SynthEpoch"), dict(type="CheckpointLoader"), dict(type="ModelHook"),
+         dict(type="IterationTimer"), dict(type="InformationWriter"), dict(type="SemSegEvaluator"),
+         dict(type="CheckpointSaver")]
+data = dict(train=dict(type="MixedSemanticKITTI", data_root="ROOT", mixture="MIX"))
+"""
+
+_RANGENET = """# in train/tasks/semantic of lidar-bonnetal or SalsaNext, or in CENet: bash HERE/train.sh
+export LIDAR_SYNTH_MIX=MIX
+python -m lidar_synth.integrations.rangenet train.py -d ROOT -ac ARCH.yaml \\
+    -dc config/labels/semantic-kitti.yaml -l HERE/log
+"""
+
+_CYLINDER3D = """# in Cylinder3D: bash HERE/train.sh
+export LIDAR_SYNTH_MIX=MIX
+sed 's/SemKITTI_sk/SemKITTI_mixed/; s|data_path: .*|data_path: "ROOT/sequences/"|' \\
+    config/semantickitti.yaml > HERE/cylinder3d.yaml
+python -m lidar_synth.integrations.cylinder3d train_cylinder_asym.py \\
+    --config_path HERE/cylinder3d.yaml
+"""
+
+_OPEN3D_ML = """# python HERE/train.py, with randlanet_semantickitti.yml of open3d/_ml3d/configs
+import open3d.ml.torch as ml3d
+from lidar_synth.integrations.open3d_ml import dataset_class
+from open3d.ml.utils import Config
+
+config = Config.load_from_file("randlanet_semantickitti.yml")
+dataset = dataset_class()(dataset_path="ROOT", mixture="MIX")
+model = ml3d.models.RandLANet(**config.model | {"in_channels": 4})
+ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, **config.pipeline).run_train()
+"""
+
+_WAFFLEIRON = """# in WaffleIron: bash HERE/train.sh
+export LIDAR_SYNTH_MIX=MIX
+python -m lidar_synth.integrations.waffleiron launch_train.py \\
+    --dataset semantic_kitti_mixed --path_dataset ROOT \\
+    --config configs/WaffleIron-48-256__kitti.yaml --log_path HERE/log --gpu 0
+"""
+
+_LIGHTNING = """# your own script; MODEL is your LightningModule
+import lightning
+import yaml
+from lidar_synth import mix, open_scans
+from lidar_synth.integrations.lightning import MixedData
+
+with open("MIX") as file:
+    settings = yaml.safe_load(file)
+real = open_scans("ROOT"OPTIONS)
+data = MixedData(mix(real, settings.pop("synthetic"), **settings), batch_size=4)
+trainer = lightning.Trainer(use_distributed_sampler=False, max_epochs=40)
+trainer.fit(MODEL, data)
+"""
+
+TRAINERS: dict[str, dict[str, dict[str, str]]] = {
+    "mmdet3d": {"segmentation": _MMDET3D_SEGMENTATION, "detection": _MMDET3D_DETECTION},
+    "openpcdet": {"detection": {"train.sh": _OPENPCDET}},
+    "pointcept": {"segmentation": {"mixed.py": _POINTCEPT}},
+    "rangenet": {"segmentation": {"train.sh": _RANGENET}},
+    "cylinder3d": {"segmentation": {"train.sh": _CYLINDER3D}},
+    "open3d_ml": {"segmentation": {"train.py": _OPEN3D_ML}},
+    "waffleiron": {"segmentation": {"train.sh": _WAFFLEIRON}},
+    "lightning": {
+        "segmentation": {"train.py": _LIGHTNING},
+        "detection": {"train.py": _LIGHTNING},
+    },
+}
+"""{trainer: {task: {name of a file: its text}}}."""
+
+MIX = "mix.yaml"
+_WORDS = re.compile(r"\b(?:ROOT|MIX|HERE)\b|OPTIONS")
+
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "segmentation": {
+        "ratio": {"synthetic_first": 40},
+        "labels": "generated",
+        "epoch_size": "replace",
+    },
+    "detection": {
+        "ratio": {"synthetic_first": 40},
+        "labels": "boxes",
+        "epoch_size": "replace",
+    },
+}
+"""Settings of the recipes that gained, for 40 epochs: synthetic scans alone in three quarters of
+them, then half and half (docs/research/proof.md, docs/research/detectors.md)."""
+
+
+def write_mixture(settings: dict[str, Any]) -> str:
+    """The settings of a mixture as YAML."""
+    return yaml.safe_dump(settings, sort_keys=False)
+
+
+def tasks_of(trainer: str) -> list[str]:
+    """The tasks that a trainer is connected for; raises a ConfigError on an unknown trainer."""
+    return list(choose("--trainer", trainer, TRAINERS))
+
+
+def configure(
+    trainer: str,
+    task: str,
+    settings: dict[str, Any],
+    root: str = "/data/scans",
+    here: str = "/data/start",
+    options: str = "",
+) -> dict[str, str]:
+    """The files of a trainer for a mixture.
+
+    Args:
+        trainer: one of ``TRAINERS``.
+        task: "segmentation" or "detection".
+        settings: of the mixture, as ``read_settings`` reads them.
+        root: folder of the real scans.
+        here: folder in which the files will lie.
+        options: further arguments of ``open_scans``, as Python.
+
+    Returns:
+        {name: text}; the first one is the mixture.
+
+    Raises:
+        ConfigError: on an unknown trainer, or a task that it is not connected for.
+    """
+    if task not in tasks_of(trainer):
+        able = [name for name, known in TRAINERS.items() if task in known]
+        raise ConfigError(
+            f"--trainer {trainer} for {task}",
+            f"one of {', '.join(able)}" if able else "segmentation or detection",
+        )
+    words = {"ROOT": root, "MIX": f"{here}/{MIX}", "HERE": here}
+    words["OPTIONS"] = options
+    files = {MIX: write_mixture(settings)}
+    for name, text in TRAINERS[trainer][task].items():
+        files[name] = _WORDS.sub(lambda found: words[found[0]], text)
+    return files
+
+
+def write_files(files: dict[str, str], folder: Path) -> None:
+    """Write configurations into a folder."""
+    for name, text in files.items():
+        write_file(folder / name, text.encode())
