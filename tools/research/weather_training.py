@@ -1,23 +1,23 @@
 """Does a network learn to withstand weather and failing sensors from the corruptions? For
 docs/research/weather.md.
 
-    python tools/research/weather_training.py LABELLED [--iterations N] [--seeds N] [--folds N]
-        [--chance P] [--first SEED]
+    python tools/research/weather_training.py LABELLED | town [--iterations N] [--seeds N]
+        [--folds N] [--chance P] [--first SEED]
 
 LABELLED is a root of SemanticKITTI; a sequence is a place. The small segmenter of ``prove`` is
 trained on the other places, with and without the benchmark's corruptions among its augmentations,
-with the same scans, order and iterations, and tested on the places left out.
+with the same scans, order and iterations, and tested on the places left out. ``town`` trains in one
+town and tests in another, one pair for each fold and seed.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from typer import run
 
-from lidar_synth import Compose, MixedScans, Scan, SemanticKITTI
+from lidar_synth import Compose, MixedScans, Scan, SemanticKITTI, Town
 from lidar_synth.lab.evaluate.robustness import NAMES_OF_BENCHMARK, Card, stress
 from lidar_synth.lab.evaluate.segmentation import Judge
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter
@@ -31,6 +31,19 @@ CHANCE = 0.15
 BATCH = 2
 WIDTHS = (8, 16, 32, 48)
 """Channels of the segmenter: half of its default."""
+TOWN_SCANS = 150
+TOWN_TEST = 30
+FIRST_TOWN = 1000
+SPACING = 10
+"""Every how many scans of a town one is taken: 4 s apart."""
+
+
+class Fold(NamedTuple):
+    """Scans to train on and scans of other places to test on."""
+
+    tested: str
+    known: list[Scan]
+    test: list[Scan]
 
 
 def steps_of(chance: float) -> list[Any]:
@@ -61,8 +74,36 @@ def train(scans: Sequence[Scan], steps: list[Any], iterations: int, seed: int) -
     return Judge(network, sensor, {})
 
 
+def split_places(root: str, folds: int) -> Iterator[Fold]:
+    """The places of a SemanticKITTI folder, some left out in each fold."""
+    scans = list(SemanticKITTI(root))
+    places = sorted({scan.id.split("/")[0] for scan in scans})
+    for fold in range(folds):
+        held = places[fold::FOLDS]
+        test = [scan for scan in scans if scan.id.split("/")[0] in held]
+        known = [scan for scan in scans if scan.id.split("/")[0] not in held]
+        yield Fold(", ".join(held), known, test)
+
+
+def cast(seed: int, count: int) -> list[Scan]:
+    """Scans of a town, spaced out."""
+    town = Town(seed, "hdl64e_lasers", count * SPACING)
+    return [town[i * SPACING] for i in range(count)]
+
+
+def cast_towns(seed: int, folds: int) -> Iterator[Fold]:
+    """Pairs of towns that nothing else uses."""
+    for fold in range(folds):
+        first = FIRST_TOWN + 2 * (seed * FOLDS + fold)
+        known, test = (
+            cast(town, count)
+            for town, count in ((first, TOWN_SCANS), (first + 1, TOWN_TEST))
+        )
+        yield Fold(f"town {first + 1}", known, test)
+
+
 def main(
-    labelled: Path,
+    labelled: str,
     iterations: int = 600,
     seeds: int = 2,
     folds: int = FOLDS,
@@ -70,24 +111,19 @@ def main(
     first: int = 0,
 ) -> None:
     """Prints the card of each training, and the means of both arms."""
-    source = SemanticKITTI(labelled)
-    scans = [source[i] for i in range(len(source))]
-    places = sorted({scan.id.split("/")[0] for scan in scans})
     arms = {"without": [], "with": steps_of(chance)}
     cards: dict[str, list[Card]] = {arm: [] for arm in arms}
     for seed in range(first, first + seeds):
-        for fold in range(folds):
-            held = places[fold::FOLDS]
-            test = [scan for scan in scans if scan.id.split("/")[0] in held]
-            known = [scan for scan in scans if scan.id.split("/")[0] not in held]
+        towns = labelled == "town"
+        for fold in cast_towns(seed, folds) if towns else split_places(labelled, folds):
             for arm, steps in arms.items():
-                judge = train(known, steps, iterations, seed)
+                judge = train(fold.known, steps, iterations, seed)
                 card = stress(
-                    test, lambda s, _, j=judge: j.agreement(s), progress=False
+                    fold.test, lambda s, _, j=judge: j.agreement(s), progress=False
                 )
                 cards[arm].append(card)
                 print(
-                    f"{arm}, seed {seed}, without {held}\n\n{card.to_text()}\n",
+                    f"{arm}, seed {seed}, tested on {fold.tested}\n\n{card.to_text()}\n",
                     flush=True,
                 )
     print(
