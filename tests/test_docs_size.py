@@ -9,13 +9,13 @@ from project import ROOT
 
 LIMITS = {
     "README.md": 800,
-    "docs/index.md": 150,
+    "docs/index.md": 210,
     "docs/start/install.md": 150,
     "docs/start/tutorial.md": 460,
     "docs/faq.md": 130,
     "docs/how-to/choose.md": 140,
     "docs/explanation/comparison.md": 130,
-    "docs/how-to/mix.md": 680,
+    "docs/how-to/mix.md": 685,
     "docs/how-to/trainers/index.md": 315,
     "docs/how-to/trainers/mmdetection3d.md": 230,
     "docs/how-to/trainers/openpcdet.md": 160,
@@ -33,7 +33,7 @@ LIMITS = {
     "docs/how-to/label-kitti360.md": 130,
     "docs/how-to/another-sensor.md": 180,
     "docs/how-to/skin.md": 170,
-    "docs/how-to/measure.md": 270,
+    "docs/how-to/measure.md": 340,
     "docs/how-to/adapt.md": 160,
     "docs/how-to/train-a-generator.md": 380,
     "docs/how-to/edit.md": 160,
@@ -50,7 +50,6 @@ LIMITS = {
     "docs/reference/api/lab.md": 15,
     "docs/reference/command-line.md": 30,
     "docs/reference/recipes.md": 80,
-    "docs/bank-format.md": 350,
     "docs/reference/descriptions.md": 230,
     "docs/reliability.md": 330,
     "docs/explanation/method.md": 320,
@@ -61,11 +60,11 @@ LIMITS = {
     "docs/models/town-camera.md": 190,
     "docs/models/town-layout.md": 160,
     "docs/models/skin-pandar64.md": 140,
-    "docs/gallery.md": 98,
+    "docs/gallery.md": 110,
 }
 """The main path: what a user reads. Notes in docs/research/ and notebooks are not counted."""
 
-MAIN_PATH = 9_167
+MAIN_PATH = 9_000
 """Words of all pages of docs/ on the main path."""
 
 PAGES = [

@@ -11,6 +11,7 @@
     sensors   one street as three sensors see it
     weather   a scan in clear air, and in weather of three severities
     changed   a recorded sweep of PandaSet, and what the demo makes of it
+    steps     the same sweep after each augmentation and edit
 
 All scans are the first ones of their seed: none is selected. Each picture takes less than a minute
 on one core.
@@ -20,7 +21,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -29,9 +30,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from typer import Argument, BadParameter, run
 
-from lidar_synth import Scan, load_generator, project, sample_scans
+from lidar_synth import Compose, Scan, load_generator, project, sample_scans
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
-from lidar_synth.labels import ObjectBank, make_policy
+from lidar_synth.labels import ObjectBank, edit, make_policy
+from lidar_synth.labels.compose import MIXES, MOVES
+from lidar_synth.labels.objects import objects_of
 from lidar_synth.viz import Orbit, picture, render, write_view
 from lidar_synth.weather import CORRUPTIONS, SEVERITIES
 
@@ -41,6 +44,10 @@ import demo
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8."""
 
+AHEAD = 58
+"""Box of the car ahead in the first recorded sweep."""
+FLIPPING = 3
+"""Seed of random numbers with which ``flip_x`` and ``flip_y`` flip."""
 UNSEEN = 1
 """Seed of a town that no model was trained on."""
 NEAR = Orbit(
@@ -195,6 +202,32 @@ def changed() -> list[list[tuple[str, Picture]]]:
     return [views[:3], views[3:]]
 
 
+def steps() -> list[list[tuple[str, Picture]]]:
+    """A recorded sweep after each augmentation and edit. Of ``drop_reflectance`` labels show
+    nothing."""
+    real = sample_scans()
+    scan = real[0]
+    assert scan.boxes is not None
+    x, y, *_, yaw = scan.boxes.values[AHEAD].tolist()
+    views = [("as recorded", near(scan))]
+    named: dict[str, dict[str, Any]] = {name: {} for name in (*MOVES, *MIXES)}
+    named["paste"] = {"count": 12}
+    named |= {name: {"severity": "moderate"} for name in CORRUPTIONS}
+    del named["drop_reflectance"], named["polarmix_or_lasermix"]
+    for name, arguments in named.items():
+        step = Compose([{name: arguments}]).bind(real, frozenset(real.fields))
+        title = name.replace("_", " ")
+        views.append((title, near(step(scan, np.random.default_rng(FLIPPING)))))
+    edits = {
+        "with its boxes": scan,
+        "remove": edit.remove(scan, AHEAD),
+        "move": edit.move(scan, AHEAD, (x, y + 4, yaw)),
+        "insert": edit.insert(scan, objects_of(scan)[AHEAD], (x - 5, y, yaw)),
+    }
+    views += [(name, near(made, boxes=True)) for name, made in edits.items()]
+    return [views[first : first + 3] for first in range(0, len(views), 3)]
+
+
 PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "pairs": pairs,
     "map": from_map,
@@ -204,6 +237,7 @@ PICTURES: dict[str, Callable[[], list[list[tuple[str, Picture]]]]] = {
     "sensors": sensors,
     "weather": weather,
     "changed": changed,
+    "steps": steps,
 }
 """Rows of titled images."""
 
@@ -240,7 +274,7 @@ def sheet(scans: Sequence[Scan], title: str = "") -> Picture:
         return np.asarray(Image.open(path).convert("RGB"))
 
 
-def save(path: Path, pixels: Picture, width: int = WIDTH, colours: int = 96) -> None:
+def save(path: Path, pixels: Picture, width: int = WIDTH, colours: int = 48) -> None:
     """Write a PNG with few colours, small enough for a repository."""
     image = Image.fromarray(pixels)
     size = (width, round(image.height * width / image.width))

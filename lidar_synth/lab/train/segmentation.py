@@ -86,7 +86,9 @@ def train_segmenter(
     network.train()
     if half:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    losses: list[Tensor] = []
+    # In one tensor: small ones that stay among the large ones that go would fragment the memory.
+    losses = torch.zeros(steps, device=height.device)
+    done = 0
     bar = tqdm(total=steps, desc="segmenter", unit="step", disable=not progress)
     for _, batch in zip(range(steps), batches, strict=False):
         target = batch["label"].long()
@@ -104,19 +106,18 @@ def train_segmenter(
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
-        losses.append(loss.detach())
+        losses[done] = loss.detach()
+        done += 1
         if watch is not None:
-            watch(len(losses))
+            watch(done)
             network.train()
         bar.update()
         if progress:  # it waits for a GPU
-            recent = torch.stack(losses[-20:]).mean()
+            recent = losses[max(0, done - 20) : done].mean()
             bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
     bar.close()
     network.eval()
-    if len(losses) < steps:
-        raise DataError(
-            f"{len(losses)} batches for {steps} steps", "as many batches as steps"
-        )
-    values: list[float] = torch.stack(losses).tolist()
+    if done < steps:
+        raise DataError(f"{done} batches for {steps} steps", "as many batches as steps")
+    values: list[float] = losses.tolist()
     return values

@@ -159,7 +159,9 @@ def train(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, rate, total_steps=iterations
     )
-    losses: list[Tensor] = []
+    # In one tensor: small ones that stay among the large ones that go would fragment the memory.
+    losses = torch.zeros(iterations, device=next(network.parameters()).device)
+    done = 0
     bar = tqdm(
         islice(batches, iterations), name, iterations, mininterval=5, unit="iteration"
     )
@@ -172,11 +174,12 @@ def train(
         nn.utils.clip_grad_norm_(network.parameters(), 10.0)
         optimizer.step()
         schedule.step()
-        losses.append(loss.detach())
-        if len(losses) % SHOWN_EVERY == 0:  # it waits for a GPU
-            recent = torch.stack(losses[-SHOWN_EVERY:]).mean()
+        losses[done] = loss.detach()
+        done += 1
+        if done % SHOWN_EVERY == 0:  # it waits for a GPU
+            recent = losses[done - SHOWN_EVERY : done].mean()
             bar.set_postfix(loss=f"{recent:.3f}", refresh=False)
-    found: list[float] = torch.stack(losses).tolist()
+    found: list[float] = losses[:done].tolist()
     return found
 
 
