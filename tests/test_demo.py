@@ -40,7 +40,7 @@ def write_scans(layout: str, root: Path, names: list[str]) -> None:
         ("KITTI360_ROOT", "kitti360", ["00/0", "00/1", "04/0"]),
     ],
 )
-def test_a_dataset_takes_the_place_of_the_town(
+def test_a_dataset_takes_the_place_of_the_sample(
     demo: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -52,25 +52,19 @@ def test_a_dataset_takes_the_place_of_the_town(
     for other in ("SEMANTICKITTI_ROOT", "KITTI360_ROOT"):
         monkeypatch.delenv(other, raising=False)
     monkeypatch.setenv(variable, str(tmp_path))
-    data = demo.dataset(tmp_path, 2, 0)
+    data = demo.dataset(2)
     assert len(data.real) == 2 and data.real[0].id != data.real[1].id
-    assert "Real scans" in data.notes and data.kind == "real"
+    assert "Recorded scan (" in data.name and "PandaSet" not in data.name
 
 
-def test_the_town_says_that_it_is_not_real(
-    demo: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_a_dataset_it_shows_the_scans_that_ship(
+    demo: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seeds = {}
-
-    def command(*words: str) -> None:
-        seeds[Path(words[1]).name] = words[words.index("--seed") + 1]
-        write_scans("semantic_kitti", Path(words[1]), ["00/000000"])
-
-    monkeypatch.setattr(demo, "command", command)
-    data = demo.town(tmp_path, 2, 6)
-    assert seeds == {"town": "6"}
-    assert "take the place of your real ones" in data.notes
-    assert "in place of a real one" in data.name
+    for variable in ("SEMANTICKITTI_ROOT", "KITTI360_ROOT"):
+        monkeypatch.delenv(variable, raising=False)
+    data = demo.dataset(2)
+    assert [scan.id for scan in data.real] == [scan.id for scan in sample_scans()]
+    assert "PandaSet" in data.name
 
 
 def test_a_recorded_scan_is_changed(demo: ModuleType) -> None:

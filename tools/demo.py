@@ -1,12 +1,12 @@
-"""The whole package in a few minutes on one machine: real scans mixed with synthetic ones, what can
-be done to a recorded scan, a page to look at.
+"""The whole package in a few minutes on one machine: recorded scans mixed with synthetic ones, what
+can be done to a recorded scan, a page to look at.
 
     python tools/demo.py demo_out --scans 24
 
-1. Writes scans of a procedural town in SemanticKITTI's layout, in place of your own labelled
-   dataset. With SEMANTICKITTI_ROOT or KITTI360_ROOT set, that dataset is used instead.
-2. Bakes a bank of scans that the shipped model generates, and verifies it.
-3. Mixes both as a training would see them.
+1. Bakes a bank of scans that the shipped model generates, and verifies it.
+2. Writes scans of a procedural town, another source.
+3. Mixes the bank with the recorded scans that ship, as a training would see them; with
+   SEMANTICKITTI_ROOT or KITTI360_ROOT set, with that dataset.
 4. Changes a recorded scan: weather, another sensor, a car that is taken away.
 5. Writes a page with all of them.
 
@@ -32,7 +32,7 @@ from typer import Argument, run
 from lidar_synth import Bank, Scan, Source, load_sensor, mix, open_scans, sample_scans
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.files.disk import write_file
-from lidar_synth.geometry.scan import REAL
+from lidar_synth.geometry.scan import REAL, SYNTHETIC
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels import edit
 from lidar_synth.viz import html_page
@@ -43,9 +43,10 @@ SHOWN = 4
 EPOCHS = 40
 """Epochs of the training for which scans are mixed."""
 
-_TOWN_MODEL = (
-    "The synthetic scans come from a model of a procedural town, which has not seen this dataset: "
-    "they look like the town. For scans like yours, adapt a model to yours (lidar-synth adapt)."
+_SYNTHETIC = (
+    "The synthetic scans are four of the shipped model, which has learnt a procedural town, and four "
+    "of another such town: they look like the town. For scans like yours, adapt the model "
+    "(lidar-synth adapt)."
 )
 _RECORDED = (
     "The scans named after a change are one recorded sweep of PandaSet (Scale AI and Hesai, CC BY "
@@ -55,18 +56,16 @@ _RECORDED = (
 
 @dataclass(frozen=True)
 class Data:
-    """The user's scans, or what stands in for them.
+    """The user's scans, or those that ship.
 
     Args:
         real: the scans.
         name: what the page calls one of them.
-        kind: the same in one word.
         notes: what else the page says about them.
     """
 
     real: Sequence[Scan]
     name: str
-    kind: str
     notes: str
 
 
@@ -83,34 +82,20 @@ def spread(source: Source, count: int) -> list[Scan]:
     return [source[int(i)] for i in places]
 
 
-def town(out: Path, scans: int, seed: int) -> Data:
-    """Scans of the town, in the place of the user's own."""
-    words = (
-        f"--scans {scans} --interval 1 --sensor hdl64e_lasers --layout semantic_kitti"
-    )
-    words += f" --jobs {os.cpu_count() or 1}"
-    command("town", str(out / "town"), *words.split(), "--seed", str(seed))
-    notes = (
-        "No real sensor measured the scans called town: no dataset was given, so scans of a "
-        f"procedural town take the place of your real ones (seed {seed}). Set "
-        "SEMANTICKITTI_ROOT to see your own data. The synthetic scans come from the model that "
-        'ships with the package, "town"; it was trained on many more scans of the town of seed 0.'
-    )
-    name = "Scan of the town, in place of a real one"
-    return Data(list(open_scans(out / "town")), name, "town", notes)
-
-
-def dataset(out: Path, scans: int, seed: int) -> Data:
-    """The dataset that an environment variable names, or the town."""
+def dataset(scans: int) -> Data:
+    """The dataset that an environment variable names, or the scans that ship."""
     for variable, layout, title in (
         ("SEMANTICKITTI_ROOT", "semantic_kitti", "SemanticKITTI"),
         ("KITTI360_ROOT", "kitti360", "KITTI-360"),
     ):
         if root := os.environ.get(variable):
             real = spread(open_scans(root, layout=layout), scans)
-            notes = f"Real scans: {title}. {_TOWN_MODEL}"
-            return Data(real, f"Real scan ({title})", "real", notes)
-    return town(out, scans, seed)
+            return Data(real, f"Recorded scan ({title})", f"Recorded scans: {title}.")
+    notes = (
+        "The recorded scans are those that ship with the package. Set SEMANTICKITTI_ROOT to see "
+        "your own."
+    )
+    return Data(list(sample_scans()), "Recorded scan (PandaSet)", notes)
 
 
 def change(scan: Scan) -> list[Scan]:
@@ -157,7 +142,7 @@ def panels(data: Data, bank: Bank) -> list[str]:
     )
     mixed.set_epoch(EPOCHS - 1)
     epoch = [mixed[i] for i in tqdm(range(len(mixed)), desc="mixing", unit="scan")]
-    kinds = (data.kind, "synthetic")
+    kinds = ("recorded", "synthetic")
     columns = {
         f"% of points, {kind}": shares([s for s in epoch if s.domain == d])
         for d, kind in enumerate(kinds)
@@ -171,34 +156,38 @@ def panels(data: Data, bank: Bank) -> list[str]:
     return [*made, classes_panel(columns, ["Labelled points of this epoch."])]
 
 
-def write_page(path: Path, data: Data, bank: Bank) -> None:
+def write_page(path: Path, data: Data, bank: Bank, town: Source) -> None:
     """Write the page."""
-    # The town stands in for real scans.
-    real = [replace(scan, domain=REAL) for scan in spread(data.real, SHOWN)]
-    changed = change(sample_scans()[0])
+    cast = [replace(scan, domain=SYNTHETIC) for scan in spread(town, SHOWN)]
     text = html_page(
-        real + spread(bank, SHOWN) + changed,
+        spread(data.real, SHOWN)
+        + spread(bank, SHOWN)
+        + cast
+        + change(sample_scans()[0]),
         title="Real, synthetic and changed scans",
-        notes=f"{data.notes}\n\n{_RECORDED}",
-        domains=(data.name, "Synthetic scan, generated in 4 steps"),
+        notes=f"{data.notes} {_SYNTHETIC}\n\n{_RECORDED}",
+        domains=(data.name, "Synthetic scan"),
         panels=panels(data, bank),
     )
     write_file(path, text.encode())
 
 
 def main(
-    out: Annotated[Path, Argument()] = Path("demo_out"), scans: int = 24, seed: int = 0
+    out: Annotated[Path, Argument()] = Path("demo_out"), scans: int = 24, seed: int = 1
 ) -> None:
     """Runs all steps."""
     start = time.monotonic()
     command("doctor")
-    data = dataset(out, scans, seed)
-    folder = str(out / "bank")
-    words = f"--model town --count {scans} --seed 1 --shard-size 16"
-    command("bake", folder, *words.split())
-    command("verify", folder, "--deep")
+    bank, town = str(out / "bank"), str(out / "town")
+    words = f"--model town --count {scans} --seed {seed} --shard-size 16"
+    command("bake", bank, *words.split())
+    command("verify", bank, "--deep")
+    words = (
+        f"--scans {SHOWN} --interval 20 --sensor hdl64e_lasers --layout semantic_kitti"
+    )
+    command("town", town, *words.split(), "--seed", str(seed))
     page = out / "index.html"
-    write_page(page, data, Bank(folder))
+    write_page(page, dataset(scans), Bank(bank), open_scans(town))
     print(f"\n{time.monotonic() - start:.0f} s. The page is {page.resolve()}")
 
 
