@@ -25,6 +25,7 @@ SMALLEST = {
     "gpu": "{pixels} --device cpu --dtype float32 --batch 1 --rounds 1",
     "label": "--scans 4 --points 1",
     "latent": "--width 32 --rounds 1",
+    "million": "--shards 2",
     "mixing": "--scans 2 --rounds 1",
     "networks": "--model {full_size} --rounds 1",
     "projection": "--rounds 1",

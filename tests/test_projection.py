@@ -16,12 +16,11 @@ from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import (
     locate,
     project,
-    project_batch,
     ring_numbers,
     unfold,
     unproject,
 )
-from lidar_synth.geometry.projection.batch import torch_asin, torch_atan2
+from lidar_synth.geometry.projection.batch import project_batch, torch_asin, torch_atan2
 from lidar_synth.geometry.projection.kernels import asin, atan2
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, presets

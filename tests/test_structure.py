@@ -252,6 +252,11 @@ def test_a_mixture_loads_few_modules_and_no_network() -> None:
     ]
 
 
+def test_banks_and_files_are_read_without_torch() -> None:
+    code = "import sys, lidar_synth.bank, lidar_synth.formats; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def repeated_classes(folder: Path) -> set[str]:
     """The names of classes that stand more than once in a folder's files."""
     trees = [ast.parse(path.read_text()) for path in folder.rglob("*.py")]

@@ -19,10 +19,10 @@ from lidar_synth.formats.points import read_points
 from lidar_synth.geometry.projection import (
     locate,
     project,
-    project_batch,
     unfold,
     unproject,
 )
+from lidar_synth.geometry.projection.batch import project_batch
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 

@@ -1,6 +1,6 @@
-"""Points to range image and back (geometry only: no networks, no files)."""
+"""Points to range image and back (geometry only: no networks, no files); ``batch`` does it with torch,
+on any device."""
 
-from lidar_synth.geometry.projection.batch import BatchImage, project_batch
 from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import (
     Cells,
@@ -12,13 +12,11 @@ from lidar_synth.geometry.projection.spherical import (
 from lidar_synth.geometry.projection.unfold import laser_rows, unfold
 
 __all__ = [
-    "BatchImage",
     "Cells",
     "carry",
     "laser_rows",
     "locate",
     "project",
-    "project_batch",
     "ring_numbers",
     "unfold",
     "unproject",

@@ -88,7 +88,7 @@ def project_batch(
     Example:
         >>> import torch
         >>> from lidar_synth import load_sensor
-        >>> from lidar_synth.geometry.projection import project_batch
+        >>> from lidar_synth.geometry.projection.batch import project_batch
         >>> points = torch.tensor([[10.0, 0.1, -1.0, 0.3], [12.0, 4.0, 0.5, 0.9], [7.0, -2.0, -1.0, 0.2]])
         >>> images = project_batch(points, torch.tensor([0, 2, 3]), load_sensor("hdl64e_kitti"))  # 2 points, 1 point
         >>> images.range.shape, images.channels.shape
