@@ -42,6 +42,12 @@ def evaluate(
             help="how well a small classifier tells the cars and persons of both sets apart"
         ),
     ] = False,
+    detector: Annotated[
+        Path | None,
+        typer.Option(
+            help="OpenPCDet's PointPillars for KITTI: how well it finds the boxes of both sets"
+        ),
+    ] = None,
     columns: Annotated[
         int | None, typer.Option(help="width of the judge's grid; its own by default")
     ] = None,
@@ -96,6 +102,9 @@ def evaluate(
     With --objects, cars and persons of both sets are compared at the same distance and seen width:
     AUC of a classifier at real places that it has not seen, returns, surfaces, roughness.
 
+    With --detector, a detector that was trained on KITTI looks for the boxes of both sets in front of
+    the sensor: average precision and recall by class and distance.
+
     Papers define metrics of the same name differently: scores of two protocols are not comparable.
     Fewer scans than the protocol's paper compares, and other sensors than its own, are refused. A
     reference that shares frames with the model's training data is refused, because it flatters the
@@ -108,6 +117,7 @@ def evaluate(
       lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
       lidar-synth evaluate SemanticKITTI town --objects
+      lidar-synth evaluate KITTI town --detector pointpillar_7728.pth
     """
     from lidar_synth.errors import suggest
     from lidar_synth.formats import open_scans
@@ -118,14 +128,15 @@ def evaluate(
     from lidar_synth.lab.evaluate.published import compare_published as published
     from lidar_synth.lab.evaluate.segmentation import load_judge
 
-    if beside and (as_json or objects or judge is not None):
+    kinds = [protocol, judge, detector, objects or None]
+    if beside and (as_json or protocol is None):
         raise typer.BadParameter(
             "goes with --protocol and prints tables: leave out --json",
             param_hint="--beside",
         )
-    if (protocol is not None) + (judge is not None) + objects != 1:
+    if sum(kind is not None for kind in kinds) != 1:
         raise typer.BadParameter(
-            "give --protocol, --judge or --objects, one of them",
+            "give --protocol, --judge, --objects or --detector, one of them",
             param_hint="--protocol",
         )
     if protocol is not None and protocol not in PROTOCOLS:
@@ -139,6 +150,9 @@ def evaluate(
         typer.echo(note, err=True)
     if judge is not None:
         _recognition(judge, columns, sources, as_json)
+        return
+    if detector is not None:
+        _boxes(detector, sources, as_json)
         return
     if objects:
         _objects(sources, as_json)
@@ -176,6 +190,22 @@ def _objects(sources: "tuple[Source, Source]", as_json: bool) -> None:
     from lidar_synth.lab.evaluate.objects import as_text, compare_objects
 
     figures = compare_objects(*sources)
+    typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
+
+
+def _boxes(path: Path, sources: "tuple[Source, Source]", as_json: bool) -> None:
+    """Print how well a detector finds the boxes of both sets."""
+    from lidar_synth.lab.proof.detection.detector_judge import (
+        as_text,
+        recognise_boxes,
+    )
+    from lidar_synth.lab.proof.detection.pointpillars import load_detector
+
+    network = load_detector(path)
+    figures = {
+        name: recognise_boxes(network, source, name, not as_json)
+        for source, name in zip(sources, ("real", "fake"), strict=True)
+    }
     typer.echo(json.dumps(figures, indent=2) if as_json else as_text(figures))
 
 
