@@ -28,6 +28,7 @@ WRITTEN_AS = {
     "png": "png",
     "webdataset": "webdataset",
     "mcap": "mcap",
+    "cosmos": "cosmos",
 }
 """Which reader reads what each writer writes."""
 
@@ -199,6 +200,7 @@ MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "png": lambda root: write_all("png", root, [some_scan(i) for i in range(3)]),
     "webdataset": write_tars,
     "mcap": lambda root: write_all("mcap", root, [some_scan(i) for i in range(3)]),
+    "cosmos": lambda root: write_all("cosmos", root, [some_scan(i) for i in range(3)]),
     "nuscenes": write_nuscenes,
     "pandaset": write_pandaset,
     "kitti_raw": write_kitti_raw,

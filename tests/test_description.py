@@ -53,7 +53,7 @@ ORIGINS = {
 BESIDE = ("kitti", "semantic_kitti", "kitti_object", "kitti360")
 """The formats whose files have no room for a description."""
 
-IMAGES = ("range", "png")
+IMAGES = ("range", "png", "cosmos")
 
 
 def a_scan(

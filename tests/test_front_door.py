@@ -35,6 +35,7 @@ TASKS = {
     "png": "segmentation",
     "webdataset": "segmentation",
     "mcap": "segmentation",
+    "cosmos": "unlabelled",
     "nuscenes": "segmentation",
     "pandaset": "segmentation",
     "kitti_raw": "detection",

@@ -107,7 +107,7 @@ def test_a_bank_and_a_tar_with_names_that_lead_out(
             source, WRITERS[to](out / str(number)), on_bad="skip", progress=False
         )
         assert (report.written == 0) == (
-            to in ("kitti", "npz", "range", "pcd", "ply", "png", "mcap")
+            to in ("kitti", "npz", "range", "pcd", "ply", "png", "mcap", "cosmos")
         ), report
     assert everything(tmp_path, out) == before
 
@@ -161,7 +161,7 @@ COLLISIONS = {
     "kitti_object": [("training/1", "training/000001"), ("other", "training/0")],
 } | {
     to: [("x", "x")]
-    for to in ("kitti", "npz", "range", "pcd", "ply", "webdataset", "mcap")
+    for to in ("kitti", "npz", "range", "pcd", "ply", "webdataset", "mcap", "cosmos")
 }
 
 

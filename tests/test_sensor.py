@@ -19,6 +19,7 @@ LASERS = {
     "hdl32e": (32, 10.67, -30.67),
     "vls128": (128, 15.0, -25.0),
     "pandar64": (64, 14.87, -24.909),
+    "pandar128": (128, 14.436, -25.016),
 }
 """{sensor: number of lasers, highest and lowest elevation in degrees} by the manuals."""
 

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 
 FORMATS = (
     "output format: npz (keeps every field) | kitti | semantic_kitti | kitti_object | kitti360 | "
-    "range | pcd | ply | png | webdataset | mcap"
+    "range | pcd | ply | png | webdataset | mcap | cosmos"
 )
 """Help of ``--to``; names of ``formats.WRITERS``."""
 
@@ -22,7 +22,7 @@ class Reading(BaseModel):
     layout: str | None = Field(
         None,
         description="layout of the input: kitti360 | semantic_kitti | kitti_object | nuscenes | "
-        "pandaset | kitti_raw | bank | webdataset | mcap | png | range | folder [detected]",
+        "pandaset | kitti_raw | bank | webdataset | mcap | cosmos | png | range | folder [detected]",
     )
     split: str | None = Field(
         None, description="split of the input, for instance r2flow/train"

@@ -14,6 +14,7 @@ from lidar_synth.bank import is_url
 from lidar_synth.errors import ConfigError, DataError, FileError, choose
 from lidar_synth.formats.bank import BankScans
 from lidar_synth.formats.calibration import Calibration
+from lidar_synth.formats.cosmos import Cosmos, CosmosWriter
 from lidar_synth.formats.folder import (
     SUFFIXES,
     Folder,
@@ -43,6 +44,7 @@ __all__ = [
     "WRITERS",
     "BankScans",
     "Calibration",
+    "Cosmos",
     "Folder",
     "KITTIObject",
     "KITTIRaw",
@@ -69,6 +71,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "bank": BankScans,
     "webdataset": WebDataset,
     "mcap": MCAP,
+    "cosmos": Cosmos,
     "png": RangePNG,
     "range": RangeImages,
     "folder": Folder,
@@ -87,6 +90,7 @@ WRITERS: dict[str, type[Writer]] = {
     "png": PNGWriter,
     "webdataset": WebDatasetWriter,
     "mcap": MCAPWriter,
+    "cosmos": CosmosWriter,
 }
 """{format: writer}."""
 

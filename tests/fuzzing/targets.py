@@ -406,6 +406,7 @@ TARGETS: dict[str, Target] = {
     "png": Target(partial(write, "png"), partial(read, "png")),
     "webdataset": Target(partial(write, "webdataset"), partial(read, "webdataset")),
     "mcap": Target(make_mcap, partial(read, "mcap")),
+    "cosmos": Target(partial(write, "cosmos"), partial(read, "cosmos")),
     "semantic_kitti": Target(
         partial(write, "semantic_kitti"), partial(read, "semantic_kitti")
     ),
