@@ -35,6 +35,13 @@ NETWORKS: dict[str, dict[str, Any]] = {
     },
     "unet": {"resolution": (8, 64), "width": 32, "multipliers": [1, 2]},
     "diffusion_unet": {"resolution": (8, 64), "width": 32, "multipliers": [1, 2]},
+    "efficient_unet": {
+        "resolution": (8, 64),
+        "width": 16,
+        "multipliers": [1, 2],
+        "blocks": [1, 1],
+        "angles": torch.linspace(-1, 1, 1024).view(2, 8, 64),
+    },
 }
 """Small networks by architecture."""
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_module_registration_hook
 
 from lidar_synth.errors import ConfigError, DataError
+from lidar_synth.generate.models.efficient_unet import EfficientUNet
 from lidar_synth.generate.models.encoders.calibrated_camera import SightEncoder
 from lidar_synth.generate.models.encoders.camera_views import ViewEncoder
 from lidar_synth.generate.models.encoders.clip_views import ClipViewEncoder
@@ -34,6 +35,7 @@ NETWORKS: dict[str, type[Network]] = {
     "denoiser": Denoiser,
     "unet": UNet,
     "diffusion_unet": DiffusionUNet,
+    "efficient_unet": EfficientUNet,
     "vqvae": VQVAE,
     "surfaces": SurfaceAutoencoder,
     "semantic_map": SemanticMapEncoder,

@@ -17,7 +17,7 @@ def import_(
         Path, typer.Argument(metavar="OUT.safetensors", help="checkpoint to write")
     ],
     peer: Annotated[
-        str, typer.Option(help="project of the weights: r2flow | lidm")
+        str, typer.Option(help="project of the weights: r2flow | lidm | r2dm")
     ] = "r2flow",
     check: Annotated[
         bool,
@@ -45,6 +45,8 @@ def import_(
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
 
       lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
+
+      lidar-synth import diffusion_0000300000.pth r2dm.safetensors --peer r2dm
     """
     from lidar_synth.generate.checkpoint import save_checkpoint
     from lidar_synth.lab.importers import IMPORTERS

@@ -80,7 +80,7 @@ def read_r2flow(path: Path) -> tuple[Header, dict[str, nn.Module]]:
         normalisation = _normalisation(data, path)
         header = Header(
             networks={VELOCITY: part},
-            sensor=_sensor(data),
+            sensor=sensor_of(data),
             normalisation=normalisation,
             channels=("range", "reflectance")
             if data["train_reflectance"]
@@ -150,8 +150,8 @@ def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
     )
 
 
-def _sensor(data: Mapping[str, Any]) -> Sensor:
-    """The HDL-64E with the grid of the network's training."""
+def sensor_of(data: Mapping[str, Any]) -> Sensor:
+    """The HDL-64E with the grid of the network's training; R2DM's configuration has the same keys."""
     sensor = presets()[DATA[data["dataset"]][1]]
     if data["projection"].startswith("unfolding"):
         sensor = sensor.by_beams()
@@ -181,23 +181,28 @@ def _time_grid(cfg: Mapping[str, Any]) -> tuple[float, ...]:
 
 def _provenance(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     cfg = content["cfg"]
-    # R2Flow's split of KITTI raw is not published.
-    known = all_frames(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
-    seen = {"seen": known.to_list()} if cfg["data"]["dataset"] == "kitti_360" else {}
+    groups = ("data", "flow", "training", "finetuning")
     return {
-        "data": DATA[cfg["data"]["dataset"]][0],
+        **describe_source(path, cfg["data"]["dataset"], "R2Flow"),
+        "images": content.get("num_images"),
+        "recipe": {group: cfg.get(group) for group in groups},
+    }
+
+
+def describe_source(path: Path, dataset: str, peer: str) -> dict[str, Any]:
+    """What a file of R2Flow or R2DM, which share their data and their author, learnt from."""
+    # The split of KITTI raw is not published.
+    known = all_frames(KITTI360, KITTI360_SPLITS["r2flow/train"] or ())
+    seen = {"seen": known.to_list()} if dataset == "kitti_360" else {}
+    return {
+        "data": DATA[dataset][0],
         "data_licence": "CC BY-NC-SA 3.0",
         "split": "r2flow/train",
         **seen,
-        "licence": "as R2Flow's repository: MIT",
-        "source": "https://github.com/kazuto1011/r2flow",
+        "licence": f"as {peer}'s repository: MIT",
+        "source": f"https://github.com/kazuto1011/{peer.lower()}",
         "file": path.name,
         "file_sha256": sha256(path),
-        "images": content.get("num_images"),
-        "recipe": {
-            group: cfg.get(group)
-            for group in ("data", "flow", "training", "finetuning")
-        },
     }
 
 
@@ -250,7 +255,8 @@ def convert(
         state["position.table"] = state["position.table"][0]
     state |= _harmonics(weights, depths, what)
     if position == "fourier_features":
-        _check_octaves(weights, what)
+        stored, phase = (weights[name] for name in FOURIER)
+        check_octaves(stored, phase, what)
     return assemble(*part, state, what)
 
 
@@ -331,9 +337,12 @@ def _harmonics(
     return state
 
 
-def _check_octaves(weights: Mapping[str, Tensor], what: str) -> None:
-    """Check the stored octaves of R2Flow's Fourier features, since ours are computed."""
-    stored, phase = (weights[name] for name in FOURIER)
+def check_octaves(stored: Tensor, phase: Tensor, what: str) -> None:
+    """Check the octaves (K, 2, 1, 1) and phases (K,) of Fourier features, since ours are computed.
+
+    Raises:
+        DataError: on others.
+    """
     rows = int((stored[:, 0] > 0).sum())
     octaves = torch.zeros(len(stored), 2)
     octaves[:rows, 0], octaves[rows:, 1] = (
@@ -343,5 +352,5 @@ def _check_octaves(weights: Mapping[str, Tensor], what: str) -> None:
     if phase.any() or not torch.equal(stored[..., 0, 0], octaves):
         raise DataError(
             f"{what}: Fourier features other than octaves of the angles",
-            "those of R2Flow's encoding",
+            "those of R2Flow's and R2DM's encoding",
         )
