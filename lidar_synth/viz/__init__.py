@@ -13,6 +13,7 @@ from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.viz.images import picture
 from lidar_synth.viz.page import html_page
 from lidar_synth.viz.render import Camera, Orbit, bird, render
+from lidar_synth.viz.rerun import to_rerun
 from lidar_synth.viz.scales import Scale, make_scales
 from lidar_synth.viz.sheet import contact_sheet, histograms, sheet
 from lidar_synth.viz.window import show
@@ -30,6 +31,7 @@ __all__ = [
     "render",
     "sheet",
     "show",
+    "to_rerun",
     "view_suffix",
     "write_view",
 ]
