@@ -45,7 +45,7 @@ def evaluate(
     detector: Annotated[
         Path | None,
         typer.Option(
-            help="OpenPCDet's PointPillars for KITTI: how well it finds the boxes of both sets"
+            help="OpenPCDet's PointPillars or CenterPoint: how well it finds the boxes of both sets"
         ),
     ] = None,
     columns: Annotated[
@@ -102,8 +102,8 @@ def evaluate(
     With --objects, cars and persons of both sets are compared at the same distance and seen width:
     AUC of a classifier at real places that it has not seen, returns, surfaces, roughness.
 
-    With --detector, a detector that was trained on KITTI looks for the boxes of both sets in front of
-    the sensor: average precision and recall by class and distance.
+    With --detector, a detector that was trained on KITTI or nuScenes looks for the boxes of both
+    sets: average precision and recall by class and distance.
 
     Papers define metrics of the same name differently: scores of two protocols are not comparable.
     Fewer scans than the protocol's paper compares, and other sensors than its own, are refused. A
@@ -197,9 +197,9 @@ def _boxes(path: Path, sources: "tuple[Source, Source]", as_json: bool) -> None:
     """Print how well a detector finds the boxes of both sets."""
     from lidar_synth.lab.proof.detection.detector_judge import (
         as_text,
+        load_detector,
         recognise_boxes,
     )
-    from lidar_synth.lab.proof.detection.pointpillars import load_detector
 
     network = load_detector(path)
     figures = {

@@ -2,13 +2,16 @@
 own boxes."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.evaluate.extractors.archive import load_weights
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.boxes import (
     CLASSES,
@@ -17,11 +20,8 @@ from lidar_synth.lab.proof.detection.boxes import (
     detected,
     points_in,
 )
-from lidar_synth.lab.proof.detection.pointpillars import (
-    PointPillars,
-    find_boxes,
-    in_view,
-)
+from lidar_synth.lab.proof.detection.centerpoint import CenterPoint
+from lidar_synth.lab.proof.detection.pointpillars import PointPillars
 from lidar_synth.lab.proof.detection.scores import (
     OVERLAP,
     Criterion,
@@ -39,19 +39,41 @@ BANDS = {
 """Distance of the boxes from the sensor, metres."""
 NEUTRAL = ("Van", "Person_sitting")
 """Boxes that KITTI's detectors neither learn nor get wrong."""
+Detecting = PointPillars | CenterPoint
 
 
-def _truth(scan: Scan) -> Truth:
+def load_detector(path: Path) -> Detecting:
+    """Load a checkpoint of OpenPCDet's PointPillars for KITTI or CenterPoint on pillars for
+    nuScenes, without running code of the file.
+
+    Raises:
+        FileError: if the file cannot be read.
+        DataError: on a damaged file, or weights of another network.
+    """
+    content = load_pickle(Path(path), "OpenPCDet")
+    state = content.get("model_state") if isinstance(content, dict) else None
+    if not isinstance(state, dict):
+        raise DataError(
+            f"{path} without model_state",
+            "a checkpoint of OpenPCDet, such as pointpillar_7728.pth",
+        )
+    centres = "dense_head.shared_conv.0.weight" in state
+    network = CenterPoint() if centres else PointPillars()
+    load_weights(network, state, str(path), extra=True)
+    return network.eval()
+
+
+def _truth(network: Detecting, scan: Scan) -> Truth:
     boxes = detected(scan)
-    wanted = in_view(boxes.values) & (points_in(boxes, scan) >= LEAST)
+    wanted = network.sees(boxes.values) & (points_in(boxes, scan) >= LEAST)
     wanted &= np.array([name not in NEUTRAL for name in boxes.names], bool)
     return Truth(boxes.values, classes_of(boxes), wanted)
 
 
 def recognise_boxes(
-    network: PointPillars, scans: Source, name: str = "scans", progress: bool = True
+    network: Detecting, scans: Source, name: str = "scans", progress: bool = True
 ) -> dict[str, Any]:
-    """How well a detector finds the boxes of scans, in front of the sensor.
+    """How well a detector finds the boxes of scans, where it looks.
 
     Args:
         network: the detector, in evaluation mode.
@@ -70,8 +92,8 @@ def recognise_boxes(
     pairs: list[tuple[Found, Truth]] = []
     for i in tqdm(range(len(scans)), desc=name, disable=not progress):
         scan = scans[i]
-        truth = _truth(scan)
-        pairs.append((find_boxes(network, scan), truth))
+        truth = _truth(network, scan)
+        pairs.append((network.find(scan), truth))
     classes: dict[str, dict[str, dict[str, float]]] = {}
     for each, title in enumerate(CLASSES):
         for band, (near, far) in BANDS.items():
@@ -85,8 +107,8 @@ def recognise_boxes(
                 }
     if not classes:
         raise DataError(
-            f"{name}: no car, pedestrian or cyclist with {LEAST} returns in front of the sensor",
-            "scans with boxes from 0 to 69 m along x",
+            f"{name}: no car, pedestrian or cyclist with {LEAST} returns where the detector looks",
+            "scans with such boxes in front of the sensor, within 50 m",
         )
     return {"scans": len(pairs), "classes": classes}
 
