@@ -128,13 +128,14 @@ def evaluate(
     from lidar_synth.lab.evaluate.published import compare_published as published
     from lidar_synth.lab.evaluate.segmentation import load_judge
 
-    kinds = [protocol, judge, detector, objects or None]
-    if beside and (as_json or protocol is None):
+    judges = [judge, detector, objects or None]
+    judged = sum(given is not None for given in judges)
+    if beside and (as_json or judged):
         raise typer.BadParameter(
             "goes with --protocol and prints tables: leave out --json",
             param_hint="--beside",
         )
-    if sum(kind is not None for kind in kinds) != 1:
+    if (protocol is not None) + judged != 1:
         raise typer.BadParameter(
             "give --protocol, --judge, --objects or --detector, one of them",
             param_hint="--protocol",
