@@ -26,6 +26,7 @@ SMALLEST = {
     "label": "--scans 4 --points 1",
     "latent": "--width 32 --rounds 1",
     "million": "--shards 2",
+    "link": "--scans 2 --rates 1000 --delay 1",
     "mixing": "--scans 2 --rounds 1",
     "networks": "--model {full_size} --rounds 1",
     "projection": "--rounds 1",

@@ -66,18 +66,22 @@ def town_images(count: int) -> list[RangeImage]:
 
 
 def write(
-    root: Path, images: list[RangeImage], fields: tuple[str, ...], threads: int = 1
+    root: Path,
+    images: list[RangeImage],
+    fields: tuple[str, ...],
+    threads: int = 1,
+    size: int = SHARD,
 ) -> Bank:
-    """A bank of the images, compressed by this many threads."""
+    """A bank of the images in shards of this size, compressed by this many threads."""
     facts = Facts(images[0].sensor, fields, "town", "", {}, "generated", "MIT", "MIT")
     entries = []
     root.mkdir()
-    for first in range(0, len(images), SHARD):
+    for first in range(0, len(images), size):
         entry = Entry(
-            f"shard-{len(entries):05d}.h5", 0, first, len(images[first : first + SHARD])
+            f"shard-{len(entries):05d}.h5", 0, first, len(images[first : first + size])
         )
         with ShardWriter(root / entry.file, facts, entry, threads=threads) as writer:
-            for image in images[first : first + SHARD]:
+            for image in images[first : first + size]:
                 writer.append(image)
         path = root / entry.file
         entries.append(replace(entry, bytes=path.stat().st_size, sha256=sha256(path)))
