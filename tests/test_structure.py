@@ -169,9 +169,9 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (168_000, 6.1, 142),
-    "laboratory": (136_000, 6.2, 151),
-    "tools": (41_000, 5.8, 132),
+    "plugin": (167_000, 6.0, 138),
+    "laboratory": (135_000, 6.1, 149),
+    "tools": (40_000, 5.8, 131),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""
