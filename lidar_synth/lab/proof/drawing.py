@@ -20,7 +20,7 @@ COLOURS = (
     "#0b7285",
     "#a1286a",
     "#5c6f00",
-    "#333",
+    "currentColor",
 )
 
 
@@ -41,16 +41,16 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
 
     height = ROW * len(shown) + 30
     parts = [
-        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences">'
+        f'<div class="scroll"><svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences">'
     ]
     for tick in ticks(low, high):
-        colour, width = ("#1b1f27", 1.4) if tick == 0 else ("#d8dce4", 1)
+        colour, width = ("var(--ink)", 1.4) if tick == 0 else ("var(--line)", 1)
         parts.append(
             f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="4" y2="{height - 22}" stroke="{colour}" '
             f'stroke-width="{width}"/>'
         )
         parts.append(
-            f'<text x="{x(tick):.1f}" y="{height - 6}" text-anchor="middle" fill="#5d6573">{tick:+g}</text>'
+            f'<text x="{x(tick):.1f}" y="{height - 6}" text-anchor="middle" fill="var(--dim)">{tick:+g}</text>'
         )
     for number, row in enumerate(shown):
         y = 4 + ROW * (number + 0.5)
@@ -72,7 +72,7 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
         parts.append(
             f'<circle cx="{x(row["difference"]):.1f}" cy="{y:.1f}" r="6" fill="{colour}"/>'
         )
-    return "".join([*parts, "</svg>"])
+    return "".join([*parts, "</svg></div>"])
 
 
 def curves(arms: Sequence[Mapping[str, Any]]) -> str:
@@ -92,23 +92,24 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
 
     legend = 24 * len(shown)
     parts = [
-        f'<svg viewBox="0 0 {WIDTH} {max(bottom + 34, legend + 20)}" role="img" aria-label="mIoU by iterations">'
+        f'<div class="scroll"><svg viewBox="0 0 {WIDTH} {max(bottom + 34, legend + 20)}" '
+        'role="img" aria-label="mIoU by iterations">'
     ]
     for tick in ticks(0, top):
         y = bottom - height * tick / top
         parts.append(
-            f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" stroke="#d8dce4"/>'
+            f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" stroke="var(--line)"/>'
         )
         parts.append(
-            f'<text x="{left - 8}" y="{y + 4:.1f}" text-anchor="end" fill="#5d6573">{tick:g}</text>'
+            f'<text x="{left - 8}" y="{y + 4:.1f}" text-anchor="end" fill="var(--dim)">{tick:g}</text>'
         )
     for tick in ticks(0, last):
         x = left + width * tick / last
         parts.append(
-            f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" fill="#5d6573">{tick:g}</text>'
+            f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" fill="var(--dim)">{tick:g}</text>'
         )
     parts.append(
-        f'<text x="{left + width / 2}" y="{bottom + 33}" text-anchor="middle" fill="#5d6573">iterations</text>'
+        f'<text x="{left + width / 2}" y="{bottom + 33}" text-anchor="middle" fill="var(--dim)">iterations</text>'
     )
     for number, row in enumerate(shown):
         colour = COLOURS[number % len(COLOURS)]
@@ -126,7 +127,7 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
             row["title"] if len(row["title"]) < 48 else row["title"][:46] + " …"
         )
         parts.append(f'<text x="{left + width + 58}" y="{y + 4}">{words}</text>')
-    return "".join([*parts, "</svg>"])
+    return "".join([*parts, "</svg></div>"])
 
 
 def ticks(low: float, high: float) -> list[float]:
