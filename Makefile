@@ -9,19 +9,19 @@ READY := $(VENV)/.ready
 TYPES := $(VENV)/types
 DEMO_OUT ?= demo_out
 SCANS ?= 24
-# Two test processes of one thread each; `make test PARALLEL=` runs all tests in one.
+# Two test processes of one thread each; `make test PARALLEL=` runs them in one.
 PARALLEL ?= -n 2 --dist loadfile
 
-.PHONY: demo test quick test-lowest lint types lock docs notebooks bench clean
+.PHONY: demo test test-slow test-lowest lint types lock docs notebooks bench clean
 
 demo: $(READY)  ## scans mixed with synthetic ones, a recorded scan changed, a page to look at
 	$(BIN)/python tools/demo.py $(DEMO_OUT) --scans $(SCANS)
 
-test: $(READY)  ## all tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL)
-
-quick: $(READY)  ## the tests that are not marked slow
+test: $(READY)  ## every test that is not marked slow
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+test-slow: $(READY)  ## the tests that are marked slow
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PARALLEL) -m slow
 
 test-lowest: $(READY)  ## tests of files and banks on the lowest versions of the dependencies; installs them
 	$(BIN)/python tools/test_lowest_versions.py
