@@ -157,13 +157,7 @@ class MixedScans(Dataset[Any]):
         seed = to_integer(seed, "seed")
         if locality not in (None, "shard"):
             raise ConfigError(f"locality={locality!r}", '"shard", or None')
-        for source, _ in reals:
-            if not hasattr(source, "__len__"):
-                raise ConfigError(
-                    f"real={type(source).__name__}, which has no length",
-                    "real scans first, then what synthetic ones come from",
-                    "MixedScans(real, synth, ratio)",
-                )
+        _check_lengths(reals)
         synthetics = [
             (make_synthetic(source, seed), weight) for source, weight in each(synth)
         ]
@@ -179,12 +173,7 @@ class MixedScans(Dataset[Any]):
                 for source, weight in reals
             ),
             tuple(
-                PlannedSource(
-                    source.length,
-                    weight,
-                    source.identity + suffix,
-                    getattr(source, "shard_size", 1) if locality else 1,
-                )
+                _plan_synthetic(source, weight, suffix, bool(locality))
                 for source, weight in synthetics
             ),
             make_schedule(ratio),
@@ -209,14 +198,9 @@ class MixedScans(Dataset[Any]):
             _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
         )
         self._notices = Notices(images=collate == "range")
-        self._augment: LabelPolicy | None = None
-        if augment is not None:
-            # It loads the corruptions.
-            from lidar_synth.labels.compose import make_augmentation
-
-            every = frozenset({*POINT_FIELDS, "boxes"})
-            common = every.intersection(*(s.fields | rings for s in self.synthetic))
-            self._augment = make_augmentation(augment, scans, common)
+        every = frozenset({*POINT_FIELDS, "boxes"})
+        common = every.intersection(*(s.fields | rings for s in self.synthetic))
+        self._augment = _make_augment(augment, scans, common)
         self._augment_real = augment_real
         self._to_sample = to_sample
         self._real_as_is = real_as_is
@@ -227,20 +211,23 @@ class MixedScans(Dataset[Any]):
             collate = Collate(collate, sensor, unlabelled)
         self.collate: Callable[[Any], Any] = collate
         self.current = CurrentEpoch()
-        self._untold = (
-            False  # whether it is made as an earlier one was, and no epoch has been set
-        )
         self._planned: tuple[int, MixingPlan] | None = None
+        # Whether it is made as an earlier one was, and no epoch has been set.
+        self._untold = False
         self.set_epoch(0)
+        self._untold = self._take_earlier()
+        if real_as_is and compare:
+            check_alike(self.real, self.synthetic, self._finish)
+
+    def _take_earlier(self) -> bool:
+        """Take the pass of the latest mixture with the same plan, if there is one."""
         first = MixingPlan(self.mixture, 0)
         report_repeats(first)
         earlier = _LATEST.get(first.hash)
         if earlier is not None:
             self.current.take_pass(earlier.current)
-        self._untold = earlier is not None
         _LATEST[first.hash] = self
-        if real_as_is and compare:
-            check_alike(self.real, self.synthetic, self._finish)
+        return earlier is not None
 
     @classmethod
     def wrap(
@@ -550,6 +537,44 @@ class MixedScans(Dataset[Any]):
             (2, 0)
         """
         return MixedLoader(self, batch_size, num_workers, **options)
+
+
+def _check_lengths(reals: Iterable[tuple[Any, float | None]]) -> None:
+    """Refuse real sources without a length.
+
+    Raises:
+        ConfigError: on one.
+    """
+    for source, _ in reals:
+        if not hasattr(source, "__len__"):
+            raise ConfigError(
+                f"real={type(source).__name__}, which has no length",
+                "real scans first, then what synthetic ones come from",
+                "MixedScans(real, synth, ratio)",
+            )
+
+
+def _plan_synthetic(
+    source: Any, weight: float | None, suffix: str, by_shard: bool
+) -> PlannedSource:
+    """What the plan has to know of a synthetic source; ``suffix`` names the sensor it is turned
+    into."""
+    return PlannedSource(
+        source.length,
+        weight,
+        source.identity + suffix,
+        getattr(source, "shard_size", 1) if by_shard else 1,
+    )
+
+
+def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy | None:
+    """The augmentation of scans that all have ``fields``; None without one."""
+    if given is None:
+        return None
+    # It loads the corruptions.
+    from lidar_synth.labels.compose import make_augmentation
+
+    return make_augmentation(given, scans, fields)
 
 
 def _make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
