@@ -75,6 +75,13 @@ def prove(
     sensor: Annotated[
         str | None, typer.Option(help="sensor of the scans: a preset or a YAML file")
     ] = None,
+    beams: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="evenly spaced beams that all scans keep, such as 32 [all]",
+        ),
+    ] = None,
     split: Annotated[
         str | None, typer.Option(help="split of ROOT, if its layout has splits")
     ] = None,
@@ -127,6 +134,7 @@ def prove(
             "--tests": tests,
             "--ratio": ratio,
             "--only": only,
+            "--beams": beams,
         }
         _check_task(task, [name for name, given in further.items() if given])
         options = {
@@ -153,6 +161,7 @@ def prove(
         model=model,
         classes=classes,
         only=tuple(only or ()),
+        beams=beams,
         columns=None if trainer else 512,
     )
     source = open_scans(root, sensor=sensor, split=split)

@@ -31,7 +31,7 @@ class ProofPlan:
         settings: what was asked for.
         places: {name: indices of its scans}.
         names: of all scans.
-        sensor: of the scans.
+        sensor: of the scans, with the beams that they keep.
         grid: on which they are thinned; None to keep all returns.
         rows: the arms.
         groups: the scored classes.
@@ -112,6 +112,8 @@ class ProofPlan:
             "classes",
             "only",
         )
+        if self.settings.beams is None:
+            own.pop("beams")  # comparisons of earlier versions do not have it
         digest = hash_of_names(self.names)
         return {
             "format": FORMAT,

@@ -18,6 +18,7 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, recordings_of
 from lidar_synth.lab.proof.arms import rows
+from lidar_synth.lab.proof.beams import coarser, keep_beams
 from lidar_synth.lab.proof.budget import measure_step, within
 from lidar_synth.lab.proof.places import (
     Places,
@@ -60,15 +61,15 @@ def make_plan(
         ``tests`` follow those of ``source``.
 
     Raises:
-        ConfigError: on settings that do not fit the scans, too short a time, a device that is not
-            there, or tests of another sensor or of scans that are trained on.
+        ConfigError: on settings that do not fit the scans or the sensor, too short a time, a device
+            that is not there, or tests of another sensor or of scans that are trained on.
         DataError: on one place only, on scans without labels, or on a class that nothing is
             labelled as.
     """
     check_device(device)
     arms = rows(settings.arms, settings.ratios)
     groups = groups_of(_classes(source, settings.classes), settings.only)
-    sensor = sensor_of(source)
+    sensor = coarser(sensor_of(source), settings.beams)
     training, places = _split(source, tests, settings.places)
     grid = (
         None if settings.columns is None else replace(sensor, columns=settings.columns)
@@ -84,7 +85,7 @@ def make_plan(
         {i for part in (*labelled.values(), *tested.values()) for i in part}
     )
     names = (*names_of(source), *names_of([] if tests is None else tests))
-    scans = {i: _read(*locate(source, tests, i), grid) for i in needed}
+    scans = {i: _read(*locate(source, tests, i), grid, settings.beams) for i in needed}
     recordings = recordings_of_scans(
         source if tests is None else tests,
         [names[i] for part in tested.values() for i in part],
@@ -206,7 +207,7 @@ def _count_labelled(places: Places, settings: ProofSettings, where: str) -> int:
     return count
 
 
-def _read(source: Source, index: int, grid: Sensor | None) -> Scan:
+def _read(source: Source, index: int, grid: Sensor | None, beams: int | None) -> Scan:
     scan = source[index]
     if scan.label is None:
         raise DataError(
@@ -222,6 +223,7 @@ def _read(source: Source, index: int, grid: Sensor | None) -> Scan:
             f"train ids 0 to {len(NAMES) - 1}, or {IGNORE} = ignore",
             "They are of another table: map them when they are read (Taxonomy.decode).",
         )
+    scan = keep_beams(scan, beams)
     return scan if grid is None else thin_scan(scan, grid)
 
 

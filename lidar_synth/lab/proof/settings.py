@@ -29,6 +29,8 @@ class ProofSettings:
         widths: channels of the reference network by level.
         classes: how classes are pooled: a name of ``GROUPS``; "auto" takes that of the dataset's
             layout.
+        beams: number of the sensor's beams, evenly spaced, that all scans keep, to compare on a
+            coarser sensor; all by default.
         only: names of the classes that the mean IoU is over; all that occur by default.
         seed: of the choice of labelled scans and of the order of places.
 
@@ -57,6 +59,7 @@ class ProofSettings:
     classes: str = "auto"
     only: tuple[str, ...] = ()
     seed: int = 0
+    beams: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("iterations", "batch", "seeds", "tested", "synthetic"):

@@ -26,6 +26,7 @@ from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.leakage import refuse_leaks
 from lidar_synth.lab.proof.arms import Row
+from lidar_synth.lab.proof.beams import keep_beams
 from lidar_synth.lab.proof.page import write_page
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.planning import locate, make_plan
@@ -388,7 +389,7 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
                 plan.settings.synthetic,
                 seed,
                 plan.settings.model,
-                partial(_scans, source, indices),
+                partial(_scans, source, indices, plan.settings.beams),
                 tuple(plan.names[i] for i in indices),
             )
     with map_in_processes(
@@ -432,8 +433,8 @@ def _nameless(source: Source, tests: Source | None, plan: ProofPlan) -> Iterator
             yield origin[number]
 
 
-def _scans(source: Source, indices: Sequence[int]) -> list[Scan]:
-    return [source[i] for i in indices]
+def _scans(source: Source, indices: Sequence[int], beams: int | None) -> list[Scan]:
+    return [keep_beams(source[i], beams) for i in indices]
 
 
 def _preparation(work: Trainings, row: Row) -> float:
