@@ -1,0 +1,87 @@
+"""What generated scans first add with four labelled frames, on a sensor with fewer beams or with
+another network.
+
+    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16] [--points]
+
+The places are split in two halves; four frames of each half are trained on and the other half is
+tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
+and its interval. ``--points`` takes point_network.py instead of the range-view segmenter.
+"""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from point_network import learn
+from typer import run
+
+from lidar_synth import ProofSettings, prove
+from lidar_synth.lab.proof import reference
+from lidar_synth.lab.proof.scores import interval
+
+
+def halves(root: Path, out: Path) -> list[Path]:
+    """Two folders with links to every second sequence."""
+    folders = [out / "half-0", out / "half-1"]
+    for number, sequence in enumerate(sorted((root / "sequences").iterdir())):
+        link = folders[number % 2] / "sequences" / sequence.name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        if not link.exists():
+            link.symlink_to(sequence.resolve())
+    return folders
+
+
+def main(
+    root: Path,
+    out: Path,
+    beams: int | None = None,
+    points: bool = False,
+    iterations: int = 300,
+    synthetic: int = 48,
+    seeds: int = 1,
+    columns: int = 256,
+) -> None:
+    """Trains and tests both ways."""
+    settings = ProofSettings(
+        labelled=4,
+        arms=("pretrain-generator",),
+        iterations=iterations,
+        seeds=seeds,
+        synthetic=synthetic,
+        columns=columns,
+        beams=beams,
+    )
+    folders = halves(root, out)
+    name = f"{beams or 'all'}-{'points' if points else 'range'}-{iterations}"
+    runs = [out / f"{name}-{number}" for number in range(2)]
+    scores: dict[str, dict[str, float]] = {"real": {}, "pretrain-generator": {}}
+    for number, (folder, other) in enumerate(
+        zip(folders, reversed(folders), strict=True)
+    ):
+        if number and (runs[0] / "starts").is_dir():  # the same for both halves
+            shutil.copytree(runs[0] / "starts", runs[1] / "starts", dirs_exist_ok=True)
+        proof = prove(
+            folder,
+            runs[number],
+            settings,
+            jobs=1,
+            trainer=learn if points else reference,
+            pools=out / f"pools-{beams or 'all'}",
+            tests=other,
+        )
+        for row in proof.values["arms"]:
+            scores[row["key"]] |= row["miou_by_place"]
+    places = sorted(scores["real"])
+    real, first = (np.array([s[p] for p in places]) for s in scores.values())
+    low, high = interval((first - real)[:, None]) or (np.nan, np.nan)
+    gains = ", ".join(
+        f"{p} {g:+.1f}" for p, g in zip(places, first - real, strict=True)
+    )
+    print(
+        f"{name}: real {real.mean():.1f}, generated first {first.mean():.1f}, gain "
+        f"{(first - real).mean():+.1f} ({low:.1f} to {high:.1f}); {gains}"
+    )
+
+
+if __name__ == "__main__":
+    run(main)
