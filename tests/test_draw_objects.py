@@ -1,8 +1,10 @@
 """Objects cast into the scan of a model: boxes, labels and instances are exact."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +25,13 @@ from lidar_synth import (
     open_scans,
 )
 from lidar_synth.bake import bake
+from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import GROUND, LABELS
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.generate.generator import Generated
+from lidar_synth.geometry.layout.files import NAMES, SIZES
+from lidar_synth.geometry.layout.layout import CLASSES
 from lidar_synth.lab.town.pasted import TownObjects
 from lidar_synth.labels import draw_objects
 from lidar_synth.labels.objects import THINGS
@@ -162,46 +167,98 @@ def test_objects_of_a_model_without_layouts_are_refused(tmp_path: Path) -> None:
     assert "a model of layouts" in str(result.exception)
 
 
+def laid(folder: Path, text: str) -> tuple[Path, dict[str, Any]]:
+    """A model of layouts, and the settings of a bake of one scan of a layout."""
+    model = write(folder / "laid.safetensors", dropout=0.1, condition="layout")
+    layout = folder / "street.yaml"
+    layout.write_text(text)
+    return model, {"condition": str(layout), "count": 1}
+
+
+CAR = "objects: [{class: Car, at: [7, 2]}]"
+
+
+@pytest.mark.parametrize("recorded", [{"objects": None}, {}])
+def test_a_bank_of_drawn_objects_is_resumed_only_as_such(
+    tmp_path: Path, recorded: dict[str, None]
+) -> None:
+    """Also one of a version that recorded no name."""
+    model, given = laid(tmp_path, CAR)
+    drawn = plan_in(tmp_path / "bank", model, objects="drawn", **given)
+    bake(drawn, progress=False)
+    note = tmp_path / "bank" / SETTINGS
+    settings = json.loads(note.read_text())
+    assert settings.pop("objects") == "drawn"
+    note.write_text(json.dumps(settings | recorded))
+    with pytest.raises(ConfigError, match=r"'objects': 'drawn'.*'objects': 'town'"):
+        bake(plan_in(tmp_path / "bank", model, **given), progress=False)
+    bake(drawn, progress=False)
+
+
 def test_a_folder_begun_without_an_option_refuses_it(tmp_path: Path) -> None:
     """Also where the option is left out at first: its scans would be of two kinds."""
-    model = write(tmp_path / "laid.safetensors", dropout=0.1, condition="layout")
-    layout = tmp_path / "street.yaml"
-    layout.write_text("objects: [{class: Car, at: [7, 2]}]")
-    given = {"condition": str(layout), "count": 1}
-    bake(plan_in(tmp_path / "bank", model, **given), progress=False)
-    with pytest.raises(ConfigError, match="was filled with.*objects"):
-        bake(plan_in(tmp_path / "bank", model, objects="town", **given), progress=False)
+    model, given = laid(tmp_path, CAR)
     out = tmp_path / "out"
-    command = ["sample", str(out), "--model", str(model), "--condition", str(layout)]
-    assert CliRunner().invoke(app, [*command, "--count", "1"]).exit_code == 0
-    refused = CliRunner().invoke(app, [*command, "--count", "2", "--objects", "town"])
-    assert "was filled with" in str(refused.exception)
+    command = ["sample", str(out), "--model", str(model), "--count", "1"]
+    command += ["--condition", given["condition"]]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    refused = CliRunner().invoke(app, [*command, "--objects", "drawn"])
+    assert "was filled with {'objects': 'town'}" in str(refused.exception)
     plain = ["sample", str(tmp_path / "plain"), "--count", "1", "--steps", "1"]
     assert CliRunner().invoke(app, plain).exit_code == 0
     refused = CliRunner().invoke(app, [*plain, "--columns", "1024"])
     assert "was filled with" in str(refused.exception)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)  # the objects of 60 moments of the town
-def test_a_bank_and_a_folder_keep_cast_objects(tmp_path: Path) -> None:
-    model = write(tmp_path / "laid.safetensors", dropout=0.1, condition="layout")
-    layout = tmp_path / "street.yaml"
-    cars = "objects: [{class: Car, at: [7, 2]}, {class: Truck, at: [-9, 4], size: [9, 3, 3]}]"
-    layout.write_text(cars)
-    given = {"condition": str(layout), "count": 2}
-    bake(plan_in(tmp_path / "bank", model, objects="town", **given), progress=False)
+def test_a_bank_and_a_folder_have_cast_objects(tmp_path: Path) -> None:
+    """Of classes that the streets of the town lack, too."""
+    model, given = laid(
+        tmp_path,
+        "objects: [{class: Car, at: [7, 2]}, {class: Motorcyclist, at: [-3, 3]},"
+        " {class: Truck, at: [-9, 4], size: [9, 3, 3]}]",
+    )
+    bake(plan_in(tmp_path / "bank", model, **given), progress=False)
     baked = Bank(tmp_path / "bank")
     assert baked.index.sources[0].settings["objects"] == "town"
     assert '"objects": "town"' in (tmp_path / "bank" / "README.md").read_text()
-    with pytest.raises(ConfigError, match="was filled with"):
-        bake(plan_in(tmp_path / "bank", model, **given), progress=False)
     out = tmp_path / "out"
-    command = ["sample", str(out), "--model", str(model), "--condition", str(layout)]
-    command += ["--objects", "town", "--count", "2", "--seed", "4"]
+    command = ["sample", str(out), "--model", str(model), "--count", "1"]
+    command += ["--condition", given["condition"], "--seed", "4"]
     assert CliRunner().invoke(app, command).exit_code == 0
-    assert "town" in json.dumps(json.loads((out / ".sample.json").read_text()))
-    for number, sampled in enumerate(open_scans(out, sensor=SMALL)):
-        assert_exact(baked[number])
-        assert_exact(sampled)
-        assert baked[number].boxes.names == sampled.boxes.names == ("Car", "Truck")  # type: ignore[union-attr]
+    [sampled] = open_scans(out, sensor=SMALL)
+    for scan in (baked[0], sampled):
+        assert_exact(scan)
+        assert scan.boxes is not None
+        assert set(scan.boxes.names) == {"Car", "Motorcyclist", "Truck"}
+
+
+def test_a_layout_without_objects_gets_a_scan_without_objects(tmp_path: Path) -> None:
+    model, given = laid(tmp_path, "outlines: []")
+    bake(plan_in(tmp_path / "bank", model, **given), progress=False)
+    [scan] = Bank(tmp_path / "bank")
+    assert scan.boxes is not None and scan.label is not None
+    assert len(scan) and not len(scan.boxes) and scan.label.min() >= THINGS
+
+
+def test_without_embreex_the_error_names_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, given = laid(tmp_path, CAR)
+    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
+    with pytest.raises(LibraryError, match=r"pip install embreex.*--objects drawn"):
+        plan_in(tmp_path / "bank", model, **given)
+    bake(plan_in(tmp_path / "bank", model, objects="drawn", **given), progress=False)
+    assert len(Bank(tmp_path / "bank")) == 1
+
+
+def test_the_shapes_of_the_town_have_every_class_of_a_layout(street: Scan) -> None:
+    """And what is cast in a box has the class of the box."""
+    shapes = ObjectBank.from_town_shapes()
+    assert set(shapes.boxes.names) == set(CLASSES)
+    for name, size in SIZES.items():
+        kind = NAMES.get(name, name)
+        values = np.array([[15, 0, size[2] / 2 - 1.7, *size, 1]], np.float32)
+        drawn = draw_objects(street[:0], Boxes(values, (kind,)), shapes)
+        assert drawn.boxes is not None and drawn.boxes.names == (kind,)
+        assert drawn.label is not None and len(drawn) > 20
+        assert kind == "Misc" or set(drawn.label.tolist()) == {LABELS[kind]}

@@ -5,12 +5,13 @@ The dataset of a layout model may be a YAML file of a layout, or a folder of the
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lidar_synth.errors import ConfigError, DataError, choose
+from lidar_synth.errors import ConfigError, DataError, LibraryError, choose
 from lidar_synth.files.disk import hash_of_names, read_file
 from lidar_synth.formats import ScanFiles, open_scans
 from lidar_synth.generate.generator import Generator
@@ -23,6 +24,13 @@ from lidar_synth.labels.bank import ObjectBank
 FOCAL_TOLERANCE = 0.02
 """Relative difference that is allowed between a camera's focal length and that of the training
 data."""
+
+OBJECTS: dict[str, Callable[[Sensor], Any]] = {
+    "town": ObjectBank.from_town_shapes,
+    "drawn": lambda sensor: None,
+}
+"""What stands in the boxes of layouts, by name: objects of the town that are cast there, or what
+the model draws."""
 
 
 class ConditionSource(Protocol):
@@ -164,30 +172,50 @@ def _check_camera(source: ScanFiles, focal: float | None) -> None:
         )
 
 
-def refuse_objects(generator: Generator, name: str | None) -> None:
-    """Refuse objects for a model that takes no layouts.
+def settle_objects(generator: Generator, name: str | None) -> str | None:
+    """How the objects in the boxes of layouts are made: "town", the default, or "drawn"; None for a
+    model that takes no layouts.
 
     Raises:
-        ConfigError: then.
+        ConfigError: on a name for such a model, or an unknown one.
+        LibraryError: if objects are to be cast and embreex is missing.
     """
-    if name is not None and generator.condition != "layout":
-        raise ConfigError(
-            f"objects {name} for model {generator.name!r}",
-            "a model of layouts, such as town-layout",
-        )
+    if generator.condition != "layout":
+        if name is not None:
+            raise ConfigError(
+                f"objects {name} for model {generator.name!r}",
+                "a model of layouts, such as town-layout",
+            )
+        return None
+    chosen = name or "town"
+    choose("objects", chosen, OBJECTS)
+    if chosen == "town":
+        _check_embree()
+    return chosen
+
+
+def _check_embree() -> None:
+    """Refuse at once what would fail in each worker."""
+    # By name: only the town imports it.
+    try:
+        import_module("lidar_synth.lab.town.solid").load_embree()
+    except LibraryError as error:
+        raise LibraryError(
+            f"objects that are cast into the boxes of layouts, but {error}",
+            hint="Or type --objects drawn (objects='drawn'): the model draws them, less well.",
+        ) from error
 
 
 @lru_cache(maxsize=1)
 def open_objects(name: str | None, sensor: Sensor) -> Any:
-    """The objects of this name, which are cast into the scans of layouts; None without a name.
+    """The objects of this name, which are cast into the scans of layouts; None where the model
+    draws them.
 
     Raises:
         ConfigError: on an unknown name.
         LibraryError: if embreex is missing.
     """
-    if name is None:
-        return None
-    return choose("objects", name, {"town": ObjectBank.from_town})(sensor)
+    return None if name is None else choose("objects", name, OBJECTS)(sensor)
 
 
 def fingerprint(source: ConditionSource | None) -> str | None:

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import torch
 
-from lidar_synth.bake.conditions import conditions_for, fingerprint, refuse_objects
+from lidar_synth.bake.conditions import conditions_for, fingerprint, settle_objects
 from lidar_synth.bake.options import BakeJob, default_shard_size
 from lidar_synth.bank import Entry, Facts
 from lidar_synth.bank.encoding import TYPES
@@ -99,7 +99,9 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
 
     Raises:
         ConfigError: on an unknown model, solver or data type, a field that the model does not
-            generate, or a conditional model without conditions.
+            generate, a conditional model without conditions, or objects for a model without
+            layouts.
+        LibraryError: if objects are to be cast and embreex is missing.
         FileError, DataError: if the checkpoint or the dataset of the conditions cannot be read.
     """
     choose("solver", job.solver, SOLVERS)
@@ -112,7 +114,6 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
     source = conditions_for(
         generator, job.condition, job.condition_layout, job.condition_split
     )
-    refuse_objects(generator, job.objects)
     fields = _fields(job, generator.fields)
     software = {
         # Its names are at home here too: a plain import would be a circle.
@@ -128,6 +129,7 @@ def make_plan(out: str | Path, job: BakeJob) -> BakePlan:
         update={
             "model": settle_model(job.model),
             "fields": fields,
+            "objects": settle_objects(generator, job.objects),
             "batch": job.batch or BATCH[job.device],
             "shard_size": job.shard_size or default_shard_size(job.count),
         }

@@ -58,10 +58,11 @@ class BakeJob(BaseModel):
     condition_split: str | None = Field(
         None, description="split of that dataset, for instance r2flow/train"
     )
-    objects: Literal["town"] | None = Field(
+    objects: Literal["town", "drawn"] | None = Field(
         None,
         description=(
-            "objects that are cast into the boxes of layouts: town [the model draws them]"
+            "what stands in the boxes of layouts: town, objects that are cast there | drawn, by the "
+            "model [town]"
         ),
     )
     guidance: float = Field(

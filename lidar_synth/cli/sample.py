@@ -46,7 +46,10 @@ def sample(
     objects: Annotated[
         str | None,
         typer.Option(
-            help="objects that are cast into the boxes of layouts: town [the model draws them]"
+            help=(
+                "what stands in the boxes of layouts: town, objects that are cast there | drawn, by "
+                "the model [town]"
+            )
         ),
     ] = None,
     guidance: Annotated[
@@ -94,7 +97,7 @@ def sample(
         conditions,
         conditions_for,
         open_objects,
-        refuse_objects,
+        settle_objects,
     )
     from lidar_synth.errors import choose
     from lidar_synth.files.claims import hold_claim
@@ -111,7 +114,7 @@ def sample(
     )
     grid = None if times is None else read_grid(times.split(","))
     given = conditions_for(generator, condition, condition_layout, condition_split)
-    refuse_objects(generator, objects)
+    chosen = settle_objects(generator, objects)
     settings = {
         "checkpoint": generator.hash,
         "seed": seed,
@@ -125,7 +128,7 @@ def sample(
         "guidance": guidance,
         "columns": columns,
         "times": grid,
-        "objects": objects,
+        "objects": chosen,
     }
     provenance = generator.header.provenance
     trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
@@ -138,7 +141,7 @@ def sample(
                     seed,
                     indices,
                     conditions(given, indices),
-                    open_objects(objects, generator.sensor),
+                    open_objects(chosen, generator.sensor),
                     steps=steps,
                     times=grid,
                     solver=solver,

@@ -217,7 +217,7 @@ class Generator:
                 itself: its projected labels, the image at its ``image_path``, or its layout. In a
                 dictionary of conditions, the one with the condition's name is used. See
                 ``conditions``.
-            objects: such as ``ObjectBank.from_town(generator.sensor)``: the objects of layouts are
+            objects: such as ``ObjectBank.from_town_shapes()``: the objects of layouts are
                 cast from these, and the model draws the street around them.
             options: ``steps`` or ``times``, ``solver`` and ``guidance``; see
                 ``SamplingOptions``.
@@ -247,7 +247,7 @@ class Generator:
         if objects is not None and not cast:
             raise ConfigError(
                 f"{objects!r} as objects for {self.name!r}",
-                "ObjectBank.from_town(generator.sensor), for layouts of a model of layouts",
+                "ObjectBank.from_town_shapes(), for layouts of a model of layouts",
             )
         images = []
         for tensor in self.samples(seed, indices, given, **options):

@@ -198,6 +198,25 @@ class ObjectBank:
         names = None if classes is None else list(classes)
         return town.collect_objects(sensor, names, scans, seed, skin)
 
+    @staticmethod
+    def from_town_shapes(
+        sensor: str | Path | Sensor = "hdl64e_lasers", skin: str | Path | None = None
+    ) -> Any:
+        """One object of every kind of the town, to be cast into the boxes of layouts: of all
+        classes that a layout may have, in about a second.
+
+        Args:
+            sensor: of the bank's own returns; what is cast has the sensor of its scan.
+            skin: the look of a real sensor's returns, as ``load_skin`` takes it.
+
+        Returns:
+            A bank such as that of ``from_town``, whose objects stand in front of the sensor.
+
+        Raises:
+            LibraryError: if embreex is missing.
+        """
+        return import_module("lidar_synth.lab.town").collect_shapes(sensor, skin)
+
     @classmethod
     def collect(cls, objects: list[tuple[int, Object]]) -> Self:
         """A bank of (number in its scan, object) pairs of one sensor."""

@@ -1,13 +1,13 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
     python tools/research/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
-                                   [--picture OUT.png]
+                                   [--cast] [--picture OUT.png]
                                    [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of
-road. The first row is the town's own scans: boxes are larger than objects, so that some of their
-rays return from behind. Other models are compared by the distances alone, with the labels or images
-of the same scans as conditions.
+road; --cast casts their objects, as the commands do. The first row is the town's own scans: boxes
+are larger than objects, so that some of their rays return from behind. Other models are compared by
+the distances alone, with the labels or images of the same scans as conditions.
 """
 
 import json
@@ -29,8 +29,9 @@ from model_card import (
 from tqdm import tqdm
 from typer import run
 
-from lidar_synth import Scan, Town, layout_of, load_generator
+from lidar_synth import ObjectBank, Scan, Town, layout_of, load_generator
 from lidar_synth.files.markdown import escape_markdown
+from lidar_synth.generate.boxed import Drawer
 from lidar_synth.geometry.layout import Layout
 from lidar_synth.lab.evaluate.layouts import LayoutAgreement, layout_agreement
 from lidar_synth.lab.evaluate.segmentation import load_judge
@@ -44,15 +45,18 @@ SHOWN = 6
 
 
 def generate(
-    asked: Asked, guidance: float, real: list[Scan]
+    asked: Asked, guidance: float, real: list[Scan], objects: Drawer | None
 ) -> tuple[str | None, list[Scan]]:
     """The model's condition, and one scan of it for each real scan."""
     generator = load_generator(asked.model)
     strength = guidance if generator.condition == "layout" else 1.0
+    stood = objects if generator.condition == "layout" else None
     made = []
     for i, scan in enumerate(tqdm(real, desc=asked.name, unit="scan")):
         given = scan if generator.condition else None
-        made += generator.scans(SEED, [i], given, steps=asked.steps, guidance=strength)
+        made += generator.scans(
+            SEED, [i], given, stood, steps=asked.steps, guidance=strength
+        )
     return generator.condition, made
 
 
@@ -105,6 +109,7 @@ def main(
     count: int = 64,
     seed: int = 1,
     guidance: float = 1.0,
+    cast: bool = False,
     distances: bool = False,
     picture: Path | None = None,
     intervals: int = 200,
@@ -116,13 +121,14 @@ def main(
     layouts = [layout_of(scan) for scan in real]
     every = [Asked.parse(text) for text in models]
     own = layout_agreement(real, layouts, real)
+    objects = ObjectBank.from_town_shapes() if cast else None
     counts: dict[str, LayoutAgreement | None] = {"the town's own scans": own}
     made = {}
     with TemporaryDirectory() as folder:
         if needs_images(every):
             real = with_images(real, town, Path(folder))
         for asked in every:
-            kind, scans = generate(asked, guidance, real)
+            kind, scans = generate(asked, guidance, real, objects)
             made[asked.name] = scans
             follows = kind == "layout"
             found = layout_agreement(scans, layouts, real) if follows else None

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError, DataError
@@ -214,7 +215,10 @@ def collect_objects(
     """See ``ObjectBank.from_town``."""
     found = load_sensor(sensor)
     town = ObjectCaster(seed, found, scans * STRETCH_FRAMES, 2.0, skin=skin)
-    pairs = [pair for moment in range(scans) for pair in _at(town, moment, skin)]
+    moments = tqdm(
+        range(scans), "objects of the town", leave=False, disable=None, delay=2
+    )
+    pairs = [pair for moment in moments for pair in _at(town, moment, skin)]
     names = [shape.prototype.name for shape, _ in pairs]
     wanted = set(names if classes is None else classes)
     if unknown := sorted(wanted - set(names)):
@@ -238,10 +242,10 @@ def _at(
     """The shapes and boxes (7,) of the objects around the sensor at a moment."""
     stretch, part = divmod(moment, len(MOMENTS))
     index = stretch * STRETCH_FRAMES + MOMENTS[part]
-    snapshot, pose, _ = town.moment(index)
+    movers, pose, _ = town.movers(index)
     world = town.world(index)
     to_sensor = np.linalg.inv(pose)
-    for placed in (*world.scene.placed, *snapshot.movers):
+    for placed in (*world.scene.placed, *movers):
         box = box_values(placed, to_sensor @ placed.pose)
         if placed.prototype.name and NEAR < np.hypot(box[0], box[1]) < FAR:
             columns: list[Any] = [c[placed.surfaces] for c in world.surfaces]

@@ -10,8 +10,12 @@ from lidar_synth.errors import LibraryError
 Floats = NDArray[np.float32]
 
 
-def _embree() -> tuple[Any, Any]:
-    """Embree's scene and triangle mesh classes."""
+def load_embree() -> tuple[Any, Any]:
+    """Embree's scene and triangle mesh classes.
+
+    Raises:
+        LibraryError: if embreex is missing.
+    """
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -36,7 +40,7 @@ class Solid:
     """
 
     def __init__(self, triangles: Floats) -> None:
-        scene, mesh = _embree()
+        scene, mesh = load_embree()
         self._triangles = np.ascontiguousarray(triangles, np.float32)
         self._scene = scene()
         self._mesh = mesh(self._scene, self._triangles)

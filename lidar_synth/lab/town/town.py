@@ -28,7 +28,7 @@ from lidar_synth.lab.town.materials import SurfaceTable
 from lidar_synth.lab.town.meshes import Floats, Ints
 from lidar_synth.lab.town.movers import ego_place, ego_pose, place_movers
 from lidar_synth.lab.town.returns import ReturnNoise, laser_gains, measure, see_through
-from lidar_synth.lab.town.scene import Pose
+from lidar_synth.lab.town.scene import PlacedObject, Pose
 from lidar_synth.lab.town.shading import render, sample_light
 from lidar_synth.lab.town.skin.skin import Skin, load_skin
 from lidar_synth.lab.town.world import (
@@ -188,6 +188,11 @@ class Town:
     def moment(self, index: int) -> tuple[Snapshot, Pose, Rng]:
         """The scene of a scan, the sensor's pose in its stretch, and the random generator of the
         scan."""
+        movers, pose, rng = self.movers(index)
+        return Snapshot(self.world(index), movers), pose, rng
+
+    def movers(self, index: int) -> tuple[list[PlacedObject], Pose, Rng]:
+        """As ``moment``, without what rays are cast against, which takes half of its time."""
         stretch, frame = divmod(index, STRETCH_FRAMES)
         rng = rng_for(SCAN, self.seed, stretch, frame)
         world = self.world(index)
@@ -197,7 +202,7 @@ class Town:
         about = ego_place(world.street, time)[:2]
         reach = self.sensor.range_max + 20
         movers = place_movers(world.movers, world.scene, time, about, reach)
-        return Snapshot(world, movers), pose, rng
+        return movers, pose, rng
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """(376, 1408, 3) uint8 RGB, the image that the camera of ``calibration`` takes with scan
