@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import fsspec
@@ -24,9 +25,11 @@ from torch.utils.data import DataLoader
 import lidar_synth
 from lidar_synth import MixedScans, MixedStream
 from lidar_synth.bank import Bank
-from lidar_synth.bank.cache import read_size
+from lidar_synth.bank import folder as folder_module
+from lidar_synth.bank.cache import ShardCache, read_size
+from lidar_synth.bank.storage import RemoteFile
 from lidar_synth.errors import ConfigError, DataError, FileError
-from lidar_synth.files.lock import lock_alone
+from lidar_synth.files.lock import lock_alone, one_writer
 from lidar_synth.geometry.sensor import load_sensor
 
 pytest.importorskip("aiohttp")  # of the extra `remote`, which `dev` has
@@ -164,8 +167,11 @@ def test_each_node_fetches_what_it_needs_once(
 
 
 def test_shards_are_fetched_ahead_in_the_order_of_the_plan(
-    served: Served, near: Bank, tmp_path: Path
+    served: Served, near: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(
+        folder_module, "_AT_ONCE", 1
+    )  # so that requests arrive in order
     bank = Bank(served.url, tmp_path / "cache")
     order = [20, 1, 13, 9, 21, 5, 16]
     bank.expect([0, 1, 2])  # corrected before the first read
@@ -180,6 +186,37 @@ def test_shards_are_fetched_ahead_in_the_order_of_the_plan(
     assert points(bank, order) == points(near, order)
     assert set(fetched(served).values()) == {1}
     bank.close()
+
+
+def test_the_next_shard_is_requested_before_one_ends(
+    served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No request is answered before all shards have been asked for."""
+    together = Barrier(SHARDS)
+    real = RemoteFile.read
+
+    def read(file: RemoteFile, offset: int, size: int) -> bytes:
+        together.wait(10)
+        return real(file, offset, size)
+
+    monkeypatch.setattr(RemoteFile, "read", read)
+    index = Bank(served.url).index
+    cache = ShardCache(tmp_path / "cache", None, served.url, index)
+    assert cache.fetch(range(SHARDS)) is None
+    assert held(tmp_path / "cache") == index.size
+
+
+def test_a_copy_that_another_process_makes_takes_room(
+    served: Served, near: Bank, tmp_path: Path
+) -> None:
+    bank = Bank(served.url, tmp_path / "cache", room_for(near, 2.1))
+    part = tmp_path / "cache" / ".x.h5.12.part"
+    with one_writer(part):
+        os.truncate(part, room_for(near, 1.5))
+        assert points(bank, [0]) == points(near, [0])
+        assert part.exists() and not held(tmp_path / "cache")
+    assert points(bank, [SHARD]) == points(near, [SHARD])
+    assert not part.exists() and held(tmp_path / "cache")
 
 
 def test_a_cache_serves_the_next_process(

@@ -1,7 +1,8 @@
 """Copies of a bank's shards on this machine, for a bank at a URL.
 
-A copy is a whole shard, named by its SHA-256, which is checked. One process at a time copies, so
-that all processes of a machine together fetch each shard once, and the limit holds.
+A copy is a whole shard, named by its SHA-256, which is checked. One process at a time decides what
+is copied and makes a file of the copy's size, which is locked until it is complete, so that all
+processes of a machine together fetch each shard once, and the limit holds.
 
 What a process and its workers read next, ``MixedScans`` announces for each epoch: a *plan*, a file
 that is locked as long as its process lives. A table has the time when each shard was last read.
@@ -13,12 +14,15 @@ read one by one from the URL.
 """
 
 import json
+import os
 import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from itertools import chain, takewhile
 from math import inf
 from pathlib import Path
 from threading import Event, Thread
@@ -27,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.bank.folder import LocalFolder, copy_shard
+from lidar_synth.bank.folder import LocalFolder, check_copy, copy_files
 from lidar_synth.bank.index import Entry, Index
 from lidar_synth.bank.storage import LocalFile, RemoteFile, Storage
 from lidar_synth.errors import ConfigError, FileError, LidarSynthError
@@ -92,10 +96,10 @@ class ShardCache:
             DataError: if it is not the shard of the index.
         """
         entry = self.index.shards[number]
-        self.fetch(number, now=True)
+        self.fetch([number], now=True)
         with suppress(FileError):  # there is no copy, or another process has dropped it
             return _Copy(self._path(entry))
-        return _Original(f"{self.url}/{entry.file}", entry.bytes, self._path(entry))
+        return _Original(self._url(entry), entry.bytes, self._path(entry))
 
     def note(self, number: int) -> None:
         """Note that a shard is read now."""
@@ -114,36 +118,44 @@ class ShardCache:
             self._plan = _Plan(self, shards)
         self._plan.start()
 
-    def fetch(self, number: int, now: bool = False) -> bool:
-        """Copy a shard, unless there is a copy or no room; waits while others copy. Raises as
-        ``open``.
+    def fetch(self, numbers: Iterable[int], now: bool = False) -> int | None:
+        """Copy shards in order, unless there is a copy, or no room, or another process copies; the
+        next one is requested before one ends. Raises as ``open``.
 
         Args:
-            number: number of the shard.
-            now: whether it is read now.
+            numbers: numbers of the shards.
+            now: whether they are read now; then it waits while another process copies.
 
         Returns:
-            False if it is planned, with most of its scans, and there is no room yet.
+            The first one that is planned, with most of its scans, and has no room yet, up to which
+            they were copied; None if there is none.
         """
-        entry = self.index.shards[number]
-        if self._has(entry):
-            return True
-        with self._alone():
-            if self._has(entry):
-                return True
-            name = self._path(entry).name
-            needed = self._needed()
-            use = needed.get(name)
-            if use is None or 2 * use.scans < entry.kept:
-                use = None  # the shard is not worth what it would displace
-            spare = self._spare(needed, use, now) if use else []
-            if not self._make_room(entry.bytes, spare):
-                return use is None
-            files = LocalFolder(self.folder)
-            with files.making(name) as part:
-                copy_shard(self.url, entry, part)
-                files.put(part, name)
-        return True
+        claims: deque[_Claim] = deque()
+        late: list[int] = []
+
+        def copies() -> Iterator[tuple[RemoteFile, Path]]:
+            for number in numbers:
+                try:
+                    claim = self._claim(self.index.shards[number], now)
+                except _NoRoomYet:
+                    late.append(number)
+                    return
+                if claim is not None:
+                    claims.append(claim)
+                    yield (
+                        RemoteFile(self._url(claim.entry), claim.entry.bytes),
+                        claim.part,
+                    )
+
+        try:
+            with closing(copy_files(copies())) as digests:
+                for digest in digests:
+                    self._keep(claims[0], digest)
+                    claims.popleft().held.close()
+        finally:
+            for claim in claims:
+                claim.held.close()
+        return late[0] if late else None
 
     def close(self) -> None:
         """End the plan of this process."""
@@ -160,7 +172,7 @@ class ShardCache:
         if self._plan is not None:
             self._plan.join()
         with self._alone():
-            self._remove_parts()
+            self._parts()
             self._needed()  # removes plans of dead processes
             for path in (*map(self._path, self.index.shards), self._table):
                 remove_file(path)
@@ -182,13 +194,14 @@ class ShardCache:
         by a thread: a process that is forked meanwhile would wait for that thread."""
         return np.memmap(self._table, np.int64, "r+")
 
+    def _url(self, entry: Entry) -> str:
+        return f"{self.url}/{entry.file}"
+
     def _path(self, entry: Entry) -> Path:
         return self.folder / f"{entry.sha256}.h5"
 
     def _has(self, entry: Entry) -> bool:
-        with suppress(OSError):
-            return self._path(entry).stat().st_size == entry.bytes
-        return False
+        return _size(self._path(entry)) == entry.bytes
 
     def _check_space(self) -> None:
         held = sum(entry.bytes for entry in self.index.shards if self._has(entry))
@@ -208,10 +221,54 @@ class ShardCache:
                 held.enter_context(lock_alone(self.folder / "lock"))
             yield
 
-    def _remove_parts(self) -> None:
-        """Remove what killed processes left; only the one that holds the lock copies."""
+    def _claim(self, entry: Entry, now: bool) -> "_Claim | None":
+        """A place for a copy of a shard, with as many bytes, if there is to be one; see ``fetch``."""
+        name = self._path(entry).name
+        while not self._has(entry):
+            with self._alone():
+                parts = self._parts()
+                busy = any(part.name.startswith(f".{name}.") for part in parts)
+                if not busy and not self._has(entry):
+                    return self._reserve(entry, now, parts)
+            if not now:
+                break
+            time.sleep(_PAUSE / 20)
+        return None
+
+    def _reserve(self, entry: Entry, now: bool, parts: list[Path]) -> "_Claim | None":
+        name = self._path(entry).name
+        needed = self._needed()
+        use = needed.get(name)
+        if use is None or 2 * use.scans < entry.kept:
+            use = None  # the shard is not worth what it would displace
+        spare = self._spare(needed, use, now) if use else []
+        if not self._make_room(entry.bytes, spare, parts):
+            if use:
+                raise _NoRoomYet
+            return None
+        with ExitStack() as held:
+            part = held.enter_context(LocalFolder(self.folder).making(name))
+            with _writing(part):
+                held.enter_context(one_writer(part))
+                os.truncate(part, entry.bytes)
+            return _Claim(entry, part, held.pop_all())
+
+    def _keep(self, claim: "_Claim", digest: str) -> None:
+        """Check a copy, and give it its name."""
+        check_copy(self._url(claim.entry), digest, claim.entry)
+        with self._alone():
+            LocalFolder(self.folder).put(claim.part, self._path(claim.entry).name)
+
+    def _parts(self) -> list[Path]:
+        """The copies that are being made; what killed processes left is removed."""
+        parts = []
         for part in self.folder.glob(".*.part"):
-            remove_file(part)
+            with one_writer(part) as dead:
+                if dead:
+                    remove_file(part)
+                else:
+                    parts.append(part)
+        return parts
 
     def _spare(self, needed: dict[str, Use], use: Use, now: bool) -> list[str]:
         """The copies that may be dropped for a planned shard, in this order: those that are not
@@ -223,10 +280,10 @@ class ShardCache:
             spare += sorted(later, key=lambda name: -needed[name].first)
         return spare
 
-    def _make_room(self, size: int, spare: list[str]) -> bool:
-        """Drop copies until there is room for one more."""
-        self._remove_parts()
-        sizes = {path.name: path.stat().st_size for path in self.folder.glob("*.h5")}
+    def _make_room(self, size: int, spare: list[str], parts: list[Path]) -> bool:
+        """Drop copies until there is room for one more, beside those that are being made."""
+        held = (*self.folder.glob("*.h5"), *parts)
+        sizes = {path.name: _size(path) for path in held}
         room = self._limit - sum(sizes.values()) - size
         for name in spare:
             if room >= 0:
@@ -257,6 +314,18 @@ class ShardCache:
                             use.scans + other.scans,
                         )
         return needed
+
+
+class _Claim(NamedTuple):
+    """A copy that this process makes: its file, which is locked and removed by ``held``."""
+
+    entry: Entry
+    part: Path
+    held: ExitStack
+
+
+class _NoRoomYet(Exception):
+    """Copies that are needed before a planned one take all the room."""
 
 
 class _Plan(Thread):
@@ -307,9 +376,10 @@ class _Plan(Thread):
         while self._cache._times.max() < self._since:
             if self.ended.wait(_PAUSE / 10):
                 return
-        for number in self._order:
-            while not self.ended.is_set() and not self._cache.fetch(number):
-                self.ended.wait(_PAUSE)
+        order = takewhile(lambda _: not self.ended.is_set(), self._order)
+        late = self._cache.fetch(order)
+        while late is not None and not self.ended.wait(_PAUSE):
+            late = self._cache.fetch(chain([late], order))
 
 
 def _read_plan(path: Path) -> dict[str, Use]:
@@ -359,6 +429,13 @@ def read_size(given: int | str) -> int:
     if match is None:
         raise ConfigError(f"limit={given!r}", 'a size such as "200GB", or bytes')
     return int(float(match[1]) * _UNITS[match[2]])
+
+
+def _size(path: Path) -> int:
+    """The size of a file; 0 if there is none."""
+    with suppress(OSError):
+        return path.stat().st_size
+    return 0
 
 
 @contextmanager

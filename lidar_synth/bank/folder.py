@@ -9,9 +9,11 @@ import base64
 import hashlib
 import tempfile
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,10 +35,10 @@ from lidar_synth.files.disk import (
     write_file,
 )
 
-BLOCK = 8 << 20
+BLOCK = 4 << 20
 """Bytes of a request for a part of a file that is copied."""
 
-_AT_ONCE = 4  # requests at a time
+_AT_ONCE = 8  # requests at a time
 
 _LARGEST = 4 << 30  # bytes that S3 takes with one request, with room for its 5 GB
 
@@ -193,7 +195,7 @@ class RemoteFolder:
         with self.making(name) as path:
             found = self._size(name)
             size = size if found is None else found
-            copy_file(RemoteFile(f"{self.url}/{name}", size), path)
+            list(copy_files([(RemoteFile(f"{self.url}/{name}", size), path)]))
             yield path
 
     def remove(self, names: list[str]) -> None:
@@ -246,24 +248,36 @@ def copy_shard(root: str, entry: Entry, path: Path) -> None:
         DataError: if it is not the shard of the index.
     """
     url = f"{root}/{entry.file}"
-    check_copy(url, copy_file(RemoteFile(url, entry.bytes), path), entry)
+    [digest] = copy_files([(RemoteFile(url, entry.bytes), path)])
+    check_copy(url, digest, entry)
 
 
-def copy_file(file: RemoteFile, path: Path) -> str:
-    """Copy a file at a URL to a path, by several requests at a time.
+def copy_files(copies: Iterable[tuple[RemoteFile, Path]]) -> Iterator[str]:
+    """Copy files at URLs to paths, one after the other, by several requests at a time.
 
-    Returns:
-        Its SHA-256.
+    Args:
+        copies: the files and paths; the next one is taken as soon as all bytes of the one before
+            have been requested.
+
+    Yields:
+        The SHA-256 of each, once it has been written.
 
     Raises:
-        FileError: if it cannot be read, or the path not written.
+        FileError: if a file cannot be read, or its path not written.
     """
+    for (_, path), blocks in groupby(_requested(copies), itemgetter(0)):
+        yield _write_blocks(path, (block.result() for _, block in blocks))
+
+
+def _write_blocks(path: Path, blocks: Iterable[bytes]) -> str:
     digest = hashlib.sha256()
     try:
-        with path.open("wb") as out:
-            for block in _read_ahead(file):
+        path.touch()
+        with path.open("r+b") as out:  # its size stays what was reserved for it
+            for block in blocks:
                 digest.update(block)
                 out.write(block)
+            out.truncate()
     except OSError as error:
         if isinstance(error, LidarSynthError):
             raise
@@ -271,15 +285,18 @@ def copy_file(file: RemoteFile, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _read_ahead(file: RemoteFile) -> Iterator[bytes]:
-    """The bytes of a file in blocks; the next ones are requested meanwhile, so that the time until
-    an answer begins costs no transfer."""
-    waiting: deque[Future[bytes]] = deque()
+def _requested(
+    copies: Iterable[tuple[RemoteFile, Path]],
+) -> Iterator[tuple[tuple[RemoteFile, Path], Future[bytes]]]:
+    """The blocks of files in order; the next ones are requested meanwhile, also those of the next
+    file, so that the time until an answer begins costs no transfer."""
+    waiting: deque[tuple[tuple[RemoteFile, Path], Future[bytes]]] = deque()
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        for start in range(0, file.size, BLOCK):
-            size = min(BLOCK, file.size - start)
-            waiting.append(pool.submit(file.read, start, size))
-            if len(waiting) > _AT_ONCE:
-                yield waiting.popleft().result()
-        for block in waiting:
-            yield block.result()
+        for copy in copies:
+            file = copy[0]
+            for start in range(0, max(file.size, 1), BLOCK):
+                size = min(BLOCK, file.size - start)
+                waiting.append((copy, pool.submit(file.read, start, size)))
+                if len(waiting) > _AT_ONCE:
+                    yield waiting.popleft()
+        yield from waiting

@@ -143,7 +143,7 @@ class RemoteFile:
                 f"{self.url} ends before byte {offset + size}",
                 "the size in the bank's index",
             )
-        content = self._fetch(offset, offset + size)
+        content = self._fetch(offset, offset + size) if size else b""
         if len(content) != size:
             raise FileError(
                 f"{self.url} gave {len(content)} bytes for a range of {size}",
@@ -181,13 +181,14 @@ class RemoteFile:
         if self.url.startswith("http"):
             from fsspec.asyn import sync
 
-            return bytes(sync(self._system.loop, self._get, start, end, at_most))
+            content: bytes = sync(self._system.loop, self._get, start, end, at_most)
+            return content
         # The hub's file system reads ahead by 5 MB otherwise.
         more = {"cache_type": "none"} if self.url.startswith("hf:") else {}
         end = end or at_most + 1
         return bytes(self._system.cat_file(self._path, start=start, end=end, **more))
 
-    async def _get(self, start: int, end: int | None, at_most: int) -> bytearray:
+    async def _get(self, start: int, end: int | None, at_most: int) -> bytes:
         """One byte more than ``at_most`` at most; fsspec itself would read an answer of any
         length."""
         from aiohttp import ClientTimeout
@@ -206,12 +207,12 @@ class RemoteFile:
             ):
                 raise PermissionError("it redirects from https to http")
             answer.raise_for_status()
-            content = bytearray()
-            while len(content) <= at_most and (
-                part := await answer.content.read(at_most + 1 - len(content))
-            ):
-                content += part
-        return content
+            parts: list[bytes] = []
+            left = at_most + 1
+            while left and (part := await answer.content.read(left)):
+                parts.append(part)
+                left -= len(part)
+        return b"".join(parts)
 
 
 def open_system(url: str) -> tuple[Any, str]:

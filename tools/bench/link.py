@@ -29,7 +29,7 @@ from timing import machine
 from typer import Option, run
 
 from lidar_synth.bank import Bank
-from lidar_synth.bank.folder import copy_shard
+from lidar_synth.bank.cache import ShardCache
 
 BLOCK = 1 << 17
 MEGABIT = 1e6 / 8
@@ -145,7 +145,9 @@ def read_bank(url: str, cache: Path) -> list[float]:
     bank = Bank(url)
     cache.mkdir()
     shards = bank.index.shards
-    fetch = seconds(lambda: [copy_shard(url, e, cache / "part") for e in shards])
+    whole = ShardCache(cache / "whole", None, url, bank.index)
+    fetch = seconds(lambda: whole.fetch(range(len(shards))))
+    whole.clear()
     bank = Bank(url, cache / "bank")
     bank.expect(range(len(bank)))
     return [
