@@ -9,7 +9,7 @@ import base64
 import hashlib
 import tempfile
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import groupby
@@ -252,7 +252,9 @@ def copy_shard(root: str, entry: Entry, path: Path) -> None:
     check_copy(url, digest, entry)
 
 
-def copy_files(copies: Iterable[tuple[RemoteFile, Path]]) -> Iterator[str]:
+def copy_files(
+    copies: Iterable[tuple[RemoteFile, Path]],
+) -> Generator[str, None, None]:
     """Copy files at URLs to paths, one after the other, by several requests at a time.
 
     Args:
