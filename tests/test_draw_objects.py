@@ -235,7 +235,7 @@ def test_a_bank_and_a_folder_have_cast_objects(tmp_path: Path) -> None:
 def test_a_layout_without_objects_gets_a_scan_without_objects(tmp_path: Path) -> None:
     model, given = laid(tmp_path, "outlines: []")
     bake(plan_in(tmp_path / "bank", model, **given), progress=False)
-    [scan] = Bank(tmp_path / "bank")
+    scan = Bank(tmp_path / "bank")[0]
     assert scan.boxes is not None and scan.label is not None
     assert len(scan) and not len(scan.boxes) and scan.label.min() >= THINGS
 
