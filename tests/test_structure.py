@@ -169,8 +169,8 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (167_000, 6.0, 138),
-    "laboratory": (135_000, 6.1, 149),
+    "plugin": (166_500, 6.0, 136),
+    "laboratory": (135_000, 6.1, 148),
     "tools": (40_000, 5.8, 131),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
