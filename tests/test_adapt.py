@@ -176,6 +176,7 @@ def adapted(model: Path, scans: Path, tmp_path_factory: pytest.TempPathFactory) 
     )
 
 
+@pytest.mark.slow
 def test_an_adapted_model_generates_scans_of_the_users_sensor_with_labels(
     adapted: Path,
 ) -> None:
@@ -270,6 +271,7 @@ def test_the_card_says_what_was_learnt_and_whether_it_repeats(adapted: Path) -> 
         assert part in text, part
 
 
+@pytest.mark.slow
 def test_a_model_of_label_maps_is_adapted_with_its_encoder(
     scans: Path, own_scans: list[Scan], tmp_path: Path
 ) -> None:

@@ -162,6 +162,7 @@ def test_the_command_bakes_and_verifies_at_a_url(
 # Interruptions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [False, True])
 def test_a_bake_that_is_killed_at_any_change_of_the_store_resumes(
     model: Path, expected: dict[str, bytes], after: bool

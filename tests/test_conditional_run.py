@@ -196,6 +196,7 @@ def test_a_camera_model(
         call("train", config, "data.roll=true", f"output={tmp_path / 'rolled'}")
 
 
+@pytest.mark.slow
 def test_the_town_renders_the_images_of_a_camera_model(
     scans: Path, tmp_path: Path
 ) -> None:

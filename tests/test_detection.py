@@ -137,6 +137,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_comparison_from_scans_to_page(places: Path, tmp_path: Path) -> None:
     pool = tmp_path / "pool"
     pool.mkdir()

@@ -186,6 +186,7 @@ def test_scans_without_boxes_in_front_are_refused() -> None:
         recognise_boxes(network, [bare], progress=False)
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_table(tmp_path: Path) -> None:
     weights = released(tmp_path / "weights.pth")
     scan = scan_of((10, 0, -1, 4, 1.8, 1.5, 0), names=("Car",))

@@ -71,6 +71,7 @@ def test_the_sensor_of_a_vendors_logs_is_fitted(vendor: str, tmp_path: Path) -> 
     assert found.source.sensor.shape[0] == lidar_synth.load_sensor(sensor).shape[0]
 
 
+@pytest.mark.slow
 def test_from_logs_without_labels_to_a_mixture(logs: Path, tmp_path: Path) -> None:
     out = tmp_path / "start"
     said: list[str] = []

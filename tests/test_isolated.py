@@ -75,6 +75,7 @@ def test_isolated_returns_are_counted_by_class() -> None:
     assert doubled.value == pytest.approx(2)
 
 
+@pytest.mark.slow
 def test_generated_scans_have_hardly_more_isolated_returns_than_the_town() -> None:
     town = Town(11, "hdl64e_lasers", scans=13, motion=False)
     real = sum(count_isolated(town[i]) for i in (0, 6, 12))

@@ -313,6 +313,7 @@ def _skewed(
     return raw.astype(np.float32)
 
 
+@pytest.mark.slow
 def test_scans_measured_while_driving_are_recognised_and_labelled(
     root: Path, copy: Path, tmp_path: Path
 ) -> None:

@@ -116,6 +116,7 @@ def test_it_is_distilled_on_timesteps_selected_with_its_conditions(
     )
 
 
+@pytest.mark.slow
 def test_a_student_learns_the_autoguided_teacher(
     scans: Path, codec: Path, teacher: Path, tmp_path: Path
 ) -> None:

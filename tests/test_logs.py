@@ -20,6 +20,7 @@ def town_of(name: str) -> list[Scan]:
     return [town[i] for i in range(SCANS)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOGS)
 def test_a_log_reaches_a_sensor_a_picture_and_a_mixture(
     name: str, tmp_path: Path

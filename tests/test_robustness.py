@@ -147,6 +147,7 @@ def run(*words: object) -> str:
     return CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False).stdout
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_card(tmp_path: Path) -> None:
     """With another card as its baseline; all eight give the means."""
     folder = tmp_path / "town"

@@ -180,6 +180,7 @@ def test_threads_read_it(bank: RollingBank) -> None:
     assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
 
 
+@pytest.mark.slow
 def test_announced_scans_are_made_before_they_are_requested(path: Path) -> None:
     with RollingBank(
         path, seed=SEED, slots=6, threads=1, timeout=60

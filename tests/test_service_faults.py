@@ -140,6 +140,7 @@ def test_the_generators_last_words_are_heard(path: Path, tmp_path: Path) -> None
                 bank[0]
 
 
+@pytest.mark.slow
 def test_banks_are_independent_and_end_with_their_last_reference(path: Path) -> None:
     first, second = (
         RollingBank(path, seed=seed, slots=2, threads=1, timeout=60) for seed in (1, 2)
@@ -199,6 +200,7 @@ def test_a_trainer_that_ends_without_closing_leaves_nothing(
     assert gone(int(pid))
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_gets_a_hint(path: Path, tmp_path: Path) -> None:
     script = tmp_path / "trainer.py"
     script.write_text(TRAINER + "main()\n")

@@ -149,6 +149,7 @@ def test_a_cache_on_disk_is_found_again_goes_on_and_is_never_that_of_other_data(
         )
 
 
+@pytest.mark.slow
 def test_processes_make_the_cache_that_one_makes(tmp_path: Path) -> None:
     scans = [SCANS[i % 5] for i in range(40)]
     caches = [
