@@ -41,6 +41,7 @@ from lidar_synth.geometry.layout import CODES, Outline, layout_image
 from lidar_synth.geometry.layout.raster import depth_of
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import Boxes, RangeImage
+from lidar_synth.labels import ObjectBank
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -198,10 +199,11 @@ def test_a_bank_keeps_boxes_and_instances(
         not verify(bank, progress=False)
         and min(regenerate(bank, str(model), progress=False).values()) > 0.9
     )
+    shapes = ObjectBank.from_town_shapes()
     for number in range(COUNT):
         scan, [made] = (
             opened[number],
-            generator.scans(4, [number], [layouts[number % 3]]),
+            generator.scans(4, [number], [layouts[number % 3]], objects=shapes),
         )
         assert scan.boxes is not None and made.boxes is not None
         assert scan.boxes.names == made.boxes.names and np.array_equal(
