@@ -1,6 +1,5 @@
 """Objects cast into the scan of a model: boxes, labels and instances are exact."""
 
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from lidar_synth import (
     open_scans,
 )
 from lidar_synth.bake import bake
-from lidar_synth.bake.remote import SETTINGS
 from lidar_synth.cli import app
 from lidar_synth.datasets.classes import GROUND, LABELS
 from lidar_synth.errors import ConfigError, LibraryError
@@ -178,18 +176,10 @@ def laid(folder: Path, text: str) -> tuple[Path, dict[str, Any]]:
 CAR = "objects: [{class: Car, at: [7, 2]}]"
 
 
-@pytest.mark.parametrize("recorded", [{"objects": None}, {}])
-def test_a_bank_of_drawn_objects_is_resumed_only_as_such(
-    tmp_path: Path, recorded: dict[str, None]
-) -> None:
-    """Also one of a version that recorded no name."""
+def test_a_bank_of_drawn_objects_is_resumed_only_as_such(tmp_path: Path) -> None:
     model, given = laid(tmp_path, CAR)
     drawn = plan_in(tmp_path / "bank", model, objects="drawn", **given)
     bake(drawn, progress=False)
-    note = tmp_path / "bank" / SETTINGS
-    settings = json.loads(note.read_text())
-    assert settings.pop("objects") == "drawn"
-    note.write_text(json.dumps(settings | recorded))
     with pytest.raises(ConfigError, match=r"'objects': 'drawn'.*'objects': 'town'"):
         bake(plan_in(tmp_path / "bank", model, **given), progress=False)
     bake(drawn, progress=False)

@@ -12,9 +12,6 @@ from lidar_synth.files.disk import read_text, unwritable, write_file
 from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import parse_json
 
-UNNAMED = {"objects": "drawn"}
-"""Settings that earlier versions did not name: what they did then, where no value is recorded."""
-
 
 def claim(path: Path, settings: dict[str, Any]) -> None:
     """Record the settings of an output folder in a file, and refuse a folder with other settings.
@@ -50,9 +47,7 @@ def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) ->
             f"{folder}/{name} is damaged (it holds {type(existing).__name__})",
             hint="Choose another output folder.",
         )
-    recorded = {
-        name: _recorded(existing, name, value) for name, value in wanted.items()
-    }
+    recorded = {name: existing.get(name, value) for name, value in wanted.items()}
     other = {n: v for n, v in recorded.items() if v != wanted[n]}
     if other:
         raise ConfigError(
@@ -60,14 +55,6 @@ def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) ->
             f"{ {name: wanted[name] for name in other} }",
             "Use the same options to resume, or choose another folder.",
         )
-
-
-def _recorded(existing: dict[str, Any], name: str, value: Any) -> Any:
-    """A recorded setting, to be compared with a wanted value; what earlier versions did not record
-    has that value."""
-    if name in UNNAMED and value is not None and existing.get(name) is None:
-        return UNNAMED[name]
-    return existing.get(name, value)
 
 
 @contextmanager
