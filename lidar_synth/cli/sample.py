@@ -1,12 +1,18 @@
 """``lidar-synth sample``: generates scans with a model."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidar_synth.cli.options import FORMATS
 from lidar_synth.datasets.recordings import NOTE, seen_by
+
+if TYPE_CHECKING:
+    from lidar_synth.bake.conditions import ConditionSource
+    from lidar_synth.generate.generator import Generator
+    from lidar_synth.geometry.scan import Scan
 
 
 def sample(
@@ -91,14 +97,8 @@ def sample(
       lidar-synth sample out --model town-layout --condition behind_a_van.yaml
     """
     import torch
-    from tqdm import tqdm
 
-    from lidar_synth.bake.conditions import (
-        conditions,
-        conditions_for,
-        open_objects,
-        settle_objects,
-    )
+    from lidar_synth.bake.conditions import conditions_for, settle_objects
     from lidar_synth.errors import choose
     from lidar_synth.files.claims import hold_claim
     from lidar_synth.formats import WRITERS
@@ -112,45 +112,57 @@ def sample(
     generator = load_generator(
         model, device=device, dtype=precision, batch=batch, columns=columns
     )
-    grid = None if times is None else read_grid(times.split(","))
     given = conditions_for(generator, condition, condition_layout, condition_split)
+    sampling: dict[str, Any] = {
+        "steps": steps,
+        "times": None if times is None else read_grid(times.split(",")),
+        "solver": solver,
+        "guidance": guidance,
+    }
     chosen = settle_objects(generator, objects)
-    settings = {
+    provenance = generator.header.provenance
+    settings = sampling | {
         "checkpoint": generator.hash,
         "seed": seed,
-        "steps": steps,
-        "solver": solver,
         "dtype": dtype,
         "to": to,
         "condition": condition,
         "condition_layout": condition_layout,
         "condition_split": condition_split,
-        "guidance": guidance,
         "columns": columns,
-        "times": grid,
         "objects": chosen,
+        "trained_on": provenance["data"],
+        "seen": seen_by(provenance).to_list(),
     }
-    provenance = generator.header.provenance
-    trained = {"trained_on": provenance["data"], "seen": seen_by(provenance).to_list()}
-    with hold_claim(writer.root / NOTE, settings | trained):
+    with hold_claim(writer.root / NOTE, settings):
         missing = [i for i in range(count) if not writer.complete(i)]
-        with tqdm(total=len(missing), desc="scans", unit="scan") as bar:
-            for first in range(0, len(missing), generator.batch):
-                indices = missing[first : first + generator.batch]
-                scans = generator.scans(
-                    seed,
-                    indices,
-                    conditions(given, indices),
-                    open_objects(chosen, generator.sensor),
-                    steps=steps,
-                    times=grid,
-                    solver=solver,
-                    guidance=guidance,
-                )
-                for index, scan in zip(indices, scans, strict=True):
-                    writer.write(scan, index)
-                bar.update(len(indices))
+        for index, scan in _generate(generator, seed, missing, given, chosen, sampling):
+            writer.write(scan, index)
         writer.finish()
     typer.echo(
         f"{out}: {len(missing)} scans written, {count - len(missing)} were there already"
     )
+
+
+def _generate(
+    generator: "Generator",
+    seed: int,
+    numbers: Sequence[int],
+    given: "ConditionSource | None",
+    objects: str | None,
+    sampling: dict[str, Any],
+) -> "Iterator[tuple[int, Scan]]":
+    """The numbers and their scans, with a progress bar."""
+    from tqdm import tqdm
+
+    from lidar_synth.bake.conditions import conditions, open_objects
+
+    with tqdm(total=len(numbers), desc="scans", unit="scan") as bar:
+        for first in range(0, len(numbers), generator.batch):
+            batch = numbers[first : first + generator.batch]
+            cast = open_objects(objects, generator.sensor)
+            scans = generator.scans(
+                seed, batch, conditions(given, batch), cast, **sampling
+            )
+            yield from zip(batch, scans, strict=True)
+            bar.update(len(batch))
