@@ -22,7 +22,8 @@ class Reading(BaseModel):
     layout: str | None = Field(
         None,
         description="layout of the input: kitti360 | semantic_kitti | kitti_object | nuscenes | "
-        "pandaset | kitti_raw | bank | webdataset | mcap | cosmos | png | range | folder [detected]",
+        "pandaset | kitti_raw | bank | webdataset | mcap | py123d | cosmos | png | range | "
+        "folder [detected]",
     )
     split: str | None = Field(
         None, description="split of the input, for instance r2flow/train"

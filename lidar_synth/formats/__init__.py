@@ -30,6 +30,7 @@ from lidar_synth.formats.mcap import MCAP, MCAPWriter
 from lidar_synth.formats.nuscenes import NuScenes
 from lidar_synth.formats.pandaset import PandaSet
 from lidar_synth.formats.png import PNGWriter, RangePNG
+from lidar_synth.formats.py123d import Py123D
 from lidar_synth.formats.range_images import RangeImages, RangeWriter
 from lidar_synth.formats.semantic_kitti import SemanticKITTI, SemanticKITTIWriter
 from lidar_synth.formats.source import OnBad, ScanFiles
@@ -51,6 +52,7 @@ __all__ = [
     "NuScenes",
     "OnBad",
     "PandaSet",
+    "Py123D",
     "RangeImages",
     "RangePNG",
     "ScanFiles",
@@ -71,6 +73,7 @@ READERS: dict[str, type[ScanFiles]] = {
     "bank": BankScans,
     "webdataset": WebDataset,
     "mcap": MCAP,
+    "py123d": Py123D,
     "cosmos": Cosmos,
     "png": RangePNG,
     "range": RangeImages,
