@@ -25,10 +25,11 @@ settings.load_profile("untimed")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Tests of every format take MCAP where its extra is installed."""
+    """Tests of every format take MCAP and py123d where their extras are installed."""
     values = getattr(item, "callspec", None)
-    if values is not None and "mcap" in map(str, values.params.values()):
-        pytest.importorskip("mcap_ros2")
+    for name, library in (("mcap", "mcap_ros2"), ("py123d", "pyarrow")):
+        if values is not None and name in map(str, values.params.values()):
+            pytest.importorskip(library)
 
 
 def _folder(variable: str) -> Path:

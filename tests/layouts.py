@@ -9,6 +9,7 @@ import numpy as np
 from banks import write_bank
 from conftest import random_scan
 from pandaset_files import write_pandaset
+from py123d_files import copy_logs
 
 from lidar_synth.formats import WRITERS
 from lidar_synth.formats.calibration import AXES_CAMERA_FROM_SENSOR, Calibration
@@ -201,6 +202,7 @@ MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "webdataset": write_tars,
     "mcap": lambda root: write_all("mcap", root, [some_scan(i) for i in range(3)]),
     "cosmos": lambda root: write_all("cosmos", root, [some_scan(i) for i in range(3)]),
+    "py123d": copy_logs,
     "nuscenes": write_nuscenes,
     "pandaset": write_pandaset,
     "kitti_raw": write_kitti_raw,

@@ -37,6 +37,7 @@ TASKS = {
     "mcap": "segmentation",
     "cosmos": "unlabelled",
     "nuscenes": "segmentation",
+    "py123d": "segmentation",
     "pandaset": "segmentation",
     "kitti_raw": "detection",
 }

@@ -327,7 +327,7 @@ def _transform(values: list[float]) -> NDArray[np.float64]:
     result = np.eye(4)
     result[:3, 3] = values[:3]
     scalar, *vector = np.array(values[3:]) / np.linalg.norm(values[3:])
-    cross = np.cross(np.eye(3), vector).T
+    cross = np.cross(np.eye(3), vector)
     result[:3, :3] += 2 * (scalar * cross + cross @ cross)
     return result
 
