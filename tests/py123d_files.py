@@ -101,7 +101,9 @@ def write_logs(
         now = Timestamp.from_us(START + number * 100_000)
         assert scan.boxes is not None and scan.label is not None
         found = []
-        for name, box in zip(scan.boxes.names, scan.boxes.values.astype(float)):
+        for name, box in zip(
+            scan.boxes.names, scan.boxes.values.astype(float), strict=True
+        ):
             half = (box[6] + 2.0) / 2
             place = in_world(in_vehicle(box[None, :3]))[0]
             pose = PoseSE3.from_array(

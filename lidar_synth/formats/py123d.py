@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import NUSCENES, PANDASET, WAYMO
 from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
 from lidar_synth.formats.folder import rows_of_rings
+from lidar_synth.formats.nuscenes import RINGS
 from lidar_synth.formats.points import check_points
 from lidar_synth.formats.source import OnBad, ScanFiles
 from lidar_synth.geometry.motion import from_world
@@ -170,7 +171,10 @@ class Py123D(ScanFiles):
         scan = Scan(points, grey / np.float32(255), self.sensor, id=self.ids[index])
         if "channel" in cloud:
             scan.ring = cloud["channel"].astype(np.int16)
-            scan.ring = scan.ring if self._unknown else rows_of_rings(scan)
+            if frame.dataset == "nuscenes":
+                scan.ring = RINGS - 1 - scan.ring
+            elif not self._unknown:
+                scan.ring = rows_of_rings(scan)
         if "instance" in cloud:
             scan.instance = cloud["instance"].astype(np.int32)
         if "semantic" in cloud:
