@@ -21,7 +21,6 @@ SMALLEST = {
     "bake": "--model {pixels} --count 2 --lengths 2 2 --rounds 1",
     "bank": "--model {pixels} --scans 2 --generated 1 --tree 2",
     "extractors": "--only squeezeseg --rounds 1",
-    "fit": "--sensor vlp16 --scans 2",
     "gpu": "{pixels} --device cpu --dtype float32 --batch 1 --rounds 1",
     "label": "--scans 4 --points 1",
     "latent": "--width 32 --rounds 1",
