@@ -11,7 +11,6 @@ Clouds are in the frame of the vehicle; the reader gives them in that of the sen
 quarters of a circle so that x is ahead. The package reads this layout and does not write it.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import NUSCENES, PANDASET, WAYMO
 from lidar_synth.errors import ConfigError, DataError, LibraryError, LidarSynthError
+from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.folder import rows_of_rings
 from lidar_synth.formats.nuscenes import RINGS
 from lidar_synth.formats.points import check_points
@@ -275,7 +275,7 @@ def _referenced(
             row["data"],
             frame.dataset,
             lidar_metadatas=dict(known) if merged else {known.lidar_id: known},
-            load_kwargs=json.loads(row["kwargs"] or "{}"),
+            load_kwargs=parse_json(row["kwargs"] or "{}", "its place in the file"),
         )
     except Exception as error:  # py123d asserts
         raise DataError(
