@@ -2,10 +2,10 @@
 
 Layout, a folder for each log, each file a table of Arrow with its metadata in MessagePack::
 
-    SPLIT/LOG/sync.arrow                dataset, split and name; row numbers of what was measured together
+    SPLIT/LOG/sync.arrow                dataset, split, name; rows of what was measured together
     SPLIT/LOG/lidar.NAME.arrow          clouds as LAZ, Draco or Arrow, or paths in the raw dataset
     SPLIT/LOG/ego_state_se3.arrow       x, y, z, qw, qx, qy, qz: the vehicle (IMU) to the world
-    SPLIT/LOG/box_detections_se3.arrow  the same of each box in the world, then length, width, height
+    SPLIT/LOG/box_detections_se3.arrow  the same of each box, then length, width, height
 
 Clouds are in the frame of the vehicle; the reader gives them in that of the sensor, turned by
 quarters of a circle so that x is ahead. The package reads this layout and does not write it.

@@ -46,7 +46,6 @@ def main(labelled: Path, out: Path, match: bool = False, seeds: int = 1) -> None
         synthetic=48,
         columns=256,
         classes="pandaset",
-        places="stretch:2",
     )
     turned = [replace(turn(scan), id=scan.id) for scan in scans]
     for row in prove(turned, out, settings, jobs=1, tests=tests).values["arms"]:
