@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import typer
 from layouts import some_scan, write_all
 
 from lidar_synth import cli
+from lidar_synth.files.processes import defer_signals
 
 
 def test_control_c_gives_one_message(
@@ -36,6 +38,7 @@ def test_control_c_gives_one_message(
 
 HALF_MADE = """
 from lidar_synth import cli
+from lidar_synth.files.processes import defer_signals
 
 class Half:
     def __del__(self):
@@ -58,6 +61,25 @@ def test_control_c_while_an_object_is_made() -> None:
     )
     assert ended.returncode == 130
     assert ended.stderr == "lidar-synth: interrupted\n"
+
+
+@pytest.mark.skipif(
+    not hasattr(signal, "pthread_kill"), reason="Windows has no signals of threads"
+)
+def test_control_c_waits_while_processes_start() -> None:
+    """Python interrupts the main thread also for a signal that another thread received."""
+    end = threading.Event()
+    other = threading.Thread(target=end.wait)
+    other.start()
+    started = []
+    with pytest.raises(KeyboardInterrupt), defer_signals(signal.SIGINT):
+        signal.pthread_kill(other.ident, signal.SIGINT)
+        time.sleep(0.1)
+        started.append(True)
+    end.set()
+    other.join()
+    assert started
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def children(process: int) -> list[str]:

@@ -5,9 +5,7 @@ the next run writes its unfinished shard.
 """
 
 import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from multiprocessing import get_context, parent_process
 from operator import attrgetter
 from typing import Any
@@ -16,6 +14,7 @@ from lidar_synth.bake.job import BakePlan
 from lidar_synth.bake.resources import Resources
 from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import FileError
+from lidar_synth.files.processes import defer_signals
 
 _POLL = 0.2  # seconds between two checks of the workers
 _PATIENCE = 60  # seconds for a worker to abort its shard
@@ -47,7 +46,8 @@ def bake_in_processes(
     ]
     reported = 0
     try:
-        with _signals_deferred():
+        # They ignore Ctrl-C: this process tells them when to stop.
+        with defer_signals(signal.SIGINT, signal.SIGTERM):
             for worker in workers:
                 worker.start()
         while any(worker.is_alive() for worker in workers):
@@ -76,30 +76,6 @@ def bake_in_processes(
             worker.join(_PATIENCE)
             worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()
-
-
-@contextmanager
-def _signals_deferred() -> Iterator[None]:
-    """Defer signals until the block has started all processes. These ignore Ctrl-C, which a
-    terminal sends to every process of the group: the parent process tells them when to stop."""
-    received: list[int] = []
-    in_charge = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if in_charge else ()
-    before = {
-        number: signal.signal(number, lambda number, frame: received.append(number))
-        for number in numbers
-    }
-    masks = hasattr(signal, "pthread_sigmask")  # not on Windows
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
-    try:
-        yield
-    finally:
-        if masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for late in received:
-        signal.raise_signal(late)
 
 
 def _report(progress: Progress, scans: int) -> int:

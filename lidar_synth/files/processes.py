@@ -3,6 +3,7 @@ worker."""
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -49,18 +50,34 @@ def _next(item: Any) -> Any:
 
 
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Defer Ctrl-C to the end of the block; processes that it starts do not get it before they ask
-    for it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # which lets signals through when it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def defer_signals(*numbers: int) -> Iterator[None]:
+    """Defer signals to the end of the block, in which processes start. These do not get Ctrl-C,
+    which a terminal sends to every process of the group, before they ask for it.
+
+    Args:
+        numbers: the signals; Ctrl-C is SIGINT.
+    """
+    received: list[int] = []
+    # A mask alone is not enough: any thread that takes the signal makes Python call the handler in
+    # the main thread. Other threads get no exception from it.
+    in_charge = threading.current_thread() is threading.main_thread()
+    before = {
+        number: signal.signal(number, lambda number, frame: received.append(number))
+        for number in (numbers if in_charge else ())
+    }
+    masks = hasattr(signal, "pthread_sigmask")  # not on Windows
+    if masks:
+        resource_tracker.ensure_running()  # which lets signals through when it starts
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for late in received:
+        signal.raise_signal(late)
 
 
 @contextmanager
@@ -83,7 +100,7 @@ def map_in_processes(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, (work,)) as pool:
         try:
-            with _without_interrupts():  # map starts the workers
+            with defer_signals(signal.SIGINT):  # map starts the workers
                 results = pool.map(_next, items, chunksize=chunk)
             yield results
         except BaseException:

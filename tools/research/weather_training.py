@@ -2,7 +2,7 @@
 docs/research/weather.md.
 
     python tools/research/weather_training.py LABELLED | town [--iterations N] [--seeds N]
-        [--folds N] [--chance P] [--first SEED] [--columns N]
+        [--folds N] [--chance P] [--first SEED] [--columns N] [--width N]
 
 LABELLED is a root of SemanticKITTI; a sequence is a place. The small segmenter of ``prove`` is
 trained on the other places, with and without the benchmark's corruptions among its augmentations,
@@ -30,8 +30,8 @@ FOLDS = 3
 CHANCE = 0.15
 """Probability of each corruption: nearly three scans in four have one or more; --chance."""
 BATCH = 2
-WIDTHS = (8, 16, 32, 48)
-"""Channels of the segmenter: half of its default."""
+WIDTH = 8
+"""Channels of the segmenter's first level, half of its default; --width."""
 TOWN_SCANS = 300
 TOWN_TEST = 60
 FIRST_TOWN = 1000
@@ -55,7 +55,9 @@ def steps_of(chance: float) -> list[Any]:
     ]
 
 
-def train(scans: Sequence[Scan], steps: list[Any], iterations: int, seed: int) -> Judge:
+def train(
+    scans: Sequence[Scan], steps: list[Any], iterations: int, seed: int, width: int
+) -> Judge:
     """The segmenter, trained on some scans."""
     torch.manual_seed(seed)
     mixed = MixedScans(
@@ -68,7 +70,7 @@ def train(scans: Sequence[Scan], steps: list[Any], iterations: int, seed: int) -
         collate="range",
     )
     sensor = scans[0].sensor
-    network = RangeSegmenter(widths=WIDTHS)
+    network = RangeSegmenter(widths=(width, 2 * width, 4 * width, 6 * width))
     height = torch.from_numpy(np.sin(sensor.ray_angles()[0]))
     batches = endless_batches(mixed, BATCH)
     train_segmenter(network, batches, height, iterations, progress=False)
@@ -112,6 +114,7 @@ def main(
     chance: float = CHANCE,
     first: int = 0,
     columns: int = 512,
+    width: int = WIDTH,
 ) -> None:
     """Prints the card of each training, and the means of both arms."""
     arms = {"without": [], "with": steps_of(chance)}
@@ -124,7 +127,7 @@ def main(
         )
         for fold in places:
             for arm, steps in arms.items():
-                judge = train(fold.known, steps, iterations, seed)
+                judge = train(fold.known, steps, iterations, seed, width)
                 card = stress(
                     fold.test, lambda s, _, j=judge: j.agreement(s), progress=False
                 )
