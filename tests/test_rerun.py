@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from layouts import a_pose, some_boxes, some_scan
 
-from lidar_synth.datasets.classes import COLOURS
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import ConfigError
 from lidar_synth.viz import to_rerun
 

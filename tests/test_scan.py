@@ -9,7 +9,6 @@ from conftest import random_scan
 from hypothesis import given
 
 from lidar_synth.datasets.classes import (
-    COLOURS,
     IGNORE,
     KITTI360,
     NAMES,
@@ -17,6 +16,7 @@ from lidar_synth.datasets.classes import (
     SEMANTIC_KITTI,
     Taxonomy,
 )
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import (
     ConfigError,
     DataError,

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from pictures import CAR, ROAD, SMALL, page_data
 from PIL import Image
 
-from lidar_synth.datasets.classes import COLOURS, IGNORE, NAMES
+from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import ConfigError, FileError
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, RangeImage, Scan

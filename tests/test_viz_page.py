@@ -15,7 +15,8 @@ from conftest import random_scan
 from pictures import ROAD, SMALL, page_data, pixels
 from PIL import Image
 
-from lidar_synth.datasets.classes import COLOURS, IGNORE, TRAIN_ID
+from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, Boxes, Scan
 from lidar_synth.geometry.sensor import load_sensor

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import COLOURS, NAMES
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.viz.scales import DOMAINS
 
 

@@ -70,32 +70,6 @@ LABELS = {
 """Train id of the points in a box, by the class of the box; those of KITTI's ``Misc`` are
 unknown."""
 
-COLOURS = np.array(
-    [
-        (100, 150, 245),
-        (100, 230, 245),
-        (30, 60, 150),
-        (80, 30, 180),
-        (0, 0, 255),
-        (255, 30, 30),
-        (255, 40, 200),
-        (150, 30, 90),
-        (255, 0, 255),
-        (255, 150, 255),
-        (75, 0, 75),
-        (175, 0, 75),
-        (255, 200, 0),
-        (255, 120, 50),
-        (0, 175, 0),
-        (135, 60, 0),
-        (150, 240, 80),
-        (255, 240, 150),
-        (255, 0, 0),
-    ],
-    dtype=np.uint8,
-)
-"""(19, 3) RGB in SemanticKITTI's own colours, by train id."""
-
 
 @dataclass(frozen=True)
 class Taxonomy:

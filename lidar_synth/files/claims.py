@@ -5,12 +5,17 @@ import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from reprlib import Repr
 from typing import Any
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import read_text, unwritable, write_file
 from lidar_synth.files.lock import one_writer
 from lidar_synth.files.parsing import parse_json
+
+_SHORT = Repr()  # a sensor's numbers would fill the screen
+_SHORT.maxstring = 100
+_SHORT.maxdict = 8
 
 
 def claim(path: Path, settings: dict[str, Any]) -> None:
@@ -36,7 +41,7 @@ def claim(path: Path, settings: dict[str, Any]) -> None:
 
 def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) -> None:
     """Refuse a folder, or a URL, whose file ``name`` records other settings; raises as
-    ``claim``."""
+    ``claim``. A setting that it does not record was None."""
     existing = parse_json(
         text,
         f"{folder}/{name}, which is damaged,",
@@ -47,12 +52,12 @@ def compare(text: str, wanted: dict[str, Any], folder: str | Path, name: str) ->
             f"{folder}/{name} is damaged (it holds {type(existing).__name__})",
             hint="Choose another output folder.",
         )
-    recorded = {name: existing.get(name, value) for name, value in wanted.items()}
+    recorded = {name: existing.get(name) for name in wanted}
     other = {n: v for n, v in recorded.items() if v != wanted[n]}
     if other:
         raise ConfigError(
-            f"{folder} was filled with {other}",
-            f"{ {name: wanted[name] for name in other} }",
+            f"{folder} was filled with {_SHORT.repr(other)}",
+            _SHORT.repr({name: wanted[name] for name in other}),
             "Use the same options to resume, or choose another folder.",
         )
 

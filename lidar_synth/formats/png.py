@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import COLOURS, IGNORE
+from lidar_synth.datasets.classes import IGNORE
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
 from lidar_synth.files.parsing import parse_json, read_picture

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from lidar_synth.datasets.classes import COLOURS, NAMES
+from lidar_synth.datasets.classes import NAMES
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import LibraryError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.viz.scales import make_scales, point_values

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidar_synth.datasets.classes import COLOURS
+from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import Scan
 

@@ -78,7 +78,7 @@ FURTHER = (
     "lidar_synth.weather.sensor.LowPower",
     "lidar_synth.weather.cover.Spray",
     "lidar_synth.weather.cover.Dirt",
-    "lidar_synth.lab.evaluate.metric.Metric",
+    "lidar_synth.lab.evaluate.loop_metric.Metric",
     "lidar_synth.lab.evaluate.segmentation.load_judge",
     "lidar_synth.lab.train.runs.run",
     "lidar_synth.lab.train.config.load.load_config",

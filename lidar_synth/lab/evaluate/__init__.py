@@ -13,7 +13,7 @@ from lidar_synth.lab.evaluate.distances import (
 )
 from lidar_synth.lab.evaluate.features import Extractor
 from lidar_synth.lab.evaluate.intervals import Interval, bootstrap, extrapolated_frechet
-from lidar_synth.lab.evaluate.metric import Metric, Score
+from lidar_synth.lab.evaluate.loop_metric import Metric, Score
 from lidar_synth.lab.evaluate.neighbours import manifold, nearest_training
 from lidar_synth.lab.evaluate.protocols import PROTOCOLS, Protocol
 

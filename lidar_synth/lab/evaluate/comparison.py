@@ -12,7 +12,7 @@ from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.cache import extract_all
 from lidar_synth.lab.evaluate.features import Extractor, find_weights, load_published
 from lidar_synth.lab.evaluate.leakage import refuse_training_data
-from lidar_synth.lab.evaluate.metric import Metric, Score, choice
+from lidar_synth.lab.evaluate.loop_metric import Metric, Score, choice
 from lidar_synth.lab.evaluate.protocols import Protocol, find_protocol
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict
 
-from lidar_synth.lab.evaluate.metric import SIDES, Score
+from lidar_synth.lab.evaluate.loop_metric import SIDES, Score
 
 
 class PublishedTable(BaseModel):
