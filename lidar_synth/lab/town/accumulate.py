@@ -111,27 +111,30 @@ def write_window(
         write_cloud(path, {n: v for n, v in cloud.items() if n not in left_out})
 
 
+def _place(
+    points: NDArray[np.float32], pose: NDArray[np.float64], rng: np.random.Generator
+) -> Cloud:
+    """Points of a scan in the world, with an error of the pose."""
+    a, b, c = rng.normal(0, ANGLE, 3)
+    turn = np.eye(3) + np.array([(0, -c, b), (c, 0, -a), (-b, a, 0)])
+    placed = points @ (pose[:3, :3] @ turn).T + pose[:3, 3] + rng.normal(0, POSITION, 3)
+    return dict(zip("xyz", placed.T, strict=True))
+
+
 def _measured(scan: Scan, frame: int, rng: np.random.Generator) -> Cloud:
     """The points of a scan in the world, from ``NEAREST`` to ``REACH``, with an error of the
     pose."""
     assert scan.raw_label is not None and scan.pose is not None
     distance = np.linalg.norm(scan.points, axis=1)
     near = (distance > NEAREST) & (distance < REACH)
-    a, b, c = rng.normal(0, ANGLE, 3)
-    turn = np.eye(3) + np.array([(0, -c, b), (c, 0, -a), (-b, a, 0)])
-    points = (
-        scan.points[near] @ (scan.pose[:3, :3] @ turn).T
-        + scan.pose[:3, 3]
-        + rng.normal(0, POSITION, 3)
-    )
     values = label_values(scan)[near]
     semantic = (values & 0xFFFF).astype(np.int32)
     instance = (values >> 16).astype(np.int32)
-    return dict(zip("xyz", points.T, strict=True)) | {
+    return _place(scan.points[near], scan.pose, rng) | {
         "semantic": semantic,
         "instance": np.where(instance > 0, instance, semantic * MAX_INSTANCES),
-        "confidence": np.ones(len(points), np.float32),
-        "timestamp": np.full(len(points), frame, np.int32),
+        "confidence": np.ones(len(values), np.float32),
+        "timestamp": np.full(len(values), frame, np.int32),
         "moving": (scan.raw_label[near] & 0xFFFF) >= _MOVING,
         "range": distance[near],
     }

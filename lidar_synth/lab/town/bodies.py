@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from lidar_synth.lab.town.catalogue import TABLES
 from lidar_synth.lab.town.materials import Finish, read_finishes
-from lidar_synth.lab.town.meshes import Mesh, ball, boxes, merge, tube
+from lidar_synth.lab.town.meshes import Array, Mesh, ball, boxes, merge, tube
 from lidar_synth.lab.town.objects import Prototype, assemble
 from lidar_synth.lab.town.vehicles import FINISHES
 
@@ -115,6 +115,13 @@ def sitter() -> Prototype:
     return Prototype(mesh, _BODY, "Person_sitting", (30, 254))
 
 
+def _bend_knee(top: Array, foot: Array) -> Array:
+    """The place of the knee of a leg of 0.88 m, in front of the line from hip to foot."""
+    reach = max(0.05, 0.44**2 - float(np.sum((foot - top) ** 2)) / 4) ** 0.5
+    across = np.array((top[2] - foot[2], 0, foot[0] - top[0]))
+    return np.asarray((foot + top) / 2 + reach * across / np.linalg.norm(across))
+
+
 def _rider(
     hip: tuple[float, float, float],
     neck: ArrayLike,
@@ -126,14 +133,11 @@ def _rider(
     for side, (x, z) in zip((-1, 1), np.asarray(feet), strict=True):
         foot = np.array((x, side * 0.11, z))
         top = np.array((hip[0], side * 0.1, hip[2]))
-        reach = max(0.05, 0.44**2 - float(np.sum((foot - top) ** 2)) / 4) ** 0.5
-        across = np.array((top[2] - foot[2], 0, foot[0] - top[0]))
-        knee = (foot + top) / 2 + reach * across / np.linalg.norm(across)
         shoulder = np.array(neck) - (0, -side * 0.18, 0.04)
         hand = np.array(grip) * (1, side, 1)
         elbow = (shoulder + hand) / 2 + (0, side * 0.05, -0.08)
         parts += [
-            _thigh(top, knee, foot),
+            _thigh(top, _bend_knee(top, foot), foot),
             _shoe(foot - (0.05, 0, 0.03), foot - (-0.16, 0, 0.03)),
             _arm(shoulder, elbow, hand),
         ]

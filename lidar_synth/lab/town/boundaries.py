@@ -43,18 +43,22 @@ def put_boundary(
     length = ends[1] - ends[0]
     if kind == "none" or length < 0.8:
         return
-    height = rng.uniform(0.7, 1.25)
-    shade = rng.uniform(0.1, 0.5)
-    stone = Finish("render", (0.8, 0.78, 0.72))
-    if rng.random() < 0.6:
-        stone = Finish(pick(("stone", "concrete", "brick"), rng))
-    style = Style(height, stone, (shade, shade, 1.1 * shade))
+    style = _sample_style(rng)
     for a, b in pairwise(np.linspace(*ends, max(1, int(np.ceil(length / 7))) + 1)):
         for item, aside, lift in _piece(kind, b - a, style, rng):
             if along:
                 scene.put(item, a, at + aside, 0.0, lift)
             else:
                 scene.put(item, at - aside, a, np.pi / 2, lift)
+
+
+def _sample_style(rng: Rng) -> Style:
+    height = rng.uniform(0.7, 1.25)
+    shade = rng.uniform(0.1, 0.5)
+    stone = Finish("render", (0.8, 0.78, 0.72))
+    if rng.random() < 0.6:
+        stone = Finish(pick(("stone", "concrete", "brick"), rng))
+    return Style(height, stone, (shade, shade, 1.1 * shade))
 
 
 def _piece(

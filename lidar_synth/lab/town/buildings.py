@@ -126,9 +126,8 @@ def _skylights(slope: Array, count: int, rng: Rng) -> Mesh:
     up = 0.04 * up / np.linalg.norm(up)
     width = 0.8 / float(np.linalg.norm(b - a))
     height = 1.2 / float(np.linalg.norm(d - a))
-    left = rng.uniform(0.1, 0.85, (count, 1, 1))
-    s = left + np.array([0, width, width, 0])[:, None]
-    v = np.array([0.4, 0.4, 0.4 + height, 0.4 + height])[:, None]
+    s = rng.uniform(0.1, 0.85, (count, 1, 1)) + np.array([0, width, width, 0])[:, None]
+    v = 0.4 + np.array([0, 0, height, height])[:, None]
     corners = (1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up
     return quads(corners, GLASS)
 

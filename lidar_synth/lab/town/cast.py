@@ -80,11 +80,7 @@ class Snapshot:
         """
         distance, face, normal = self._solid.first(origins, directions)
         surface = np.where(face >= 0, self._faces[face], MISS)
-        if eye is None:
-            near: Iterable[NDArray[np.bool_]] = self._near_any(origins, directions)
-        else:
-            margin = float(np.abs(origins - eye).sum(1).max(initial=0))
-            near = self._near_from(directions, eye, margin)
+        near = self._near(origins, directions, eye)
         for mover, candidates in zip(self.movers, near, strict=True):
             rays = np.flatnonzero(candidates)
             if len(rays):
@@ -113,6 +109,15 @@ class Snapshot:
         hits.surface[rays] = beyond.surface
         hits.normal[rays] = beyond.normal
         return np.asarray(rays[beyond.surface != MISS])
+
+    def _near(
+        self, origins: Floats, directions: Floats, eye: Floats | None
+    ) -> Iterable[NDArray[np.bool_]]:
+        """Which rays can hit each mover, (N,) for one after another; may include a few more."""
+        if eye is None:
+            return self._near_any(origins, directions)
+        margin = float(np.abs(origins - eye).sum(1).max(initial=0))
+        return self._near_from(directions, eye, margin)
 
     def _near_from(
         self, directions: Floats, eye: Floats, margin: float

@@ -104,11 +104,8 @@ def wall_around(
     return sheets(cells[~inside.all(2).any(1)], 0.0, frame, WALL)
 
 
-def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
-    """Recessed windows: glass, frames and sills, with a blind in front of the glass or a curtain
-    behind it."""
-    count = len(rect)
-    recess = 0.13
+def _bars(rect: Array, depth: float, frame: Frame) -> Mesh:
+    """The left, right, middle and lower bars of the frames of windows."""
     u0, u1, z0, z1 = rect.T
     middle = (u0 + u1) / 2
     bars = [
@@ -117,6 +114,15 @@ def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
         (middle - 0.04, middle + 0.04, z0, z1),
         (u0, u1, z0, z0 + 0.08),
     ]
+    return merge([sheets(np.stack(bar, 1), depth, frame, FRAME) for bar in bars])
+
+
+def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
+    """Recessed windows: glass, frames and sills, with a blind in front of the glass or a curtain
+    behind it."""
+    count = len(rect)
+    recess = 0.13
+    u0, u1, z0, z1 = rect.T
     shut = rng.choice([0, 0.12, 0.3, 0.6, 1.0], count, p=[0.4, 0.3, 0.1, 0.1, 0.1])
     blind = np.stack([u0, u1, z1 - (z1 - z0) * shut, z1], 1)
     sill = np.stack([u0 - 0.06, u1 + 0.06, z0 - 0.07, z0], 1)
@@ -125,7 +131,7 @@ def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
         [
             sheets(rect, recess, frame, GLASS),
             reveals(rect, recess, frame),
-            *(sheets(np.stack(bar, 1), recess - 0.02, frame, FRAME) for bar in bars),
+            _bars(rect, recess - 0.02, frame),
             sheets(blind, recess - 0.05, frame, BLIND),
             sheets(sill, -0.06, frame, SLAB),
             sheets(curtain, recess + 0.22, frame, ROOM),

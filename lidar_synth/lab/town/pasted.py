@@ -22,7 +22,7 @@ from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.boxes import box_values
 from lidar_synth.lab.town.cast import MISS, SceneHits, Snapshot
 from lidar_synth.lab.town.materials import SurfaceTable
-from lidar_synth.lab.town.meshes import Floats
+from lidar_synth.lab.town.meshes import Array, Floats
 from lidar_synth.lab.town.objects import Prototype
 from lidar_synth.lab.town.returns import measure, see_through
 from lidar_synth.lab.town.town import Town
@@ -102,20 +102,12 @@ class ObjectCaster(Town):
             rng,
         )
         points = origins[rays] + far[:, None] * directions[rays]
-        kept = np.ones(len(rays), bool)
-        if self.skin is not None:
-            boxed = np.ones(len(rays), bool)
-            worn = self.skin.apply(points, reflectance, laser[rays], boxed, rng)
-            points += worn.shift[:, None] * directions[rays]
-            reflectance = worn.reflectance
-            kept = worn.kept
-        distance = np.linalg.norm(points, axis=1)
-        kept &= distance >= self.sensor.range_min
-        kept &= distance <= self.sensor.range_max
+        boxed = np.ones(len(rays), bool)
+        dressed, kept = self._dress(fired[rays], points, reflectance, boxed, rng)
         rays = rays[kept]
         return Scan(
             points[kept],
-            reflectance[kept],
+            dressed[kept],
             self.sensor,
             label=SEMANTIC_KITTI.decode(surfaces.raw)[hits.surface[rays]],
             ring=laser[rays].astype(np.int16),
@@ -205,6 +197,21 @@ class TownObjects(ObjectBank):
         return make_bank(replace(self.boxes, values=values), self.shapes, self.sensor)
 
 
+def _choose(
+    pairs: list[tuple[TownShape, Array]], classes: Any
+) -> list[tuple[TownShape, Array]]:
+    """The objects of some classes; None for all."""
+    names = {shape.prototype.name for shape, _ in pairs}
+    wanted = names if classes is None else set(classes)
+    if unknown := sorted(wanted - names):
+        raise ConfigError(
+            f"classes {unknown} of the town",
+            f"some of {', '.join(sorted(names))}",
+            "Use more scans if a rare class is missing.",
+        )
+    return [pair for pair in pairs if pair[0].prototype.name in wanted]
+
+
 def collect_objects(
     sensor: str | Path | Sensor,
     classes: Any,
@@ -219,15 +226,7 @@ def collect_objects(
         range(scans), "objects of the town", leave=False, disable=None, delay=2
     )
     pairs = [pair for moment in moments for pair in _at(town, moment, skin)]
-    names = [shape.prototype.name for shape, _ in pairs]
-    wanted = set(names if classes is None else classes)
-    if unknown := sorted(wanted - set(names)):
-        raise ConfigError(
-            f"classes {unknown} of the town",
-            f"some of {', '.join(sorted(set(names)))}",
-            "Use more scans if a rare class is missing.",
-        )
-    chosen = [pair for pair in pairs if pair[0].prototype.name in wanted]
+    chosen = _choose(pairs, classes)
     if not chosen:
         raise DataError(f"no object in {scans} scans of the town", "objects")
     values = np.array([box for _, box in chosen], np.float32)

@@ -1,6 +1,7 @@
 """The kinds of ground of a street: verges, pavements, parking bays, carriageways, markings,
 crossings."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -159,7 +160,6 @@ def _mark_zebras(street: Street, c: SideStreet, paint: Paint) -> None:
 
 def _mark_lanes(street: Street, paint: Paint) -> None:
     """Paint the lane markings of the street."""
-    full_length = paint.reach[:2]
     dashes = {
         round((a.t + b.t) / 2, 3)
         for a in street.lanes
@@ -171,16 +171,19 @@ def _mark_lanes(street: Street, paint: Paint) -> None:
     for s in np.arange(-REACH - 60, street.length + REACH + 60, 9.0):
         for t in dashes:
             paint((s, s + 3.0), (t - 0.06, t + 0.06), "marking")
-    lines = []
+    for line in _long_lines(street):
+        paint(paint.reach[:2], line, "marking")
+
+
+def _long_lines(street: Street) -> Iterator[tuple[float, float]]:
+    """The intervals of t of the lines along the whole street."""
     if street.median:
-        inner = street.median
-        lines += [(side * inner, side * (inner + 0.12)) for side in SIDES]
+        for side in SIDES:
+            yield side * street.median, side * (street.median + 0.12)
     if street.kind == "edge":
-        kerbs = (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32)
-        lines += [(t, t + 0.12) for t in kerbs]
+        for t in (-street.edge[RIGHT] + 0.2, street.edge[LEFT] - 0.32):
+            yield t, t + 0.12
     for side in SIDES:
         if street.parking[side] == "street":
             edge = street.edge[side]
-            lines.append((side * (edge - 2.15), side * (edge - 2.05)))
-    for line in lines:
-        paint(full_length, line, "marking")
+            yield side * (edge - 2.15), side * (edge - 2.05)

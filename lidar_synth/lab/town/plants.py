@@ -179,6 +179,14 @@ def coarse_plant(species: str, variant: int) -> Mesh:
     )
 
 
+def _sample_tint(species: str, rng: Rng) -> Array:
+    """(3,) factors of the colour of leaves; some bushes are red."""
+    tint = rng.uniform(0.8, 1.25) * rng.uniform(0.9, 1.1, 3)
+    if species == "bush" and rng.random() < 0.2:
+        tint = np.array((1.9, 0.6, 1.0))
+    return tint
+
+
 def random_plant(
     species: str,
     rng: Rng,
@@ -191,10 +199,7 @@ def random_plant(
     yaw = rng.uniform(0, 2 * np.pi)
     mesh = mesh.moved(yaw=yaw, scale=size * rng.uniform(0.85, 1.15, 3))
     row = SPECIES[species]
-    tint = rng.uniform(0.8, 1.25) * rng.uniform(0.9, 1.1, 3)
-    if species == "bush" and rng.random() < 0.2:
-        tint = np.array((1.9, 0.6, 1.0))
-    r, g, b = np.clip(np.array(row["leaf"]) * tint, 0, 1)
+    r, g, b = np.clip(np.array(row["leaf"]) * _sample_tint(species, rng), 0, 1)
     bark = (*row["bark"],) if "bark" in row else None
     return make_object(
         "plant", mesh, finishes={0: Finish("leaf", (r, g, b)), 1: Finish("bark", bark)}
@@ -246,8 +251,16 @@ def _grow_hedge(
         rng,
     )
     ends = [loft([core[i, :4], core[i, :3:-1]], 1) for i in (0, -1)]
-    steps, columns, _ = core.shape
     count = int(length * (2 * height + depth) * 8)
+    scatter = 0.04 if profile == "clipped" else 0.1
+    centres = _points_on(core, count, rng) + rng.normal(0, scatter, (count, 3))
+    foliage = leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)
+    return merge([loft(core, 1), *ends, foliage])
+
+
+def _points_on(core: Array, count: int, rng: Rng) -> Array:
+    """(count, 3) random points on the surface through the cross-sections (S, P, 3) of a hedge."""
+    steps, columns, _ = core.shape
     row = rng.integers(0, steps - 1, count)
     column = rng.integers(0, columns - 1, count)
     way = rng.random((2, count, 1))
@@ -255,10 +268,7 @@ def _grow_hedge(
         core[i, column] * (1 - way[0]) + core[i, column + 1] * way[0]
         for i in (row, row + 1)
     )
-    scatter = rng.normal(0, 0.04 if profile == "clipped" else 0.1, (count, 3))
-    centres = near * (1 - way[1]) + far * way[1] + scatter
-    foliage = leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)
-    return merge([loft(core, 1), *ends, foliage])
+    return np.asarray(near * (1 - way[1]) + far * way[1])
 
 
 def _hedge_core(

@@ -123,6 +123,22 @@ _JOINTS = (
 they are seen."""
 
 
+def _darken_joints(
+    value: Floats,
+    place: Floats,
+    normal: Floats,
+    far: Floats,
+    material: NDArray[np.uint8],
+) -> None:
+    """Darken, in place, the joints between bricks, tiles and stones."""
+    along = place[:, 0] * -normal[:, 1] + place[:, 1] * normal[:, 0]
+    for name, height, width, near in _JOINTS:
+        rays = np.flatnonzero((material == INDEX[name]) & (far < near))
+        level = place[rays, 2] / height
+        upright = (along[rays] / width + 0.5 * np.floor(level)) % 1 < 0.07
+        value[rays] *= np.where((level % 1 < 0.16) | upright, 0.72, 1)
+
+
 def _texture(
     place: Floats,
     normal: Floats,
@@ -135,12 +151,7 @@ def _texture(
     fine = cell_noise(place / size[:, None], 1.0) - 0.5
     coarse = cell_noise(place, 0.55) - 0.5
     value = 1 + _GRAIN[material] * (1.1 * fine + 0.5 * coarse)
-    along = place[:, 0] * -normal[:, 1] + place[:, 1] * normal[:, 0]
-    for name, height, width, near in _JOINTS:
-        rays = np.flatnonzero((material == INDEX[name]) & (far < near))
-        level = place[rays, 2] / height
-        upright = (along[rays] / width + 0.5 * np.floor(level)) % 1 < 0.07
-        value[rays] *= np.where((level % 1 < 0.16) | upright, 0.72, 1)
+    _darken_joints(value, place, normal, far, material)
     slabs = (material == INDEX["paving"]) & (far < 14) & (normal[:, 2] > 0.8)
     rays = np.flatnonzero(slabs)
     value[rays] *= np.where((place[rays, :2] / 0.4 % 1 < 0.05).any(1), 0.8, 1)

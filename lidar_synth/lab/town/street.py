@@ -153,11 +153,15 @@ def _sample_crossings(
     share = 0.10 if kind == "edge" else 0.22
     for s in np.arange(-70, length + 70, 14.0) + rng.uniform(0, 14):
         if all(abs(s - p.s) > 45 for p in places) and rng.random() < share:
-            sides = pick((SIDES, (RIGHT,), (LEFT,)), rng)
-            half = rng.uniform(2.5, 3.4)
-            pavement = 0.0 if kind == "edge" else rng.uniform(1.5, 2.2)
-            places.append(SideStreet(float(s), half, pavement, sides))
+            places.append(_sample_side_street(kind, float(s), rng))
     return places
+
+
+def _sample_side_street(kind: str, s: float, rng: Rng) -> SideStreet:
+    sides = pick((SIDES, (RIGHT,), (LEFT,)), rng)
+    half = rng.uniform(2.5, 3.4)
+    pavement = 0.0 if kind == "edge" else rng.uniform(1.5, 2.2)
+    return SideStreet(s, half, pavement, sides)
 
 
 def _add_apart(places: list[SideStreet], new: SideStreet) -> list[SideStreet]:

@@ -21,7 +21,7 @@ from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
-from lidar_synth.lab.town.cast import Snapshot
+from lidar_synth.lab.town.cast import SceneHits, Snapshot
 from lidar_synth.lab.town.catalogue import Rng
 from lidar_synth.lab.town.ego import HEIGHT, free_rays, point_rays
 from lidar_synth.lab.town.materials import SurfaceTable
@@ -286,21 +286,47 @@ class Town:
         The vehicle moves while the sensor turns; the points are in the frame of ``pose``, as motion
         compensated scans.
         """
-        turn = pose[:3, :3].astype(np.float32)
         moved = self._turned[:, None] * travelled
-        eye = pose[:3, 3].astype(np.float32)
-        origins = eye + moved + self._heights[:, None] * turn[:, 2]
-        hits = snapshot.cast(origins, self._rays @ turn.T, eye)
-        see_through(snapshot, hits, eye, surfaces, rng)
+        hits = self._cast(snapshot, pose, moved, surfaces, rng)
         rays, far, reflectance = measure(
             hits, self._laser, surfaces, self._gains, self._noise, rng
         )
         points = far[:, None] * self._rays[rays]
         points[:, 2] += self._heights[rays]
-        points += moved[rays] @ turn
+        points += moved[rays] @ pose[:3, :3].astype(np.float32)
+        surface = hits.surface[rays]
+        boxed = surfaces.instance[surface] > 0
+        dressed, kept = self._dress(rays, points, reflectance, boxed, rng)
+        return rays[kept], surface[kept], points[kept], dressed[kept]
+
+    def _cast(
+        self,
+        snapshot: Snapshot,
+        pose: Pose,
+        moved: Floats,
+        surfaces: SurfaceTable,
+        rng: Rng,
+    ) -> SceneHits:
+        """The hits of the rays of one revolution, with those behind what they see through."""
+        turn = pose[:3, :3].astype(np.float32)
+        eye = pose[:3, 3].astype(np.float32)
+        origins = eye + moved + self._heights[:, None] * turn[:, 2]
+        hits = snapshot.cast(origins, self._rays @ turn.T, eye)
+        see_through(snapshot, hits, eye, surfaces, rng)
+        return hits
+
+    def _dress(
+        self,
+        rays: NDArray[np.intp],
+        points: Floats,
+        reflectance: Floats,
+        boxed: NDArray[np.bool_],
+        rng: Rng,
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Move returns along their rays as the skin does; their reflectance with it, and which of
+        them are left, within the sensor's range."""
         kept = np.ones(len(rays), bool)
         if self.skin is not None:
-            boxed = surfaces.instance[hits.surface[rays]] > 0
             laser = self._laser[rays]
             dressed = self.skin.apply(points, reflectance, laser, boxed, rng)
             points += dressed.shift[:, None] * self._rays[rays]
@@ -309,5 +335,4 @@ class Town:
         distance = np.sqrt(np.einsum("ij,ij->i", points, points))
         kept &= distance >= self.sensor.range_min
         kept &= distance <= self.sensor.range_max
-        rays = rays[kept]
-        return rays, hits.surface[rays], points[kept], reflectance[kept]
+        return reflectance, kept

@@ -5,6 +5,8 @@ mover is discarded if it would collide with an earlier mover or, where ``solid``
 static obstacle in any frame.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, walker
@@ -50,6 +52,17 @@ def _ego_track(street: Street, times: Array) -> Array:
     half_s = 2.35 * along + 0.9 * across + 1.2
     half_t = 2.35 * across + 0.9 * along + 1.2
     return _bounds(s, t, half_s, half_t)
+
+
+def _strips(street: Street) -> Iterator[tuple[int, float, float, float]]:
+    """Where people walk along the street: side, lowest and highest |t|, mean number of people."""
+    for side in SIDES:
+        if pavement := street.band(side, "sidewalk"):
+            low, high = pavement
+            yield side, low + 0.3, high - 0.3, street.row["walking"]
+        if street.plaza == side:
+            front = street.front(side)
+            yield side, front + 1, front + PLAZA_DEPTH - 2, 16
 
 
 class Traffic:
@@ -107,10 +120,10 @@ class Traffic:
             return
         if any(_overlap(track, other) for other in self._tracks):
             return
-        if solid:
-            footprints = np.array(self._scene.footprints).reshape(-1, 1, 4)
-            if _overlap(track, footprints):
-                return
+        if solid and _overlap(
+            track, np.array(self._scene.footprints).reshape(-1, 1, 4)
+        ):
+            return
         self._tracks.append(track)
         instance, surfaces = self._scene.add_instance(
             shapes[0], colour, moving=line.speed > 0
@@ -162,32 +175,22 @@ class Traffic:
         """Add vehicles on a side street, waiting at the stop line or driving away."""
         rng = self._rng
         edge = self._street.edge[side]
+        aside = side * c.half / 2
         for k in range(rng.poisson(1.2 if self._street.kind == "junction" else 0.5)):
             shapes, colour = self._sample_mover()
-            start = side * (edge + 4.2 + 7.5 * k)
-            line = Line(False, c.s - side * c.half / 2, start, -side, 0.0)
-            self._add(shapes, colour, line, 0.4)
+            t = side * (edge + 4.2 + 7.5 * k)
+            self._add(shapes, colour, Line(False, c.s - aside, t, -side, 0.0), 0.4)
         if rng.random() < 0.7:
             shapes, colour = self._sample_mover()
             start = side * (edge + rng.uniform(5, 40))
-            s = c.s + side * c.half / 2
-            line = Line(False, s, start, side, rng.uniform(4, 9))
+            line = Line(False, c.s + aside, start, side, rng.uniform(4, 9))
             self._add(shapes, colour, line, 0.5)
 
     def _add_pedestrians(self) -> None:
         """Add pedestrians on pavements, on squares and crossing the street."""
         street = self._street
         rng = self._rng
-        strips = []
-        for side in SIDES:
-            pavement = street.band(side, "sidewalk")
-            if pavement:
-                low, high = pavement
-                strips.append((side, low + 0.3, high - 0.3, street.row["walking"]))
-            if street.plaza == side:
-                front = street.front(side)
-                strips.append((side, front + 1, front + PLAZA_DEPTH - 2, 16))
-        for side, low, high, mean in strips:
+        for side, low, high, mean in _strips(street):
             for _ in range(rng.poisson(mean)):
                 t = side * rng.uniform(low, max(low, high))
                 self._add_pedestrian(True, t, rng.uniform(-50, street.length + 60))

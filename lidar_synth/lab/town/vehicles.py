@@ -170,6 +170,22 @@ def _box_lorry(length: float, height: float) -> Mesh:
     return _lorry(length, box)
 
 
+def _coach_stations(low: float, height: float) -> list[list[float]]:
+    """The cross-sections of a bus or a tram, front to rear."""
+    stations: list[list[float]] = [
+        [0.0, low, 1.0, height - 0.5, 0.93, 0.9, PAINT, GLASS],
+        [0.012, low, 1.0, height - 0.08, 0.99, 0.92, GLASS],
+    ]
+    for p in np.arange(0.1, 0.96, 0.1):
+        window = [low, 1.0, height, 1.0, 0.93]
+        stations += [[p, *window], [p + 0.012, *window, GLASS]]
+    return [
+        *stations,
+        [0.985, low, 1.0, height - 0.08, 1.0, 0.92, PAINT, GLASS],
+        [1.0, low, 1.0, height - 0.4, 0.97, 0.9],
+    ]
+
+
 def _coach(
     length: float,
     width: float,
@@ -178,20 +194,11 @@ def _coach(
     tyres: Mesh,
 ) -> Mesh:
     """A bus or a tram: one long body with a band of windows; ``low`` is the height of its sill."""
-    stations: list[list[float]] = [
-        [0.0, low, 1.0, height - 0.5, 0.93, 0.9, PAINT, GLASS],
-        [0.012, low, 1.0, height - 0.08, 0.99, 0.92, GLASS],
-    ]
-    for p in np.arange(0.1, 0.96, 0.1):
-        window = [low, 1.0, height, 1.0, 0.93]
-        stations += [[p, *window], [p + 0.012, *window, GLASS]]
-    stations.append([0.985, low, 1.0, height - 0.08, 1.0, 0.92, PAINT, GLASS])
-    stations.append([1.0, low, 1.0, height - 0.4, 0.97, 0.9])
     front = length / 2 + 0.006
     lights = width * 0.9
     return merge(
         [
-            shell(stations, length, width),
+            shell(_coach_stations(low, height), length, width),
             tyres,
             face(
                 front,

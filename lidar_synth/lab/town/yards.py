@@ -31,16 +31,20 @@ def build_lot(
         _furnish_driveway(scene, lot, lot.driveway, rng)
     _plant_garden(scene, lot, street, rng)
     behind = front + (lot.plan.depth if lot.plan else 0)
-    width = lot.end - lot.start
-    for _ in range(rng.poisson(width / 6)):
-        plant = random_plant(pick_name("plants_behind_house", rng), rng, near=False)
-        s = rng.uniform(lot.start, lot.end)
-        scene.put(plant, s, lot.side * (behind + rng.uniform(2, 16)))
+    _plant_behind(scene, lot, behind, rng)
     if lot.plan:
         _divide_garden(scene, lot, rng)
         low, high = lot.house
         for gap in ((lot.start, low), (high, lot.end)):
             _close_gap(scene, lot, gap, behind, rng)
+
+
+def _plant_behind(scene: Scene, lot: Lot, behind: float, rng: Rng) -> None:
+    """Put plants beyond |t| ``behind``, that of the back of the house."""
+    for _ in range(rng.poisson((lot.end - lot.start) / 6)):
+        plant = random_plant(pick_name("plants_behind_house", rng), rng, near=False)
+        s = rng.uniform(lot.start, lot.end)
+        scene.put(plant, s, lot.side * (behind + rng.uniform(2, 16)))
 
 
 def _put_boundaries(scene: Scene, lot: Lot, rng: Rng) -> None:
@@ -92,13 +96,17 @@ def _furnish_driveway(
         front = lot.front + lot.setback + rng.uniform(0.5, 3)
         _put_facing_street(scene, shed, lot, (low, low + 2.9), front)
     if rng.random() < 0.4 and lot.setback > 2.5:
-        kind = vehicles()[pick_name("driveway", rng)]
-        yaw = np.pi / 2 * (1 if rng.random() < 0.5 else -1)
-        colour = pick_colour("paints", rng)
-        scene.park(kind, colour, middle, lot.side * (lot.front + 2.6), yaw)
+        _park(scene, middle, lot.side * (lot.front + 2.6), rng)
     if rng.random() < 0.35:
         t = lot.side * (lot.front + 0.9)
         scene.put(furniture.bin_(rng), driveway[0] - 0.5, t, -lot.side * np.pi / 2)
+
+
+def _park(scene: Scene, s: float, t: float, rng: Rng) -> None:
+    """Park a vehicle that faces the street or the house."""
+    kind = vehicles()[pick_name("driveway", rng)]
+    yaw = np.pi / 2 * (1 if rng.random() < 0.5 else -1)
+    scene.park(kind, pick_colour("paints", rng), s, t, yaw)
 
 
 def _plant_garden(

@@ -49,6 +49,19 @@ class Returns(NamedTuple):
     boxed: NDArray[np.bool_]
 
 
+def _check_lasers(scan: Scan, rows: NDArray[np.intp], lasers: Sensor) -> None:
+    """Refuse a scan whose rings are not where the lasers of its sensor look."""
+    distance = np.maximum(np.linalg.norm(scan.points, axis=1), 1e-3)
+    elevation = np.arcsin(scan.points[:, 2] / distance)
+    away = np.abs(elevation - lasers.laser_elevations[rows])[distance > 5]
+    if len(away) and np.median(away) > _ANOTHER:
+        raise DataError(
+            f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
+            f"lasers of {lasers.name!r} (median)",
+            "scans of this sensor",
+        )
+
+
 def returns_of(
     scan: Scan,
     lasers: Sensor,
@@ -70,26 +83,18 @@ def returns_of(
     """
     rows = laser_rows(scan, lasers.by_beams())
     if scan.ring is not None:
-        turn = np.arctan2(scan.points[:, 1], scan.points[:, 0])
-        order = np.lexsort((turn, rows))
+        order = np.lexsort((np.arctan2(scan.points[:, 1], scan.points[:, 0]), rows))
         scan = scan[order]
         rows = rows[order]
     points = scan.points
     boxed = np.zeros(len(points), bool) if scan.instance is None else scan.instance > 0
-    distance = np.maximum(np.linalg.norm(points, axis=1), 1e-3)
-    elevation = np.arcsin(points[:, 2] / distance)
-    away = np.abs(elevation - lasers.laser_elevations[rows])[distance > 5]
-    if len(away) and np.median(away) > _ANOTHER:
-        raise DataError(
-            f"scan {scan.id!r}: its rings are {np.degrees(np.median(away)):.1f} degrees from the "
-            f"lasers of {lasers.name!r} (median)",
-            "scans of this sensor",
-        )
-    dither = (rng.random(len(points), np.float32) - (0.5 if centred else 0)) * step
+    _check_lasers(scan, rows, lasers)
+    dither = (rng.random(len(points), np.float32) - 0.5 * centred) * step
     bright = (scan.reflectance + dither).astype(np.float32)
     laser = rows.astype(np.int32)
-    found = find_features(points, bright, laser, lasers)
-    return Returns(found, points, bright, laser, boxed)
+    return Returns(
+        find_features(points, bright, laser, lasers), points, bright, laser, boxed
+    )
 
 
 @dataclass(frozen=True)

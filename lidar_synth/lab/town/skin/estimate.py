@@ -76,11 +76,10 @@ def _tables(
     domain: Domain, offset: Floats, quantiles: Floats | None = None
 ) -> dict[str, Pair]:
     """Values and groups of the local mean, the residual of reflectance and that of range."""
-    kinds = [np.minimum(STRATUM_KIND[stratum], 1) for stratum in domain.strata]
     mean = np.concatenate(
         [
-            s.found.mean - offset[k, s.rows]
-            for s, k in zip(domain.scans, kinds, strict=True)
+            s.found.mean - offset[np.minimum(STRATUM_KIND[stratum], 1), s.rows]
+            for s, stratum in zip(domain.scans, domain.strata, strict=True)
         ]
     )
     residual = np.concatenate([s.bright - s.found.mean for s in domain.scans])
@@ -88,7 +87,7 @@ def _tables(
     stratum = np.concatenate(domain.strata)
     if quantiles is None:
         [quantiles] = pool_quantiles([(mean, BAND[stratum])], BAND_LEVELS, MEANS)
-    measured = np.flatnonzero(~np.isnan(distance))
+    measured = ~np.isnan(distance)
     return {
         "mean": (mean, BAND[stratum]),
         "residual": (residual, part_of(mean, stratum, quantiles)),
@@ -134,12 +133,9 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     return replace(skin, arrays=arrays)
 
 
-def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
-    """(rows,) reflectance of each laser on one kind of surface, beyond that of its neighbours.
-
-    It is the sum of the median differences between neighbouring rings on the same surface, less its
-    running median.
-    """
+def _differences(domain: Domain, kind: int) -> Pair:
+    """Of returns on one kind of surface, the difference to the mean of the one below, and the
+    row."""
     difference = []
     ring = []
     for scan, stratum in zip(domain.scans, domain.strata, strict=True):
@@ -149,14 +145,27 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
         below = scan.found.below[pairs]
         difference.append(scan.found.mean[below] - scan.found.mean[pairs])
         ring.append(scan.rows[pairs])
-    value = np.concatenate(difference)
-    upper = np.concatenate(ring)
-    [table] = pool_quantiles([(value, upper)], [np.arange(rows)], 3)
+    return np.concatenate(difference), np.concatenate(ring)
+
+
+def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
+    """(rows,) reflectance of each laser on one kind of surface, beyond that of its neighbours.
+
+    It is the sum of the median differences between neighbouring rings on the same surface, less its
+    running median.
+    """
+    [table] = pool_quantiles([_differences(domain, kind)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
     return np.asarray(
         total - np.median(sliding_window_view(padded, _SMOOTH), axis=1), np.float32
     )
+
+
+def _gaps(domain: Domain) -> tuple[Ints, Ints]:
+    """Stratum and gap of each return."""
+    gaps = [s.found.gap for s in domain.scans]
+    return np.concatenate(domain.strata), np.concatenate(gaps)
 
 
 def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
@@ -165,12 +174,9 @@ def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
     Returns:
         (STRATA,) probability, and (rows,) a factor by laser, near 1.
     """
-    rates = []
-    for domain in (real, town):
-        stratum = np.concatenate(domain.strata)
-        gap = np.concatenate([s.found.gap for s in domain.scans])
-        rates.append((_rate(stratum, gap), stratum, gap))
-    (of_real, stratum, gap), (of_town, _, _) = rates
+    stratum, gap = _gaps(real)
+    of_real = _rate(stratum, gap)
+    of_town = _rate(*_gaps(town))
     laser = np.concatenate([s.rows for s in real.scans])
     lost = np.bincount(laser, np.maximum(gap - 1, 0), rows)
     expected = np.bincount(laser, of_real[stratum] * gap, rows)

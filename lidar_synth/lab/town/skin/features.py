@@ -91,7 +91,6 @@ def find_features(
     mean, residual, gap = _along(
         rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings
     )
-    roughness = _roughness(rows, residual)
     kind, below = _across(
         rows,
         turn,
@@ -105,7 +104,7 @@ def find_features(
     return RayFeatures(
         mean,
         residual,
-        roughness,
+        _roughness(rows, residual),
         cell,
         below,
         gap,

@@ -244,10 +244,7 @@ class Skin:
         return {
             "sensor": self.sensor.name,
             **{k: v for k, v in self.provenance.items() if k != "town"},
-            **{
-                f"town: {k}": v
-                for k, v in dict(self.provenance.get("town", {})).items()
-            },
+            **{f"town: {k}": v for k, v in self.provenance.get("town", {}).items()},
             "reflectance, step": self.step,
             "reflectance, median": float(np.median(self.arrays["mean_real"]).round(3)),
             "lasers, spread of reflectance": float(
@@ -380,6 +377,19 @@ def _checksum(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     return digest.hexdigest()
 
 
+def _find_file(skin: str | Path) -> Path:
+    """The file of a skin that ships with the package, or of one's own."""
+    path = Path(skin)
+    if path.suffix == SUFFIX:
+        return path
+    folder = Path(str(files("lidar_synth.lab.town.skin")))
+    names = sorted(p.stem for p in folder.glob(f"*{SUFFIX}"))
+    if str(skin) not in names:
+        expected = f"one of {', '.join(names)}, or a file that ends in {SUFFIX}"
+        raise ConfigError(f"skin {str(skin)!r}", expected, suggest(str(skin), names))
+    return folder / f"{skin}{SUFFIX}"
+
+
 def load_skin(skin: "str | Path | Skin") -> Skin:
     """Load a skin: one that ships with the package by its name, or one of your own from a file.
 
@@ -400,14 +410,7 @@ def load_skin(skin: "str | Path | Skin") -> Skin:
     """
     if isinstance(skin, Skin):
         return skin
-    path = Path(skin)
-    if path.suffix != SUFFIX:
-        folder = Path(str(files("lidar_synth.lab.town.skin")))
-        names = sorted(p.stem for p in folder.glob(f"*{SUFFIX}"))
-        if str(skin) not in names:
-            expected = f"one of {', '.join(names)}, or a file that ends in {SUFFIX}"
-            raise ConfigError(f"skin {str(skin)!r}", expected, suggest(skin, names))
-        path = folder / f"{skin}{SUFFIX}"
+    path = _find_file(skin)
     content = read_file(path, f"a file of {FORMAT}", LONGEST)
     try:
         start = int.from_bytes(content[:8], "little") + 8
