@@ -26,6 +26,20 @@ class Interval(NamedTuple):
         return f"[{self.low:.4g}, {self.high:.4g}]"
 
 
+def _resample(statistic: Statistic, replicates: int, seed: int) -> NDArray[np.floating]:
+    """(replicates,) values of the statistic of resamples."""
+    rng = np.random.default_rng(seed)
+    values = []
+    for first in range(0, replicates, _BATCH):
+        count = min(_BATCH, replicates - first)
+        values.append(
+            statistic.at(
+                *(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)
+            )
+        )
+    return np.concatenate(values)
+
+
 def bootstrap(
     statistic: Statistic,
     replicates: int = REPLICATES,
@@ -67,19 +81,11 @@ def bootstrap(
             f"{statistic.sizes[0]} real and {statistic.sizes[1]} generated samples",
             "at least two of each for an interval",
         )
-    rng = np.random.default_rng(seed)
-    values = []
-    for first in range(0, replicates, _BATCH):
-        count = min(_BATCH, replicates - first)
-        values.append(
-            statistic.at(
-                *(rng.multinomial(n, np.full(n, 1 / n), count) for n in statistic.sizes)
-            )
-        )
-    if not np.isfinite(together := np.concatenate(values)).all():
+    values = _resample(statistic, replicates, seed)
+    if not np.isfinite(values).all():
         return None
-    tails = np.quantile(together, [(1 - level) / 2, (1 + level) / 2])
-    ends = 2 * statistic.value - np.array([*tails[::-1], together.mean()])
+    tails = np.quantile(values, [(1 - level) / 2, (1 + level) / 2])
+    ends = 2 * statistic.value - np.array([*tails[::-1], values.mean()])
     return Interval(*np.clip(ends, smallest, largest).tolist())
 
 

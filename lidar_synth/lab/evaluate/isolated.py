@@ -30,11 +30,10 @@ def count_isolated(scan: Scan) -> NDArray[np.int64]:
         kinds = np.minimum(scan.label[near], len(NAMES))
     found = np.zeros(len(kinds), bool)
     if len(scan) > NEIGHBOURS:
-        tree = cKDTree(scan.points)
-        apart, _ = tree.query(scan.points[near], [NEIGHBOURS + 1])  # and itself
+        # The nearest one is the return itself.
+        apart, _ = cKDTree(scan.points).query(scan.points[near], [NEIGHBOURS + 1])
         found = apart[:, 0] > TOLERANCE[0] + TOLERANCE[1] * distance[near]
-    size = len(NAMES) + 1
-    counts = [np.bincount(k, minlength=size) for k in (kinds[found], kinds)]
+    counts = [np.bincount(k, minlength=len(NAMES) + 1) for k in (kinds[found], kinds)]
     return np.array(counts, np.int64)
 
 

@@ -6,7 +6,7 @@ scans for the next epoch.
 """
 
 import random
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -114,6 +114,11 @@ class _Kept:
             self.features.setdefault(key, []).extend(arrays)
         self.count += other.count
         self.sensor = self.sensor or other.sensor
+
+
+def _features(kept: Mapping[str, _Kept], name: str) -> Iterator[NDArray[np.floating]]:
+    """What an extractor found in the real and in the generated scans."""
+    return (np.concatenate(kept[side].features[name]) for side in SIDES)
 
 
 class Metric:
@@ -278,17 +283,14 @@ class Metric:
             if (score := self._score(name, kept)) is not None
         ]
         for name in self._extractors:
-            real, fake = (np.concatenate(kept[side].features[name]) for side in SIDES)
-            scores += self._of_figures(
-                figures_of(name, real, fake, self._extended), kept
-            )
+            real, fake = _features(kept, name)
+            figures = figures_of(name, real, fake, self._extended)
+            scores += self._of_figures(figures, kept)
         if self._extended:
             for name in self._published:
-                real, fake = (
-                    np.concatenate(kept[side].features[_own(name)]) for side in SIDES
-                )
                 table = self.protocol.measures[name].table or name
-                scores += self._of_figures(more_figures(table, real, fake), kept)
+                figures = more_figures(table, *_features(kept, _own(name)))
+                scores += self._of_figures(figures, kept)
         if not scores:
             raise DataError(
                 f"no figure of {self.protocol.name}: {'; '.join(self.left_out.values())}",
@@ -301,9 +303,7 @@ class Metric:
         if measure.kind == FEATURES:
             if name not in self._published:
                 return None
-            real, fake = (
-                np.concatenate(kept[side].features[_own(name)]) for side in SIDES
-            )
+            real, fake = _features(kept, _own(name))
             statistic = statistic_of(real, fake) if self._replicates else None
             return self._made(
                 measure, frechet_distance(real, fake), statistic, len(real), len(fake)

@@ -160,8 +160,7 @@ def match(real: Sequence[Crop], fake: Sequence[Crop]) -> list[tuple[Crop, Crop]]
     used: tuple[set[int], set[int]] = (set(), set())
     matched = []
     for _, *ends in rows[np.lexsort(rows.T[::-1])].tolist():
-        i = int(ends[0])
-        j = int(ends[1])
+        i, j = map(int, ends)
         if i not in used[0] and j not in used[1]:
             used[0].add(i)
             used[1].add(j)
@@ -205,7 +204,7 @@ def _area(known: NDArray[np.float64], asked: NDArray[np.float64]) -> float:
     scale = known.std(0) + 1e-3
     inputs, given = (_with_squares((rows - mean) / scale) for rows in (known, asked))
     middle = inputs.mean(0)
-    inputs = inputs - middle
+    inputs -= middle
     ridge = RIDGE * len(inputs) * np.eye(inputs.shape[1])
     target = np.repeat([-1.0, 1.0], len(known) // 2)
     weights = np.linalg.solve(inputs.T @ inputs + ridge, inputs.T @ target)
@@ -242,6 +241,22 @@ def find_floor(real: Sequence[Crop]) -> float | None:
     return float(np.mean(areas)) if areas else None
 
 
+def _compare(own: Sequence[Crop], pairs: Sequence[tuple[Crop, Crop]]) -> dict[str, Any]:
+    """The figures of one class."""
+    sides = list(zip(*pairs, strict=True))
+    return {
+        "pairs": len(pairs),
+        "places": len({one.place for one in sides[0]}),
+        "auc": separate(pairs),
+        "floor": find_floor(own),
+        "by": {group: separate(pairs, [group]) for group in GROUPS},
+        "returns": float(np.median([f.returns / r.returns for r, f in pairs])),
+        "roof": [float(np.mean([c.roof for c in side])) for side in sides],
+        "side": [float(np.mean([c.side for c in side])) for side in sides],
+        "rough": [float(np.median([c.rough for c in side])) for side in sides],
+    }
+
+
 def compare_objects(real: Source, fake: Source) -> dict[str, Any]:
     """Judge the objects of generated scans by class; see the module.
 
@@ -264,18 +279,7 @@ def compare_objects(real: Source, fake: Source) -> dict[str, Any]:
         pairs = match(own, crops(fake, name, placed=False))
         if not pairs:
             continue
-        sides = list(zip(*pairs, strict=True))
-        figures[name] = {
-            "pairs": len(pairs),
-            "places": len({one.place for one in sides[0]}),
-            "auc": separate(pairs),
-            "floor": find_floor(own),
-            "by": {group: separate(pairs, [group]) for group in GROUPS},
-            "returns": float(np.median([f.returns / r.returns for r, f in pairs])),
-            "roof": [float(np.mean([c.roof for c in side])) for side in sides],
-            "side": [float(np.mean([c.side for c in side])) for side in sides],
-            "rough": [float(np.median([c.rough for c in side])) for side in sides],
-        }
+        figures[name] = _compare(own, pairs)
     if not figures:
         raise DataError(
             f"no two similar objects with {LEAST} returns in both sets",

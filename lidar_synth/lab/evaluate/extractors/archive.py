@@ -116,6 +116,27 @@ def _some(names: Sequence[str]) -> str:
     return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
 
 
+def _check_architecture(
+    own: Mapping[str, Tensor], given: Mapping[str, Tensor], where: str
+) -> None:
+    """Refuse weights of other names or shapes than a module's own."""
+    differences = {
+        "lacks": [k for k in own if k not in given],
+        "has another shape of": [
+            k for k, v in given.items() if k in own and v.shape != own[k].shape
+        ],
+        "has": [k for k in given if k not in own],
+    }
+    if any(differences.values()):
+        found = "; ".join(
+            f"it {what} {_some(names)}" for what, names in differences.items() if names
+        )
+        raise DataError(
+            f"{where}: weights of another architecture ({found})",
+            "those of the published network",
+        )
+
+
 def load_weights(
     module: nn.Module, state: Any, where: str, extra: bool = False
 ) -> None:
@@ -142,21 +163,7 @@ def load_weights(
     # Absent before PyTorch 0.4.1.
     counters = {k: v for k, v in own.items() if k.endswith("num_batches_tracked")}
     chosen = counters | {k: v for k, v in state.items() if k in own or not extra}
-    differences = {
-        "lacks": [k for k in own if k not in chosen],
-        "has another shape of": [
-            k for k, v in chosen.items() if k in own and v.shape != own[k].shape
-        ],
-        "has": [k for k in chosen if k not in own],
-    }
-    if any(differences.values()):
-        found = "; ".join(
-            f"it {what} {_some(names)}" for what, names in differences.items() if names
-        )
-        raise DataError(
-            f"{where}: weights of another architecture ({found})",
-            "those of the published network",
-        )
+    _check_architecture(own, chosen, where)
     module.load_state_dict(chosen)
     if bad := [
         k for k, v in chosen.items() if v.is_floating_point() and not v.isfinite().all()

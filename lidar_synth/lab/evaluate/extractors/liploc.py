@@ -4,10 +4,11 @@ an image of 224 x 224.
 """
 
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError, LibraryError
 from lidar_synth.geometry.scan import Scan
@@ -41,6 +42,21 @@ def picture(depth: Tensor) -> Tensor:
     ]
 
 
+def _load_state(network: nn.Module, content: Any, where: str) -> None:
+    """Load the part of a checkpoint of R3DPA that is the encoder of range images."""
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if isinstance(state, dict):
+        # Averaging patches, timm normalises with a layer that LIP-Loc's weights lack; R3DPA leaves
+        # it as it is made.
+        made = {
+            k: v for k, v in network.state_dict().items() if k.startswith("fc_norm.")
+        }
+        state = made | {
+            k.removeprefix(PREFIX): v for k, v in state.items() if k.startswith(PREFIX)
+        }
+    load_weights(network, state, where, extra=True)
+
+
 def load_liploc(path: Path, prepared: str) -> PerScan:
     """An extractor from R3DPA's archive, with ``config.yaml`` and ``model.ckpt``; see
     ``load_extractor``.
@@ -68,18 +84,7 @@ def load_liploc(path: Path, prepared: str) -> PerScan:
     network = timm.create_model(
         name, pretrained=False, num_classes=0, global_pool="avg"
     ).eval()
-    content = archive.weights("model.ckpt")
-    state = content.get("state_dict") if isinstance(content, dict) else None
-    if isinstance(state, dict):
-        # Averaging patches, timm normalises with a layer that LIP-Loc's weights lack; R3DPA leaves
-        # it as it is made.
-        made = {
-            k: v for k, v in network.state_dict().items() if k.startswith("fc_norm.")
-        }
-        state = made | {
-            k.removeprefix(PREFIX): v for k, v in state.items() if k.startswith(PREFIX)
-        }
-    load_weights(network, state, str(path / "model.ckpt"), extra=True)
+    _load_state(network, archive.weights("model.ckpt"), str(path / "model.ckpt"))
     inputs = preparation(prepared)
 
     def describe(scan: Scan, generated: bool) -> Tensor:

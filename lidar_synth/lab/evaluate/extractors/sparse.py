@@ -105,11 +105,8 @@ def neighbours(voxels: Tensor) -> Pairs:
         (all_of_them, all_of_them),
         *((t, s) for s, t in reversed(before)),
     ]
-    return Pairs(
-        torch.cat([s for s, _ in pairs]),
-        torch.cat([t for _, t in pairs]),
-        [len(s) for s, _ in pairs],
-    )
+    sources, targets = zip(*pairs, strict=True)
+    return Pairs(torch.cat(sources), torch.cat(targets), list(map(len, sources)))
 
 
 def pyramid(voxels: Tensor, depth: int) -> list[SparseLevel]:
