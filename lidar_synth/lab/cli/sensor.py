@@ -49,13 +49,12 @@ def fit_from_scans(
     """
     import json
 
-    import numpy as np
-
     from lidar_synth.errors import ConfigError
     from lidar_synth.files.disk import write_file
     from lidar_synth.formats import open_scans
     from lidar_synth.geometry.sensor import sensor_yaml
     from lidar_synth.lab.fitting import fit_sensor
+    from lidar_synth.lab.spread import spread
 
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--out {out}", "a file that ends in .yaml")
@@ -63,12 +62,8 @@ def fit_from_scans(
         raise ConfigError(f"--picture {picture}", "a file that ends in .png")
     source = open_scans(path, **drop_missing(reading))
     source.skip_sensor_check()
-    chosen = np.unique(
-        np.linspace(0, len(source) - 1, min(scans, len(source))).round().astype(int)
-    )
-    found = fit_sensor(
-        [source[int(index)] for index in chosen], name=out.stem, columns=columns
-    )
+    chosen = [source[index] for index in spread(range(len(source)), scans)]
+    found = fit_sensor(chosen, name=out.stem, columns=columns)
     write_file(out, sensor_yaml(found.sensor).encode())
     if picture is not None:
         from lidar_synth.lab.fitting.picture import fit_figure

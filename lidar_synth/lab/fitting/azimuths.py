@@ -7,6 +7,7 @@ its own offset, so correlation finds the offsets. With the time of each point, o
 order of time, the offset is the azimuth beyond that of the turning head.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,22 +182,24 @@ def _firings(turn: Turn, beams: int) -> float:
     return float(np.median([1 / step.mean() for step in single]))
 
 
-def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
-    """Coherence and number of steps per turn of the coarsest lattice of the azimuths."""
-    power = np.zeros(BINS // 2 + 1)
-    rings = 0
+def _powers(turn: Turn, beams: int) -> Iterator[Floats]:
+    """The power spectrum of the azimuths of each beam with enough distant points."""
     for beam in range(beams):
         own = turn.azimuth[(turn.ring == beam) & (turn.rho > DISTANT)]
-        if len(own) < FEW:
-            continue
-        histogram = np.bincount((own * BINS).astype(np.int64) % BINS, minlength=BINS)
-        power += (np.abs(np.fft.rfft(histogram)) / len(own)) ** 2
-        rings += 1
-    if not rings:
+        if len(own) >= FEW:
+            bins = (own * BINS).astype(np.int64) % BINS
+            histogram = np.bincount(bins, minlength=BINS)
+            yield (np.abs(np.fft.rfft(histogram)) / len(own)) ** 2
+
+
+def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
+    """Coherence and number of steps per turn of the coarsest lattice of the azimuths."""
+    powers = list(_powers(turn, beams))
+    if not powers:
         return 0.0, 0
     first = int(0.9 * firings)
     last = int(min(4.5 * firings, BINS / 8))
-    coherence = np.sqrt(power[first:last] / rings)
+    coherence = np.sqrt(np.sum(powers, axis=0)[first:last] / len(powers))
     best = float(coherence.max(initial=0.0))
     strong = np.flatnonzero(coherence > 0.8 * best)
     if not len(strong):

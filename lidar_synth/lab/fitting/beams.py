@@ -107,11 +107,12 @@ def gather(scans: Sequence[Scan]) -> Cloud:
             "Read it with on_bad='drop-points'.",
         )
     number = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
-    if all(scan.time is not None for scan in scans):
-        time = np.concatenate([np.asarray(scan.time, np.float64) for scan in scans])
-    else:
-        time = np.concatenate([turn_fraction(scan.points) for scan in scans])
-    return Cloud(points, number, time, np.full(len(points), -1))
+    timed = all(scan.time is not None for scan in scans)
+    times = [
+        np.asarray(scan.time, np.float64) if timed else turn_fraction(scan.points)
+        for scan in scans
+    ]
+    return Cloud(points, number, np.concatenate(times), np.full(len(points), -1))
 
 
 def turn_fraction(points: NDArray[np.float32]) -> Floats:
@@ -141,22 +142,24 @@ def _unwrapped(points: NDArray[np.float32]) -> Floats:
     return np.asarray(np.cumsum(step - np.round(step)))
 
 
+def _complete_rings(scans: Sequence[Scan]) -> list[NDArray[np.int16] | None]:
+    """The rings that follow from the order of each scan's points, of scans with all of them."""
+    found = [rings_in_order(scan.points) if len(scan) else None for scan in scans]
+    counts = [0 if ring is None else int(ring.max()) + 1 for ring in found]
+    # A scan with fewer rings is a crop; its rings have other numbers.
+    return [
+        ring if count == max(counts) else None
+        for ring, count in zip(found, counts, strict=True)
+    ]
+
+
 def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]:
     """(N,) rings that the scans have, or that follow from their order; None if there are none."""
     if all(scan.ring is not None for scan in scans):
         return "ring field", np.concatenate(
             [np.asarray(scan.ring, np.int64) for scan in scans]
         )
-    found = [rings_in_order(scan.points) for scan in scans]
-    most = max(
-        (int(ring.max()) + 1 for ring in found if ring is not None and len(ring)),
-        default=0,
-    )
-    # A scan with fewer rings is a crop; its rings have other numbers.
-    complete = [
-        ring if ring is not None and len(ring) and ring.max() + 1 == most else None
-        for ring in found
-    ]
+    complete = _complete_rings(scans)
     if sum(ring is not None for ring in complete) <= len(scans) / 2:
         return "elevations", None
     given = [
@@ -273,13 +276,10 @@ def _without_gaps(cloud: Cloud) -> Cloud:
     )
 
 
-def _attempt(
-    cloud: Cloud, still: Model, seed: int, parts: frozenset[str] = frozenset()
-) -> tuple[tuple[Model, frozenset[str]] | None, float]:
-    """The best model from one mounting, its parts, and its quality."""
-    model = _from_rings(cloud, still) if cloud.kept else add_peaks(cloud, still)
-    if model is None:
-        return None, 0.0
+def _grow(
+    cloud: Cloud, model: Model, parts: frozenset[str], seed: int
+) -> tuple[Model, frozenset[str]]:
+    """The model with the parts that fit it, and with the beams that are peaks once it has them."""
     few = _some_points(cloud, POINTS // 3, seed)
     for _ in range(1 if cloud.kept else ROUNDS):
         model, parts = _choose_parts(few, model, parts)
@@ -287,6 +287,17 @@ def _attempt(
         if again is None or len(again.tangents) == len(model.tangents):
             break
         model = again
+    return model, parts
+
+
+def _attempt(
+    cloud: Cloud, still: Model, seed: int, parts: frozenset[str] = frozenset()
+) -> tuple[tuple[Model, frozenset[str]] | None, float]:
+    """The best model from one mounting, its parts, and its quality."""
+    model = _from_rings(cloud, still) if cloud.kept else add_peaks(cloud, still)
+    if model is None:
+        return None, 0.0
+    model, parts = _grow(cloud, model, parts, seed)
     if "motion" in parts:
         model = _with_motion(cloud, model)
     quality = 0.0

@@ -22,6 +22,7 @@ from lidar_synth.lab.fitting.beams import (
 )
 from lidar_synth.lab.fitting.doubts import doubts, name_vendor
 from lidar_synth.lab.fitting.limits import range_limits, range_step, reflectance_levels
+from lidar_synth.lab.spread import spread
 
 Floats = NDArray[np.float64]
 
@@ -131,12 +132,7 @@ def fit_sensor(
         >>> fit.sensor.shape, fit.sensor.elevations[:2], round(fit.share, 3)
         ((128, 1024), (22.3242, 21.9727), 1.0)
     """
-    given = [
-        scans[i]
-        for i in np.unique(
-            np.linspace(0, len(scans) - 1, min(SCANS, len(scans))).round().astype(int)
-        )
-    ]
+    given = [scans[i] for i in spread(range(len(scans)), SCANS)]
     returned = [np.asarray(scan.points.any(axis=1)) for scan in given]
     scans = [
         scan if there.all() else scan[there]
@@ -150,25 +146,29 @@ def fit_sensor(
         )
     beams, cloud = fit_beams(scans)
     if beams is None:
-        given_points = f"{count} points whose elevations show fewer than two beams"
-        raise DataError(given_points, "two beams or more", FRAME_HINT)
+        raise DataError(
+            f"{count} points whose elevations show fewer than two beams",
+            "two beams or more",
+            FRAME_HINT,
+        )
     found = _described(beams, cloud, scans, name, columns)
-    rings = tuple(
-        _spread(there, part, -1)
-        for there, part in zip(returned, found.rings, strict=True)
+    return replace(
+        found,
+        rings=_fill_up(found.rings, returned, -1),
+        off=_fill_up(found.off, returned, 0),
     )
-    off = tuple(
-        _spread(there, part, 0) for there, part in zip(returned, found.off, strict=True)
-    )
-    return replace(found, rings=rings, off=off)
 
 
-def _spread(there: NDArray[np.bool_], values: NDArray[Any], other: int) -> NDArray[Any]:
-    """Values of the points that are there, as values of all points, with another one for the
-    rest."""
-    spread = np.full(len(there), other, values.dtype)
-    spread[there] = values
-    return spread
+def _fill_up(
+    parts: Sequence[NDArray[Any]], returned: Sequence[NDArray[np.bool_]], other: int
+) -> tuple[NDArray[Any], ...]:
+    """Values of the points of each scan that are there as values of all points, with another one
+    for the rest."""
+    filled = []
+    for values, there in zip(parts, returned, strict=True):
+        filled.append(np.full(len(there), other, values.dtype))
+        filled[-1][there] = values
+    return tuple(filled)
 
 
 def _described(

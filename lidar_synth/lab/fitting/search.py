@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lidar_synth.geometry.deskew import rotate
 from lidar_synth.geometry.lines import CAP, Cloud, Model, nearest_beams, residuals
+from lidar_synth.lab.spread import spread
 
 Floats = NDArray[np.float64]
 
@@ -69,11 +70,7 @@ def find_mount(scans: Sequence[Floats], seed: int = 0) -> tuple[Floats, Floats]:
         scans: (N, 3) metres each.
         seed: of the choice of points.
     """
-    chosen = [
-        scans[i]
-        for i in np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
-    ]
-    chosen = [scan for scan in chosen if len(scan)]
+    chosen = [scans[i] for i in spread(range(len(scans)), SCANS) if len(scans[i])]
     best = FLAT
     place = np.zeros(5)
     for scan in chosen:
@@ -141,23 +138,28 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
         ]
     best = FLAT
     found = np.zeros(5)
-    for place in _best_on_grid(dense, starts):
-        for sectors in _SECTORS:
-            value = partial(
-                _sharpness_within, dense if sectors > 32 else points, sectors
-            )
-            step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
-            step = step * (1 if sectors < 32 else 4)
-            place = climb(value, place, step)
-            sharp = value(place)
-            if sharp <= best:  # fewer sectors do not raise it
-                break
-        else:
+    for start in _best_on_grid(dense, starts):
+        sharp, place = _sharpen(start, dense, points, best)
+        if sharp > best:
             best = sharp
             found = place
         if best > SHARP:
             break
     return best, found
+
+
+def _sharpen(
+    place: Floats, dense: Floats, points: Floats, least: float
+) -> tuple[float, Floats]:
+    """The best sharpness near a place, and where; given up when it is not above ``least``."""
+    for sectors in _SECTORS:
+        value = partial(_sharpness_within, dense if sectors > 32 else points, sectors)
+        step = np.array([0.1, 0.1, 0.1, 0.004, 0.004]) * (1 if sectors > 8 else 0.5)
+        place = climb(value, place, step * (1 if sectors < 32 else 4))
+        sharp = value(place)
+        if sharp <= least:  # fewer sectors do not raise it
+            break
+    return sharp, place
 
 
 def tilt_of(angles: Floats) -> Floats:
@@ -182,8 +184,12 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     rows = round(np.pi / _BIN)
     row = np.clip((elevation / np.pi + 0.5) * rows, 0, rows - 1).astype(np.int32)
     sector = np.minimum((azimuth * sectors).astype(np.int32), sectors - 1)
+    return _concentration(np.sort(sector * np.int32(rows) + row))
+
+
+def _concentration(ordered: NDArray[np.int32]) -> float:
+    """How much points concentrate in few of their bins, given the bins (N,) in ascending order."""
     # Bins that hold points, since most hold none.
-    ordered = np.sort(sector * np.int32(rows) + row)
     first = np.flatnonzero(np.diff(ordered, prepend=-1))
     count = np.diff(first, append=len(ordered)).astype(np.float64)
     filled = ordered[first]

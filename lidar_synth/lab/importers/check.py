@@ -1,11 +1,14 @@
 """A look at imported weights: scans of ten steps, which noise or a wrong convention would give away."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidar_synth.bake.conditions import conditions, conditions_for
 from lidar_synth.generate.loading import load_generator
+from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.viz import write_view
 
 STEPS = 10
@@ -34,16 +37,21 @@ def check_model(path: Path, condition: str | None = None) -> str:
     images = generator.range_images(0, range(SCANS), given, steps=STEPS)
     picture = path.with_suffix(".png")
     write_view(picture, images, title=f"{path.stem}, {STEPS} steps")
-    sensor = generator.sensor
     ranges = np.concatenate([image.range[image.mask] for image in images])
-    edges = np.geomspace(max(sensor.range_min, 1.0), sensor.range_max, BINS + 1)
-    counts, _ = np.histogram(ranges, edges)
     filled = np.mean([image.mask.mean() for image in images])
     lines = [
         f"{SCANS} scans of {STEPS} steps: {100 * filled:.1f} % of the cells have a return",
         "range, m         share of the returns, %",
+        *_draw_histogram(ranges, generator.sensor),
+        f"picture: {picture}",
     ]
+    return "\n".join(lines)
+
+
+def _draw_histogram(ranges: NDArray[np.float32], sensor: Sensor) -> Iterator[str]:
+    """A line for each bin of the sensor's range."""
+    edges = np.geomspace(max(sensor.range_min, 1.0), sensor.range_max, BINS + 1)
+    counts, _ = np.histogram(ranges, edges)
     for i, share in enumerate(counts / max(1, len(ranges))):
         bar = "#" * round(_WIDTH * share)
-        lines.append(f"{edges[i]:5.1f} to {edges[i + 1]:5.1f} {100 * share:6.1f} {bar}")
-    return "\n".join([*lines, f"picture: {picture}"])
+        yield f"{edges[i]:5.1f} to {edges[i + 1]:5.1f} {100 * share:6.1f} {bar}"

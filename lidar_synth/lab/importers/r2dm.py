@@ -141,6 +141,15 @@ def _network(
     return NetworkSpec("efficient_unet", arguments)
 
 
+def _drop_octaves(named: dict[str, Tensor], what: str) -> None:
+    """Check the octaves of the Fourier features, which our networks do not store."""
+    lost = [name for name in OCTAVES if name not in named]
+    if lost:
+        raise DataError(f"{what}: missing keys {lost}", "the keys of R2DM's U-Net")
+    stored, phase = (named.pop(name) for name in OCTAVES)
+    check_octaves(stored, phase, what)
+
+
 def convert_r2dm(
     weights: Mapping[str, Tensor], part: NetworkSpec, what: str = "R2DM's weights"
 ) -> nn.Module:
@@ -159,11 +168,7 @@ def convert_r2dm(
     named = {name.removeprefix("model."): value for name, value in weights.items()}
     named.pop("_dummy", None)
     if part.arguments["position"] == "fourier_features":
-        lost = [name for name in OCTAVES if name not in named]
-        if lost:
-            raise DataError(f"{what}: missing keys {lost}", "the keys of R2DM's U-Net")
-        stored, phase = (named.pop(name) for name in OCTAVES)
-        check_octaves(stored, phase, what)
+        _drop_octaves(named, what)
     for name, value in named.items():
         known = next(
             (v for end, v in BUFFERS.items() if re.search(f"{end}$", name)), None

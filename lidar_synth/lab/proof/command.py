@@ -17,7 +17,7 @@ from lidar_synth.errors import ConfigError, DataError, ProcessError
 from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan
-from lidar_synth.lab.proof.arms import REAL, options_of
+from lidar_synth.lab.proof.arms import REAL, ArmStage, options_of
 from lidar_synth.lab.proof.pools import OBJECTS
 from lidar_synth.lab.proof.trial import Job
 from lidar_synth.labels import ObjectBank
@@ -66,21 +66,7 @@ class CommandTrainer:
         write_scans(bare, job.folder / "held_out")
         path = job.folder / "job.yaml"
         write_file(path, yaml.safe_dump(describe(job), sort_keys=False).encode())
-        words = [word.replace(FIELD, str(path)) for word in shlex.split(self.command)]
-        try:
-            done = subprocess.run(
-                words, capture_output=True, text=True, errors="replace"
-            )
-        except OSError as error:
-            raise ProcessError(
-                f"trainer {words[0]!r} does not start ({error.strerror})", "a command"
-            ) from error
-        if done.returncode:
-            raise ProcessError(
-                f"trainer {shlex.join(words)} ended with status {done.returncode}: "
-                f"{(done.stderr or done.stdout)[-_TAIL:].strip()}",
-                "status 0",
-            )
+        _run([word.replace(FIELD, str(path)) for word in shlex.split(self.command)])
         tables = {}
         first = 0
         for place, scans in job.held_out.items():
@@ -89,29 +75,25 @@ class CommandTrainer:
         return tables
 
 
+def _run(words: list[str]) -> None:
+    """Run a trainer to its end."""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, errors="replace")
+    except OSError as error:
+        raise ProcessError(
+            f"trainer {words[0]!r} does not start ({error.strerror})", "a command"
+        ) from error
+    if done.returncode:
+        raise ProcessError(
+            f"trainer {shlex.join(words)} ended with status {done.returncode}: "
+            f"{(done.stderr or done.stdout)[-_TAIL:].strip()}",
+            "status 0",
+        )
+
+
 def describe(job: Job) -> dict[str, Any]:
     """The plain values of a job, for its YAML file."""
-    stages = []
-    for stage, iterations in job.stages():
-        folder = (
-            job.folder / "real"
-            if stage.pool == REAL
-            else job.pool_folders.get(stage.pool)
-        )
-        options = options_of(stage, list(job.real), job.objects)
-        if isinstance(options.get("bank"), ObjectBank):
-            options["bank"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
-        stages.append(
-            {
-                "iterations": iterations,
-                "ratio": float(stage.ratio),
-                "synthetic": None
-                if not stage.ratio or folder is None
-                else str(folder.resolve()),
-                "labels": {stage.labels: options} if options else stage.labels,
-                "rate": stage.rate,
-            }
-        )
+    stages = [_describe_stage(job, *stage) for stage in job.stages()]
     home = job.folder.resolve()
     folders = {name: str(home / name) for name in ("real", "held_out", "predictions")}
     plain = {
@@ -123,6 +105,24 @@ def describe(job: Job) -> dict[str, Any]:
     return {**plain, "iterations": job.iterations, **folders, "stages": stages}
 
 
+def _describe_stage(job: Job, stage: ArmStage, iterations: int) -> dict[str, Any]:
+    folder = (
+        job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
+    )
+    options = options_of(stage, list(job.real), job.objects)
+    if isinstance(options.get("bank"), ObjectBank):
+        options["bank"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
+    return {
+        "iterations": iterations,
+        "ratio": float(stage.ratio),
+        "synthetic": None
+        if not stage.ratio or folder is None
+        else str(folder.resolve()),
+        "labels": {stage.labels: options} if options else stage.labels,
+        "rate": stage.rate,
+    }
+
+
 def write_scans(scans: Sequence[Scan], folder: Path) -> None:
     """Write scans in SemanticKITTI's layout, as sequence 00 from frame 0 on."""
     writer = SemanticKITTIWriter(folder)
@@ -131,20 +131,23 @@ def write_scans(scans: Sequence[Scan], folder: Path) -> None:
     writer.finish()
 
 
+def _read(path: Path, count: int) -> NDArray[np.uint8]:
+    """The train ids of the predictions of a scan with this number of points."""
+    raw = read_values(path, "<u4")
+    if len(raw) != count:
+        raise DataError(
+            f"{path} with {len(raw)} predictions", f"{count}, one for each point"
+        )
+    return SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
+
+
 def _table(scans: Sequence[Scan], folder: Path, first: int) -> NDArray[np.int64]:
     """The table of the predictions from this number on."""
     count = len(NAMES)
     table = np.zeros((count, count), np.int64)
     for index, scan in enumerate(scans, first):
-        path = folder / f"{index:06d}.label"
-        raw = read_values(path, "<u4")
         assert scan.label is not None
-        if len(raw) != len(scan):
-            raise DataError(
-                f"{path} with {len(raw)} predictions",
-                f"{len(scan)}, one for each point",
-            )
-        predicted = SEMANTIC_KITTI.decode((raw & 0xFFFF).astype(np.uint16), str(path))
+        predicted = _read(folder / f"{index:06d}.label", len(scan))
         valid = scan.label != IGNORE
         # A return without a prediction is an error: it counts as a class with which its own is
         # never pooled.

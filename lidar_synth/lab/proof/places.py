@@ -202,11 +202,3 @@ def choose(
 
 def _others(without: str | None) -> str:
     return "all places" if without is None else f"the places other than {without!r}"
-
-
-def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of the indices, evenly spread."""
-    picks = np.unique(
-        np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
-    )
-    return [indices[i] for i in picks]

@@ -26,11 +26,11 @@ from lidar_synth.lab.proof.places import (
     choose,
     find_places,
     names_of,
-    spread,
 )
 from lidar_synth.lab.proof.plan import Pair, ProofPlan
 from lidar_synth.lab.proof.scores import GROUPS, groups_of, require_labels
 from lidar_synth.lab.proof.settings import MOST_LABELLED, ProofSettings
+from lidar_synth.lab.spread import spread
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.mixing.sources import sensor_of
 

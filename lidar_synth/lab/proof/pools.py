@@ -28,7 +28,7 @@ from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.lab.evaluate.leakage import town
 from lidar_synth.lab.proof.arms import RARE
-from lidar_synth.lab.proof.places import spread
+from lidar_synth.lab.spread import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
 from lidar_synth.labels import ObjectBank

@@ -372,7 +372,8 @@ def _earlier(out: Path) -> dict[str, Any] | None:
     return values if valid else None
 
 
-def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
+def _pool_tasks(work: Trainings, source: Source) -> list[PoolTask]:
+    """What to make, once for each folder."""
     plan = work.plan
     tasks = {}
     kinds = {kind for row in plan.rows for kind in row.arm.pools()}
@@ -392,9 +393,13 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
                 partial(_scans, source, indices, plan.settings.beams),
                 tuple(plan.names[i] for i in indices),
             )
-    with map_in_processes(
-        make_pool, list(tasks.values()), min(plan.jobs, max(1, len(tasks)))
-    ) as done:
+    return list(tasks.values())
+
+
+def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
+    tasks = _pool_tasks(work, source)
+    jobs = min(work.plan.jobs, max(1, len(tasks)))
+    with map_in_processes(make_pool, tasks, jobs) as done:
         for _ in tqdm(
             done,
             total=len(tasks),

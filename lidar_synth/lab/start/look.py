@@ -14,7 +14,8 @@ from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.agreement import agreement
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
-from lidar_synth.lab.proof.places import by_drive, names_of, spread
+from lidar_synth.lab.proof.places import by_drive, names_of
+from lidar_synth.lab.spread import spread
 
 LOOKED = 8
 """Scans that are looked at, evenly spaced."""

@@ -178,6 +178,25 @@ def _footprints(values: NDArray[np.float32]) -> NDArray[np.float64]:
     return boxes.corners()[:, :4, :2].astype(np.float64)
 
 
+def _clip(
+    polygon: NDArray[np.float64], left: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The part of a polygon (n, 2) that is on the left of a line, by the sides (n,) of its
+    corners."""
+    clipped = []
+    for k in range(len(polygon)):
+        before = left[k - 1]
+        here = left[k]
+        if (before < 0) != (here < 0):
+            clipped.append(
+                polygon[k - 1]
+                + (polygon[k] - polygon[k - 1]) * before / (before - here)
+            )
+        if here >= 0:
+            clipped.append(polygon[k])
+    return np.array(clipped)
+
+
 def _common_area(
     polygon: NDArray[np.float64],
     window: NDArray[np.float64],
@@ -189,20 +208,9 @@ def _common_area(
         left = along[0] * (polygon[:, 1] - start[1]) - along[1] * (
             polygon[:, 0] - start[0]
         )
-        clipped = []
-        for k in range(len(polygon)):
-            before = left[k - 1]
-            here = left[k]
-            if (before < 0) != (here < 0):
-                clipped.append(
-                    polygon[k - 1]
-                    + (polygon[k] - polygon[k - 1]) * before / (before - here)
-                )
-            if here >= 0:
-                clipped.append(polygon[k])
-        if len(clipped) < 3:
+        polygon = _clip(polygon, left)
+        if len(polygon) < 3:
             return 0.0
-        polygon = np.array(clipped)
     x, y = (polygon - polygon[0]).T
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
 

@@ -29,6 +29,7 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.leakage import content_of, contents, recordings_of
+from lidar_synth.lab.spread import spread
 
 FEWEST = 12
 MOST = 200
@@ -68,9 +69,7 @@ def split(names: Sequence[str]) -> Split:
         raise DataError(
             f"{count} scans", f"at least {FEWEST} to adapt a model, better 20 to 200"
         )
-    picked = np.unique(
-        np.linspace(0, count - 1, min(count, MOST)).round().astype(int)
-    ).tolist()
+    picked = spread(range(count), MOST)
     first = len(picked) - round(HELD_OUT * len(picked))
     gap = max(1, round(GAP * len(picked)))
     drives = [names[i].rpartition("/")[0] for i in picked]
