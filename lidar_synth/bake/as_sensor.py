@@ -16,7 +16,7 @@ from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
 from lidar_synth.bake.verify import check_scans
 from lidar_synth.bank import Bank, Entry, Facts, Index, ShardWriter
-from lidar_synth.files.disk import part_of, sha256, sync_folder
+from lidar_synth.files.disk import part_of, sync_folder
 from lidar_synth.geometry.projection import project, unproject
 from lidar_synth.geometry.scan import RangeImage
 from lidar_synth.geometry.transfer import Transfer
@@ -84,7 +84,7 @@ def _shard(
             with suppress(OSError):
                 part.unlink(missing_ok=True)
         sync_folder(out)
-    return replace(entry, bytes=path.stat().st_size, sha256=sha256(path))
+    return entry.measure(path)
 
 
 def _images(bank: Bank, number: int, transfer: Transfer) -> Iterator[RangeImage]:

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from tqdm import tqdm
 
 from lidar_synth.bake.folder import write_bank_files
 from lidar_synth.bake.making import claim_bank
-from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardWriter
+from lidar_synth.bank import INDEX, Bank, Entry, Facts, Index, ShardReader, ShardWriter
 from lidar_synth.bank.folder import LocalFolder, copy_shard
 from lidar_synth.errors import ConfigError, FileError
-from lidar_synth.files.disk import hash_of_names, part_of, sha256
+from lidar_synth.files.disk import hash_of_names, part_of
 
 
 def merge(banks: Sequence[Bank], out: Path, progress: bool = True) -> Index:
@@ -67,35 +67,28 @@ def split(
             something else.
         FileError: if it cannot be written.
     """
-    if (
-        any(not share > 0 for share in parts.values())
-        or abs(sum(parts.values()) - 1) > 1e-9
-    ):
-        raise ConfigError(
-            f"shares {list(parts.values())}", "positive numbers that sum to 1"
-        )
-    ends = [0]
-    total = 0.0
-    for share in parts.values():
-        total += share
-        ends.append(round(total * len(bank)))
+    ends = _cut(len(bank), list(parts.values()))
+    with ExitStack() as claims:
+        made = {
+            out: (claims.enter_context(_making(out, "split", [bank], *span)), span)
+            for out, span in zip(parts, pairwise(ends), strict=True)
+        }
+        return {
+            out: _write(out, complete, [(bank, *span)], progress)
+            for out, (complete, span) in made.items()
+        }
+
+
+def _cut(scans: int, shares: list[float]) -> list[int]:
+    """The numbers of the scans at which parts of these shares begin and end."""
+    if any(not share > 0 for share in shares) or abs(sum(shares) - 1) > 1e-9:
+        raise ConfigError(f"shares {shares}", "positive numbers that sum to 1")
+    ends = [round(total * scans) for total in accumulate(shares, initial=0.0)]
     if any(start == stop for start, stop in pairwise(ends)):
         raise ConfigError(
-            f"{len(bank)} scans in shares {list(parts.values())}",
-            "at least one scan for each",
+            f"{scans} scans in shares {shares}", "at least one scan for each"
         )
-    with ExitStack() as claims:
-        made = {}
-        for out, start, stop in zip(parts, ends, ends[1:], strict=False):
-            made[out] = (
-                claims.enter_context(_making(out, "split", [bank], start, stop)),
-                start,
-                stop,
-            )
-        return {
-            out: _write(out, complete, [(bank, start, stop)], progress)
-            for out, (complete, start, stop) in made.items()
-        }
+    return ends
 
 
 def head(bank: Bank, scans: int, out: Path, progress: bool = True) -> Index:
@@ -234,17 +227,19 @@ def _copy_part(
     entry = replace(
         entry, first=entry.first + start, scans=stop - start, dropped=dropped
     )
-    shard = bank.shard(number)
-    names = [
-        name for p in range(start, stop) if (name := shard.condition(p)) is not None
-    ]
     part = part_of(path)
-    with ShardWriter(part, shard.facts, entry, conditions=names) as writer:
-        for position in range(start, stop):
-            writer.append_chunks(*shard.chunks(position))
-    entry = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
+    _copy_scans(bank.shard(number), range(start, stop), entry, part)
+    entry = entry.measure(part)
     part.replace(path)
     return entry
+
+
+def _copy_scans(shard: ShardReader, positions: range, entry: Entry, path: Path) -> None:
+    """Write scans of a shard to a new file, without decompressing them."""
+    names = [name for p in positions if (name := shard.condition(p)) is not None]
+    with ShardWriter(path, shard.facts, entry, conditions=names) as writer:
+        for position in positions:
+            writer.append_chunks(*shard.chunks(position))
 
 
 def _link(bank: Bank, entry: Entry, path: Path) -> None:

@@ -120,9 +120,7 @@ def publish(plan: BakePlan, number: int, part: Path) -> Entry:
     check_folder(plan.out)
     path = plan.out / plan.shards[number].file
     try:
-        entry = replace(
-            plan.shards[number], bytes=part.stat().st_size, sha256=sha256(part)
-        )
+        entry = plan.shards[number].measure(part)
         write_file(
             _note(plan.out, entry), json.dumps(entry.to_dict()).encode(), durable=True
         )

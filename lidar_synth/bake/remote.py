@@ -20,7 +20,6 @@ from lidar_synth.bank.folder import open_folder
 from lidar_synth.bank.reader import read_index
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.claims import compare
-from lidar_synth.files.disk import sha256
 from lidar_synth.formats.writer import NOTES
 
 SETTINGS = ".bake.json"
@@ -73,7 +72,7 @@ def publish(plan: BakePlan, url: str, number: int, part: Path) -> Entry:
     there = _finished(plan, url, sizes).get(entry.file)
     if there is not None:
         return there
-    made = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
+    made = entry.measure(part)
     folder.remove([name for name in sizes if _shard_of(name) == entry.file])
     folder.put(part, entry.file)
     folder.write(f"{NOTES}/{made.file}-{made.bytes}-{made.sha256}", b"")

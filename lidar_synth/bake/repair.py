@@ -23,7 +23,7 @@ from lidar_synth.bank.folder import BankFolder, open_folder
 from lidar_synth.bank.reader import read_index
 from lidar_synth.bank.storage import bank_root, open_storage
 from lidar_synth.errors import DataError, FileError
-from lidar_synth.files.disk import remove_file, sha256
+from lidar_synth.files.disk import remove_file
 
 
 def repair(
@@ -102,7 +102,7 @@ def _regenerate(
     job = job_of(facts, model)
     with folder.making(entry.file) as part:
         write_shard(load_checked(job, facts), part, job, facts, entry, progress)
-        new = replace(entry, bytes=part.stat().st_size, sha256=sha256(part))
+        new = entry.measure(part)
         folder.put(part, entry.file)
     return new
 
@@ -126,22 +126,14 @@ def _index_from_shards(
         DataError: if no shard can be read, or the readable ones come from different bakes.
     """
     sizes = {name: n for name, n in folder.sizes().items() if name.endswith(".h5")}
-    found: dict[str, tuple[Facts, Entry]] = {}
-    for name, size in sorted(sizes.items()):
-        with (
-            suppress(DataError, FileError),
-            ShardReader(open_storage(root, name, size), name) as shard,
-        ):
-            found[name] = shard.facts, shard.entry
+    found = _read_shards(root, sizes)
     if not found:
         raise DataError(
             f"{damage}, and no shard of {root} can be read", "at least one intact shard"
         ) from damage
-    facts = next(iter(found.values()))[0]
+    facts, _ = found[0]
     shards = BakePlan(root, job_of(facts), facts).shards
-    if any(other != facts for other, _ in found.values()) or not {
-        e for _, e in found.values()
-    } <= set(shards):
+    if any(other != facts for other, _ in found) or {e for _, e in found} - set(shards):
         raise DataError(
             f"{damage}, and the shards of {root} are of different bakes",
             "a copy of the index",
@@ -156,6 +148,18 @@ def _index_from_shards(
     return Index((facts,), tuple(_measured(folder, facts, e, sizes) for e in shards))
 
 
+def _read_shards(root: str | Path, sizes: dict[str, int]) -> list[tuple[Facts, Entry]]:
+    """Facts and entries of the shards that can be read."""
+    found = []
+    for name, size in sorted(sizes.items()):
+        with (
+            suppress(DataError, FileError),
+            ShardReader(open_storage(root, name, size), name) as shard,
+        ):
+            found.append((shard.facts, shard.entry))
+    return found
+
+
 def _measured(
     folder: BankFolder, facts: Facts, entry: Entry, sizes: dict[str, int]
 ) -> Entry:
@@ -163,6 +167,5 @@ def _measured(
     if entry.file in sizes:
         with folder.local(entry.file, sizes[entry.file]) as path:
             if next(check_scans(path, facts, entry), None) is None:
-                digest = sha256(path)
-                return replace(entry, bytes=path.stat().st_size, sha256=digest)
+                return entry.measure(path)
     return entry

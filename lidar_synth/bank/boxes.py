@@ -43,6 +43,17 @@ def encode_boxes(boxes: Boxes) -> NDArray[np.int32]:
     Raises:
         DataError: on too many boxes, an unknown class, or an instance below 1.
     """
+    _check_given(boxes)
+    rows = np.zeros(SHAPE, np.int32)
+    rows[: len(boxes), 0] = [1 + NAMES.index(name) for name in boxes.names]
+    rows[: len(boxes), 1] = boxes.instance
+    steps = np.rint(boxes.values.astype(np.float64) / _STEPS).astype(np.int32)
+    steps[:, 3:6] = np.maximum(steps[:, 3:6], 1)
+    rows[: len(boxes), 2:] = steps
+    return rows
+
+
+def _check_given(boxes: Boxes) -> None:
     if len(boxes) > MOST or not set(boxes.names) <= set(NAMES):
         unknown = sorted(set(boxes.names) - set(NAMES))
         raise DataError(
@@ -55,13 +66,6 @@ def encode_boxes(boxes: Boxes) -> NDArray[np.int32]:
         raise DataError(
             "boxes without instance, or far away", "instances from 1 on, and metres"
         )
-    rows = np.zeros(SHAPE, np.int32)
-    rows[: len(boxes), 0] = [1 + NAMES.index(name) for name in boxes.names]
-    rows[: len(boxes), 1] = boxes.instance
-    steps = np.rint(boxes.values.astype(np.float64) / _STEPS).astype(np.int32)
-    steps[:, 3:6] = np.maximum(steps[:, 3:6], 1)
-    rows[: len(boxes), 2:] = steps
-    return rows
 
 
 def decode_boxes(rows: NDArray[np.int32]) -> Boxes:

@@ -62,7 +62,15 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
     packed = memoryview(chunk)[:-4]
     if fletcher32(packed) != int.from_bytes(chunk[-4:], "little"):
         raise ValueError("its Fletcher-32 does not match")
-    size = math.prod(shape) * dtype.itemsize
+    plain = _decompress(packed, math.prod(shape) * dtype.itemsize)
+    first, *others = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    values = first.astype(dtype, copy=False)
+    for k, plane in enumerate(others, 1):
+        values |= np.left_shift(plane, 8 * k, dtype=dtype)
+    return values.reshape(shape)
+
+
+def _decompress(packed: memoryview, size: int) -> bytearray:
     if size > _DEFLATE_RATIO * len(packed):
         raise ValueError(f"{len(packed)} bytes cannot hold {size}")
     try:
@@ -71,11 +79,7 @@ def inflate(chunk: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArr
         raise ValueError(f"it is damaged or does not hold {size} bytes") from error
     if len(plain) != size:
         raise ValueError(f"it holds {len(plain)} bytes instead of {size}")
-    first, *others = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-    values = first.astype(dtype, copy=False)
-    for k, plane in enumerate(others, 1):
-        values |= np.left_shift(plane, 8 * k, dtype=dtype)
-    return values.reshape(shape)
+    return plain
 
 
 def unpack(

@@ -108,10 +108,9 @@ class Encoding:
                 f"a range image of {image.sensor.shape}",
                 f"{self.sensor.shape} of {self.sensor.name!r}",
             )
-        given: dict[str, Any] = {**image.channels, "range": image.range}
-        if image.boxes is not None:
-            given["boxes"] = image.boxes
-        if missing := [name for name in self.names if name not in given]:
+        own = {"range": image.range, "boxes": image.boxes}
+        given: dict[str, Any] = {**image.channels, **own}
+        if missing := [name for name in self.names if given.get(name) is None]:
             raise DataError(
                 f"a range image without {missing}", f"channels {list(self.names[1:])}"
             )
@@ -184,25 +183,31 @@ class Encoding:
                     f"instances from {values.min()} to {values.max()}", "0..65535"
                 )
             return values.astype(np.uint16)
-        codes = np.empty(values.shape, TYPES[name])
         if name == "range":
-            near = self.sensor.range_min - self.scale / 2
-            far = self.sensor.range_max + self.scale / 2
-            limits = np.float32(max(near, 0)), np.float32(far)
-            if not _encode_range(
-                values.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)
-            ):
-                returns = values[values != 0]
-                raise DataError(
-                    f"a range image with ranges from {returns.min():g} to {returns.max():g} m",
-                    f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of "
-                    f"{self.sensor.name!r}, or 0 = no return",
-                )
-        elif not _encode_shares(
+            return self._code_ranges(values)
+        codes = np.empty(values.shape, TYPES[name])
+        if not _encode_shares(
             values.ravel(), np.float32(LEVELS[name]), codes.reshape(-1)
         ):
             raise DataError(
                 f"{name} from {values.min():g} to {values.max():g}", "values in [0, 1]"
+            )
+        return codes
+
+    def _code_ranges(self, metres: NDArray[Any]) -> NDArray[Any]:
+        """The inverse of ``metres``."""
+        codes = np.empty(metres.shape, np.uint16)
+        near = self.sensor.range_min - self.scale / 2
+        far = self.sensor.range_max + self.scale / 2
+        limits = np.float32(max(near, 0)), np.float32(far)
+        if not _encode_range(
+            metres.ravel(), np.float32(1 / self.scale), *limits, codes.reshape(-1)
+        ):
+            returns = metres[metres != 0]
+            raise DataError(
+                f"a range image with ranges from {returns.min():g} to {returns.max():g} m",
+                f"{self.sensor.range_min:g} to {self.sensor.range_max:g} m, the limits of "
+                f"{self.sensor.name!r}, or 0 = no return",
             )
         return codes
 

@@ -34,9 +34,10 @@ import json
 import re
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -45,6 +46,7 @@ import numpy as np
 from lidar_synth.bank.chunks import FILTERS
 from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import DataError
+from lidar_synth.files.disk import sha256
 from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-bank/1"
@@ -256,6 +258,10 @@ class Entry:
             range(len(self.dropped)), rank, key=lambda i: self.dropped[i] - i
         )
 
+    def measure(self, path: Path) -> "Entry":
+        """The entry with the size and hash of its file."""
+        return replace(self, bytes=path.stat().st_size, sha256=sha256(path))
+
     def to_dict(self) -> dict[str, Any]:
         """The entry as plain values."""
         values = asdict(self)
@@ -322,29 +328,7 @@ class Index:
 
     def __post_init__(self) -> None:
         for entry in self.shards:
-            if not re.fullmatch(r"[\w.-]+\.h5", entry.file) or entry.file[0] == ".":
-                raise DataError(
-                    f"a bank's shard {entry.file!r}",
-                    "the name of an .h5 file in the bank's folder",
-                )
-            if not (
-                0 <= entry.source < len(self.sources)
-                and entry.scans >= 1
-                and entry.first >= 0
-            ):
-                raise DataError(
-                    f"a bank with {entry}", "at least one scan, of one of its sources"
-                )
-            steps = pairwise((-1, *entry.dropped, entry.scans))
-            if not (
-                entry.kept >= 1
-                and all(a < b for a, b in steps)
-                and (self.curation or not entry.dropped)
-            ):
-                raise DataError(
-                    f"a bank with {entry}",
-                    "ascending positions that leave a scan, and the rule",
-                )
+            self._check_shard(entry)
         if not self.shards or len({e.file for e in self.shards}) < len(self.shards):
             raise DataError(
                 f"a bank with the shards {[e.file for e in self.shards]}",
@@ -356,6 +340,31 @@ class Index:
         ):
             raise DataError(
                 "a bank with several sensors or fields", "the same for all scans"
+            )
+
+    def _check_shard(self, entry: Entry) -> None:
+        if not re.fullmatch(r"[\w.-]+\.h5", entry.file) or entry.file[0] == ".":
+            raise DataError(
+                f"a bank's shard {entry.file!r}",
+                "the name of an .h5 file in the bank's folder",
+            )
+        if not (
+            0 <= entry.source < len(self.sources)
+            and entry.scans >= 1
+            and entry.first >= 0
+        ):
+            raise DataError(
+                f"a bank with {entry}", "at least one scan, of one of its sources"
+            )
+        steps = pairwise((-1, *entry.dropped, entry.scans))
+        if not (
+            entry.kept >= 1
+            and all(a < b for a, b in steps)
+            and (self.curation or not entry.dropped)
+        ):
+            raise DataError(
+                f"a bank with {entry}",
+                "ascending positions that leave a scan, and the rule",
             )
 
     @property
@@ -408,30 +417,7 @@ class Index:
                     f"{where} does not match its checksum: it was damaged or edited",
                     "an index",
                 )
-            index = cls(
-                tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
-                tuple(Entry.from_dict(entry) for entry in values["shards"]),
-                tuple(values["repairs"]),
-                tuple(values.get("curation", ())),
-                {
-                    str(name): str(sha256)
-                    for name, sha256 in values.get("files", {}).items()
-                },
-            )
-            if values["format"] != index.sources[0].format:
-                raise ValueError(
-                    f"format {values['format']!r} of scans with {index.sources[0].fields}"
-                )
-            if values["scans"] != index.scans:
-                raise ValueError(
-                    f"{values['scans']} scans, but its shards hold {index.scans}"
-                )
-            for notes in (values["repairs"], values.get("curation", [])):
-                if not isinstance(notes, list) or not all(
-                    isinstance(note, str) for note in notes
-                ):
-                    raise TypeError(f"notes {str(notes)[:80]}")
-            return index
+            return cls._from_values(values, where)
         except DataError:
             raise
         except (
@@ -446,6 +432,34 @@ class Index:
                 f"the index of a bank, {FORMAT}",
                 REPAIR,
             ) from error
+
+    @classmethod
+    def _from_values(cls, values: Mapping[str, Any], where: str) -> "Index":
+        """An index from plain values; bad ones raise whatever error they cause."""
+        index = cls(
+            tuple(Facts.from_dict(facts, where) for facts in values["sources"]),
+            tuple(Entry.from_dict(entry) for entry in values["shards"]),
+            tuple(values["repairs"]),
+            tuple(values.get("curation", ())),
+            {
+                str(name): str(digest)
+                for name, digest in values.get("files", {}).items()
+            },
+        )
+        if values["format"] != index.sources[0].format:
+            raise ValueError(
+                f"format {values['format']!r} of scans with {index.sources[0].fields}"
+            )
+        if values["scans"] != index.scans:
+            raise ValueError(
+                f"{values['scans']} scans, but its shards hold {index.scans}"
+            )
+        for notes in (values["repairs"], values.get("curation", [])):
+            if not isinstance(notes, list) or not all(
+                isinstance(note, str) for note in notes
+            ):
+                raise TypeError(f"notes {str(notes)[:80]}")
+        return index
 
     def _values(self) -> dict[str, Any]:
         values: dict[str, Any] = {

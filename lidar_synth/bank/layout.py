@@ -224,7 +224,7 @@ def _chunks(
     dtype: np.dtype[Any],
     compression: str,
 ) -> Chunks:
-    """The addresses of an array's chunks."""
+    """The addresses of an array's chunks, after checking how it is stored."""
     properties = dataset.id.get_create_plist()
     kind = dataset.id.get_type()
     if not _is(dtype.newbyteorder("<"))(kind) or dataset.shape != (scans, *shape):
@@ -248,6 +248,10 @@ def _chunks(
         raise ValueError(
             f"{dataset.name} of one scan takes more than {_BLOSC2_ARRAY >> 20} MiB"
         )
+    return _locate_chunks(dataset, scans)
+
+
+def _locate_chunks(dataset: h5py.Dataset, scans: int) -> Chunks:
     found = Chunks(
         np.zeros(scans, np.uint64),
         np.zeros(scans, np.uint64),

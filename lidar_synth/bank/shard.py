@@ -206,20 +206,7 @@ class ShardReader:
 
     def _packed(self, position: int) -> dict[str, bytes]:
         """The chunks of a scan; adjacent ones are read at once."""
-        places = {}
-        for name, chunks in self._layout.chunks.items():
-            offset, size, skipped = (
-                int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped)
-            )
-            if skipped:
-                raise ValueError(f"filters {skipped:b} were not applied")
-            if not size or offset + size > self._file.size:
-                raise ValueError(
-                    f"its {name} is missing"
-                    if not size
-                    else f"its {name} lies outside the file"
-                )
-            places[name] = (offset, offset + size)
+        places = self._locate(position)
         packed: dict[str, bytes] = {}
         for names in _side_by_side(places):
             start = min(places[name][0] for name in names)
@@ -231,6 +218,22 @@ class ShardReader:
                 for name in names
             }
         return {name: packed[name] for name in places}
+
+    def _locate(self, position: int) -> dict[str, tuple[int, int]]:
+        """Where in the file the chunks of a scan begin and end."""
+        places = {}
+        for name, chunks in self._layout.chunks.items():
+            offset, size, skipped = (
+                int(v[position]) for v in (chunks.offset, chunks.size, chunks.skipped)
+            )
+            if skipped:
+                raise ValueError(f"filters {skipped:b} were not applied")
+            if not size:
+                raise ValueError(f"its {name} is missing")
+            if offset + size > self._file.size:
+                raise ValueError(f"its {name} lies outside the file")
+            places[name] = (offset, offset + size)
+        return places
 
     def _condition(self, position: int) -> bytes:
         return (

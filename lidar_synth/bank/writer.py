@@ -138,7 +138,7 @@ class ShardWriter:
             raise
 
     def _declare(self, facts: Facts) -> None:
-        """Write the attributes and create the datasets."""
+        """Write the attributes and the scans' numbers, and create the datasets of the arrays."""
         count = self.entry.scans
         own = {
             "seed": np.uint64(self.entry.seed),
@@ -156,10 +156,13 @@ class ShardWriter:
             numbers["condition"] = np.array(self._conditions, "S")
         for name, values in numbers.items():
             self._file.create_dataset(name, data=values, track_times=False)
+        self._create_arrays()
+
+    def _create_arrays(self) -> None:
         self._datasets = {
             name: self._file.create_dataset(
                 name,
-                (count, *shape),
+                (self.entry.scans, *shape),
                 dtype.newbyteorder("<"),
                 chunks=(1, *shape),
                 fletcher32=True,
