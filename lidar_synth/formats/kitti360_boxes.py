@@ -17,7 +17,7 @@ has labels only.
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -213,28 +213,7 @@ def write_boxes(
         FileError: if it cannot be read or written.
         DataError: if the existing file is not XML, or a timestamp in it is no frame.
     """
-    root = ElementTree.Element("opencv_storage")
-    kept = []
-    if path.is_file():
-        try:
-            root = ElementTree.parse(path).getroot()
-            kept = [
-                node
-                for node in root
-                if int(node.findtext("timestamp") or -1) not in frames
-            ]
-        except OSError as error:
-            raise unreadable(path, error) from error
-        except (
-            ElementTree.ParseError,
-            ValueError,
-            LookupError,
-        ) as error:  # LookupError: an unknown encoding
-            raise DataError(
-                f"{path}: {error}",
-                "KITTI-360's data_3d_bboxes",
-                "Remove it to write a new one.",
-            ) from error
+    root = _read_others(path, frames)
     objects = [
         node
         for frame, (boxes, pose) in sorted(frames.items())
@@ -242,7 +221,7 @@ def write_boxes(
     ]
     # In the order of frames, so that a resumed export has the bytes of one in a single run.
     root[:] = sorted(
-        [*kept, *objects], key=lambda node: int(node.findtext("timestamp") or -1)
+        [*root, *objects], key=lambda node: int(node.findtext("timestamp") or -1)
     )
     for index, node in enumerate(root):
         node.tag = f"object{index}"
@@ -254,6 +233,27 @@ def write_boxes(
             file, "utf-8", xml_declaration=True
         ),
     )
+
+
+def _read_others(path: Path, frames: Container[int]) -> ElementTree.Element:
+    """What a file says about other frames; an empty root if there is no file."""
+    if not path.is_file():
+        return ElementTree.Element("opencv_storage")
+    try:
+        root = ElementTree.parse(path).getroot()
+        root[:] = [
+            node for node in root if int(node.findtext("timestamp") or -1) not in frames
+        ]
+    except OSError as error:
+        raise unreadable(path, error) from error
+    # LookupError: an unknown encoding
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DataError(
+            f"{path}: {error}",
+            "KITTI-360's data_3d_bboxes",
+            "Remove it to write a new one.",
+        ) from error
+    return root
 
 
 def _objects(

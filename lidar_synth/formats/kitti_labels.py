@@ -7,6 +7,7 @@ The camera is tilted by about one degree relative to the sensor, so that the end
 by some centimetres; conversion back is exact.
 """
 
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry.scan import FARTHEST, Boxes
+
+_FIELDS = "15 fields: a name and 14 numbers"
 
 
 def read_label_2(path: Path, camera: Calibration) -> Boxes:
@@ -34,20 +37,8 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     Raises:
         DataError: as ``read_label_2``.
     """
-    rows = [line.split() for line in text.splitlines() if line.strip()]
-    bad = [row for row in rows if len(row) not in (15, 16)]
-    if bad:
-        raise DataError(
-            f"{path}: a line with {len(bad[0])} fields",
-            "15 fields: a name and 14 numbers",
-        )
-    try:
-        values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
-    except ValueError as error:
-        raise DataError(
-            f"{path}: {error}", "15 fields: a name and 14 numbers"
-        ) from error
-    ignored = np.array([row[0] == "DontCare" for row in rows], bool)
+    names, values = _split_fields(text, path)
+    ignored = np.array([name == "DontCare" for name in names], bool)
     _check_values(values, ignored, path)
     truncation, occlusion, alpha, image_box, size, floor, turn = np.split(
         values, [1, 2, 3, 7, 10, 13], axis=1
@@ -55,13 +46,26 @@ def decode_label_2(text: str, path: Path, camera: Calibration) -> Boxes:
     keep = ~ignored
     return Boxes(
         boxes_from_camera(floor[keep], size[keep], turn[keep, 0], camera),
-        tuple(row[0] for row, k in zip(rows, keep, strict=True) if k),
+        tuple(compress(names, keep)),
         truncation=truncation[keep, 0].astype(np.float32),
         occlusion=occlusion[keep, 0].astype(np.int8),
         image_box=image_box[keep].astype(np.float32),
         alpha=alpha[keep, 0].astype(np.float32),
         dont_care=image_box[ignored].astype(np.float32),
     )
+
+
+def _split_fields(text: str, path: Path) -> tuple[list[str], NDArray[np.float64]]:
+    """The names, and the (M, 14) numbers that follow them."""
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    bad = [row for row in rows if len(row) not in (15, 16)]
+    if bad:
+        raise DataError(f"{path}: a line with {len(bad[0])} fields", _FIELDS)
+    try:
+        values = np.array([row[1:15] for row in rows], np.float64).reshape(-1, 14)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}", _FIELDS) from error
+    return [row[0] for row in rows], values
 
 
 def _check_values(

@@ -102,15 +102,7 @@ class KITTIObject(ScanFiles):
         parts = choose("KITTI object split", split, SPLITS)
         image_set = root / "ImageSets" / f"{split}.txt"
         if split != "all" and image_set.is_file():
-            frames = read_text(image_set).split()
-            if bad := [
-                frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)
-            ]:
-                raise DataError(
-                    f"{image_set} lists {bad[0][:100]!r}",
-                    "names of frames, such as 000123",
-                )
-            ids = [f"{parts[0]}/{frame}" for frame in frames]
+            ids = [f"{parts[0]}/{frame}" for frame in _read_frames(image_set)]
         elif split in ("train", "val"):
             raise ConfigError(
                 f"split {split!r}, but there is no {image_set}",
@@ -118,14 +110,10 @@ class KITTIObject(ScanFiles):
                 "Copy KITTI's ImageSets there, or use split='trainval', all of training.",
             )
         else:
-            folders = [
-                (p, root / p / self._velodyne)
-                for p in parts
-                if (root / p / self._velodyne).is_dir()
-            ]
             ids = [
                 f"{part}/{path.stem}"
-                for part, folder in folders
+                for part in parts
+                if (folder := root / part / self._velodyne).is_dir()
                 for path in list_files(folder, ".bin")
             ]
         super().__init__(root, ids, sensor, on_bad)
@@ -239,6 +227,15 @@ class KITTIObjectWriter(Writer):
                     self.root / "ImageSets" / f"{split}.txt",
                     "".join(f"{f}\n" for f in frames).encode(),
                 )
+
+
+def _read_frames(image_set: Path) -> list[str]:
+    frames = read_text(image_set).split()
+    if bad := [frame for frame in frames if not re.fullmatch(r"\w[\w.-]*", frame)]:
+        raise DataError(
+            f"{image_set} lists {bad[0][:100]!r}", "names of frames, such as 000123"
+        )
+    return frames
 
 
 def read_calibration(

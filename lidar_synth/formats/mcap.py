@@ -116,7 +116,7 @@ class MCAP(ScanFiles):
             ids += [name] if len(places) == 1 else [f"{name}/{n:06d}" for n in numbers]
             self._places += places
         said = self._said[paths[0]]
-        stored = None if said is None else said.sensor
+        stored = said.sensor if said else None
         super().__init__(root, ids, sensor, on_bad, stored=stored)
 
     def read(self, index: int) -> Scan:
@@ -225,27 +225,34 @@ def _index(file: BinaryIO, start: int) -> list[tuple[int, int]]:
 def _message(place: MessagePlace) -> Any:
     """A decoded message."""
     with _opened(place.path) as (file, _):
-        import zstandard
         from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk, Message, Schema
-        from mcap.stream_reader import get_chunk_data_stream
+        from mcap.records import Message, Schema
         from mcap_ros2.decoder import DecoderFactory
 
-        content = _record(file, place.chunk, _CHUNK)
-        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-        declared = [chunk.uncompressed_size]
-        if chunk.compression == "zstd":
-            declared.append(zstandard.frame_content_size(chunk.data))
-        if max(declared) > LARGEST:
-            raise ValueError(f"a chunk of {max(declared)} bytes")
-        stream, _ = get_chunk_data_stream(chunk, validate_crc=True)
-        records = BytesIO(stream.read(chunk.uncompressed_size))
-        content = _record(records, place.offset, _MESSAGE)
+        content = _record(_unpack_chunk(file, place.chunk), place.offset, _MESSAGE)
         message = Message.read(ReadDataStream(BytesIO(content)), len(content))
         schema = Schema(1, DEFINITION.encode(), "ros2msg", MESSAGE)
         decode = DecoderFactory().decoder_for("cdr", schema)
         assert decode is not None
         return decode(message.data)
+
+
+def _unpack_chunk(file: BinaryIO, start: int) -> BytesIO:
+    """The decompressed records of a chunk."""
+    import zstandard
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk
+    from mcap.stream_reader import get_chunk_data_stream
+
+    content = _record(file, start, _CHUNK)
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+    declared = [chunk.uncompressed_size]
+    if chunk.compression == "zstd":
+        declared.append(zstandard.frame_content_size(chunk.data))
+    if max(declared) > LARGEST:
+        raise ValueError(f"a chunk of {max(declared)} bytes")
+    stream, _ = get_chunk_data_stream(chunk, validate_crc=True)
+    return BytesIO(stream.read(chunk.uncompressed_size))
 
 
 def _points(message: Any, where: str) -> dict[str, NDArray[Any]]:

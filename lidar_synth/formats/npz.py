@@ -210,19 +210,23 @@ def range_image(
         values = image.channels[name].copy()
         values[~image.mask] = IGNORE if name == "label" else 0
         image.channels[name] = values
-        if (
-            name in ("reflectance", "confidence")
-            and not ((values >= 0) & (values <= 1)).all()
-        ):
-            raise DataError(
-                f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1"
-            )
-        if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
-            raise DataError(
-                f"{where}: labels {np.unique(values)[-8:].tolist()}",
-                "train ids 0..18, or 255 = ignore",
-            )
+        _check_channel(name, values, where)
     return image
+
+
+def _check_channel(name: str, values: NDArray[Any], where: str) -> None:
+    if (
+        name in ("reflectance", "confidence")
+        and not ((values >= 0) & (values <= 1)).all()
+    ):
+        raise DataError(
+            f"{where}: {name} from {values.min()} to {values.max()}", "0 to 1"
+        )
+    if name == "label" and not ((values < len(NAMES)) | (values == IGNORE)).all():
+        raise DataError(
+            f"{where}: labels {np.unique(values)[-8:].tolist()}",
+            "train ids 0..18, or 255 = ignore",
+        )
 
 
 def check_numbers(array: NDArray[Any], where: str) -> None:
@@ -295,16 +299,16 @@ def _known(arrays: dict[str, NDArray[Any]], sensor: Sensor | None) -> dict[str, 
     if "pose" in arrays:
         known["pose"] = check_pose(arrays["pose"])
     if BOX + "values" in arrays:
-        boxes = {
-            f.name: arrays[BOX + f.name] for f in fields(Boxes) if f.name != "names"
-        }
-        names = arrays[BOX + "names"]
-        if names.ndim != 1 or (names.size and names.dtype.kind != "U"):
-            raise ValueError(
-                f"the boxes' names are {names.dtype} of shape {names.shape}"
-            )
-        known["boxes"] = Boxes(**boxes, names=tuple(names.tolist()))
+        known["boxes"] = _make_boxes(arrays)
     return known
+
+
+def _make_boxes(arrays: dict[str, NDArray[Any]]) -> Boxes:
+    values = {f.name: arrays[BOX + f.name] for f in fields(Boxes)}
+    names = values.pop("names")
+    if names.ndim != 1 or (names.size and names.dtype.kind != "U"):
+        raise ValueError(f"the boxes' names are {names.dtype} of shape {names.shape}")
+    return Boxes(**values, names=tuple(names.tolist()))
 
 
 def check_pose(values: Any) -> NDArray[np.float64]:

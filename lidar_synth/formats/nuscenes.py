@@ -105,22 +105,13 @@ class NuScenes(ScanFiles):
                 f"integers 0..{RINGS - 1}",
                 f"It may hold four floats per point (KITTI), or be damaged. {SKIP_HINT}",
             )
-        labels: dict[str, Any] = {}
-        if path.name in self._labels:
-            raw = read_values(self._labels[path.name], "u1")
-            if len(raw) != len(points):
-                raise mismatch(self._labels[path.name], len(raw), path, len(points))
-            label = NUSCENES.decode(
-                raw, f"{self._labels[path.name]} (labels of {path})"
-            )
-            labels = {"label": label, "raw_label": raw.astype(np.uint32)}
         scan = Scan(
             ahead(points[:, :3]),
             points[:, 3] / np.float32(INTENSITY_MAX),
             self.sensor,
             ring=(RINGS - 1 - rings).astype(np.int16),
             id=self.ids[index],
-            **labels,
+            **self._read_labels(path, len(points)),
         )
         # Keeps NaN, which on_bad handles.
         kept = ~(np.einsum("ij,ij->i", scan.points, scan.points) < NEAREST**2)
@@ -131,6 +122,17 @@ class NuScenes(ScanFiles):
                 SKIP_HINT,
             )
         return scan[kept]
+
+    def _read_labels(self, sweep: Path, count: int) -> dict[str, Any]:
+        """The labels of a sweep's points, if there are any."""
+        path = self._labels.get(sweep.name)
+        if path is None:
+            return {}
+        raw = read_values(path, "u1")
+        if len(raw) != count:
+            raise mismatch(path, len(raw), sweep, count)
+        label = NUSCENES.decode(raw, f"{path} (labels of {sweep})")
+        return {"label": label, "raw_label": raw.astype(np.uint32)}
 
 
 def ahead(points: NDArray[np.float32]) -> NDArray[np.float32]:

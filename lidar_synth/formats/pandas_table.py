@@ -186,17 +186,9 @@ def _gunzip(content: bytes, path: Path) -> bytes:
 
 def _columns(frame: Any, wanted: set[str]) -> dict[str, NDArray[Any]]:
     """The wanted columns of a pickled ``DataFrame``."""
-    state = _call(frame, FRAMES).state
-    manager = _call(state["_mgr"] if "_mgr" in state else state["_data"], MANAGERS)
-    if manager.args:  # pandas 1.3 and later
-        blocks, axes = manager.args
-        parts = [_call(block, BLOCKS).args[:2] for block in blocks]
-    else:
-        [saved] = [part["0.14.1"] for part in manager.state if isinstance(part, dict)]
-        axes = saved["axes"]
-        parts = [(block["values"], block["mgr_locs"]) for block in saved["blocks"]]
+    index, parts = _take_apart(frame)
     arrays = _Arrays()
-    names = arrays.make(_call(axes[0], MAKE_INDEX).args[1]["data"])
+    names = arrays.make(_call(index, MAKE_INDEX).args[1]["data"])
     if names.ndim != 1 or max(len(names), len(parts)) > MOST_COLUMNS:
         raise ValueError(f"{len(names)} columns in {len(parts)} blocks")
     found: dict[str, NDArray[Any]] = {}
@@ -209,6 +201,18 @@ def _columns(frame: Any, wanted: set[str]) -> dict[str, NDArray[Any]]:
                 n: row for n, row in zip(block_names, rows, strict=True) if n in wanted
             }
     return found
+
+
+def _take_apart(frame: Any) -> tuple[Any, list[Any]]:
+    """The index of the columns' names; the values of each block, and the places of its columns."""
+    state = _call(frame, FRAMES).state
+    manager = _call(state["_mgr"] if "_mgr" in state else state["_data"], MANAGERS)
+    if manager.args:  # pandas 1.3 and later
+        blocks, axes = manager.args
+        return axes[0], [_call(block, BLOCKS).args[:2] for block in blocks]
+    [saved] = [part["0.14.1"] for part in manager.state if isinstance(part, dict)]
+    parts = [(block["values"], block["mgr_locs"]) for block in saved["blocks"]]
+    return saved["axes"][0], parts
 
 
 def _call(value: Any, names: tuple[str, ...]) -> Call:
@@ -239,11 +243,7 @@ class _Arrays:
         else:
             _, shape, dtype, fortran, data = _call(value, ARRAYS).state
             order = "F" if fortran else "C"
-        lengths = shape if isinstance(shape, tuple) else ()
-        if len(lengths) not in (1, 2) or not all(
-            type(length) is int and length >= 0 for length in lengths
-        ):
-            raise ValueError("an array of another shape than (N,) or (N, M)")
+        _check_shape(shape)
         kind = dtype_of(dtype)
         self.left -= prod(shape) * kind.itemsize
         if self.left < 0:
@@ -259,6 +259,14 @@ class _Arrays:
         if len(places) > count:
             raise ValueError(f"{len(places)} places for {count} columns")
         return [range(count)[place] for place in places.tolist()]
+
+
+def _check_shape(shape: Any) -> None:
+    lengths = shape if isinstance(shape, tuple) else ()
+    if len(lengths) not in (1, 2) or not all(
+        type(length) is int and length >= 0 for length in lengths
+    ):
+        raise ValueError("an array of another shape than (N,) or (N, M)")
 
 
 def _objects(values: Any) -> NDArray[Any]:

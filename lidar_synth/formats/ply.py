@@ -147,9 +147,8 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     content = read_file(path)
     where = str(path)
     encoding, elements, offset = _parse(content[:LONGEST_HEADER], where)
-    [(position, vertex)] = [
-        (i, e) for i, e in enumerate(elements) if e.name == "vertex"
-    ]
+    position = [e.name for e in elements].index("vertex")
+    vertex = elements[position]
     if vertex.lists or (
         encoding != "ascii" and any(e.lists for e in elements[:position])
     ):
@@ -164,14 +163,8 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
         if len(lines) != (wanted := sum(e.count for e in elements)):
             raise size_error(where, len(lines), wanted, "lines")
         start = sum(e.count for e in elements[:position])
-        return to_arrays(
-            from_text(
-                "\n".join(lines[start : start + vertex.count]),
-                vertex.fields,
-                vertex.count,
-                where,
-            )
-        )
+        text = "\n".join(lines[start : start + vertex.count])
+        return to_arrays(from_text(text, vertex.fields, vertex.count, where))
     size = sum(e.size for e in elements)  # a lower bound if there are lists
     check_size(body, size, where, more=any(e.lists for e in elements))
     start = sum(e.size for e in elements[:position])

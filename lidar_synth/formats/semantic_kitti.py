@@ -116,30 +116,16 @@ class SemanticKITTI(ScanFiles):
     ) -> None:
         root = Path(root)
         self.taxonomy = taxonomy
-        wanted = choose("SemanticKITTI split", split, SPLITS)
-        existing = sorted(
-            p.parent.name for p in (root / "sequences").glob("*/velodyne")
-        )
-        sequences = [s for s in existing if wanted is None or s in wanted]
-        if not sequences:
-            raise DataError(
-                f"{root} has no sequence of split {split!r} (it has "
-                f"{', '.join(existing) or 'none at all'})",
-                "sequences/NN/velodyne/*.bin",
-            )
+        folders = _find_sequences(root, split)
         ids = [
             f"{s}/{p.stem}"
-            for s in sequences
-            for p in list_files(root / "sequences" / s / "velodyne", ".bin")
+            for s, folder in folders.items()
+            for p in list_files(folder / "velodyne", ".bin")
         ]
         super().__init__(root, ids, sensor, on_bad)
-        self._labelled = {
-            s for s in sequences if (root / "sequences" / s / "labels").is_dir()
-        }
-        self._cameras = {s: read_calibration(root / "sequences" / s) for s in sequences}
-        self._poses = {
-            s: read_poses(root / "sequences" / s, self._cameras[s]) for s in sequences
-        }
+        self._labelled = {s for s, f in folders.items() if (f / "labels").is_dir()}
+        self._cameras = {s: read_calibration(f) for s, f in folders.items()}
+        self._poses = {s: read_poses(f, self._cameras[s]) for s, f in folders.items()}
 
     def read(self, index: int) -> Scan:
         sequence, frame = self.ids[index].split("/")
@@ -276,6 +262,20 @@ class SemanticKITTIWriter(Writer):
             if notes and camera is not None:
                 write_poses(folder, camera, poses, frames=1 + max(notes))
             clear_notes(folder)
+
+
+def _find_sequences(root: Path, split: str) -> dict[str, Path]:
+    """The folders of a split's sequences by their numbers, in order."""
+    wanted = choose("SemanticKITTI split", split, SPLITS)
+    existing = sorted(p.parent.name for p in (root / "sequences").glob("*/velodyne"))
+    found = [s for s in existing if wanted is None or s in wanted]
+    if not found:
+        raise DataError(
+            f"{root} has no sequence of split {split!r} (it has "
+            f"{', '.join(existing) or 'none at all'})",
+            "sequences/NN/velodyne/*.bin",
+        )
+    return {s: root / "sequences" / s for s in found}
 
 
 def read_calibration(folder: Path) -> Calibration | None:
