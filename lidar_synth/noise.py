@@ -176,31 +176,30 @@ def _words(
     stream: int,
 ) -> tuple[Tensor, int]:
     """(4, B, blocks) random 32-bit words, and the number of elements of one sample."""
+    _check(seed, indices, shape)
     count = math.prod(shape)
-    if not 0 <= seed < 2**64:
-        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
-    if any(not 0 <= i < 2**63 for i in indices):
-        raise ConfigError(
-            f"index {next(i for i in indices if not 0 <= i < 2**63)}",
-            "0 <= index < 2^63",
-        )
-    if min(shape, default=1) < 1 or count >= 2**34:
-        raise ConfigError(
-            f"noise of shape {tuple(shape)}",
-            "positive sizes, less than 2^34 elements in all",
-        )
     # CPU and CUDA have float64; for other devices the noise is computed on the CPU and copied.
-    place = (
-        torch.device(device)
-        if torch.device(device).type == "cuda"
-        else torch.device("cpu")
-    )
+    place = torch.device(device)
+    if place.type != "cuda":
+        place = torch.device("cpu")
     blocks = torch.arange(-(-count // 4), device=place)
     index = torch.tensor(list(indices), dtype=torch.int64, device=place)[:, None]
     counter = (blocks, index & _WORD, index >> 32, blocks.new_tensor(stream))
     return philox(
         torch.stack([word.expand(len(index), len(blocks)) for word in counter]), seed
     ), count
+
+
+def _check(seed: int, indices: Sequence[int], shape: Sequence[int]) -> None:
+    if not 0 <= seed < 2**64:
+        raise ConfigError(f"seed {seed}", "0 <= seed < 2^64")
+    if wrong := [i for i in indices if not 0 <= i < 2**63]:
+        raise ConfigError(f"index {wrong[0]}", "0 <= index < 2^63")
+    if min(shape, default=1) < 1 or math.prod(shape) >= 2**34:
+        raise ConfigError(
+            f"noise of shape {tuple(shape)}",
+            "positive sizes, less than 2^34 elements in all",
+        )
 
 
 def _samples(

@@ -40,6 +40,11 @@ class Trajectory:
     def __init__(self, times: ArrayLike, poses: ArrayLike) -> None:
         self.times = np.asarray(times, np.float64)
         self.poses = np.asarray(poses, np.float64)
+        self._check()
+        turn = self.poses[:, :3, :3]
+        self._steps = rotation_vectors(turn[:-1].swapaxes(1, 2) @ turn[1:])
+
+    def _check(self) -> None:
         count = len(self.times) if self.times.ndim == 1 else 0
         if count < 2 or self.poses.shape != (count, 4, 4):
             given = f"times of shape {self.times.shape} and poses of shape {self.poses.shape}"
@@ -57,7 +62,6 @@ class Trajectory:
                 "poses whose upper left 3 x 3 part is not a rotation",
                 "rigid poses, sensor to world",
             )
-        self._steps = rotation_vectors(turn[:-1].swapaxes(1, 2) @ turn[1:])
 
     def at(self, time: float) -> Floats:
         """(4, 4) the pose at one moment."""

@@ -217,12 +217,16 @@ def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> No
     strength = (scale / sigma) ** 2
     normal[np.diag_indices_from(normal)] += strength
     right -= strength * now
-    # Lasers of one block stand at nearly the same height; robust, because there can be several
-    # blocks.
+    _add_block_prior(normal, right, model, scale)
+
+
+def _add_block_prior(normal: Floats, right: Floats, model: Model, scale: float) -> None:
+    """Lasers of one block stand at nearly the same height; robust, because there can be several
+    blocks."""
     step = np.diff(model.heights)
     alike = (scale / PRIOR_HEIGHT_STEP) ** 2 / (1 + (step / PRIOR_HEIGHT_STEP) ** 2)
-    upper = 2 * np.arange(beams - 1) + 1
-    lower = 2 * np.arange(beams - 1) + 3
+    upper = 2 * np.arange(len(step)) + 1
+    lower = upper + 2
     normal[upper, upper] += alike
     normal[lower, lower] += alike
     normal[upper, lower] -= alike

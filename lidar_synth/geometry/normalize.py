@@ -282,7 +282,7 @@ class TensorFormat:
                 f"a tensor of shape {tuple(x.shape)}",
                 f"(B, {self.size}, H, W) for {self.channels}",
             )
-        if not bool(x.abs().amax().isfinite()):
+        if not x.abs().amax().isfinite():
             raise DataError(
                 f"a tensor for {self.channels} with NaN or infinity", "finite values"
             )

@@ -113,16 +113,17 @@ def instances_of(scan: Scan, least: int = 5) -> list[Object]:
         things[np.argsort(which, kind="stable")], np.cumsum(np.bincount(which))[:-1]
     ):
         if len(part) >= least:
-            low = scan.points[part].min(0)
-            high = scan.points[part].max(0)
-            box = grow_box(
-                np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(
-                    np.float32
-                ),
-                scan.points[part],
-            )
+            box = _enclose(scan.points[part])
             objects.append(_object(scan, part, Boxes(box, ("Misc",))))
     return objects
+
+
+def _enclose(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The box of yaw 0 around points, as of ``Boxes``."""
+    low = points.min(0)
+    high = points.max(0)
+    box = np.r_[(low + high) / 2, np.maximum(high - low, 0.1), 0].astype(np.float32)
+    return grow_box(box, points)
 
 
 def enlarge_boxes(scan: Scan) -> Scan:

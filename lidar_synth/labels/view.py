@@ -52,20 +52,17 @@ class Composition:
         self.parts = [
             VisibleReturns(cell, distance, np.ones(len(scan), bool), len(scan))
         ]
-        empty = point < 0
+        seen = point >= 0
         self._front = np.full(point.shape, np.inf, np.float32)
         self._height = np.zeros(point.shape, np.float32)
         height = scan.points[:, 2]
-        if (
-            scan.label is not None
-        ):  # returns labelled as other classes than ground occlude at any height
-            height = np.where(
-                GROUND[scan.label] | (scan.label == IGNORE), height, np.float32(np.inf)
-            )
-        self._front[~empty], self._height[~empty] = (
-            distance[point[~empty]],
-            height[point[~empty]],
-        )
+        label = scan.label
+        if label is not None:
+            # Returns labelled as other classes than ground occlude at any height.
+            low = GROUND[label] | (label == IGNORE)
+            height = np.where(low, height, np.float32(np.inf))
+        self._front[seen] = distance[point[seen]]
+        self._height[seen] = height[point[seen]]
         _close_gaps(self._front, self._height)
 
     def add(self, placed: Object, least: int) -> bool:

@@ -1,6 +1,7 @@
 """The layout of a scan: its boxes, and the ground and the outlines that its points show."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,18 +166,7 @@ def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
     z = points[order, 2]
     rows = []
     for number, start, stop in _groups(sector):
-        # The first run of returns without a gap that has enough of them.
-        ends = np.append(
-            np.flatnonzero(np.diff(rho[start:stop]) > _GAP) + 1, stop - start
-        )
-        first, last = next(
-            (
-                (a, b)
-                for a, b in zip(np.r_[0, ends[:-1]], ends, strict=True)
-                if b - a >= _LEAST
-            ),
-            (0, 0),
-        )
+        first, last = _find_run(rho[start:stop])
         if last:
             part = slice(start + first, start + last)
             near, far = np.quantile(rho[part], (0.1, 0.9))
@@ -191,6 +181,16 @@ def _profiles(points: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
                 )
             )
     yield from _connected(np.array(rows, np.float64).reshape(-1, 5))
+
+
+def _find_run(rho: NDArray[np.float32]) -> tuple[int, int]:
+    """The first run of ascending distances without a gap that has enough of them; (0, 0) without
+    one."""
+    ends = np.append(np.flatnonzero(np.diff(rho) > _GAP) + 1, len(rho))
+    for first, last in pairwise([0, *ends.tolist()]):
+        if last - first >= _LEAST:
+            return first, last
+    return 0, 0
 
 
 def _groups(sector: NDArray[np.int64]) -> Iterator[tuple[int, int, int]]:
@@ -218,13 +218,14 @@ def _connected(rows: NDArray[np.float64]) -> Iterator[NDArray[np.float32]]:
         | (gap[:, 3] > _STEP)
     )
     for line in np.split(rows, np.flatnonzero(breaks) + 1):
-        # Half a sector on both sides, so that lines of neighbouring sectors meet.
-        edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
-        padded = np.r_[line[:1], line, line[-1:]]
-        azimuth = (edges / SECTORS - 0.5) * 2 * np.pi
-        corners = np.c_[
-            padded[:, 1] * np.cos(azimuth),
-            -padded[:, 1] * np.sin(azimuth),
-            padded[:, 2:],
-        ]
-        yield corners.astype(np.float32)
+        yield _trace(line)
+
+
+def _trace(line: NDArray[np.float64]) -> NDArray[np.float32]:
+    # Half a sector on both sides, so that lines of neighbouring sectors meet.
+    edges = np.r_[line[0, 0], line[:, 0] + 0.5, line[-1, 0] + 1]
+    padded = np.r_[line[:1], line, line[-1:]]
+    azimuth = (edges / SECTORS - 0.5) * 2 * np.pi
+    x = padded[:, 1] * np.cos(azimuth)
+    y = -padded[:, 1] * np.sin(azimuth)
+    return np.asarray(np.c_[x, y, padded[:, 2:]], np.float32)

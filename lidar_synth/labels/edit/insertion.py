@@ -420,11 +420,9 @@ def _behind(
         mine = np.flatnonzero(rays.ring[window] == ring)
         hit = np.flatnonzero(np.isfinite(rho[mine]))
         if len(hit):
-            # After the widest gap.
-            start = hit[
-                np.argmax(np.diff(hit, append=hit[0] + len(mine))) + 1 - len(hit)
-            ]
-            length = len(mine) - np.diff(hit, append=hit[0] + len(mine)).max() + 1
+            gaps = np.diff(hit, append=hit[0] + len(mine))
+            start = hit[np.argmax(gaps) + 1 - len(hit)]  # after the widest gap
+            length = len(mine) - gaps.max() + 1
             inner = mine[(start + np.arange(length)) % len(mine)]
             behind[inner] = rays.rho[window[inner]] > np.min(rho[mine][hit])
     return behind

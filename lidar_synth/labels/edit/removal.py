@@ -244,9 +244,9 @@ def _copies(
     points = np.where(
         found[:, None], rays.points(which, np.where(found, rho, 0.0)), np.float32(0)
     )
-    limits = scan.sensor.range_min, scan.sensor.range_max
     distance = np.linalg.norm(points, axis=1)
-    points[(distance < limits[0]) | (distance > limits[1])] = 0
+    near = distance < scan.sensor.range_min
+    points[near | (distance > scan.sensor.range_max)] = 0
     copies = scan[np.maximum(rays.point[donor], 0)]
     fields: dict[str, Any] = {"points": points.astype(np.float32)}
     if scan.instance is not None:
