@@ -84,6 +84,11 @@ class Codebook(nn.Module):
             torch.distributed.all_reduce(sums)
         self.counts.lerp_(counts, 1 - DECAY)
         self.sums.lerp_(sums, 1 - DECAY)
+        self._replace_dead(tokens)
+        self.codes.copy_(self.sums / self.counts[:, None])
+
+    def _replace_dead(self, tokens: Tensor) -> None:
+        """Give codes that are hardly used new sums and counts, from vectors (N, K) of a batch."""
         dead = self.counts < _LEAST
         # Evenly spaced vectors of the batch replace dead codes: a deterministic choice.
         places = torch.linspace(
@@ -92,7 +97,6 @@ class Codebook(nn.Module):
         # Without an index by ``dead``, whose number of entries a GPU would have to be asked for.
         self.sums.copy_(torch.where(dead[:, None], tokens[places], self.sums))
         self.counts.masked_fill_(dead, 1.0)
-        self.codes.copy_(self.sums / self.counts[:, None])
 
 
 @torch.no_grad()

@@ -264,6 +264,15 @@ def reduced(size: Grid, strides: Sequence[Grid], what: str) -> Grid:
     return size[0] // unit[0], size[1] // unit[1]
 
 
+def halve(widths: Sequence[int]) -> nn.Sequential:
+    """Convolutions of a camera image to features of these widths; each halves rows and columns."""
+    body = nn.Sequential()
+    for a, b in zip([3, *widths[:-1]], widths, strict=True):
+        convolution = nn.Conv2d(a, b, 3, 2, 1, bias=False)
+        body.extend([convolution, nn.BatchNorm2d(b), nn.SiLU()])
+    return body
+
+
 def check_shape(x: Tensor, shape: tuple[int, ...], what: str) -> None:
     """Check the shape of a batch; ``what`` names it in an error.
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.models.convolution import check_shape, pair, reduced
+from lidar_synth.generate.models.convolution import check_shape, halve, pair, reduced
 from lidar_synth.generate.models.network import Encoder
 from lidar_synth.generate.models.positions import RayAngles
 
@@ -71,11 +71,7 @@ class SightEncoder(Encoder):
             )
         reduced(self.resolution, [(2, 2)] * len(widths), "an image")
         self.angles = RayAngles(target, angles)
-        self.body = nn.Sequential()
-        for a, b in zip([3, *widths[:-1]], widths, strict=True):
-            self.body.extend(
-                [nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()]
-            )
+        self.body = halve(widths)
         self.body.append(nn.Conv2d(widths[-1], channels - 1, 3, 1, 1))
 
     def pixel_coordinates(self) -> Tensor:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from lidar_synth.generate.models.convolution import check_shape, pair, reduced
+from lidar_synth.generate.models.convolution import check_shape, halve, pair, reduced
 from lidar_synth.generate.models.network import Encoder
 
 
@@ -42,12 +42,7 @@ class ViewEncoder(Encoder):
             [(1, views)] + [(2, 2)] * len(widths),
             f"an image of {views} views",
         )
-        inputs = [3, *widths[:-1]]
-        self.body = nn.Sequential()
-        for a, b in zip(inputs, widths, strict=True):
-            self.body.extend(
-                [nn.Conv2d(a, b, 3, 2, 1, bias=False), nn.BatchNorm2d(b), nn.SiLU()]
-            )
+        self.body = halve(widths)
         self.place = nn.Parameter(torch.empty(widths[-1], *grid))
         self.view_embedding = nn.Parameter(torch.empty(views, 1, widths[-1]))
         nn.init.trunc_normal_(self.place, std=0.02)

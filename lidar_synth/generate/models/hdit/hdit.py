@@ -24,7 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.models.attention import Grid, NeighbourhoodAttention
-from lidar_synth.generate.models.convolution import check_condition
+from lidar_synth.generate.models.convolution import check_condition, pair
 from lidar_synth.generate.models.hdit.transformer import (
     Expand,
     Level,
@@ -97,9 +97,9 @@ class HDiT(Network):
         angles: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.resolution = _pair(resolution)
-        self.patch = _pair(patch)
-        self.window = _pair(window)
+        self.resolution = pair(resolution)
+        self.patch = pair(patch)
+        self.window = pair(window)
         self.channels = channels
         self.condition_channels = condition_channels
         self.context_channels = context_channels
@@ -255,12 +255,6 @@ def _times(t: Tensor | float, y: Tensor) -> Tensor:
             "one time per state, or one for all",
         )
     return t.expand(len(y))
-
-
-def _pair(values: Sequence[int]) -> Grid:
-    """Rows and columns as a tuple; a checkpoint stores them as a list."""
-    rows, columns = values
-    return int(rows), int(columns)
 
 
 def _grids(resolution: Grid, patch: Grid, levels: int) -> list[Grid]:
