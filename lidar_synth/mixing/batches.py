@@ -263,8 +263,8 @@ class MixedBatches(Sampler[list[int]]):
                 self.dataset.expect(epoch, chain.from_iterable(rest))
                 announced = done * steps.size + AHEAD * self.world_size // 2
             if share := rank_share(step, self.rank, self.world_size):
-                number = number + 1
-                yielded = yielded + len(share)
+                number += 1
+                yielded += len(share)
                 self._taken = (epoch, number)
                 yield [Position(position, epoch) for position in share]
         self.dataset.current.passed[self.rank] = (epoch, steps.start)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -94,10 +95,11 @@ def check_alike(
     with _preserved_generators():
         expected = _try("real", dataset.__getitem__, 0)
         for number, source in enumerate(synthetic):
+            make = partial(finish, number)
             sample = _try(
                 "synthetic",
-                lambda n, s: finish(n, _scan_of(s), keyed_rng(0)),
-                number,
+                lambda own, s: own(_scan_of(s), keyed_rng(0)),
+                make,
                 source,
             )
             if expected is None or sample is None:
@@ -114,27 +116,28 @@ def check_alike(
                     "them to differ.",
                 )
             if _tables(expected) and not _is_on_demand(source):
-                more = [
-                    _try("real", dataset.__getitem__, i)
-                    for i in spread(len(dataset), SEARCHED)[1:]
-                ]
-                numbers = spread(source.length or SEARCHED, SEARCHED)
-                made = [
-                    _try(
-                        "synthetic",
-                        lambda i, n, s: finish(n, s[i], keyed_rng(i)),
-                        i,
-                        number,
-                        source,
-                    )
-                    for i in numbers
-                ]
-                report(
-                    compare_meaning(
-                        [_tables(s) for s in (expected, *more)],
-                        [_tables(s) for s in made],
-                    )
-                )
+                _compare_more(dataset, expected, source, make)
+
+
+def _compare_more(
+    dataset: Any,
+    first: Any,
+    source: Synthetic,
+    make: Callable[[Scan, np.random.Generator], Any],
+) -> None:
+    """Compare what several samples of a dataset and of a source mean."""
+    real = [
+        _try("real", dataset.__getitem__, i) for i in spread(len(dataset), SEARCHED)[1:]
+    ]
+    synthetic = [
+        _try("synthetic", lambda i: make(source[i], keyed_rng(i)), i)
+        for i in spread(source.length or SEARCHED, SEARCHED)
+    ]
+    report(
+        compare_meaning(
+            [_tables(s) for s in (first, *real)], [_tables(s) for s in synthetic]
+        )
+    )
 
 
 def report(found: Sequence[Contradiction]) -> None:

@@ -185,24 +185,24 @@ class MixingPlan:
         before = self._synthetic_up_to(positions)
         after = self._synthetic_up_to(positions + 1)
         synthetic = after > before
-        seed = self.mixture.seed
         rank = np.empty(len(positions), np.int64)
         real = (positions - before)[~synthetic]
-        rank[~synthetic] = permute(
-            real, len(self) - self.synthetics, seed, _REALS, self.epoch
-        )
+        key = (self.mixture.seed, _REALS, self.epoch)
+        rank[~synthetic] = permute(real, len(self) - self.synthetics, *key)
         if synthetic.any():
-            earlier = sum(self.before[self.reals :])
-            source, number = deal(
-                self.mixture.synthetic_weights, before[synthetic] + earlier
-            )
-            dealt = np.empty(len(source), np.int64)
-            for each, start in enumerate(self._starts.tolist()[self.reals :]):
-                here = source == each
-                total = self.reals + each
-                own = number[here] - self.before[total]
-                dealt[here] = start + self._ordered(total, own)
-            rank[synthetic] = dealt
+            rank[synthetic] = self._deal(before[synthetic])
+        return rank
+
+    def _deal(self, before: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Ranks of synthetic samples, from the number of those before each in the epoch."""
+        earlier = sum(self.before[self.reals :])
+        source, number = deal(self.mixture.synthetic_weights, before + earlier)
+        rank = np.empty(len(source), np.int64)
+        for each, start in enumerate(self._starts.tolist()[self.reals :]):
+            here = source == each
+            total = self.reals + each
+            own = number[here] - self.before[total]
+            rank[here] = start + self._ordered(total, own)
         return rank
 
     def _ordered(self, source: int, own: NDArray[np.int64]) -> NDArray[np.int64]:

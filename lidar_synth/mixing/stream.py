@@ -138,7 +138,7 @@ class MixedStream(IterableDataset[Any]):
             if guarded:
                 check_pass(begin, self.scans.epoch)
             while number >= (end := first + len(self.scans)):
-                epoch = epoch + 1
+                epoch += 1
                 first = end
                 announced = 0
                 if worker == 0:

@@ -56,15 +56,19 @@ class Client:
         end.close()
         self._owner, self.pid = os.getpid(), self._process.pid or 0
         self._end = weakref.finalize(self, _end, self._process, self._owner)
+        self._address = self._await_address(started)
+
+    def _await_address(self, started: Connection) -> str:
+        """The address of the process, which it sends when it has loaded the model."""
         try:
-            if not connection.wait([started, self._process.sentinel], timeout):
+            if not connection.wait([started, self._process.sentinel], self.timeout):
                 raise self._late("loaded the model")
-            self._address = started.recv_bytes().decode()
+            return started.recv_bytes().decode()
         except EOFError as error:
             guard = (
                 "A script that starts processes begins with: if __name__ == '__main__':"
             )
-            raise self._died("" if slots.last_words else guard) from error
+            raise self._died("" if self._slots.last_words else guard) from error
         except BaseException:
             self.close()
             raise
