@@ -6,22 +6,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import FORMATS, Reading, drop_missing, options_from
+from lidar_synth.cli.options import (
+    Format,
+    Out,
+    Reading,
+    Source,
+    drop_missing,
+    options_from,
+)
 
 if TYPE_CHECKING:
     from lidar_synth.formats import ScanFiles
     from lidar_synth.formats.convert import Report
 
 
-Source = Annotated[
-    Path,
-    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
-]
-Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
-To = Annotated[
-    str,
-    typer.Option(help=FORMATS),
-]
 InputSensor = Annotated[
     str | None,
     typer.Option(
@@ -84,7 +82,7 @@ Jobs = Annotated[int, typer.Option(help="number of worker processes")]
 def convert(
     source: Source,
     out: Out,
-    to: To,
+    to: Format,
     sensor: InputSensor = None,
     as_sensor: AsSensorName = None,
     mount: MountText = None,

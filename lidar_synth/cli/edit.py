@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import FORMATS
+from lidar_synth.cli.options import Format, Out, Source
 
 if TYPE_CHECKING:
     from lidar_synth.geometry.scan import Scan
@@ -18,11 +18,6 @@ edit = typer.Typer(
     no_args_is_help=True,
 )
 
-Source = Annotated[
-    Path,
-    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
-]
-Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
 Model = Annotated[
     str | None,
     typer.Option(
@@ -30,10 +25,6 @@ Model = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="seed of the model's noise")]
-Format = Annotated[
-    str,
-    typer.Option(help=FORMATS),
-]
 ScanNumber = Annotated[int, typer.Option(min=0, help="number of the scan in IN")]
 Place = Annotated[
     str,

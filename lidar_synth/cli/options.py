@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -14,6 +15,13 @@ FORMATS = (
     "range | pcd | ply | png | webdataset | mcap | cosmos"
 )
 """Help of ``--to``; names of ``formats.WRITERS``."""
+
+Source = Annotated[
+    Path,
+    typer.Argument(metavar="IN", help="file, folder of scans or root of a dataset"),
+]
+Out = Annotated[Path, typer.Argument(metavar="OUT", help="folder to write to")]
+Format = Annotated[str, typer.Option(help=FORMATS)]
 
 
 class Reading(BaseModel):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_synth.cli.options import FORMATS
+from lidar_synth.cli.options import Format
 from lidar_synth.datasets.recordings import NOTE, seen_by
 
 if TYPE_CHECKING:
@@ -64,10 +64,7 @@ def sample(
             min=0, max=100, help="scale of classifier-free guidance; 1 = no guidance"
         ),
     ] = 1.0,
-    to: Annotated[
-        str,
-        typer.Option(help=FORMATS),
-    ] = "npz",
+    to: Format = "npz",
     device: Annotated[
         str, typer.Option(help="device of the network: cpu | cuda")
     ] = "cpu",
