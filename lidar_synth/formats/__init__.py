@@ -145,22 +145,25 @@ def open_scans(
     name = layout_of(Path(path)) if layout is None else layout
     reader = choose("layout", name, READERS)
     taken = inspect.signature(reader).parameters
-    options: dict[str, Any] = {"sensor": sensor, "split": split}
-    if split is not None and "split" not in taken:
+    given: dict[str, Any] = {
+        "sensor": sensor,
+        "split": split,
+        "fields": fields,
+        "reflectance_max": reflectance_max,
+    }
+    options = {key: value for key, value in given.items() if value is not None}
+    if "split" in options and "split" not in taken:
         raise ConfigError(
             f"split {split!r} of {path}", f"no split: layout {name!r} has none"
         )
-    plain = {"fields": fields, "reflectance_max": reflectance_max}
-    if "fields" not in taken and any(v is not None for v in plain.values()):
-        wrong = ", ".join(f"{k}={v}" for k, v in plain.items() if v is not None)
+    plain = [f"{k}={v}" for k, v in options.items() if k not in ("sensor", "split")]
+    if plain and "fields" not in taken:
         raise ConfigError(
-            f"{wrong} for {path}",
+            f"{', '.join(plain)} for {path}",
             f"neither: layout {name!r} has a fixed file format",
             _AS_FOLDER,
         )
-    options |= plain
-    chosen = {name: value for name, value in options.items() if value is not None}
-    return reader(path, on_bad=on_bad, **chosen)  # type: ignore[arg-type]
+    return reader(path, on_bad=on_bad, **options)  # type: ignore[arg-type]
 
 
 _AS_FOLDER = "--layout folder (layout='folder') reads its files as plain ones."

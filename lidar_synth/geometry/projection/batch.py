@@ -41,7 +41,6 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
     range limits."""
     x, y, z = points.unbind(-1)
     r = torch_sqrt(x * x + y * y + z * z)
-    in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     elevation = torch_asin(z / torch.where(r > 0, r, 1.0))
     if len(grid.slopes):
         slopes, lifts, starts = (
@@ -53,7 +52,6 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
         row = (z[:, None] <= lifts[1:-1] + flat * slopes[1:-1]).sum(1)
         rise = z - starts[row]
         r = torch_sqrt(squared + rise * rise)
-        in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     elif len(grid.edges):
         inner = torch.from_numpy(grid.edges[1:-1].copy()).to(points.device)
         row = torch.searchsorted(-inner, -elevation.contiguous(), right=True)
@@ -64,6 +62,7 @@ def _cells(points: torch.Tensor, grid: Grid) -> tuple[torch.Tensor, torch.Tensor
             .clamp(0, grid.rows - 1)
             .long()
         )
+    in_range = (r >= float(grid.range_min)) & (r <= float(grid.range_max)) & (r > 0)
     azimuth = -torch_atan2(y, x)
     column = ((azimuth / torch.pi + 1) * 0.5 * grid.columns).long() % grid.columns
     return torch.where(in_range, row * grid.columns + column, 0), torch.where(
