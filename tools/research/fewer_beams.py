@@ -1,19 +1,22 @@
-"""What generated scans first add with four labelled frames, on a sensor with fewer beams.
+"""What generated scans first add with four labelled frames, on a sensor with fewer beams or with
+another network.
 
-    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16]
+    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16] [--polar]
 
 The places are split in two halves; four frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
-and its interval.
+and its interval. ``--polar`` takes polar_network.py instead of the range-view segmenter.
 """
 
 import shutil
 from pathlib import Path
 
 import numpy as np
+from polar_network import learn
 from typer import run
 
 from lidar_synth import ProofSettings, prove
+from lidar_synth.lab.proof import reference
 from lidar_synth.lab.proof.scores import interval
 
 
@@ -32,6 +35,7 @@ def main(
     root: Path,
     out: Path,
     beams: int | None = None,
+    polar: bool = False,
     iterations: int = 300,
     synthetic: int = 48,
     seeds: int = 1,
@@ -48,7 +52,7 @@ def main(
         beams=beams,
     )
     folders = halves(root, out)
-    name = f"{beams or 'all'}-{iterations}"
+    name = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
     runs = [out / f"{name}-{number}" for number in range(2)]
     scores: dict[str, dict[str, float]] = {"real": {}, "pretrain-generator": {}}
     for number, (folder, other) in enumerate(
@@ -61,6 +65,7 @@ def main(
             runs[number],
             settings,
             jobs=1,
+            trainer=learn if polar else reference,
             pools=out / f"pools-{beams or 'all'}",
             tests=other,
         )

@@ -1,0 +1,118 @@
+"""A second network for ``prove``: points in polar pillars, a small U-Net over the bird's-eye view of
+them, and a perceptron of each point and its pillar (after PolarNet). No range image.
+
+``learn`` is a trainer of ``prove``; fewer_beams.py --polar runs it.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.geometry.scan import Scan
+from lidar_synth.lab.evaluate.segmenter import CircularConv
+from lidar_synth.lab.proof import Job
+
+RINGS = 64
+SECTORS = 128
+NEAR = 2.0
+FAR = 60.0
+"""Metres; the rings' widths grow with the distance."""
+WIDTH = 32
+RATE = 4e-3
+
+
+class PolarNetwork(nn.Module):
+    """Predicts the class of every point of some scans."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.point = nn.Sequential(
+            nn.Linear(7, WIDTH),
+            nn.BatchNorm1d(WIDTH),
+            nn.ReLU(),
+            nn.Linear(WIDTH, WIDTH),
+        )
+        self.first = CircularConv(WIDTH, WIDTH)
+        self.second = CircularConv(WIDTH, 2 * WIDTH, (2, 2))
+        self.third = CircularConv(2 * WIDTH, 2 * WIDTH, (2, 2))
+        self.middle = CircularConv(2 * WIDTH, 2 * WIDTH)
+        self.up = CircularConv(4 * WIDTH, WIDTH)
+        self.out = CircularConv(2 * WIDTH, WIDTH)
+        self.last = nn.Sequential(
+            nn.Linear(2 * WIDTH, 64),
+            nn.BatchNorm1d(64),
+            nn.ReLU(),
+            nn.Linear(64, len(NAMES)),
+        )
+
+    def forward(self, scans: Sequence[Scan]) -> Tensor:
+        """Scans of N points in all to (N, classes) logits."""
+        points = torch.from_numpy(np.concatenate([s.points for s in scans]))
+        reflectance = torch.from_numpy(np.concatenate([s.reflectance for s in scans]))
+        counts = torch.tensor([len(s) for s in scans])
+        scan = torch.repeat_interleave(torch.arange(len(scans)), counts)
+        flat = points[:, :2].norm(dim=1)
+        ring = (flat.clamp(NEAR, FAR) / NEAR).log() / np.log(FAR / NEAR) * (RINGS - 1)
+        angle = torch.atan2(points[:, 1], points[:, 0])
+        sector = (angle / (2 * np.pi) + 0.5) * SECTORS
+        row = ring.round()
+        column = sector.floor()
+        seen = [
+            points[:, 2] / 2,
+            flat / 20,
+            points[:, 2] / flat.clamp(min=1) * 5,
+            reflectance * 2,
+            ring - row,
+            sector - column - 0.5,
+            torch.ones_like(flat),
+        ]
+        x = self.point(torch.stack(seen, 1))
+        cell = (scan * RINGS + row.long()) * SECTORS + column.long() % SECTORS
+        size = len(scans) * RINGS * SECTORS
+        pillars = x.new_zeros(size, WIDTH)
+        pillars = pillars.scatter_reduce(0, cell[:, None].expand(-1, WIDTH), x, "amax")
+        image = pillars.reshape(len(scans), RINGS, SECTORS, WIDTH).permute(0, 3, 1, 2)
+        a = self.first(image)
+        b = self.second(a)
+        c = self.middle(self.third(b))
+        up = self.up(torch.cat([F.interpolate(c, scale_factor=2), b], 1))
+        out = self.out(torch.cat([F.interpolate(up, scale_factor=2), a], 1))
+        around = out.permute(0, 2, 3, 1).reshape(size, WIDTH)[cell]
+        logits: Tensor = self.last(torch.cat([F.relu(x), around], 1))
+        return logits
+
+
+def learn(job: Job) -> dict[str, NDArray[np.int64]]:
+    """Train as a job says; {place: (19, 19) confusion table}."""
+    torch.manual_seed(job.seed)
+    network = PolarNetwork()
+    mixtures = job.mixtures(to_sample=lambda scan, rng: scan)
+    for (mixed, count), (stage, _) in zip(mixtures, job.stages(), strict=True):
+        rate = RATE * stage.rate
+        optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
+        cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, count)
+        for step in range(count):
+            scans = [mixed[step * job.batch + i] for i in range(job.batch)]
+            label = torch.from_numpy(np.concatenate([s.label for s in scans])).long()
+            loss = F.cross_entropy(network(scans), label, ignore_index=IGNORE)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            cycle.step()
+    network.eval()
+    return {place: table_of(network, scans) for place, scans in job.held_out.items()}
+
+
+@torch.no_grad()
+def table_of(network: nn.Module, scans: Sequence[Scan]) -> NDArray[np.int64]:
+    """(19, 19) number of returns by label (row) and prediction (column)."""
+    label = np.concatenate([scan.label for scan in scans if scan.label is not None])
+    guess = torch.cat([network([scan]).argmax(1) for scan in scans]).numpy()
+    table = np.zeros((256, len(NAMES)), np.int64)
+    np.add.at(table, (label, guess), 1)
+    return table[: len(NAMES)]
