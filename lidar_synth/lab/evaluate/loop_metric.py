@@ -116,7 +116,9 @@ class _Kept:
         self.sensor = self.sensor or other.sensor
 
 
-def _features(kept: Mapping[str, _Kept], name: str) -> Iterator[NDArray[np.floating]]:
+def _join_features(
+    kept: Mapping[str, _Kept], name: str
+) -> Iterator[NDArray[np.floating]]:
     """What an extractor found in the real and in the generated scans."""
     return (np.concatenate(kept[side].features[name]) for side in SIDES)
 
@@ -283,13 +285,13 @@ class Metric:
             if (score := self._score(name, kept)) is not None
         ]
         for name in self._extractors:
-            real, fake = _features(kept, name)
+            real, fake = _join_features(kept, name)
             figures = figures_of(name, real, fake, self._extended)
             scores += self._of_figures(figures, kept)
         if self._extended:
             for name in self._published:
                 table = self.protocol.measures[name].table or name
-                figures = more_figures(table, *_features(kept, _own(name)))
+                figures = more_figures(table, *_join_features(kept, _own(name)))
                 scores += self._of_figures(figures, kept)
         if not scores:
             raise DataError(
@@ -303,7 +305,7 @@ class Metric:
         if measure.kind == FEATURES:
             if name not in self._published:
                 return None
-            real, fake = _features(kept, _own(name))
+            real, fake = _join_features(kept, _own(name))
             statistic = statistic_of(real, fake) if self._replicates else None
             return self._made(
                 measure, frechet_distance(real, fake), statistic, len(real), len(fake)

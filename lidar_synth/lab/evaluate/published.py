@@ -67,7 +67,7 @@ def compare_published(scores: Sequence[Score]) -> str:
     return "\n\n".join(parts) or "No published figures of this protocol are known."
 
 
-def _columns(table: PublishedTable) -> list[str]:
+def _list_columns(table: PublishedTable) -> list[str]:
     """The metrics of a table, in the order of its rows of most metrics."""
     longest_first = sorted(table.rows, key=len, reverse=True)
     names = dict.fromkeys(key for row in longest_first for key in row)
@@ -76,7 +76,7 @@ def _columns(table: PublishedTable) -> list[str]:
 
 def show_table(table: PublishedTable, own: Mapping[str, Sequence[Score]]) -> str:
     """A published table in Markdown, with rows of one's own below: {"method | steps": scores}."""
-    columns = _columns(table)
+    columns = _list_columns(table)
     source = read_published()[1][table.source]
     where = f"{table.dataset}, {table.task}. {source}. {table.note}".rstrip(". ")
     lines = [

@@ -182,7 +182,7 @@ def _firings(turn: Turn, beams: int) -> float:
     return float(np.median([1 / step.mean() for step in single]))
 
 
-def _powers(turn: Turn, beams: int) -> Iterator[Floats]:
+def _measure_powers(turn: Turn, beams: int) -> Iterator[Floats]:
     """The power spectrum of the azimuths of each beam with enough distant points."""
     for beam in range(beams):
         own = turn.azimuth[(turn.ring == beam) & (turn.rho > DISTANT)]
@@ -194,7 +194,7 @@ def _powers(turn: Turn, beams: int) -> Iterator[Floats]:
 
 def _lattice(turn: Turn, beams: int, firings: float) -> tuple[float, int]:
     """Coherence and number of steps per turn of the coarsest lattice of the azimuths."""
-    powers = list(_powers(turn, beams))
+    powers = list(_measure_powers(turn, beams))
     if not powers:
         return 0.0, 0
     first = int(0.9 * firings)

@@ -142,7 +142,7 @@ def _unwrapped(points: NDArray[np.float32]) -> Floats:
     return np.asarray(np.cumsum(step - np.round(step)))
 
 
-def _complete_rings(scans: Sequence[Scan]) -> list[NDArray[np.int16] | None]:
+def _find_complete_rings(scans: Sequence[Scan]) -> list[NDArray[np.int16] | None]:
     """The rings that follow from the order of each scan's points, of scans with all of them."""
     found = [rings_in_order(scan.points) if len(scan) else None for scan in scans]
     counts = [0 if ring is None else int(ring.max()) + 1 for ring in found]
@@ -159,7 +159,7 @@ def rings_of_file(scans: Sequence[Scan]) -> tuple[str, NDArray[np.int64] | None]
         return "ring field", np.concatenate(
             [np.asarray(scan.ring, np.int64) for scan in scans]
         )
-    complete = _complete_rings(scans)
+    complete = _find_complete_rings(scans)
     if sum(ring is not None for ring in complete) <= len(scans) / 2:
         return "elevations", None
     given = [

@@ -184,10 +184,10 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     rows = round(np.pi / _BIN)
     row = np.clip((elevation / np.pi + 0.5) * rows, 0, rows - 1).astype(np.int32)
     sector = np.minimum((azimuth * sectors).astype(np.int32), sectors - 1)
-    return _concentration(np.sort(sector * np.int32(rows) + row))
+    return _measure_concentration(np.sort(sector * np.int32(rows) + row))
 
 
-def _concentration(ordered: NDArray[np.int32]) -> float:
+def _measure_concentration(ordered: NDArray[np.int32]) -> float:
     """How much points concentrate in few of their bins, given the bins (N,) in ascending order."""
     # Bins that hold points, since most hold none.
     first = np.flatnonzero(np.diff(ordered, prepend=-1))

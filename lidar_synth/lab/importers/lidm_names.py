@@ -57,6 +57,26 @@ STATISTICS = ("shift", "scale", "codebook.counts", "codebook.sums")
 """Buffers that only our autoencoder has."""
 
 
+def _list_names(name: str, part: NetworkSpec) -> Sources:
+    """The names without the prefix of a part."""
+    with torch.device("meta"), limit_modules(MOST_MODULES):
+        keys = list(build_network(*part).state_dict())
+    if name == VELOCITY:
+        attending = {
+            key.partition(".attention.")[0] for key in keys if ".attention." in key
+        }
+        attention = CONTEXT if part.arguments["context_channels"] else ATTENTION
+        return {key: _unet(key, attending, attention) for key in keys}
+    if name == CODEC:
+        levels = len(part.arguments["multipliers"])
+        attending = part.arguments.get("attention_levels", ())
+        return {
+            key: _codec(key, levels, attending) for key in keys if key not in STATISTICS
+        }
+    renamed = {"mix": "channel_mapper", "project": "linear"}
+    return {key: (_renamed(key, renamed),) for key in keys}
+
+
 def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
     """The LiDM names of every weight of a part.
 
@@ -65,30 +85,14 @@ def peer_names(name: str, part: NetworkSpec, nested: bool) -> Sources:
         part: the network.
         nested: whether the file is that of a diffusion model, whose names have prefixes.
     """
-    with torch.device("meta"), limit_modules(MOST_MODULES):
-        keys = list(build_network(*part).state_dict())
-    if name == VELOCITY:
-        attending = {
-            key.partition(".attention.")[0] for key in keys if ".attention." in key
-        }
-        attention = CONTEXT if part.arguments["context_channels"] else ATTENTION
-        names = {key: _unet(key, attending, attention) for key in keys}
-    elif name == CODEC:
-        levels = len(part.arguments["multipliers"])
-        attending = part.arguments.get("attention_levels", ())
-        names = {
-            key: _codec(key, levels, attending) for key in keys if key not in STATISTICS
-        }
-    else:
-        renamed = {"mix": "channel_mapper", "project": "linear"}
-        names = {key: (_renamed(key, renamed),) for key in keys}
     prefix = (
         {VELOCITY: UNET, CODEC: FIRST_STAGE, ENCODER: COND_STAGE}[name]
         if nested
         else ""
     )
     return {
-        ours: tuple(prefix + one for one in theirs) for ours, theirs in names.items()
+        ours: tuple(prefix + one for one in theirs)
+        for ours, theirs in _list_names(name, part).items()
     }
 
 

@@ -146,14 +146,19 @@ def _rigid(box: NDArray[np.float64]) -> NDArray[np.float64]:
     return rigid
 
 
-def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
-    """The objects with one box per frame; an instance number that is used again is another
-    object."""
+def _sort_boxes(boxes: WorldBoxes, frames: range) -> NDArray[np.intp]:
+    """The boxes of one frame each, object by object, by frame."""
     stamped = (boxes.windows[:, 0] == boxes.windows[:, 1]) & np.isin(
         boxes.windows[:, 0], frames
     )
     order = np.flatnonzero(stamped)
-    order = order[np.lexsort((boxes.windows[order, 0], boxes.instances[order]))]
+    return order[np.lexsort((boxes.windows[order, 0], boxes.instances[order]))]
+
+
+def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
+    """The objects with one box per frame; an instance number that is used again is another
+    object."""
+    order = _sort_boxes(boxes, frames)
     instance = boxes.instances[order]
     frame = boxes.windows[order, 0]
     place = boxes.transforms[order, :3, 3]

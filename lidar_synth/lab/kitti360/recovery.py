@@ -96,6 +96,22 @@ class Recovered:
     fits: bool
 
 
+def _find_bounds(
+    places: NDArray[np.float64], name: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The lowest and the highest coordinates in view of the places (N, 3) of a window's scans."""
+    low = places.min(axis=0) + np.array([-VIEW, -VIEW, _HEIGHTS[0]])
+    high = places.max(axis=0) + np.array([VIEW, VIEW, _HEIGHTS[1]])
+    if (high - low)[:2].max() > _WIDEST or (high - low)[2] > _WIDEST / 4:
+        raise DataError(
+            f"the poses of window {name} and its neighbours spread over "
+            f"{(high - low).max():.0f} m",
+            f"at most {_WIDEST:.0f} m: a window of KITTI-360 covers about 200 m",
+            "Check data_poses.",
+        )
+    return low, high
+
+
 class Recovery:
     """The clouds around the frames of one window, ready to label its scans.
 
@@ -117,17 +133,10 @@ class Recovery:
         frames: Sequence[int],
     ) -> None:
         places = np.array([poses[f][:3, 3] for f in frames])
-        low = places.min(axis=0) + np.array([-VIEW, -VIEW, _HEIGHTS[0]])
-        high = places.max(axis=0) + np.array([VIEW, VIEW, _HEIGHTS[1]])
-        if (high - low)[:2].max() > _WIDEST or (high - low)[2] > _WIDEST / 4:
-            raise DataError(
-                f"the poses of window {windows[0].name} and its neighbours spread over "
-                f"{(high - low).max():.0f} m",
-                f"at most {_WIDEST:.0f} m: a window of KITTI-360 covers about 200 m",
-                "Check data_poses.",
-            )
         self._poses = poses
-        self._static = index_cloud(_chunks(windows), low, high)
+        self._static = index_cloud(
+            _chunks(windows), *_find_bounds(places, windows[0].name)
+        )
         dynamic = [read_cloud(w.dynamic) for w in windows if w.dynamic is not None]
         span = range(min(w.first for w in windows), max(w.last for w in windows) + 100)
         self.movers = Movers(dynamic, boxes, span)

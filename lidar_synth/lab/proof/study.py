@@ -279,9 +279,7 @@ def prove(
         if not all(_is_there(work.path(row, pair), read_outcome) for pair in pairs)
     ]
     _pretrain(work, tasks, progress)
-    with map_in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
-        for _ in tqdm(done, total=len(tasks), desc="trainings", disable=not progress):
-            pass
+    _run_all(work, tasks, jobs, "trainings", progress)
     return report(work, named, seen)
 
 
@@ -372,7 +370,7 @@ def _earlier(out: Path) -> dict[str, Any] | None:
     return values if valid else None
 
 
-def _pool_tasks(work: Trainings, source: Source) -> list[PoolTask]:
+def _plan_pools(work: Trainings, source: Source) -> list[PoolTask]:
     """What to make, once for each folder."""
     plan = work.plan
     tasks = {}
@@ -397,17 +395,14 @@ def _pool_tasks(work: Trainings, source: Source) -> list[PoolTask]:
 
 
 def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
-    tasks = _pool_tasks(work, source)
-    jobs = min(work.plan.jobs, max(1, len(tasks)))
-    with map_in_processes(make_pool, tasks, jobs) as done:
-        for _ in tqdm(
-            done,
-            total=len(tasks),
-            desc="synthetic scans",
-            unit="pool",
-            disable=not progress,
-        ):
-            pass
+    _run_all(
+        make_pool,
+        _plan_pools(work, source),
+        work.plan.jobs,
+        "synthetic scans",
+        progress,
+        "pool",
+    )
 
 
 def _pretrain(work: Trainings, tasks: Sequence[Task], progress: bool) -> None:
@@ -418,12 +413,22 @@ def _pretrain(work: Trainings, tasks: Sequence[Task], progress: bool) -> None:
         if (path := work.start(row, pairs[0])) is not None
         and not _is_there(path, pretraining_seconds)
     }
-    with map_in_processes(
-        work.pretrain, list(needed.values()), min(work.plan.jobs, max(1, len(needed)))
-    ) as done:
-        for _ in tqdm(
-            done, total=len(needed), desc="pretraining", disable=not progress
-        ):
+    _run_all(
+        work.pretrain, list(needed.values()), work.plan.jobs, "pretraining", progress
+    )
+
+
+def _run_all(
+    work: Callable[[Any], object],
+    tasks: Sequence[Any],
+    jobs: int,
+    name: str,
+    progress: bool,
+    unit: str = "it",
+) -> None:
+    """Do all tasks in processes, with a bar of this name."""
+    with map_in_processes(work, tasks, min(jobs, max(1, len(tasks)))) as done:
+        for _ in tqdm(done, name, len(tasks), unit=unit, disable=not progress):
             pass
 
 

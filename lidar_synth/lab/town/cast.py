@@ -80,7 +80,7 @@ class Snapshot:
         """
         distance, face, normal = self._solid.first(origins, directions)
         surface = np.where(face >= 0, self._faces[face], MISS)
-        near = self._near(origins, directions, eye)
+        near = self._find_near(origins, directions, eye)
         for mover, candidates in zip(self.movers, near, strict=True):
             rays = np.flatnonzero(candidates)
             if len(rays):
@@ -110,7 +110,7 @@ class Snapshot:
         hits.normal[rays] = beyond.normal
         return np.asarray(rays[beyond.surface != MISS])
 
-    def _near(
+    def _find_near(
         self, origins: Floats, directions: Floats, eye: Floats | None
     ) -> Iterable[NDArray[np.bool_]]:
         """Which rays can hit each mover, (N,) for one after another; may include a few more."""

@@ -104,7 +104,7 @@ def wall_around(
     return sheets(cells[~inside.all(2).any(1)], 0.0, frame, WALL)
 
 
-def _bars(rect: Array, depth: float, frame: Frame) -> Mesh:
+def _make_bars(rect: Array, depth: float, frame: Frame) -> Mesh:
     """The left, right, middle and lower bars of the frames of windows."""
     u0, u1, z0, z1 = rect.T
     middle = (u0 + u1) / 2
@@ -131,7 +131,7 @@ def _windows(rect: Array, frame: Frame, rng: Rng) -> Mesh:
         [
             sheets(rect, recess, frame, GLASS),
             reveals(rect, recess, frame),
-            _bars(rect, recess - 0.02, frame),
+            _make_bars(rect, recess - 0.02, frame),
             sheets(blind, recess - 0.05, frame, BLIND),
             sheets(sill, -0.06, frame, SLAB),
             sheets(curtain, recess + 0.22, frame, ROOM),

@@ -171,11 +171,11 @@ def _mark_lanes(street: Street, paint: Paint) -> None:
     for s in np.arange(-REACH - 60, street.length + REACH + 60, 9.0):
         for t in dashes:
             paint((s, s + 3.0), (t - 0.06, t + 0.06), "marking")
-    for line in _long_lines(street):
+    for line in _list_lines(street):
         paint(paint.reach[:2], line, "marking")
 
 
-def _long_lines(street: Street) -> Iterator[tuple[float, float]]:
+def _list_lines(street: Street) -> Iterator[tuple[float, float]]:
     """The intervals of t of the lines along the whole street."""
     if street.median:
         for side in SIDES:

@@ -253,12 +253,12 @@ def _grow_hedge(
     ends = [loft([core[i, :4], core[i, :3:-1]], 1) for i in (0, -1)]
     count = int(length * (2 * height + depth) * 8)
     scatter = 0.04 if profile == "clipped" else 0.1
-    centres = _points_on(core, count, rng) + rng.normal(0, scatter, (count, 3))
+    centres = _sample_points(core, count, rng) + rng.normal(0, scatter, (count, 3))
     foliage = leaves(centres, rng.uniform(0.07, 0.15, count), rng, LEAF)
     return merge([loft(core, 1), *ends, foliage])
 
 
-def _points_on(core: Array, count: int, rng: Rng) -> Array:
+def _sample_points(core: Array, count: int, rng: Rng) -> Array:
     """(count, 3) random points on the surface through the cross-sections (S, P, 3) of a hedge."""
     steps, columns, _ = core.shape
     row = rng.integers(0, steps - 1, count)

@@ -54,7 +54,7 @@ def _ego_track(street: Street, times: Array) -> Array:
     return _bounds(s, t, half_s, half_t)
 
 
-def _strips(street: Street) -> Iterator[tuple[int, float, float, float]]:
+def _find_strips(street: Street) -> Iterator[tuple[int, float, float, float]]:
     """Where people walk along the street: side, lowest and highest |t|, mean number of people."""
     for side in SIDES:
         if pavement := street.band(side, "sidewalk"):
@@ -190,7 +190,7 @@ class Traffic:
         """Add pedestrians on pavements, on squares and crossing the street."""
         street = self._street
         rng = self._rng
-        for side, low, high, mean in _strips(street):
+        for side, low, high, mean in _find_strips(street):
             for _ in range(rng.poisson(mean)):
                 t = side * rng.uniform(low, max(low, high))
                 self._add_pedestrian(True, t, rng.uniform(-50, street.length + 60))

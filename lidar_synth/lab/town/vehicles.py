@@ -170,7 +170,7 @@ def _box_lorry(length: float, height: float) -> Mesh:
     return _lorry(length, box)
 
 
-def _coach_stations(low: float, height: float) -> list[list[float]]:
+def _make_coach_stations(low: float, height: float) -> list[list[float]]:
     """The cross-sections of a bus or a tram, front to rear."""
     stations: list[list[float]] = [
         [0.0, low, 1.0, height - 0.5, 0.93, 0.9, PAINT, GLASS],
@@ -198,7 +198,7 @@ def _coach(
     lights = width * 0.9
     return merge(
         [
-            shell(_coach_stations(low, height), length, width),
+            shell(_make_coach_stations(low, height), length, width),
             tyres,
             face(
                 front,

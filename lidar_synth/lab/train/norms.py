@@ -29,8 +29,8 @@ class SharedNorm(nn.BatchNorm2d):
         with torch.no_grad():
             count = y.numel() // y.shape[1] * dist.get_world_size()
             unbiased = variance * count / (count - 1)
-            self.running_mean.lerp_(mean.flatten(), self.momentum)
-            self.running_var.lerp_(unbiased.flatten(), self.momentum)
+            for kept, now in ((self.running_mean, mean), (self.running_var, unbiased)):
+                kept.lerp_(now.flatten(), self.momentum)
             self.num_batches_tracked += 1
         scale = self.weight.view(1, -1, 1, 1) * (variance + self.eps).rsqrt()
         return (centred * scale + self.bias.view(1, -1, 1, 1)).to(x.dtype)

@@ -133,7 +133,7 @@ def _corrected(skin: Skin, town: Domain, wanted: dict[str, Pair]) -> Skin:
     return replace(skin, arrays=arrays)
 
 
-def _differences(domain: Domain, kind: int) -> Pair:
+def _collect_differences(domain: Domain, kind: int) -> Pair:
     """Of returns on one kind of surface, the difference to the mean of the one below, and the
     row."""
     difference = []
@@ -154,7 +154,7 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     It is the sum of the median differences between neighbouring rings on the same surface, less its
     running median.
     """
-    [table] = pool_quantiles([_differences(domain, kind)], [np.arange(rows)], 3)
+    [table] = pool_quantiles([_collect_differences(domain, kind)], [np.arange(rows)], 3)
     total = np.concatenate([[0.0], np.cumsum(table[:-1, 1])])
     padded = np.pad(total, _SMOOTH // 2, mode="reflect", reflect_type="odd")
     return np.asarray(
@@ -162,7 +162,7 @@ def laser_offsets(domain: Domain, rows: int, kind: int) -> Floats:
     )
 
 
-def _gaps(domain: Domain) -> tuple[Ints, Ints]:
+def _collect_gaps(domain: Domain) -> tuple[Ints, Ints]:
     """Stratum and gap of each return."""
     gaps = [s.found.gap for s in domain.scans]
     return np.concatenate(domain.strata), np.concatenate(gaps)
@@ -174,9 +174,9 @@ def missing(real: Domain, town: Domain, rows: int) -> tuple[Floats, Floats]:
     Returns:
         (STRATA,) probability, and (rows,) a factor by laser, near 1.
     """
-    stratum, gap = _gaps(real)
+    stratum, gap = _collect_gaps(real)
     of_real = _rate(stratum, gap)
-    of_town = _rate(*_gaps(town))
+    of_town = _rate(*_collect_gaps(town))
     laser = np.concatenate([s.rows for s in real.scans])
     lost = np.bincount(laser, np.maximum(gap - 1, 0), rows)
     expected = np.bincount(laser, of_real[stratum] * gap, rows)
