@@ -147,7 +147,8 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
 def _flagged(boxes: Boxes, points: Values, change: Change) -> Boxes:
     """The boxes, with those that have lost all their returns flagged."""
     inside = boxes.contain(points)
-    left = inside[:, change.source[change.cause == SURFACE]].any(1)
-    gone = inside.any(1) & ~left
+    left = np.zeros(len(points), bool)
+    left[change.source[change.cause == SURFACE]] = True
+    gone = inside.any(1) & ~(inside & left).any(1)
     occlusion = np.where(gone, OUT_OF_SIGHT, boxes.occlusion).astype(np.int8)
     return replace(boxes, occlusion=occlusion)
