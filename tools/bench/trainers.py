@@ -71,8 +71,8 @@ def mmdet3d(root: Path) -> dict[str, Callable[[], Any]]:
     file = Path(__file__).parents[2] / "configs/mmdet3d/minkunet_semantickitti.py"
     config = Config.fromfile(str(file))
     ours = config.train_dataloader.dataset.to_dict() | {"ann_file": str(mixed)}
-    first, last = ours["pipeline"][:3], ours["pipeline"][-2:]
-    ours["pipeline"] = [*first, *last]  # without random partners
+    steps = ours["pipeline"]
+    ours["pipeline"] = steps[:3] + steps[-2:]  # without random partners
     theirs = ours | {"ann_file": str(listed), "data_root": str(root / "real")}
     stock = DATASETS.build(theirs)
     dataset = DATASETS.build(ours)

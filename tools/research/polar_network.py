@@ -4,7 +4,7 @@ them, and a perceptron of each point and its pillar (after PolarNet). No range i
 ``learn`` is a trainer of ``prove``; fewer_beams.py --polar runs it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -52,39 +52,50 @@ class PolarNetwork(nn.Module):
 
     def forward(self, scans: Sequence[Scan]) -> Tensor:
         """Scans of N points in all to (N, classes) logits."""
-        points = torch.from_numpy(np.concatenate([s.points for s in scans]))
-        reflectance = torch.from_numpy(np.concatenate([s.reflectance for s in scans]))
-        counts = torch.tensor([len(s) for s in scans])
-        scan = torch.repeat_interleave(torch.arange(len(scans)), counts)
-        flat = points[:, :2].norm(dim=1)
-        ring = (flat.clamp(NEAR, FAR) / NEAR).log() / np.log(FAR / NEAR) * (RINGS - 1)
-        angle = torch.atan2(points[:, 1], points[:, 0])
-        sector = (angle / (2 * np.pi) + 0.5) * SECTORS
-        row = ring.round()
-        column = sector.floor()
-        seen = [
-            points[:, 2] / 2,
-            flat / 20,
-            points[:, 2] / flat.clamp(min=1) * 5,
-            reflectance * 2,
-            ring - row,
-            sector - column - 0.5,
-            torch.ones_like(flat),
-        ]
-        x = self.point(torch.stack(seen, 1))
-        cell = (scan * RINGS + row.long()) * SECTORS + column.long() % SECTORS
+        seen, cell = place_points(scans)
+        x = self.point(seen)
         size = len(scans) * RINGS * SECTORS
         pillars = x.new_zeros(size, WIDTH)
         pillars = pillars.scatter_reduce(0, cell[:, None].expand(-1, WIDTH), x, "amax")
         image = pillars.reshape(len(scans), RINGS, SECTORS, WIDTH).permute(0, 3, 1, 2)
+        out = self._look_around(image)
+        around = out.permute(0, 2, 3, 1).reshape(size, WIDTH)[cell]
+        logits: Tensor = self.last(torch.cat([F.relu(x), around], 1))
+        return logits
+
+    def _look_around(self, image: Tensor) -> Tensor:
+        """(B, WIDTH, RINGS, SECTORS) features of pillars to those of their surroundings."""
         a = self.first(image)
         b = self.second(a)
         c = self.middle(self.third(b))
         up = self.up(torch.cat([F.interpolate(c, scale_factor=2), b], 1))
-        out = self.out(torch.cat([F.interpolate(up, scale_factor=2), a], 1))
-        around = out.permute(0, 2, 3, 1).reshape(size, WIDTH)[cell]
-        logits: Tensor = self.last(torch.cat([F.relu(x), around], 1))
-        return logits
+        out: Tensor = self.out(torch.cat([F.interpolate(up, scale_factor=2), a], 1))
+        return out
+
+
+def place_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
+    """(N, 7) inputs of all points, and (N,) numbers of their pillars."""
+    points = torch.from_numpy(np.concatenate([s.points for s in scans]))
+    reflectance = torch.from_numpy(np.concatenate([s.reflectance for s in scans]))
+    counts = torch.tensor([len(s) for s in scans])
+    scan = torch.repeat_interleave(torch.arange(len(scans)), counts)
+    flat = points[:, :2].norm(dim=1)
+    ring = (flat.clamp(NEAR, FAR) / NEAR).log() / np.log(FAR / NEAR) * (RINGS - 1)
+    angle = torch.atan2(points[:, 1], points[:, 0])
+    sector = (angle / (2 * np.pi) + 0.5) * SECTORS
+    row = ring.round()
+    column = sector.floor()
+    inputs = [
+        points[:, 2] / 2,
+        flat / 20,
+        points[:, 2] / flat.clamp(min=1) * 5,
+        reflectance * 2,
+        ring - row,
+        sector - column - 0.5,
+        torch.ones_like(flat),
+    ]
+    cell = (scan * RINGS + row.long()) * SECTORS + column.long() % SECTORS
+    return torch.stack(inputs, 1), cell
 
 
 def learn(job: Job) -> dict[str, NDArray[np.int64]]:
@@ -93,19 +104,29 @@ def learn(job: Job) -> dict[str, NDArray[np.int64]]:
     network = PolarNetwork()
     mixtures = job.mixtures(to_sample=lambda scan, rng: scan)
     for (mixed, count), (stage, _) in zip(mixtures, job.stages(), strict=True):
-        rate = RATE * stage.rate
-        optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
-        cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, count)
-        for step in range(count):
-            scans = [mixed[step * job.batch + i] for i in range(job.batch)]
-            label = torch.from_numpy(np.concatenate([s.label for s in scans])).long()
-            loss = F.cross_entropy(network(scans), label, ignore_index=IGNORE)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            cycle.step()
+        starts = range(0, count * job.batch, job.batch)
+        batches = (
+            [mixed[number] for number in range(start, start + job.batch)]
+            for start in starts
+        )
+        train(network, batches, count, RATE * stage.rate)
     network.eval()
     return {place: table_of(network, scans) for place, scans in job.held_out.items()}
+
+
+def train(
+    network: nn.Module, batches: Iterable[list[Scan]], count: int, rate: float
+) -> None:
+    """One cycle of the learning rate over a number of batches."""
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, count)
+    for scans in batches:
+        label = torch.from_numpy(np.concatenate([s.label for s in scans])).long()
+        loss = F.cross_entropy(network(scans), label, ignore_index=IGNORE)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        cycle.step()
 
 
 @torch.no_grad()
