@@ -164,10 +164,11 @@ class Boxes:
                 outside.
         """
         inside = np.zeros((len(self), len(points)), bool)
+        forward = np.ascontiguousarray(points[:, 0])
         for i, (x, y, z, length, width, height, yaw) in enumerate(self.values):
             reach = np.hypot(length, width)
-            near = np.flatnonzero(np.abs(points[:, 0] - x) <= reach)
-            dx = points[near, 0] - x
+            near = np.flatnonzero(np.abs(forward - x) <= reach)
+            dx = forward[near] - x
             dy = points[near, 1] - y
             dz = points[near, 2] - z
             c = np.cos(yaw)
