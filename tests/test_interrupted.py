@@ -38,7 +38,6 @@ def test_control_c_gives_one_message(
 
 HALF_MADE = """
 from lidar_synth import cli
-from lidar_synth.files.processes import defer_signals
 
 class Half:
     def __del__(self):
