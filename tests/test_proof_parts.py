@@ -363,16 +363,7 @@ BAD = {
         "places by 'street'; expected one of auto, drive",
     ),
     "no number of stretches": (drives(), {"places": "drive:2"}, "places by 'drive:2'"),
-    "fewer scans than a batch": (
-        drives(2, 3),
-        {"batch": 4},
-        "3 labelled scans for batches of 4",
-    ),
-    "fewer labelled than a batch": (
-        drives(),
-        {"labelled": 1},
-        "1 labelled scans for batches of 2",
-    ),
+    "no labelled scan": (drives(), {"labelled": 0}, "labelled=0; expected 1 or more"),
     "more labelled than there are": (
         drives(),
         {"labelled": 9},

@@ -1,9 +1,9 @@
-"""What generated scans first add with four labelled frames, on a sensor with fewer beams or with
+"""What generated scans first add with a few labelled frames, on a sensor with fewer beams or with
 another network.
 
-    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16] [--polar]
+    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16] [--polar] [--labelled 4]
 
-The places are split in two halves; four frames of each half are trained on and the other half is
+The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
 and its interval. ``--polar`` takes polar_network.py instead of the range-view segmenter.
 """
@@ -31,11 +31,18 @@ def halves(root: Path, out: Path) -> list[Path]:
     return folders
 
 
+def share(folder: Path, other: Path) -> None:
+    """Copy the networks after the synthetic scans alone: they do not depend on the labelled ones."""
+    if folder.is_dir():
+        shutil.copytree(folder, other, dirs_exist_ok=True)
+
+
 def main(
     root: Path,
     out: Path,
     beams: int | None = None,
     polar: bool = False,
+    labelled: int = 4,
     iterations: int = 300,
     synthetic: int = 48,
     seeds: int = 1,
@@ -43,7 +50,7 @@ def main(
 ) -> None:
     """Trains and tests both ways."""
     settings = ProofSettings(
-        labelled=4,
+        labelled=labelled,
         arms=("pretrain-generator",),
         iterations=iterations,
         seeds=seeds,
@@ -52,14 +59,15 @@ def main(
         beams=beams,
     )
     folders = halves(root, out)
-    name = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
+    group = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
+    starts = out / f"starts-{group}"
+    name = f"{group}-{labelled}"
     runs = [out / f"{name}-{number}" for number in range(2)]
     scores: dict[str, dict[str, float]] = {"real": {}, "pretrain-generator": {}}
     for number, (folder, other) in enumerate(
         zip(folders, reversed(folders), strict=True)
     ):
-        if number and (runs[0] / "starts").is_dir():  # the same for both halves
-            shutil.copytree(runs[0] / "starts", runs[1] / "starts", dirs_exist_ok=True)
+        share(starts, runs[number] / "starts")
         proof = prove(
             folder,
             runs[number],
@@ -69,6 +77,7 @@ def main(
             pools=out / f"pools-{beams or 'all'}",
             tests=other,
         )
+        share(runs[number] / "starts", starts)
         for row in proof.values["arms"]:
             scores[row["key"]] |= row["miou_by_place"]
     places = sorted(scores["real"])

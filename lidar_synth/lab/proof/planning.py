@@ -185,26 +185,17 @@ def _labelled(
     place, seed = pair
     if training is not None:
         rng = np.random.default_rng((settings.seed, seed))
-        return choose(training, None, _count_labelled(training, settings, ""), rng)
+        return choose(training, None, _count_labelled(training, settings), rng)
     others = {name: part for name, part in places.items() if name != place}
-    count = _count_labelled(others, settings, f", where {place!r} is left out")
+    count = _count_labelled(others, settings)
     number = sorted(places).index(place)
     rng = np.random.default_rng((settings.seed, seed, number))
     return choose(places, place, count, rng)
 
 
-def _count_labelled(places: Places, settings: ProofSettings, where: str) -> int:
+def _count_labelled(places: Places, settings: ProofSettings) -> int:
     there = sum(map(len, places.values()))
-    count = (
-        min(there, MOST_LABELLED) if settings.labelled is None else settings.labelled
-    )
-    if count < settings.batch:
-        raise ConfigError(
-            f"{count} labelled scans for batches of {settings.batch}{where}",
-            "at least as many scans as a batch has",
-            f"Use --batch {count} (batch={count}), or label more scans.",
-        )
-    return count
+    return min(there, MOST_LABELLED) if settings.labelled is None else settings.labelled
 
 
 def _read(source: Source, index: int, grid: Sensor | None, beams: int | None) -> Scan:

@@ -67,10 +67,5 @@ class ProofSettings:
                 raise ConfigError(f"{name}={getattr(self, name)}", "1 or more")
         if self.iterations < 10:
             raise ConfigError(f"iterations={self.iterations}", "10 or more")
-        if self.labelled is not None and self.labelled < self.batch:
-            raise ConfigError(
-                f"{self.labelled} labelled scans for batches of {self.batch}",
-                "at least as many scans as a batch has",
-                f"Use --batch {max(1, self.labelled)} (batch={max(1, self.labelled)}), or label "
-                "more scans.",
-            )
+        if self.labelled is not None and self.labelled < 1:
+            raise ConfigError(f"labelled={self.labelled}", "1 or more")

@@ -34,6 +34,7 @@ from lidar_synth.lab.train.config import DistillConfig, Run, TrainConfig
 from lidar_synth.lab.train.data import Batches, InTurns
 from lidar_synth.lab.train.decoder import DecoderStage
 from lidar_synth.lab.train.held_out import Watch
+from lidar_synth.lab.train.interrupts import first_signal
 from lidar_synth.lab.train.loop import EVERY, Record, read_figures, steps
 from lidar_synth.lab.train.norms import share_norms
 from lidar_synth.lab.train.precision import choose_precision
@@ -77,6 +78,7 @@ def run(
             settings.
         LibraryError: if Accelerate (extra ``train``) is not installed.
         DataError: if the loss becomes NaN or infinite; the last saved state is kept.
+        KeyboardInterrupt: on SIGINT or SIGTERM, after the state was saved; at once on a second one.
 
     Example:
         >>> from lidar_synth.lab.train import TrainConfig, load_config, run
@@ -256,15 +258,23 @@ def _train(
 ) -> None:
     """The steps of a stage, of any kind, until the end of the recipe, of the time or of patience."""
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    for record in steps(training, stage.task, batches, accelerator, stage.loss):
-        stops = time.monotonic() > end or (keeper is not None and keeper.exhausted)
-        late = _all_stop(stops, record.step, accelerator)
-        if keeper is not None:
-            keeper.keep(record, late or record.step == training.recipe.iterations)
-        if late:
-            break
+    interrupted = False
+    with first_signal() as received:
+        for record in steps(training, stage.task, batches, accelerator, stage.loss):
+            stops = time.monotonic() > end or (keeper is not None and keeper.exhausted)
+            late = _all_stop(stops, record.step, accelerator)
+            interrupted = _all_stop(bool(received), record.step, accelerator)
+            last = late or record.step == training.recipe.iterations
+            if keeper is not None:
+                keeper.keep(record, last)
+                if interrupted and not last:
+                    keeper.interrupt()
+            if late or interrupted:
+                break
     if keeper is not None:
         keeper.close()
+    if interrupted:
+        raise KeyboardInterrupt
 
 
 def _all_stop(stops: bool, step: int, accelerator: "Accelerator") -> bool:
@@ -341,6 +351,13 @@ class _Keeper:
                 self.draw()
         if saves:  # behind all else: what is lost in between is trained again
             self.save_state()
+
+    def interrupt(self) -> None:
+        """Keep the state alone, which takes little time: who asked may wait for seconds only."""
+        if self.records:
+            self.log()
+        self.wait()
+        self.save_state()
 
     def log(self) -> None:
         """Write the numbers since the last call, which are finite, or nothing is saved."""
