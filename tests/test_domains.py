@@ -116,14 +116,17 @@ def test_a_segmenters_default_takes_synthetic_scans_first(
     assert len(given) != 100 and given.mixture.ratio(0) == 0.25
 
 
-def test_a_default_says_where_its_gain_is_not_measured(
+def test_a_segmenters_default_ends_on_real_scans_where_they_are_many_or_of_another_sensor(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
+    other = mix(REAL, SYNTHETIC, epochs=8, as_sensor=REAL[0].sensor)
+    assert "measured" not in caplog.text
+    many = mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
     assert "more than 24 labelled scans (25 here)" in caplog.text
-    caplog.clear()
-    mix(REAL, SYNTHETIC, epochs=8, as_sensor=REAL[0].sensor)
-    assert "of a sensor that the synthetic ones are not made for" in caplog.text
+    for mixed in (other, many):
+        assert [mixed.mixture.ratio(epoch) for epoch in range(8)] == [1.0] * 2 + [
+            0.0
+        ] * 6
 
 
 def test_settings_of_trainers_take_a_schedule_by_name() -> None:

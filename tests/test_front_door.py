@@ -118,7 +118,7 @@ def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "| real scans only |" in result.output
     assert "| the town first, then half your scans |" not in result.output
-    assert "generated scans first" in result.output
+    assert "| generated scans for a quarter, then your scans alone |" in result.output
     assert "Trained and tested on one drive" in result.output
     assert len(Bank(out / "bank")) == 4
     assert {"mix.yaml", "lists.py", "mixed.py", "loop.py"} <= {
@@ -127,6 +127,8 @@ def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
     settings = read_settings(out / "mix.yaml")
     assert settings["synthetic"] == str(out / "bank")
     assert settings["as_sensor"] == str(out / "sensor.yaml")
+    assert settings["ratio"] == {0: 1.0, 10: 0.0}
+    assert "ratio={0: 1.0, 10: 0.0}, epoch_size=100" in (out / "loop.py").read_text()
     lidar_synth.mix(root, settings.pop("synthetic"), **settings)
 
 

@@ -1,7 +1,7 @@
 """A second network for ``prove``: points in polar pillars, a small U-Net over the bird's-eye view of
 them, and a perceptron of each point and its pillar (after PolarNet). No range image.
 
-``learn`` is a trainer of ``prove``; fewer_beams.py --polar runs it.
+``learn`` is a trainer of ``prove``; few_labels.py --polar runs it.
 """
 
 from collections.abc import Iterable, Sequence

@@ -93,6 +93,11 @@ def _then_real(pool: str, *ratios: float) -> tuple[ArmStage, ...]:
     return ArmStage(PRETRAINING, 1, pool), *later
 
 
+def _quarter(pool: str) -> tuple[ArmStage, ...]:
+    """Synthetic scans for a quarter, then real scans alone."""
+    return ArmStage(0.25, 1, pool), ArmStage(0.75)
+
+
 ARMS: dict[str, Arm] = {
     "real": Arm("real scans only", lambda ratio: (ArmStage(),), synthetic=False),
     "longer": Arm(
@@ -148,6 +153,16 @@ ARMS: dict[str, Arm] = {
         "generated scans first, then half your scans, then your scans alone",
         lambda ratio: _then_real("generator", 0.5, 0),
         budget=GENERATOR_BUDGET,
+    ),
+    "quarter": Arm(
+        "generated scans for a quarter, then your scans alone",
+        lambda ratio: _quarter("generator"),
+        budget=GENERATOR_BUDGET,
+    ),
+    "quarter-town": Arm(
+        "the town for a quarter, then your scans alone",
+        lambda ratio: _quarter("town"),
+        budget=_TOWN,
     ),
     "pretrain-learnt": Arm(
         "the scans that the generator learnt from first, then half your scans",

@@ -45,7 +45,7 @@ class ProofSettings:
     """
 
     labelled: int | None = None
-    arms: tuple[str, ...] = ("exchange", "pretrain", "pretrain-generator")
+    arms: tuple[str, ...] = ("exchange", "pretrain-generator", "quarter")
     ratios: tuple[float, ...] = (0.5,)
     iterations: int = 1000
     batch: int = 4

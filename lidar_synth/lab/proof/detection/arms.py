@@ -53,6 +53,12 @@ ARMS = {
     "first": DetectionArm(
         "the town first, then half, GT sampling", (OWN,), (1, 1, 1, 0.5), _TOWN
     ),
+    "quarter": DetectionArm(
+        "the town for a quarter, then real scans alone, GT sampling",
+        (OWN,),
+        (1, 0, 0, 0),
+        _TOWN,
+    ),
     "recipe": DetectionArm(
         "the town first, then half, real scans last; objects of both",
         (OWN, TOWN),

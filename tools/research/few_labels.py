@@ -1,16 +1,19 @@
-"""What generated scans first add with a few labelled frames, on a sensor with fewer beams or with
-another network.
+"""What generated scans first add with a few labelled frames; on a sensor with fewer beams, or with
+another network. For docs/research/proof.md.
 
-    python tools/research/fewer_beams.py SEMANTIC_KITTI OUT [--beams 16] [--polar] [--labelled 4]
+    python tools/research/few_labels.py SEMANTIC_KITTI OUT [--labelled 4] [--beams 16] [--polar]
 
 The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
-and its interval. ``--polar`` takes polar_network.py instead of the range-view segmenter.
+and its interval, and adds the scores to OUT/scores.json. ``--polar`` takes polar_network.py
+instead of the range-view segmenter. Call it with other ``--labelled`` for the curve OUT/gain.png.
 """
 
+import json
 import shutil
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from polar_network import learn
 from typer import run
@@ -37,6 +40,26 @@ def share(folder: Path, other: Path) -> None:
         shutil.copytree(folder, other, dirs_exist_ok=True)
 
 
+def draw(scores: dict[int, dict[str, dict[str, float]]], path: Path) -> None:
+    """A curve for each arm: the mean over the places, by the number of labelled frames."""
+    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    counts = sorted(scores)
+    for arm, title, colour in (
+        ("pretrain-generator", "generated scans first", "#1f6feb"),
+        ("real", "real scans only", "#7a8494"),
+    ):
+        means = [np.mean([*scores[count][arm].values()]) for count in counts]
+        axes.plot(counts, means, "o-", color=colour, label=title)
+    axes.set(
+        xlabel="labelled frames", ylabel="mean IoU, %", xscale="log", ylim=(0, None)
+    )
+    axes.set_xticks(counts, counts)
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", frameon=False)
+    figure.savefig(path, dpi=150)
+
+
 def main(
     root: Path,
     out: Path,
@@ -61,23 +84,22 @@ def main(
     folders = halves(root, out)
     group = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
     starts = out / f"starts-{group}"
-    name = f"{group}-{labelled}"
-    runs = [out / f"{name}-{number}" for number in range(2)]
     scores: dict[str, dict[str, float]] = {"real": {}, "pretrain-generator": {}}
     for number, (folder, other) in enumerate(
         zip(folders, reversed(folders), strict=True)
     ):
-        share(starts, runs[number] / "starts")
+        half = out / f"{group}-{labelled}-{number}"
+        share(starts, half / "starts")
         proof = prove(
             folder,
-            runs[number],
+            half,
             settings,
             jobs=1,
             trainer=learn if polar else reference,
             pools=out / f"pools-{beams or 'all'}",
             tests=other,
         )
-        share(runs[number] / "starts", starts)
+        share(half / "starts", starts)
         for row in proof.values["arms"]:
             scores[row["key"]] |= row["miou_by_place"]
     places = sorted(scores["real"])
@@ -87,9 +109,14 @@ def main(
         f"{p} {g:+.1f}" for p, g in zip(places, first - real, strict=True)
     )
     print(
-        f"{name}: real {real.mean():.1f}, generated first {first.mean():.1f}, gain "
-        f"{(first - real).mean():+.1f} ({low:.1f} to {high:.1f}); {gains}"
+        f"{group}, {labelled} labelled, {seeds} seeds: real {real.mean():.1f}, generated first "
+        f"{first.mean():.1f}, gain {(first - real).mean():+.1f} ({low:.1f} to {high:.1f}); {gains}"
     )
+    path = out / "scores.json"
+    kept = json.loads(path.read_text()) if path.is_file() else {}
+    kept.setdefault(group, {})[str(labelled)] = {"seeds": seeds, **scores}
+    path.write_text(json.dumps(kept, indent=1) + "\n")
+    draw({int(count): s for count, s in kept[group].items()}, out / "gain.png")
 
 
 if __name__ == "__main__":
