@@ -13,7 +13,7 @@ LIMITS = {
     "docs/start/install.md": 150,
     "docs/start/tutorial.md": 460,
     "docs/faq.md": 130,
-    "docs/how-to/choose.md": 144,
+    "docs/how-to/choose.md": 168,
     "docs/explanation/comparison.md": 130,
     "docs/how-to/mix.md": 685,
     "docs/how-to/trainers/index.md": 315,
