@@ -78,6 +78,7 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
         "skin-50",
         "pretrain",
         "pretrain-skin",
+        "quarter-town",
         "paste",
     ]
     for row in values["arms"]:
