@@ -8,8 +8,8 @@ import typer
 _ARMS = (
     "a training to compare, repeatable: real | longer | staged | exchange | town | skin | "
     "generator | pretrain | pretrain-skin | pretrain-generator | pretrain-generator-real | "
-    "pretrain-learnt | paste [exchange, pretrain, pretrain-generator]; of detectors: "
-    "real | gt_sampling | objects | half | first | recipe | town"
+    "pretrain-learnt | quarter | quarter-town | paste [exchange, pretrain-generator, quarter]; of "
+    "detectors: real | gt_sampling | objects | half | first | quarter | recipe | town"
 )
 
 
