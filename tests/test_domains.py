@@ -124,9 +124,8 @@ def test_a_segmenters_default_ends_on_real_scans_where_they_are_many_or_of_anoth
     many = mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
     assert "more than 24 labelled scans (25 here)" in caplog.text
     for mixed in (other, many):
-        assert [mixed.mixture.ratio(epoch) for epoch in range(8)] == [1.0] * 2 + [
-            0.0
-        ] * 6
+        ratios = [mixed.mixture.ratio(epoch) for epoch in range(8)]
+        assert ratios == [1.0] * 2 + [0.0] * 6
 
 
 def test_settings_of_trainers_take_a_schedule_by_name() -> None:
