@@ -121,8 +121,10 @@ def test_a_segmenters_default_ends_on_real_scans_where_they_are_many_or_of_anoth
 ) -> None:
     other = mix(REAL, SYNTHETIC, epochs=8, as_sensor=REAL[0].sensor)
     assert "measured" not in caplog.text
-    many = mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
+    some = mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
     assert "more than 24 labelled scans (25 here)" in caplog.text
+    assert some.mixture.ratio(5) == 1
+    many = mix([REAL[0]] * 41, SYNTHETIC, epochs=8)
     for mixed in (other, many):
         ratios = [mixed.mixture.ratio(epoch) for epoch in range(8)]
         assert ratios == [1.0] * 2 + [0.0] * 6

@@ -169,7 +169,7 @@ def test_every_module_is_imported_by_something() -> None:
 
 
 LIMITS = {
-    "plugin": (167_900, 6.0, 130),
+    "plugin": (168_000, 6.0, 130),
     "laboratory": (135_600, 6.1, 130),
     "tools": (39_850, 5.8, 130),
 }

@@ -119,7 +119,7 @@ def mix(
         task: "segmentation", or "detection", which needs ``epochs``, takes boxes as labels, and
             pastes objects of the real scans into all scans, which it turns, mirrors and scales.
         epochs: of the training. With it the recipe that gained on real scans is the default. With
-            up to 24 real scans of the synthetic scans' sensor: synthetic scans alone in three
+            up to 40 real scans of the synthetic scans' sensor: synthetic scans alone in three
             quarters of the epochs, then half, at a quarter of the learning rate. Otherwise:
             synthetic scans alone in a quarter of the epochs, then real ones alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
