@@ -1,6 +1,6 @@
 """Why synthetic scans first help or harm, one change at a time. For docs/research/proof.md.
 
-    python tools/research/why.py LABELLED OUT ARM... [--on pandaset] [--labelled 4]
+    python tools/research/why.py LABELLED OUT ARM... [--on pandaset] [--match]
 
 LABELLED has semantic_kitti and PandaSet's frames (pandaset/sensor_frame/NN.npz). The places of
 SemanticKITTI are split in two halves, the street of PandaSet in two ends: trained on one, tested
@@ -9,7 +9,6 @@ the training, then real ones alone) or ``pandar64`` (the town in that skin first
 the synthetic scans the quantiles of the labelled scans' reflectance.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,24 +18,14 @@ from few_labels import halves
 from other_sensor import read_frame
 from typer import run
 
-from lidar_synth import ProofSettings, Scan, Town, prove
+from lidar_synth import ProofSettings, prove
 from lidar_synth.geometry.transfer import Response
 from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage
-from lidar_synth.lab.proof.pools import FRAMES, POOLS, PoolTask
+from lidar_synth.lab.proof.pools import POOLS, town_scans
 from lidar_synth.lab.proof.trial import Job, TrialOutcome, reference
-from lidar_synth.lab.town import STRETCH_FRAMES
+from lidar_synth.lab.town import load_skin
 
-
-def pandar64(task: PoolTask) -> Iterator[Scan]:
-    """Scans of the town in the skin of the Pandar64."""
-    streets = -(-task.count // len(FRAMES))
-    town = Town(task.town_seed, task.sensor, streets * STRETCH_FRAMES, skin="pandar64")
-    for number in range(task.count):
-        street, frame = divmod(number, len(FRAMES))
-        yield town[STRETCH_FRAMES * street + FRAMES[frame]]
-
-
-POOLS["pandar64"] = pandar64
+POOLS["pandar64"] = lambda task: town_scans(task, load_skin("pandar64"))
 ARMS["pandar64"] = Arm(
     "the town in the skin pandar64 first, then half",
     lambda ratio: (

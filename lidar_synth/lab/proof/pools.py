@@ -76,7 +76,7 @@ class PoolTask:
 
 def raw_town(task: PoolTask) -> Iterator[Scan]:
     """Scans of the town as the physical model measures them."""
-    yield from _streets(task, None)
+    yield from town_scans(task, None)
 
 
 def make_skinned_town(task: PoolTask) -> Iterator[Scan]:
@@ -92,7 +92,7 @@ def make_skinned_town(task: PoolTask) -> Iterator[Scan]:
                 "Leave out the arms with a skin: --arm real --arm exchange --arm town.",
             )
         fit_skin(scans, task.sensor, streets=SKIN_STREETS, progress=False).save(path)
-    yield from _streets(task, load_skin(path))
+    yield from town_scans(task, load_skin(path))
 
 
 def make_generated(task: PoolTask) -> Iterator[Scan]:
@@ -101,7 +101,7 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
     generator = load_generator(task.model)
     streets: Iterable[Scan | None] = repeat(None, task.count)
     if generator.condition is not None:
-        streets = _streets(replace(task, sensor=generator.sensor), None)
+        streets = town_scans(replace(task, sensor=generator.sensor), None)
     made = (generator.scans(0, [i], s)[0] for i, s in enumerate(streets))
     yield from _as_sensor(made, task.sensor)
 
@@ -218,7 +218,8 @@ def _settings(task: PoolTask) -> dict[str, Any]:
     return plain | streets | ({"learnt_from": learnt} if task.kind == "skin" else {})
 
 
-def _streets(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:
+def town_scans(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:
+    """The scans of ``FRAMES`` of each street of the town, in a skin or as they are."""
     streets = -(-task.count // len(FRAMES))
     made = Town(task.town_seed, task.sensor, streets * STRETCH_FRAMES, skin=skin)
     places = [
