@@ -532,6 +532,30 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         Training(transformer(), Recipe(iterations=1)).load(path)
 
 
+def test_moments_get_the_strides_of_their_weights(tmp_path: Path) -> None:
+    """Fused AdamW on a GPU refuses others."""
+
+    def make() -> Training:
+        network = nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
+        return Training(network, Recipe(iterations=2))
+
+    training = make()
+    training.network(torch.ones(1, 3, 5, 5)).sum().backward()
+    training.optimizers[0].step()
+    training.save(tmp_path / "state.safetensors")
+    again = make()
+    again.load(tmp_path / "state.safetensors")
+    for weight, moments in again.optimizers[0].state.items():
+        assert moments["exp_avg"].stride() == weight.stride()
+    held = zip(
+        training.optimizers[0].state.values(),
+        again.optimizers[0].state.values(),
+        strict=True,
+    )
+    for before, after in held:
+        assert torch.equal(before["exp_avg_sq"], after["exp_avg_sq"])
+
+
 def test_a_recipe_with_an_unknown_name_is_refused() -> None:
     with pytest.raises(
         ConfigError, match="metric 'l7'; expected one of squared_l2, pseudo_huber, l1"

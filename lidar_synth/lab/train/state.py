@@ -217,6 +217,7 @@ class Training:
                     }
                 )
                 _check_moments(optimizer)
+                _lay_out_moments(optimizer)
         except (
             RuntimeError,
             ValueError,
@@ -264,6 +265,14 @@ def _check_moments(optimizer: torch.optim.Optimizer) -> None:
                 raise ValueError(
                     f"{name} of shape {tuple(value.shape)}, not {expected}"
                 )
+
+
+def _lay_out_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Give moments the strides of their weights, which fused AdamW on a GPU requires; a file holds
+    them contiguous."""
+    for parameter, moments in optimizer.state.items():
+        for name in moments.keys() - {"step"}:
+            moments[name] = torch.empty_like(parameter).copy_(moments[name])
 
 
 class Progress(NamedTuple):
