@@ -1,5 +1,6 @@
 """How a training run starts: from a shipped model, and beside other runs of the process."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from accelerate.state import AcceleratorState
 
 from lidar_synth.datasets.recordings import seen_by
 from lidar_synth.errors import ConfigError
-from lidar_synth.generate.checkpoint import load_checkpoint
+from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
 from lidar_synth.generate.loading import find_model
 from lidar_synth.lab.evaluate.leakage import overlap, town
 from lidar_synth.lab.train import TrainConfig, load_config, precision, run
@@ -31,6 +32,30 @@ def test_a_shipped_model_is_a_start_by_its_name(
         open_networks(
             load_config(TrainConfig, "town_teacher", ["init=towns", "codec=null"])
         )
+
+
+def test_a_flow_is_trained_further_on_another_autoencoder_of_the_same_latents(
+    tmp_path: Path,
+) -> None:
+    town = load_checkpoint(find_model("town"))
+    networks = {"codec": town.networks["codec"]}
+    with torch.no_grad():
+        next(networks["codec"].parameters()).add_(1)
+    path = tmp_path / "further.safetensors"
+    kept = {"codec": town.header.networks["codec"]}
+    made = save_checkpoint(path, replace(town.header, networks=kept), networks)
+    given = ["init=town", f"codec={path}"]
+    opened, header = open_networks(load_config(TrainConfig, "town_teacher", given))
+    weights = opened["codec"].state_dict()
+    assert all(
+        torch.equal(value, weights[name])
+        for name, value in networks["codec"].state_dict().items()
+    )
+    assert header.provenance["codec"] == made
+    other = replace(town.header.sensor, name="mine")
+    save_checkpoint(path, replace(town.header, networks=kept, sensor=other), networks)
+    with pytest.raises(ConfigError, match="of another sensor than init"):
+        open_networks(load_config(TrainConfig, "town_teacher", given))
 
 
 def config(folder: Path, chosen: str) -> TrainConfig:

@@ -15,6 +15,7 @@ from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
     VELOCITY,
+    Checkpoint,
     Header,
     NetworkSpec,
     load_checkpoint,
@@ -56,12 +57,8 @@ def fresh_networks(config: TrainConfig) -> Opened:
         fixed = {}
         state = (tensors.size, *sensor.shape)
     else:
-        codec = load_checkpoint(config.codec)
+        codec = _load_codec(config.codec)
         held = codec.header
-        if CODEC not in codec.networks:
-            raise ConfigError(
-                f"codec {config.codec}", "the checkpoint of an autoencoder"
-            )
         _check_held(config, held, config.codec)
         sensor = held.sensor
         tensors = held.tensors
@@ -81,6 +78,14 @@ def fresh_networks(config: TrainConfig) -> Opened:
     return _build(config, parts, sensor, state), header
 
 
+def _load_codec(path: Path) -> Checkpoint:
+    """A checkpoint with an autoencoder."""
+    codec = load_checkpoint(path)
+    if CODEC not in codec.networks:
+        raise ConfigError(f"codec {path}", "the checkpoint of an autoencoder")
+    return codec
+
+
 def _conditioning(condition: ConditionSection | None) -> dict[str, dict[str, Any]]:
     """What a header says of a condition."""
     return {} if condition is None else {condition.kind: condition.options()}
@@ -91,7 +96,8 @@ def start_networks(config: TrainConfig, init: Path) -> Opened:
     start = load_checkpoint(find_model(init))
     name = CODEC if config.autoencodes else VELOCITY
     wanted = {CODEC, VELOCITY} if config.decoder else {name}
-    if not wanted <= set(start.networks) or config.codec is not None:
+    other = config.decoder and config.codec is not None
+    if other or not wanted <= set(start.networks):
         raise ConfigError(
             f"init {init} with parts {sorted(start.networks)}",
             "a checkpoint of the same kind",
@@ -100,6 +106,8 @@ def start_networks(config: TrainConfig, init: Path) -> Opened:
     facts = {"init": start.hash, "init_provenance": start.header.provenance}
     header = replace(start.header, provenance=provenance_of(config) | facts)
     networks = start.networks
+    if config.codec is not None:
+        networks, header = _change_codec(config.codec, networks, header)
     if config.autoencodes:
         kept = {CODEC: header.networks[CODEC]}
         networks = {CODEC: networks[CODEC]}
@@ -113,6 +121,40 @@ def start_networks(config: TrainConfig, init: Path) -> Opened:
     if ENCODER in networks:
         return networks, _same_condition(config.condition, init, header)
     return _add_condition(config, networks, header)
+
+
+def _change_codec(path: Path, networks: dict[str, nn.Module], header: Header) -> Opened:
+    """A latent model on the latents of another autoencoder, such as its own trained further.
+
+    Raises:
+        ConfigError: on an autoencoder of other scans or of latents of another shape.
+    """
+    codec = _load_codec(path)
+    facts = [_latents_of(networks, header), _latents_of(codec.networks, codec.header)]
+    differs = [key for key in facts[0] if facts[0][key] != facts[1][key]]
+    if differs:
+        raise ConfigError(
+            f"codec {path} of another {', '.join(differs)} than init",
+            "an autoencoder with the latents of init",
+        )
+    made = {"codec": codec.hash, "codec_provenance": codec.header.provenance}
+    header = replace(
+        header,
+        networks=header.networks | {CODEC: codec.header.networks[CODEC]},
+        provenance=header.provenance | made,
+    )
+    return networks | {CODEC: codec.networks[CODEC]}, header
+
+
+def _latents_of(networks: dict[str, nn.Module], header: Header) -> dict[str, Any]:
+    """What an autoencoder encodes, and the shape of what it makes of it."""
+    codec = make_codec(networks.get(CODEC), header.tensors, header.sensor.shape)
+    return {
+        "sensor": header.sensor,
+        "channels": header.channels,
+        "normalisation": header.normalisation,
+        "shape of latents": codec.shape,
+    }
 
 
 def _same_condition(condition: ConditionSection, init: Path, header: Header) -> Header:

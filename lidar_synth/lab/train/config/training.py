@@ -32,7 +32,7 @@ class TrainConfig(Run):
             and LiDM.
         network: the network to train.
         codec: checkpoint of an autoencoder, for a latent model; it determines sensor, channels and
-            normalisation.
+            normalisation. With ``init``, takes the place of that model's autoencoder.
         condition: the condition of the model.
         decoder: whether to train only the decoder of ``init``, a latent model, on the latents of
             its last step.
