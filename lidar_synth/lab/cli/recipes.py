@@ -101,7 +101,11 @@ def _schema(name: str) -> dict[str, Any]:
 
 
 def _configure(
-    trainer: str, task: str | None, root: str, synthetic: str, out: Path | None
+    trainer: str,
+    task: str | None,
+    root: str,
+    synthetic: str,
+    out: Path | None,
 ) -> None:
     """Print or write the files of a trainer."""
     from lidar_synth.lab.start.trainers import (

@@ -151,7 +151,8 @@ def features(image: RangeImage) -> ScanFeatures:
 def _signature(points: NDArray[np.float32]) -> NDArray[np.float16]:
     half = SIDE / 2
     near = points[(np.abs(points[:, :2]) < half).all(1), :2]
-    row, column = ((half - near) * (CELLS / SIDE)).astype(np.int64).clip(0, CELLS - 1).T
+    cells = ((half - near) * (CELLS / SIDE)).astype(np.int64)
+    row, column = cells.clip(0, CELLS - 1).T
     roots = np.sqrt(np.bincount(row * CELLS + column, minlength=SIGNATURE))
     return (roots / max(float(np.linalg.norm(roots)), 1.0)).astype(np.float16)
 

@@ -211,9 +211,9 @@ def _keys(
     sketch."""
     a = some.astype(np.float32)
     b = others.astype(np.float32)
-    distances = (
-        (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
-    )  # whole numbers below 2^22
+    own = (a * a).sum(1)
+    theirs = (b * b).sum(1)
+    distances = own[:, None] + theirs - 2 * (a @ b.T)  # whole numbers below 2^22
     keys: NDArray[np.float64] = distances.astype(np.float64) * _NUMBERS + numbers
     return keys
 

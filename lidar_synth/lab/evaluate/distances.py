@@ -29,11 +29,12 @@ def jensen_shannon_distance(p: NDArray[np.number], q: NDArray[np.number]) -> flo
     p = p.ravel() / p.sum()
     q = q.ravel() / q.sum()
     mean = (p + q) / 2
-    divergence = (
-        sum(float((w[w > 0] * np.log(w[w > 0] / mean[w > 0])).sum()) for w in (p, q))
-        / 2
-    )
-    return float(np.sqrt(max(divergence, 0.0)))
+    total = 0.0
+    for weights in (p, q):
+        held = weights > 0
+        kept = weights[held]
+        total += float((kept * np.log(kept / mean[held])).sum())
+    return float(np.sqrt(max(total / 2, 0.0)))
 
 
 def frechet_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:

@@ -223,7 +223,11 @@ class Metric:
         self._kept[side].add(part)
 
     def _describe(
-        self, scan: Scan, generated: bool, measures: Sequence[Measure], side: str
+        self,
+        scan: Scan,
+        generated: bool,
+        measures: Sequence[Measure],
+        side: str,
     ) -> dict[str, Any]:
         described: dict[str, Any] = {}
         try:
@@ -326,7 +330,12 @@ class Metric:
         return self._made(measure, compared.value, compared, *compared.sizes)
 
     def _made(
-        self, measure: Measure, value: float, statistic: Any, real: int, fake: int
+        self,
+        measure: Measure,
+        value: float,
+        statistic: Any,
+        real: int,
+        fake: int,
     ) -> Score:
         least = -np.inf if measure.least is None else measure.least
         return Score(

@@ -114,7 +114,11 @@ Rows = Callable[[int, int], Tensor]
 
 
 def gaussian_mmd(
-    real: Rows, fake: Rows, sizes: tuple[int, int], width: int, sigma: float = 0.5
+    real: Rows,
+    fake: Rows,
+    sizes: tuple[int, int],
+    width: int,
+    sigma: float = 0.5,
 ) -> Statistic:
     """Squared maximum mean discrepancy, kernel exp(-|p - q|^2 / (2 sigma^2)), including pairs of a
     sample with itself (Gretton et al., JMLR 2012, the biased form).
@@ -131,7 +135,8 @@ def gaussian_mmd(
     block = max(16, min(_BLOCK, _NUMBERS // width))
 
     def less_one(p: Tensor, q: Tensor) -> Tensor:
-        squared = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q.T
+        own = p.square().sum(1)
+        squared = own[:, None] + q.square().sum(1) - 2 * p @ q.T
         return torch.expm1(squared.clamp_(min=0) / (-2 * sigma**2))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:
@@ -216,7 +221,10 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
     sets = checked_features(real, fake)
     x, y = (torch.from_numpy(s) for s in sets)
     rows = [lambda i, j, s=s: s[i:j] for s in (x, y)]
-    diagonals = [((s.square().sum(1) / s.shape[1] + 1) ** 3).numpy() for s in (x, y)]
+    diagonals = []
+    for features in (x, y):
+        squared = features.square().sum(1)
+        diagonals.append(((squared / features.shape[1] + 1) ** 3).numpy())
 
     def kernel(p: Tensor, q: Tensor) -> Tensor:
         return (p @ q.T / x.shape[1] + 1) ** 3

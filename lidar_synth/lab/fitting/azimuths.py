@@ -239,7 +239,11 @@ def _phases(turn: Turn, beams: int, lattice: int, sides: Floats) -> Floats:
 
 
 def _by_pattern(
-    turn: Turn, beams: int, lattice: int, sides: Floats, phases: Floats
+    turn: Turn,
+    beams: int,
+    lattice: int,
+    sides: Floats,
+    phases: Floats,
 ) -> Floats:
     """(B,) degrees: offsets that align the patterns of skipped encoder steps; their median is 0."""
     seen = turn.azimuth + sides[turn.ring] / (2 * np.pi * turn.rho)

@@ -172,7 +172,11 @@ def _fill_up(
 
 
 def _described(
-    beams: Beams, cloud: Cloud, scans: Sequence[Scan], name: str, columns: int | None
+    beams: Beams,
+    cloud: Cloud,
+    scans: Sequence[Scan],
+    name: str,
+    columns: int | None,
 ) -> SensorFit:
     points = beams.model.aligned(cloud)
     lost = beams.model if cloud.kept else add_lost_beams(beams.model, points)

@@ -182,7 +182,8 @@ def sector_sharpness(points: Floats, place: Floats, sectors: int) -> float:
     elevation = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
     azimuth = np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5
     rows = round(np.pi / _BIN)
-    row = np.clip((elevation / np.pi + 0.5) * rows, 0, rows - 1).astype(np.int32)
+    height = (elevation / np.pi + 0.5) * rows
+    row = np.clip(height, 0, rows - 1).astype(np.int32)
     sector = np.minimum((azimuth * sectors).astype(np.int32), sectors - 1)
     return _measure_concentration(np.sort(sector * np.int32(rows) + row))
 

@@ -254,9 +254,8 @@ def _label_window(
     )
     recovery = Recovery(job.windows, _boxes(root, job.drive), poses, job.frames)
     points = partial(_points, root, job.drive)
-    recovery.choose_motion(
-        {f: points(f)[:, :3] for f in job.frames[:: -(-len(job.frames) // _SAMPLES)]}
-    )
+    apart = -(-len(job.frames) // _SAMPLES)
+    recovery.choose_motion({f: points(f)[:, :3] for f in job.frames[::apart]})
     for frame in job.frames:  # labels of an earlier run with other clouds or poses
         remove_file(folder / f"{frame:010d}.label")
     counts = LabelCounts()
@@ -313,7 +312,10 @@ def _moving(
 
 def _inputs(root: Path, against: Path | None, job: WindowJob) -> dict[str, Any]:
     """What the labels of a window depend on."""
-    files = [p for w in job.windows for p in (w.static, w.dynamic) if p is not None]
+    files: list[Path] = []
+    for window in job.windows:
+        both = (window.static, window.dynamic)
+        files += [path for path in both if path is not None]
     boxes = boxes_path(root, job.drive)
     return {
         "version": VERSION,

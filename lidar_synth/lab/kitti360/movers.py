@@ -123,11 +123,9 @@ def find_inside(
         floor: metres above the box's bottom, below which points are outside.
     """
     size = np.linalg.norm(box[:3, :3], axis=0)
-    near = np.flatnonzero(
-        (np.abs(points[:, :2] - box[:2, 3]) < np.linalg.norm(size) / 2 + margin).all(
-            axis=1
-        )
-    )
+    reach = np.linalg.norm(size) / 2 + margin
+    beside = np.abs(points[:, :2] - box[:2, 3])
+    near = np.flatnonzero((beside < reach).all(axis=1))
     local = (points[near] - box[:3, 3]) @ (box[:3, :3] / size)
     kept = (np.abs(local) <= size / 2 + margin).all(axis=1)
     if floor:
@@ -163,7 +161,8 @@ def _tracks(boxes: WorldBoxes, frames: range) -> list[MovingTrack]:
     frame = boxes.windows[order, 0]
     place = boxes.transforms[order, :3, 3]
     gap = np.diff(frame)
-    jump = np.linalg.norm(np.diff(place, axis=0), axis=1) > _JUMP * np.maximum(gap, 1)
+    way = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    jump = way > _JUMP * np.maximum(gap, 1)
     parts = np.split(
         order, np.flatnonzero((np.diff(instance) != 0) | (gap > _GAP) | jump) + 1
     )

@@ -185,7 +185,8 @@ class Recovery:
         move = register(self.place(probes, frame), self._surfaces)
         local = np.linalg.inv(self._poses[frame]) @ move @ self._poses[frame]
         metres = float(np.linalg.norm(local[:3, 3]))
-        angle = float(np.arccos(np.clip((np.trace(local[:3, :3]) - 1) / 2, -1, 1)))
+        cosine = (np.trace(local[:3, :3]) - 1) / 2
+        angle = float(np.arccos(np.clip(cosine, -1, 1)))
         if metres <= NEAREST[0] and angle <= NEAREST[1]:
             return 0.0
         self._moves[frame] = move

@@ -170,7 +170,8 @@ def _score(
 
 def _robust(off: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """The weights of Geman and McClure for residuals (K, 3)."""
-    weights: NDArray[np.float64] = (1 + (off**2).sum(axis=1) / scale**2) ** -2
+    squared = (off**2).sum(axis=1)
+    weights: NDArray[np.float64] = (1 + squared / scale**2) ** -2
     return weights
 
 

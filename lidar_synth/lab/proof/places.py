@@ -6,6 +6,7 @@ on.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,10 +144,10 @@ def clusters(positions: NDArray[np.float64], apart: float) -> NDArray[np.int64]:
             here = waiting.pop()
             cluster[here] = count - 1
             x, y = squares[here].tolist()
-            near = (
-                numbers.get((x + dx, y + dy)) for dx in (-1, 0, 1) for dy in (-1, 0, 1)
-            )
-            waiting += [n for n in near if n is not None and cluster[n] < 0]
+            for dx, dy in product((-1, 0, 1), repeat=2):
+                near = numbers.get((x + dx, y + dy))
+                if near is not None and cluster[near] < 0:
+                    waiting.append(near)
     return cluster[square.reshape(-1)]
 
 

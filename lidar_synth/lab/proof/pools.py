@@ -239,4 +239,6 @@ def _alike(some: Sensor, other: Sensor) -> bool:
     """Whether two sensors have beams of the same elevations."""
     a = some.laser_elevations
     b = other.laser_elevations
-    return a.shape == b.shape and bool(np.abs(a - b).max() < np.radians(0.1))
+    if a.shape != b.shape:
+        return False
+    return bool(np.abs(a - b).max() < np.radians(0.1))

@@ -163,9 +163,8 @@ def turn_scan(scan: Scan, rng: np.random.Generator) -> Scan:
 
     Returns stay within their cells, so that the range image of a thinned scan loses none.
     """
-    scan = rotate_scan(
-        scan, 2 * np.pi / scan.sensor.columns * int(rng.integers(scan.sensor.columns))
-    )
+    columns = scan.sensor.columns
+    scan = rotate_scan(scan, 2 * np.pi / columns * int(rng.integers(columns)))
     return mirror_scan(scan, "y") if rng.random() < 0.5 else scan
 
 

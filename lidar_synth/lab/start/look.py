@@ -160,5 +160,8 @@ def _classes(scans: list[Scan]) -> tuple[str, ...]:
 
 
 def _boxes(scans: list[Scan]) -> dict[str, int]:
-    names = [name for s in scans if s.boxes is not None for name in s.boxes.names]
-    return dict(Counter(names).most_common(5))
+    names: Counter[str] = Counter()
+    for scan in scans:
+        if scan.boxes is not None:
+            names.update(scan.boxes.names)
+    return dict(names.most_common(5))

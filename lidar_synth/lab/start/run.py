@@ -268,7 +268,12 @@ def _task(found: Findings, given: str | None) -> str:
 
 
 def _plan(
-    found: Findings, task: str, out: Path, scans: int, minutes: float, jobs: int
+    found: Findings,
+    task: str,
+    out: Path,
+    scans: int,
+    minutes: float,
+    jobs: int,
 ) -> StartPlan:
     cast = task == "detection" or _blind(found.source.sensor) > BLIND
     return StartPlan(found, task, cast, out, scans, minutes, jobs)

@@ -80,7 +80,10 @@ def _swinging_arm(side: int, turn: float, stride: float) -> list[Mesh]:
     arm = -stride * 0.38 * np.sin(turn)
     x = 0.02 + 0.29 * np.sin(arm)
     z = 1.40 - 0.29 * np.cos(arm)
-    hand = (x + 0.25 * np.sin(arm + 0.3), side * 0.24, z - 0.25 * np.cos(arm + 0.3))
+    bent = arm + 0.3
+    forward = x + 0.25 * np.sin(bent)
+    up = z - 0.25 * np.cos(bent)
+    hand = (forward, side * 0.24, up)
     return [
         _arm((0.02, side * 0.19, 1.41), (x, side * 0.23, z), hand),
         ball(hand, 0.045, SKIN, 3, 5),

@@ -44,7 +44,8 @@ def put_boundary(
     if kind == "none" or length < 0.8:
         return
     style = _sample_style(rng)
-    for a, b in pairwise(np.linspace(*ends, max(1, int(np.ceil(length / 7))) + 1)):
+    count = max(1, int(np.ceil(length / 7)))
+    for a, b in pairwise(np.linspace(*ends, count + 1)):
         for item, aside, lift in _piece(kind, b - a, style, rng):
             if along:
                 scene.put(item, a, at + aside, 0.0, lift)

@@ -56,7 +56,8 @@ def boxes_of(objects: list[PlacedObject], pose: Pose, snapshot: Snapshot) -> Box
 def box_values(placed: PlacedObject, in_sensor: Pose) -> Array:
     """(7,) centre, size and yaw of an object's box, from its pose in the sensor frame."""
     low, high = placed.prototype.mesh.bounds
-    centre = in_sensor[:3, :3] @ (placed.scale * (low + high) / 2) + in_sensor[:3, 3]
+    middle = placed.scale * (low + high) / 2
+    centre = in_sensor[:3, :3] @ middle + in_sensor[:3, 3]
     yaw = np.arctan2(in_sensor[1, 0], in_sensor[0, 0])
     return np.concatenate([centre, placed.scale * (high - low), [yaw]])
 

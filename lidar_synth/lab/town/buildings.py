@@ -128,7 +128,9 @@ def _skylights(slope: Array, count: int, rng: Rng) -> Mesh:
     height = 1.2 / float(np.linalg.norm(d - a))
     s = rng.uniform(0.1, 0.85, (count, 1, 1)) + np.array([0, width, width, 0])[:, None]
     v = 0.4 + np.array([0, 0, height, height])[:, None]
-    corners = (1 - v) * ((1 - s) * a + s * b) + v * ((1 - s) * d + s * c) + up
+    below = (1 - s) * a + s * b
+    above = (1 - s) * d + s * c
+    corners = (1 - v) * below + v * above + up
     return quads(corners, GLASS)
 
 

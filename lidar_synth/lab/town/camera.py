@@ -48,7 +48,8 @@ def pixel_rays(
     (fx, _, cx, _), (_, fy, cy, _), _ = CAMERA.projection.astype(np.float32)
     x = (pixels[:, 0].astype(np.float32) - cx) / fx
     y = (pixels[:, 1].astype(np.float32) - cy) / fy
-    ahead = np.stack([x, y, np.ones_like(x)], 1) / np.sqrt(x * x + y * y + 1)[:, None]
+    length = np.sqrt(x * x + y * y + 1)
+    ahead = np.stack([x, y, np.ones_like(x)], 1) / length[:, None]
     return camera[:3, 3], ahead @ camera[:3, :3].T
 
 

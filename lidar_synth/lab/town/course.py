@@ -45,8 +45,10 @@ class Course:
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         yaw = self.heading(s)
         beyond = s - np.clip(s, self._s[0], self._s[-1])
-        x = np.interp(s, self._s, self._xy[0]) + beyond * np.cos(yaw) - t * np.sin(yaw)
-        y = np.interp(s, self._s, self._xy[1]) + beyond * np.sin(yaw) + t * np.cos(yaw)
+        cosine = np.cos(yaw)
+        sine = np.sin(yaw)
+        x = np.interp(s, self._s, self._xy[0]) + beyond * cosine - t * sine
+        y = np.interp(s, self._s, self._xy[1]) + beyond * sine + t * cosine
         return np.stack([x, y], -1)
 
 
@@ -73,9 +75,11 @@ class Relief:
         t = np.asarray(t, float)
         ways = s[..., None] * np.cos(self._way) + t[..., None] * np.sin(self._way)
         along = ways / self._length
-        hills = (self._height * np.sin(2 * np.pi * along + self._phase)).sum(-1)
+        waves = np.sin(2 * np.pi * along + self._phase)
+        hills = (self._height * waves).sum(-1)
         left = t > 0
         out = np.abs(t)
         bank = np.where(left, *self._banks) * np.clip(out - 9, 0, 40)
-        far = np.where(left, *self._far) * np.clip((out - 90) / 100, 0, 1) ** 2
+        beyond = np.clip((out - 90) / 100, 0, 1)
+        far = np.where(left, *self._far) * beyond**2
         return np.asarray(hills + self._slope * s + bank + far)

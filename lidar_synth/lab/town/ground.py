@@ -104,9 +104,7 @@ class TownGround:
     def kind(self, s: ArrayLike, t: ArrayLike) -> Ints:
         """Index in ``NAMES`` of the ground at street coordinates (rounded corners count as
         square)."""
-        i = np.clip(np.searchsorted(self._s, s, "right") - 1, 0, len(self._s) - 2)
-        j = np.clip(np.searchsorted(self._t, t, "right") - 1, 0, len(self._t) - 2)
-        return np.asarray(self._kinds[i, j])
+        return np.asarray(self._kinds[_below(self._s, s), _below(self._t, t)])
 
     def height(
         self, s: ArrayLike, t: ArrayLike, kind: ArrayLike | None = None
@@ -199,6 +197,12 @@ class TownGround:
         a = self.points(outer[:, 0], outer[:, 1], low)
         b = self.points(inner[:, 0], inner[:, 1], kind)
         return quads(np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1), kind)
+
+
+def _below(lines: Array, values: ArrayLike) -> Ints:
+    """Index of the last line that is not above each value, within the cells."""
+    found = np.searchsorted(lines, values, "right") - 1
+    return np.asarray(np.clip(found, 0, len(lines) - 2))
 
 
 def _lines(

@@ -198,7 +198,8 @@ def _cross(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     """(N, 3) cross products; ``np.cross`` is slow for few vectors."""
     x, y, z = a.T
     u, v, w = b.T
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], 1)
+    across = [y * w - z * v, z * u - x * w, x * v - y * u]
+    return np.stack(across, 1)
 
 
 def _rings(axes: Array, sides: int) -> Array:

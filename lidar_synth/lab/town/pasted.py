@@ -188,9 +188,8 @@ class TownObjects(ObjectBank):
         values = self.boxes.values.copy()
         for name in sorted({*others} & {*own}):
             mine = own == name
-            factor = boxes.values[others == name, 3:6].mean(0) / values[mine, 3:6].mean(
-                0
-            )
+            wanted = boxes.values[others == name, 3:6].mean(0)
+            factor = wanted / values[mine, 3:6].mean(0)
             floor = values[mine, 2] - values[mine, 5] / 2
             values[mine, 3:6] *= factor
             values[mine, 2] = floor + values[mine, 5] / 2

@@ -92,7 +92,8 @@ def cell_noise(points: Floats, size: float) -> Floats:
 
     A hash of the cube's indices, so that all points of a window pane get the same value.
     """
-    x, y, z = np.floor(points / np.float32(size)).astype(np.int64).astype(np.uint64).T
+    cubes = np.floor(points / np.float32(size)).astype(np.int64)
+    x, y, z = cubes.astype(np.uint64).T
     mixed = (
         x * np.uint64(0x9E3779B97F4A7C15)
         ^ y * np.uint64(0xC2B2AE3D27D4EB4F)

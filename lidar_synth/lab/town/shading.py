@@ -282,7 +282,8 @@ def _exposure(image: Floats) -> float:
 def tone_map(image: Floats) -> NDArray[np.uint8]:
     """Tone mapping: uint8 sRGB of exposed linear RGB, with soft clipping of highlights."""
     curve = np.clip(image, 0, None)
-    curve = np.clip(curve * (1 + 0.18 * curve) / (1 + 0.30 * curve), 0, 1) ** (1 / 2.2)
+    soft = curve * (1 + 0.18 * curve) / (1 + 0.30 * curve)
+    curve = np.clip(soft, 0, 1) ** (1 / 2.2)
     return np.asarray(curve * 255 + 0.5, np.uint8)
 
 

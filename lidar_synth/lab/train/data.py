@@ -246,13 +246,14 @@ class InTurns:
     def __call__(self, positions: Sequence[int]) -> Batch:
         """The samples at these positions."""
         parts = [(self.first, self.second)[p % 2]([p // 2]) for p in positions]
-        y0, y1, u = (torch.cat(values) for values in list(zip(*parts, strict=True))[:3])
-        return Batch(y0, y1, u)
+        y0, y1, u, _ = zip(*parts, strict=True)
+        return Batch(torch.cat(y0), torch.cat(y1), torch.cat(u))
 
 
 def _where(chosen: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Per sample, a where ``chosen`` (B,) is true, else b; both (B, ...)."""
-    return torch.where(chosen.to(b.device).view(-1, *[1] * (b.ndim - 1)), a, b)
+    ones = [1] * (b.ndim - 1)
+    return torch.where(chosen.to(b.device).view(-1, *ones), a, b)
 
 
 def _rolled(x: Tensor, columns: Sequence[int]) -> Tensor:
@@ -272,7 +273,11 @@ def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 
 def micro_batches(
-    step: int, batch: int, accumulate: int, process: int = 0, processes: int = 1
+    step: int,
+    batch: int,
+    accumulate: int,
+    process: int = 0,
+    processes: int = 1,
 ) -> Iterator[range]:
     """The positions that one process trains on in one optimiser step, one range per micro-batch.
 

@@ -214,7 +214,11 @@ def _split(
 
 
 def _planned(
-    name: str, stage: ModelStage, path: Path, runs: StagedRuns, overrides: Sequence[str]
+    name: str,
+    stage: ModelStage,
+    path: Path,
+    runs: StagedRuns,
+    overrides: Sequence[str],
 ) -> PlannedStage:
     """The run of a stage, with all that it needs."""
     beside = path.parent / stage.recipe

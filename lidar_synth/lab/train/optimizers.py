@@ -89,7 +89,11 @@ class _Float32(TorchFunctionMode):
     """``Tensor.bfloat16()`` gives a copy in the tensor's own precision."""
 
     def __torch_function__(
-        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+        self,
+        func: Any,
+        types: Any,
+        args: Any = (),
+        kwargs: Any = None,
     ) -> Any:
         return (
             args[0].clone()

@@ -29,7 +29,11 @@ class _DarknetResidual(nn.Module):
 
 
 def _stage(
-    name: str, conv: nn.Module, inputs: int, outputs: int, residuals: list[str]
+    name: str,
+    conv: nn.Module,
+    inputs: int,
+    outputs: int,
+    residuals: list[str],
 ) -> nn.Sequential:
     layers = [
         (name, conv),
@@ -103,7 +107,11 @@ class RangeNet(nn.Module):
     """
 
     def __init__(
-        self, channels: int = 5, classes: int = 20, layers: int = 53, width: int = 32
+        self,
+        channels: int = 5,
+        classes: int = 20,
+        layers: int = 53,
+        width: int = 32,
     ) -> None:
         super().__init__()
         self.backbone = _DarknetEncoder(channels, layers, width)

@@ -74,7 +74,13 @@ class _Wide(nn.Module):
 
 
 class _Stem(nn.Module):
-    def __init__(self, channels: int, base: int, hidden: int, width: int) -> None:
+    def __init__(
+        self,
+        channels: int,
+        base: int,
+        hidden: int,
+        width: int,
+    ) -> None:
         super().__init__()
         self.conv_block = nn.Sequential(
             _Context(channels, base),
@@ -96,7 +102,8 @@ class _Attention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        split = self.qkv(x).unflatten(-1, (3, self.heads, -1))
+        q, k, v = split.permute(2, 0, 3, 1, 4)
         y: Tensor = self.proj(
             F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
         )
@@ -130,7 +137,12 @@ class _TransformerBlock(nn.Module):
 
 class _TransformerEncoder(nn.Module):
     def __init__(
-        self, stem: _Stem, size: tuple[int, int], width: int, blocks: int, heads: int
+        self,
+        stem: _Stem,
+        size: tuple[int, int],
+        width: int,
+        blocks: int,
+        heads: int,
     ) -> None:
         super().__init__()
         self.patch_embed = stem

@@ -90,9 +90,8 @@ def neighbours(voxels: Tensor) -> Pairs:
     """The pairs of a kernel of size 3 over sorted voxels. An offset and its opposite have the same
     pairs, exchanged."""
     sorted_keys = keys(voxels)
-    steps = torch.tensor(
-        [(x, y, z) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-    )
+    near = (-1, 0, 1)
+    steps = torch.tensor([(x, y, z) for z in near for y in near for x in near])
     shifts = (steps[:, 0] << 2 * _BITS) + (steps[:, 1] << _BITS) + steps[:, 2]
     before = []
     for shift in shifts[:_CENTRE]:

@@ -23,7 +23,11 @@ class Fire(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, squeezed: int, expanded: int, upsample: bool = False
+        self,
+        inputs: int,
+        squeezed: int,
+        expanded: int,
+        upsample: bool = False,
     ) -> None:
         super().__init__()
         self.squeeze = nn.Conv2d(inputs, squeezed, 1)

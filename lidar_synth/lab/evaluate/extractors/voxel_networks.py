@@ -134,7 +134,13 @@ class MinkowskiNet(nn.Module):
             x = residual(x, coarse.neighbours)
         return x
 
-    def _up(self, i: int, x: Tensor, skip: Tensor, levels: list[SparseLevel]) -> Tensor:
+    def _up(
+        self,
+        i: int,
+        x: Tensor,
+        skip: Tensor,
+        levels: list[SparseLevel],
+    ) -> Tensor:
         children = levels[4 - i].children
         fine = levels[3 - i]
         assert children is not None  # only the finest level has none

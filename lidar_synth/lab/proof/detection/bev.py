@@ -84,7 +84,8 @@ def _fill(image, count, points, reflectance):  # type: ignore[no-untyped-def]
         if 0 <= x < CELLS and 0 <= y < CELLS and 0 <= height < SLICES:
             i = int(x)
             j = int(y)
-            cell = (i // 2 * (CELLS // 2) + j // 2) * 4 + i % 2 * 2 + j % 2
+            block = i // 2 * (CELLS // 2) + j // 2
+            cell = block * 4 + i % 2 * 2 + j % 2
             image[cell, int(height)] = 255
             image[cell, SLICES] = int(reflectance[k] * 255)  # of any of its returns
             count[cell] += 1
@@ -138,7 +139,8 @@ def _offsets(
 
 
 def _shape(box: NDArray[np.float64]) -> list[float]:
-    return [box[2], *np.log(box[3:6]), np.cos(2 * box[6]), np.sin(2 * box[6])]
+    angle = 2 * box[6]
+    return [box[2], *np.log(box[3:6]), np.cos(angle), np.sin(angle)]
 
 
 def decode(

@@ -128,5 +128,6 @@ def decode_anchors(values: Tensor, turns: Tensor, anchors: Tensor) -> Tensor:
     scale = torch.cat([diagonal, diagonal, anchors[:, 5:6]], 1)
     centre = values[:, :3] * scale + anchors[:, :3]
     size = values[:, 3:6].exp() * anchors[:, 3:6]
-    yaw = (values[:, 6] + anchors[:, 6] - FRONT) % torch.pi + FRONT + torch.pi * turns
+    turned = values[:, 6] + anchors[:, 6] - FRONT
+    yaw = turned % torch.pi + FRONT + torch.pi * turns
     return torch.cat([centre, size, yaw[:, None]], 1)

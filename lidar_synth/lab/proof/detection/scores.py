@@ -66,7 +66,7 @@ class Criterion:
         """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
         if self.overlap:
             return footprint_ious(boxes, truth) / self.overlap
-        apart = np.hypot(*(boxes[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1))
+        apart = _apart(boxes, truth)
         return np.asarray(self.distance / np.maximum(apart, 1e-9), np.float64)
 
     def includes(self, boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -149,6 +149,12 @@ def matched(
     return result
 
 
+def _apart(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(A, B) distances between the centres of boxes (A, 7) and (B, 7) on the ground."""
+    x, y = (a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1)
+    return np.asarray(np.hypot(x, y))
+
+
 def footprint_ious(
     a: NDArray[np.float32],
     b: NDArray[np.float32],
@@ -157,11 +163,9 @@ def footprint_ious(
     ious = np.zeros((len(a), len(b)))
     if not ious.size:
         return ious
-    distance = np.hypot(*(a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1))
-    near = (
-        distance
-        < (np.hypot(a[:, 3], a[:, 4])[:, None] + np.hypot(b[:, 3], b[:, 4])) / 2
-    )
+    lengths = np.hypot(a[:, 3], a[:, 4])
+    others = np.hypot(b[:, 3], b[:, 4])
+    near = _apart(a, b) < (lengths[:, None] + others) / 2
     first = _footprints(a)
     second = _footprints(b)
     for i, j in np.argwhere(near):
@@ -212,7 +216,8 @@ def _common_area(
         if len(polygon) < 3:
             return 0.0
     x, y = (polygon - polygon[0]).T
-    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
+    doubled = x * np.roll(y, -1) - y * np.roll(x, -1)
+    return float(np.sum(doubled) / 2)
 
 
 def average_precision(

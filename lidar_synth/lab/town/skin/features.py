@@ -83,7 +83,8 @@ def find_features(
         sensor: whose firings give the distance between neighbours.
     """
     firings = sensor.firings or sensor.columns
-    turn = np.arctan2(points[:, 1], points[:, 0]) * np.float32(firings / (2 * np.pi))
+    per_radian = np.float32(firings / (2 * np.pi))
+    turn = np.arctan2(points[:, 1], points[:, 0]) * per_radian
     level = np.hypot(points[:, 0], points[:, 1])
     distance = np.sqrt(np.einsum("ij,ij->i", points, points))
     rows = np.ascontiguousarray(ring, np.int32)

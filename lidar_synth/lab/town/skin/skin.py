@@ -156,7 +156,8 @@ class Skin:
         """
         mine = self.sensor.laser_elevations
         other = sensor.laser_elevations
-        if mine.shape != other.shape or np.abs(mine - other).max() > np.radians(0.3):
+        limit = np.radians(0.3)
+        if mine.shape != other.shape or np.abs(mine - other).max() > limit:
             raise ConfigError(
                 f"sensor {sensor.name!r} with a skin of {self.sensor.name!r}",
                 "a sensor with the same beams",
@@ -317,7 +318,9 @@ def _at(table: Floats, row: int, x: float) -> float:
 @njit(cache=True)
 def _root(x: float) -> float:
     """The place of a residual x in [-1, 1] on the grid, in [0, 1]."""
-    return float(0.5 + 0.5 * np.sqrt(x) if x >= 0 else 0.5 - 0.5 * np.sqrt(-x))
+    if x >= 0:
+        return float(0.5 + 0.5 * np.sqrt(x))
+    return float(0.5 - 0.5 * np.sqrt(-x))
 
 
 @njit(cache=True)

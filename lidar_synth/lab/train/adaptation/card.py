@@ -114,7 +114,11 @@ def _scans(images: Sequence[RangeImage]) -> list[Scan]:
 
 
 def provenance_of(
-    name: str, model: Checkpoint, work: Work, made: Checkpoint, found: dict[str, Any]
+    name: str,
+    model: Checkpoint,
+    work: Work,
+    made: Checkpoint,
+    found: dict[str, Any],
 ) -> dict[str, Any]:
     """The provenance of an adapted model: what it was, what it learnt from, and how well."""
     return {
@@ -141,7 +145,11 @@ def provenance_of(
 
 
 def write_card(
-    path: Path, checkpoint: Path, work: Work, header: Header, found: dict[str, Any]
+    path: Path,
+    checkpoint: Path,
+    work: Work,
+    header: Header,
+    found: dict[str, Any],
 ) -> None:
     """Write the card of an adapted model."""
     facts = header.provenance

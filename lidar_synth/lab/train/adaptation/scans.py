@@ -74,7 +74,9 @@ def split(names: Sequence[str]) -> Split:
     gap = max(1, round(GAP * len(picked)))
     drives = [names[i].rpartition("/")[0] for i in picked]
     begins = [n for n in range(1, len(picked)) if drives[n] != drives[n - 1]]
-    near = [n for n in begins if HELD_OUT / 2 <= 1 - n / len(picked) <= 2 * HELD_OUT]
+    fewest = HELD_OUT / 2
+    most = 2 * HELD_OUT
+    near = [n for n in begins if fewest <= 1 - n / len(picked) <= most]
     if near:
         first = min(near, key=lambda n: abs(n - first))
         gap = 0
