@@ -278,6 +278,7 @@ def test_what_does_not_fit_together(
         condition=SEMANTIC,
     )
     refuse("decoder without init", decoder=True)
+    refuse("with a codec", decoder=True, init=str(teacher), codec=str(codec))
     refuse(
         "expected a model whose autoencoder predicts", decoder=True, init=str(teacher)
     )

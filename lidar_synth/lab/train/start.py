@@ -96,8 +96,7 @@ def start_networks(config: TrainConfig, init: Path) -> Opened:
     start = load_checkpoint(find_model(init))
     name = CODEC if config.autoencodes else VELOCITY
     wanted = {CODEC, VELOCITY} if config.decoder else {name}
-    other = config.decoder and config.codec is not None
-    if other or not wanted <= set(start.networks):
+    if not wanted <= set(start.networks):
         raise ConfigError(
             f"init {init} with parts {sorted(start.networks)}",
             "a checkpoint of the same kind",
@@ -106,14 +105,14 @@ def start_networks(config: TrainConfig, init: Path) -> Opened:
     facts = {"init": start.hash, "init_provenance": start.header.provenance}
     header = replace(start.header, provenance=provenance_of(config) | facts)
     networks = start.networks
-    if config.codec is not None:
-        networks, header = _change_codec(config.codec, networks, header)
     if config.autoencodes:
         kept = {CODEC: header.networks[CODEC]}
         networks = {CODEC: networks[CODEC]}
         return networks, replace(header, networks=kept, conditioning={})
     if config.decoder:
         return networks, header
+    if config.codec is not None:
+        networks, header = _change_codec(config.codec, networks, header)
     header = replace(header, time_grid=uniform_grid(config.steps))
     networks, header = _drop_ends(networks, header)
     if config.condition is None:

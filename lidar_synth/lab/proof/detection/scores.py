@@ -66,7 +66,7 @@ class Criterion:
         """(D, M) how well boxes (D, 7) fit others (M, 7); 1 and more is right."""
         if self.overlap:
             return footprint_ious(boxes, truth) / self.overlap
-        apart = _apart(boxes, truth)
+        apart = _distances(boxes, truth)
         return np.asarray(self.distance / np.maximum(apart, 1e-9), np.float64)
 
     def includes(self, boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -149,7 +149,7 @@ def matched(
     return result
 
 
-def _apart(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
     """(A, B) distances between the centres of boxes (A, 7) and (B, 7) on the ground."""
     x, y = (a[:, None, :2] - b[None, :, :2]).transpose(2, 0, 1)
     return np.asarray(np.hypot(x, y))
@@ -165,7 +165,7 @@ def footprint_ious(
         return ious
     lengths = np.hypot(a[:, 3], a[:, 4])
     others = np.hypot(b[:, 3], b[:, 4])
-    near = _apart(a, b) < (lengths[:, None] + others) / 2
+    near = _distances(a, b) < (lengths[:, None] + others) / 2
     first = _footprints(a)
     second = _footprints(b)
     for i, j in np.argwhere(near):

@@ -98,10 +98,10 @@ def _check_train(config: TrainConfig) -> None:
             "an autoencoder with a codec or a condition",
             "neither: they belong to a flow",
         )
-    if config.decoder and (config.init is None or config.condition):
+    if config.decoder and (config.init is None or config.codec or config.condition):
         raise ConfigError(
-            "decoder without init, or with a condition",
-            "init: a latent model, with its own condition",
+            "decoder without init, or with a codec or a condition",
+            "init: a latent model, with its own ones",
         )
     if (
         (config.data.roll or config.data.flip == "both")
