@@ -180,9 +180,10 @@ def test_shards_are_fetched_ahead_in_the_order_of_the_plan(
     assert not fetched(served)
     assert points(bank, order[:1]) == points(near, order[:1])
     until(lambda: len(fetched(served)) == SHARDS)
-    assert list(fetched(served)) == [
-        near.index.shards[n].file for n in (5, 0, 3, 2, 1, 4)
-    ]
+    read, *ahead = (near.index.shards[n].file for n in (5, 0, 3, 2, 1, 4))
+    # The plan asks for its second shard while this thread asks for the first one.
+    assert read in list(fetched(served))[:2]
+    assert [file for file in fetched(served) if file != read] == ahead
     assert points(bank, order) == points(near, order)
     assert set(fetched(served).values()) == {1}
     bank.close()
