@@ -11,7 +11,9 @@ instead of the range-view segmenter. Call it with other ``--labelled`` for the c
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,25 +21,64 @@ from polar_network import learn
 from typer import run
 
 from lidar_synth import ProofSettings, prove
-from lidar_synth.lab.proof import reference
+from lidar_synth.lab.proof import Trainer, reference
 from lidar_synth.lab.proof.scores import interval
 
 
-def halves(root: Path, out: Path) -> list[Path]:
-    """Two folders with links to every second sequence."""
+def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
+    """Folders with links to every second sequence and to the others, and the other way round."""
     folders = [out / "half-0", out / "half-1"]
     for number, sequence in enumerate(sorted((root / "sequences").iterdir())):
         link = folders[number % 2] / "sequences" / sequence.name
         link.parent.mkdir(parents=True, exist_ok=True)
         if not link.exists():
             link.symlink_to(sequence.resolve())
-    return folders
+    one, other = folders
+    return [(one, other), (other, one)]
 
 
 def share(folder: Path, other: Path) -> None:
     """Copy the networks after the synthetic scans alone: they do not depend on the labelled ones."""
     if folder.is_dir():
         shutil.copytree(folder, other, dirs_exist_ok=True)
+
+
+def compare(
+    trials: Sequence[tuple[Any, Any]],
+    out: Path,
+    group: str,
+    settings: ProofSettings,
+    pools: Path,
+    trainer: Trainer = reference,
+    shared: bool = True,
+) -> dict[str, dict[str, float]]:
+    """The mIoU by arm and place.
+
+    Args:
+        trials: scans to train on, and those to test.
+        out: folder of all trials.
+        group: names those with the same settings except for the number of labelled scans.
+        shared: whether the synthetic scans are the same in all trials of the group.
+    """
+    starts = out / f"starts-{group}"
+    scores: dict[str, dict[str, float]] = {}
+    for number, (training, tests) in enumerate(trials):
+        folder = out / f"{group}-{settings.labelled}-{number}"
+        if shared:
+            share(starts, folder / "starts")
+        proof = prove(
+            training,
+            folder,
+            settings,
+            jobs=1,
+            trainer=trainer,
+            pools=pools,
+            tests=tests,
+        )
+        share(folder / "starts", starts)
+        for row in proof.values["arms"]:
+            scores.setdefault(row["key"], {}).update(row["miou_by_place"])
+    return scores
 
 
 def draw(scores: dict[int, dict[str, dict[str, float]]], path: Path) -> None:
@@ -81,27 +122,15 @@ def main(
         columns=columns,
         beams=beams,
     )
-    folders = halves(root, out)
     group = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
-    starts = out / f"starts-{group}"
-    scores: dict[str, dict[str, float]] = {"real": {}, "pretrain-generator": {}}
-    for number, (folder, other) in enumerate(
-        zip(folders, reversed(folders), strict=True)
-    ):
-        half = out / f"{group}-{labelled}-{number}"
-        share(starts, half / "starts")
-        proof = prove(
-            folder,
-            half,
-            settings,
-            jobs=1,
-            trainer=learn if polar else reference,
-            pools=out / f"pools-{beams or 'all'}",
-            tests=other,
-        )
-        share(half / "starts", starts)
-        for row in proof.values["arms"]:
-            scores[row["key"]] |= row["miou_by_place"]
+    scores = compare(
+        halves(root, out),
+        out,
+        group,
+        settings,
+        out / f"pools-{beams or 'all'}",
+        learn if polar else reference,
+    )
     places = sorted(scores["real"])
     real, first = (np.array([s[p] for p in places]) for s in scores.values())
     low, high = interval((first - real)[:, None]) or (np.nan, np.nan)

@@ -5,34 +5,64 @@
 LABELLED has semantic_kitti and PandaSet's frames (pandaset/sensor_frame/NN.npz). The places of
 SemanticKITTI are split in two halves, the street of PandaSet in two ends: trained on one, tested
 on the other, both ways. ARM is one of ``lidar-synth prove``, ``half`` (generated scans for half of
-the training, then real ones alone) or ``pandar64`` (the town in that skin first). ``--match`` gives
-the synthetic scans the quantiles of the labelled scans' reflectance.
+the training, then real ones alone), or the name of a pool below: the town first, in the skin
+``pandar64``, ``standing`` (each scan taken at one moment), ``streets`` (standing, one scan a
+street) or ``transferred`` (standing, by another sensor, then turned into scans of the user's).
+``--match`` gives the synthetic scans the quantiles of the labelled scans' reflectance.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from few_labels import halves
+from few_labels import compare, halves
 from other_sensor import read_frame
 from typer import run
 
-from lidar_synth import ProofSettings, prove
-from lidar_synth.geometry.transfer import Response
+from lidar_synth import ProofSettings, Scan, load_generator
+from lidar_synth.geometry.transfer import Response, Transfer
 from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage
-from lidar_synth.lab.proof.pools import POOLS, town_scans
+from lidar_synth.lab.proof.pools import FRAMES, POOLS, PoolTask, town_scans
 from lidar_synth.lab.proof.trial import Job, TrialOutcome, reference
-from lidar_synth.lab.town import load_skin
+from lidar_synth.lab.town import STRETCH_FRAMES, Town, load_skin
+from lidar_synth.noise import keyed_rng
 
-POOLS["pandar64"] = lambda task: town_scans(task, load_skin("pandar64"))
-ARMS["pandar64"] = Arm(
-    "the town in the skin pandar64 first, then half",
-    lambda ratio: (
-        ArmStage(0.75, 1, "pandar64"),
-        ArmStage(0.25, 0.5, "pandar64", rate=0.25),
-    ),
-)
+
+def standing_town(task: PoolTask, frames: tuple[int, ...] = FRAMES) -> Iterator[Scan]:
+    """Scans of these frames of each street of the town, each taken at one moment."""
+    streets = -(-task.count // len(frames))
+    size = streets * STRETCH_FRAMES
+    town = Town(task.town_seed, task.sensor, size, motion=False)
+    for street in range(streets):
+        for frame in frames:
+            yield town[STRETCH_FRAMES * street + frame]
+
+
+def transferred_town(task: PoolTask) -> Iterator[Scan]:
+    """The standing town by the sensor of the generator, as the user's sensor would see it."""
+    change = Transfer(task.sensor)
+    other = replace(task, sensor=load_generator(task.model).sensor)
+    for index, scan in enumerate(standing_town(other)):
+        yield change(scan, keyed_rng(0, index))
+
+
+TOWNS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
+    "pandar64": lambda task: town_scans(task, load_skin("pandar64")),
+    "standing": standing_town,
+    "streets": lambda task: standing_town(task, FRAMES[:1]),
+    "transferred": transferred_town,
+}
+for name, make in TOWNS.items():
+    POOLS[name] = make
+    ARMS[name] = Arm(
+        f"the town ({name}) first, then half",
+        lambda ratio, name=name: (
+            ArmStage(0.75, 1, name),
+            ArmStage(0.25, 0.5, name, rate=0.25),
+        ),
+    )
 ARMS["half"] = Arm(
     "generated scans for half, then real scans alone",
     lambda ratio: (ArmStage(0.5, 1, "generator"), ArmStage(0.5)),
@@ -70,28 +100,21 @@ def main(
         synthetic=48,
         columns=256,
     )
-    trials: list[tuple[Any, Any]]
     if on == "pandaset":
         frames = sorted((labelled_scans / "pandaset" / "sensor_frame").glob("*.npz"))
-        trials = [([read_frame(path) for path in frames], None)]
+        trials: Any = [([read_frame(path) for path in frames], None)]
         settings = replace(settings, classes="pandaset", places="stretch:2")
     else:
-        one, other = halves(labelled_scans / "semantic_kitti", out)
-        trials = [(one, other), (other, one)]
-    scores: dict[str, dict[str, float]] = {}
-    for number, (training, tests) in enumerate(trials):
-        proof = prove(
-            training,
-            out
-            / f"{on}-{'match' if match else 'keep'}-{iterations}-{labelled}-{number}",
-            settings,
-            jobs=1,
-            trainer=learn_matched if match else reference,
-            pools=out / f"pools-{on}",
-            tests=tests,
-        )
-        for row in proof.values["arms"]:
-            scores.setdefault(row["key"], {}).update(row["miou_by_place"])
+        trials = halves(labelled_scans / "semantic_kitti", out)
+    scores = compare(
+        trials,
+        out,
+        f"{on}-{'match' if match else 'keep'}-{iterations}",
+        settings,
+        out / f"pools-{on}",
+        learn_matched if match else reference,
+        shared=not match,
+    )
     for key, values in scores.items():
         places = ", ".join(f"{place} {value:.1f}" for place, value in values.items())
         print(f"{on}, {key}: {np.mean([*values.values()]):.1f} ({places})")
