@@ -62,9 +62,8 @@ if not mmdet3d.__version__.startswith("1.4."):
         f"mmdet3d {mmdet3d.__version__}", "1.4", "bash tools/install_mmdet3d.sh"
     )
 
-from lidar_synth.integrations.mmdet3d_checkpoints import (
-    allow_checkpoints,
-)  # needs mmengine
+# needs mmengine
+from lidar_synth.integrations.mmdet3d_checkpoints import allow_checkpoints
 
 allow_checkpoints()
 
@@ -134,9 +133,8 @@ class SynthBoxes:
             np.int64,
         ).reshape(-1)
         values = given.values
-        if getattr(
-            self, "with_velocity", False
-        ):  # nothing moves in the sweeps of a synthetic scan
+        # nothing moves in the sweeps of a synthetic scan
+        if getattr(self, "with_velocity", False):
             values = np.column_stack([values, np.zeros((len(values), 2), np.float32)])
         boxes = LiDARInstance3DBoxes(
             values[labels >= 0], box_dim=values.shape[1], origin=(0.5, 0.5, 0.5)
@@ -290,9 +288,8 @@ class SynthEpochHook(Hook):  # type: ignore[misc]
             return
         loader.sampler.set_epoch(runner.epoch)
         done = runner.iter - runner.epoch * len(loader)
-        if self._resumes and 0 < done <= len(
-            loader
-        ):  # otherwise at the start of an epoch
+        # otherwise at the start of an epoch
+        if self._resumes and 0 < done <= len(loader):
             loader.sampler.start = done * loader.batch_size
         self._resumes = False
 

@@ -36,9 +36,8 @@ def method_of_history(owner: Any, name: str) -> Callable[..., Any]:
 
 def allow_checkpoints() -> None:
     """Declare what a checkpoint of mmengine holds as safe to read."""
-    if not hasattr(
-        torch.serialization, "get_unsafe_globals_in_checkpoint"
-    ):  # before torch 2.6 nothing is refused
+    # before torch 2.6 nothing is refused
+    if not hasattr(torch.serialization, "get_unsafe_globals_in_checkpoint"):
         return
     dtypes = {type(np.dtype(kind)) for kind in ("?", "i4", "i8", "f4", "f8")}
     names = (

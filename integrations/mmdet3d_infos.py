@@ -122,9 +122,8 @@ def _read(real: str | Path) -> Any:
         return parse_json(
             read_text(Path(real)), str(real), "an info list of MMDetection3D"
         )
-    from mmengine.fileio import (
-        load,
-    )  # reads the trainer's own pickle, as the trainer does
+    # reads the trainer's own pickle, as the trainer does
+    from mmengine.fileio import load
 
     return load(str(real))
 

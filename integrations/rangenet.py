@@ -287,9 +287,8 @@ def _trainer() -> tuple[Any, Any]:
         try:
             return import_module(name), parser and import_module(parser)
         except ImportError as error:
-            if (
-                error.name != "tasks"
-            ):  # it is this trainer, without something that it imports
+            # it is this trainer, without something that it imports
+            if error.name != "tasks":
                 raise LibraryError(
                     f"{name} cannot be imported ({error})",
                     f"{FAMILY} with all that it imports",

@@ -251,9 +251,8 @@ class Bank:
         return shard, self._shards[shard], rank + int(earlier)
 
     def _shard(self, number: int) -> _Shard:
-        if (
-            self._process != os.getpid()
-        ):  # after a fork the parent's open files are left to the parent
+        # after a fork the parent's open files are left to the parent
+        if self._process != os.getpid():
             self._open = OrderedDict()
             self._process = os.getpid()
         if number not in self._open:

@@ -18,9 +18,8 @@ from lidar_synth.geometry.sensor import Sensor, presets
 # tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile(
-    "untimed", deadline=None
-)  # a busy machine is no fault of the code
+# a busy machine is no fault of the code
+settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 

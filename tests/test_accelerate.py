@@ -117,9 +117,8 @@ def check_refusals(accelerator: Any) -> None:
             train = mixed()
             train.set_epoch(5)
             loader = accelerator.prepare(make(train, 0, **sharing))
-            if (
-                make is batched or accelerator.is_main_process
-            ):  # which alone reads a stream
+            # which alone reads a stream
+            if make is batched or accelerator.is_main_process:
                 with pytest.raises(
                     ConfigError, match="integrations.accelerate import prepare"
                 ):

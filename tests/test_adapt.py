@@ -318,9 +318,8 @@ def test_scans_without_labels_get_those_that_the_autoencoder_learnt_on_the_town(
         progress=False,
     )
     card = out.with_suffix(".md").read_text()
-    assert (
-        "guesses" in card and "labels that are right" not in card
-    )  # nobody knows which are
+    # nobody knows which are
+    assert "guesses" in card and "labels that are right" not in card
     work = out.with_suffix(".adapt")
     assert read_history(work / "labels")
     images = [open_scans(work / "labelled" / "train")[i] for i in range(2)]

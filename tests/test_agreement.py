@@ -343,9 +343,8 @@ def test_recorded_scans_contradict_other_sensors(
     for path in sorted((labelled / "pandaset" / "sensor_frame").glob("*.npz"))[::6]:
         points = np.load(path)["points"].astype(np.float32)
         assert agrees(points, own)
-        assert (
-            agreement(points, HDL64).outside > MOST_OUTSIDE
-        )  # refused if HDL-64E is only assumed
+        # refused if HDL-64E is only assumed
+        assert agreement(points, HDL64).outside > MOST_OUTSIDE
         assert not agrees(points, HDL32) and not agrees(points, VLP16)
     sweep = NuScenes(real_scans / "nuscenes")[0].points
     assert (

@@ -105,9 +105,8 @@ def test_the_generator_alone_decides_and_nothing_given_is_changed(
         "beam_drop",
         "range_drop",
     )
-    if not name.startswith(
-        "flip"
-    ):  # two may do the same by chance, such as nothing; six do not
+    # two may do the same by chance, such as nothing; six do not
+    if not name.startswith("flip"):
         assert not all(np.array_equal(first.points, other.points) for other in others)
     copied = pickle.loads(pickle.dumps(STEPS[name]))(scan, keyed_rng(seed))
     assert np.array_equal(copied.points, first.points)

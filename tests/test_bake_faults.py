@@ -164,9 +164,8 @@ def test_control_c_while_workers_start(model: Path, tmp_path: Path) -> None:
         process_group=0,
     )
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while (
-        len(children.read_text().split()) < 3
-    ):  # the workers, and Python's own for what they share
+    # the workers, and Python's own for what they share
+    while len(children.read_text().split()) < 3:
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
@@ -442,9 +441,8 @@ def no_privileges() -> Iterator[None]:
 def test_a_folder_that_becomes_read_only(
     model: Path, expected: dict[str, bytes]
 ) -> None:
-    with (
-        tempfile.TemporaryDirectory() as folder
-    ):  # pytest's own folders are not accessible to other users
+    # pytest's own folders are not accessible to other users
+    with tempfile.TemporaryDirectory() as folder:
         plan = plan_in(Path(folder) / "bank", model)
         bake(plan, share=Share(0, 4), progress=False)
         Path(folder).chmod(0o755)

@@ -168,9 +168,8 @@ def test_each_node_fetches_what_it_needs_once(
 def test_shards_are_fetched_ahead_in_the_order_of_the_plan(
     served: Served, near: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        folder_module, "_AT_ONCE", 1
-    )  # so that requests arrive in order
+    # so that requests arrive in order
+    monkeypatch.setattr(folder_module, "_AT_ONCE", 1)
     bank = Bank(served.url, tmp_path / "cache")
     order = [20, 1, 13, 9, 21, 5, 16]
     bank.expect([0, 1, 2])  # corrected before the first read

@@ -66,9 +66,8 @@ def test_a_truncated_shard_is_found(root: Path) -> None:
             match=rf"shard-00001.h5 is {length} bytes long; expected {len(content)}",
         ):
             Bank(root)
-        with pytest.raises(
-            DataError, match="shard-00001.h5"
-        ):  # and without knowing the size
+        # and without knowing the size
+        with pytest.raises(DataError, match="shard-00001.h5"):
             shard = ShardReader(path, str(path), index.sources[0], index.shards[1])
             shard.read(0), shard.read(1)
 

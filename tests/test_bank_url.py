@@ -101,9 +101,8 @@ def test_a_url_gives_the_same_scans_as_the_folder(
 @pytest.mark.slow
 def test_forked_workers_read_from_a_url(served: Served) -> None:
     bank = Bank(f"{served.url}/bank")
-    expected = sum(
-        len(scan) for scan in bank
-    )  # the parent process has open connections
+    # the parent process has open connections
+    expected = sum(len(scan) for scan in bank)
     loader = DataLoader(
         bank, batch_size=None, num_workers=2, multiprocessing_context="fork"
     )  # type: ignore[arg-type]
@@ -187,9 +186,8 @@ def test_a_failed_request_is_not_reported_as_damage(
     served.broken.clear()
     assert bank.image(0).mask.any()
     served.broken.add("shard-00000.h5")
-    with pytest.raises(
-        FileError, match="shard-00000.h5 cannot be read .*500"
-    ):  # an open shard
+    # an open shard
+    with pytest.raises(FileError, match="shard-00000.h5 cannot be read .*500"):
         bank.image(1)
     (tmp_path / "bank" / "shard-00002.h5").unlink()
     with pytest.raises(FileError, match="shard-00002.h5 cannot be read"):

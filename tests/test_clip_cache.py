@@ -125,9 +125,8 @@ def test_features_are_those_of_the_images_mirrored_blank_or_of_one_view(
     features = kept(range(40)).cond
     assert images is not None and features is not None
     assert torch.allclose(encoder(features), encoder(images), atol=2e-3)
-    assert (
-        len(encoder(features).unique(dim=0)) == 13
-    )  # 3 scans, 2 sides, 2 sorts; blank
+    # 3 scans, 2 sides, 2 sorts; blank
+    assert len(encoder(features).unique(dim=0)) == 13
 
 
 def test_a_camera_model_is_trained_and_shown_on_features(

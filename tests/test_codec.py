@@ -97,9 +97,8 @@ def test_a_mask_is_trained_and_removes_returns() -> None:
         optimizer.zero_grad()
         training(x).backward()
         optimizer.step()
-    assert (
-        right() > before + 0.2
-    )  # a small codebook cannot reconstruct random scans much better
+    # a small codebook cannot reconstruct random scans much better
+    assert right() > before + 0.2
     with torch.no_grad():
         image = net.eval().decode(net.encode(x))
         bits = net._decode(net.codebook(net._encode(x))[0])[:, 7:]

@@ -168,9 +168,8 @@ def test_a_bank_has_no_boxes_for_kitti_objects(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*call, "--on-bad", "skip"])
     assert "0 scans written, 0 were there already, 3 skipped" in result.output
     assert not list(tmp_path.rglob("*.bin"))
-    writer = KITTIObjectWriter(
-        tmp_path / "testing", part="testing"
-    )  # which has no label_2
+    # which has no label_2
+    writer = KITTIObjectWriter(tmp_path / "testing", part="testing")
     assert convert(open_scans(tmp_path / "bank"), writer, progress=False) == Report(
         written=3
     )
@@ -461,9 +460,8 @@ def test_a_run_that_wrote_a_scan_or_was_not_the_first_keeps_its_settings(
         for path in tmp_path.rglob("*")
         if path.is_file() and path.name != SETTINGS
     ]
-    with pytest.raises(
-        DataError, match="has no boxes"
-    ):  # beside another run, which has not written a scan yet
+    # beside another run, which has not written a scan yet
+    with pytest.raises(DataError, match="has no boxes"):
         convert(scans[::-1], out, progress=False)
     assert (tmp_path / SETTINGS).is_file()
 

@@ -56,9 +56,8 @@ def test_a_fresh_network_gives_the_best_linear_estimate() -> None:
         v = network()(y, TIMES)
     # T = 1: the estimate is 0.
     assert torch.allclose(y[-1] - v[-1], torch.zeros(2, 8, 16), atol=1e-6)
-    assert torch.allclose(
-        y[0] - 1e-3 * v[0], y[0], atol=5e-3
-    )  # t near 0: the state itself
+    # t near 0: the state itself
+    assert torch.allclose(y[0] - 1e-3 * v[0], y[0], atol=5e-3)
 
 
 def test_the_velocity_is_finite_and_has_a_bounded_slope_at_all_times() -> None:

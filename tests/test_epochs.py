@@ -175,9 +175,8 @@ def test_a_stream_keeps_the_epoch_in_which_iterating_began(
     iterator: Any = iter(DataLoader(stream, 4, num_workers=workers, collate_fn=list))
     stream.set_epoch(5)
     assert samples(islice(iterator, 10)) == planned(train, 3)[:40]
-    for worker in getattr(
-        iterator, "_workers", ()
-    ):  # torch would wait for those of an endless stream
+    # torch would wait for those of an endless stream
+    for worker in getattr(iterator, "_workers", ()):
         worker.terminate()
 
 

@@ -129,9 +129,8 @@ def test_the_figures_stand_beside_the_published_ones(
         and own[1].strip() == "**these scans** (3 real, 3 generated)"
         and own[8].split()[0] == jsd[1]
     )
-    assert (
-        own[8].strip().endswith("]") and not own[3].strip()
-    )  # an interval; no weights, no FRD
+    # an interval; no weights, no FRD
+    assert own[8].strip().endswith("]") and not own[3].strip()
     assert "FRD: no weights of rangenet53" in result.stderr
     assert "those of training among them" in result.stderr
     for more in (["--json"], ["--judge", "squeezeseg"]):
@@ -567,9 +566,8 @@ def test_each_protocols_reference_is_apart_from_its_training_data(
     assert reference is not None and reference.training is not None
     if reference.layout == "kitti360":
         shared = DRIVES[reference.training] & DRIVES[reference.split]
-        assert bool(shared) == (
-            protocol == "r2flow"
-        )  # whose code compares with all drives
+        # whose code compares with all drives
+        assert bool(shared) == (protocol == "r2flow")
         assert "training" in PROTOCOLS[protocol].unverified or not shared
 
 

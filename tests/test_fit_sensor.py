@@ -97,9 +97,8 @@ def test_ring_numbers_may_have_gaps(change: str) -> None:
         ]
     else:
         scans = [s[s.ring != 5] for s in scans]
-    if (
-        change == "one almost lost"
-    ):  # its only returns are those of the sensor's own housing
+    # its only returns are those of the sensor's own housing
+    if change == "one almost lost":
         near = np.array([[0.1, 0.0, 0.01]], np.float32)
         last = replace(scans[0][-1:], points=near, ring=np.array([5], np.int16))
         fields = {

@@ -135,9 +135,8 @@ def test_the_masked_autoencoder_equals_that_of_lidm() -> None:
     output = net.decode(latent)
     assert raw.shape == expected["raw"].shape == (2, 2, *size)
     assert distance(raw, expected["raw"]) < 1e-5
-    sure = (
-        expected["raw"][:, 1:].abs() > 1e-3
-    )  # rounding can change the sign of the others
+    # rounding can change the sign of the others
+    sure = expected["raw"][:, 1:].abs() > 1e-3
     assert output.shape == (2, 1, *size)
     assert distance(output[sure], expected["output"][sure]) < 1e-5
     assert 0.3 < (output == -1).float().mean() < 0.7

@@ -291,9 +291,8 @@ def test_a_mixture_as_kitti_objects(mixed: MixedScans, tmp_path: Path) -> None:
         assert scan.boxes is not None and len(scan.boxes) == 2
         seen = in_view(mixed[i], CAMERA)
         assert seen.boxes is not None
-        assert (
-            np.abs(scan.boxes.values - seen.boxes.values).max() < 0.02
-        )  # two decimals
+        # two decimals
+        assert np.abs(scan.boxes.values - seen.boxes.values).max() < 0.02
         assert (
             abs(read_plane(root / "training" / "planes" / f"{i:06d}.txt")[3] - 1.73)
             < 0.05

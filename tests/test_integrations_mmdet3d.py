@@ -269,15 +269,13 @@ def test_boxes_hold_their_points_after_the_trainers_transforms(made: Path) -> No
     folder = open_folder(made / "det")
     for slot in range(EXTRA):
         scan = folder.scan(slot)
-        assert (
-            scan.boxes is not None and len(scan.boxes) == 2
-        )  # the third stands behind the camera
+        # the third stands behind the camera
+        assert scan.boxes is not None and len(scan.boxes) == 2
         sample = dataset[REAL + slot]
         counts = inside(sample)
         before = held(scan.boxes, scan.points)
-        assert (
-            before.min() >= 10 and np.abs(counts - before).max() <= 3
-        )  # those on a face
+        # those on a face
+        assert before.min() >= 10 and np.abs(counts - before).max() <= 3
         assert sample["data_samples"].gt_instances_3d.labels_3d.tolist() == [2, 2]
 
 
@@ -526,9 +524,8 @@ def test_configurations_change_data_only(path: Path) -> None:
     ours = flat(bare(config.to_dict()))
     stock = stock.replace("{{$FRNET_ROOT:.}}", os.environ.get("FRNET_ROOT", "."))
     stock_config = bare(Config.fromfile(stock).to_dict())
-    if (
-        stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset"
-    ):  # the list itself is balanced
+    # the list itself is balanced
+    if stock_config["train_dataloader"]["dataset"]["type"] == "CBGSDataset":
         stock_config["train_dataloader"]["dataset"] = stock_config["train_dataloader"][
             "dataset"
         ]["dataset"]

@@ -173,9 +173,8 @@ def test_names_of_boxes_become_nuscenes_classes() -> None:
     far = Scan(
         scan.points[:1] + 500, scan.reflectance[:1], scan.sensor, boxes=scan.boxes
     )
-    assert (
-        len(as_nuscenes(far).boxes or ()) == 0
-    )  # nuScenes' trainers drop boxes without a return
+    # nuScenes' trainers drop boxes without a return
+    assert len(as_nuscenes(far).boxes or ()) == 0
 
 
 def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) -> None:

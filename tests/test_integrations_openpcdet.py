@@ -201,9 +201,8 @@ def test_boxes_hold_their_points_after_augmentation(made: Path) -> None:
             scan = in_view(source[sample["frame_id"]], dataset._view[1])
             assert scan.boxes is not None
             before = held(scan.boxes, scan.points)
-            assert (
-                len(counts) >= 2 and np.abs(counts[:2] - before).max() <= 3
-            )  # those on a face
+            # those on a face
+            assert len(counts) >= 2 and np.abs(counts[:2] - before).max() <= 3
 
 
 def test_gt_sampling_places_objects_on_the_synthetic_ground(made: Path) -> None:

@@ -26,9 +26,8 @@ from streets import SENSOR, semantic_kitti, synthetic
 ROOT = checkout("RANGENET_ROOT", "lidar-bonnetal, SalsaNext or CENet")
 CENET = (ROOT / "modules/trainer.py").is_file()
 sys.path.append(str(ROOT if CENET else ROOT / "train"))
-provide(
-    "numpy.float", "imp", "tensorflow.summary", "torchvision"
-)  # as the launcher does
+# as the launcher does
+provide("numpy.float", "imp", "tensorflow.summary", "torchvision")
 
 from lidar_synth.integrations.rangenet import filled, gaps, make_parser
 

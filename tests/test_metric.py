@@ -83,9 +83,8 @@ def of_a_rank(rank: int, store: str, out: str) -> None:
     metric.update(REAL[rank::2], real=True)
     metric.update(FAKE[rank::2], real=False)
     values = metric.compute()
-    assert (
-        metric.compute() == values
-    )  # what was gathered is not collected a second time
+    # what was gathered is not collected a second time
+    assert metric.compute() == values
     Path(out, str(rank)).write_text(repr(sorted(values.items())))
     torch.distributed.destroy_process_group()
 
@@ -198,9 +197,8 @@ def test_features_that_are_not_finite_name_their_scan() -> None:
 
 
 def test_one_scan_has_no_frechet_distance() -> None:
-    assert evaluate(
-        REAL[:1], FAKE[:1], "town", progress=False
-    )  # histograms can be compared
+    # histograms can be compared
+    assert evaluate(REAL[:1], FAKE[:1], "town", progress=False)
     with pytest.raises(
         DataError, match="features of 1 and 4 scans; expected at least two of each"
     ):

@@ -51,9 +51,8 @@ def test_the_items_of_an_epoch() -> None:
             assert np.array_equal(item["label"], scan.label)
             assert np.array_equal(item["confidence"], scan.label != IGNORE)
     assert train[-1]["id"] == items[-1]["id"]
-    assert [item["id"] for item in train] == [
-        item["id"] for item in items
-    ]  # iterating ends
+    # iterating ends
+    assert [item["id"] for item in train] == [item["id"] for item in items]
     train.set_epoch(1)
     twice = [item["points"] for item in (*items, *train) if item["id"] == "s1"]
     assert not torch.equal(*twice)  # a scan that is given again is augmented anew
@@ -184,9 +183,8 @@ def test_resuming_with_other_ranks_and_workers_yields_the_remaining_samples(
             again = mixed(13)
             sampler = again.batches(3, rank=rank, world_size=later)
             sampler.load_state_dict(state)
-            again.set_epoch(
-                state["epoch"]
-            )  # as a training loop does at the head of an epoch
+            # as a training loop does at the head of an epoch
+            again.set_epoch(state["epoch"])
             for batch in loader(again, (done + later) % 3, batch_sampler=sampler):
                 rest += batch["id"]
         if state["epoch"] == 1:

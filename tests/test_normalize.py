@@ -92,9 +92,8 @@ def test_labels_have_five_bits_highest_first_and_unlabelled_is_19() -> None:
     bits = encode_labels(torch.tensor([[[0, 18, IGNORE]]], dtype=torch.uint8))
     assert bits[0, :, 0].T.tolist() == [[-1] * 5, [1, -1, -1, 1, -1], [1, -1, -1, 1, 1]]
     assert decode_labels(torch.zeros(1, 5, 1, 1))[1].item() == 0
-    label, confidence = decode_labels(
-        torch.ones(1, 5, 1, 1)
-    )  # 31 is no class; 15 is one bit away
+    # 31 is no class; 15 is one bit away
+    label, confidence = decode_labels(torch.ones(1, 5, 1, 1))
     assert (label.item(), confidence.item()) == (15, 0)
 
 

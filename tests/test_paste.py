@@ -41,9 +41,8 @@ def seen(box: np.ndarray, ground: float = -HEIGHT) -> Object:
 
 
 @settings(max_examples=25)
-@example(
-    (22.0, 0.0, 1.0), [(20.0, 1.0)]
-)  # the foot of a wall in the cells where the car meets the ground
+# the foot of a wall in the cells where the car meets the ground
+@example((22.0, 0.0, 1.0), [(20.0, 1.0)])
 @given(places, st.lists(st.tuples(st.floats(4, 40), st.floats(-180, 180)), max_size=3))
 def test_a_pasted_car_looks_as_the_sensor_would_see_it(
     place: tuple[float, float, float], walls: list[tuple[float, float]]
@@ -214,9 +213,8 @@ def test_pasted_objects_occlude_one_another_in_any_order() -> None:
     twice = paste(
         cast(), [candidates[0], candidates[0].turned(0.05), candidates[3]], count=2
     )
-    assert (
-        twice.boxes is not None and len(twice.boxes) == 2
-    )  # the second found no place
+    # the second found no place
+    assert twice.boxes is not None and len(twice.boxes) == 2
 
 
 def test_gaps_in_an_object_show_nothing_behind_it() -> None:
@@ -229,9 +227,8 @@ def test_gaps_in_an_object_show_nothing_behind_it() -> None:
     assert_nothing_shares_a_ray(pasted, 1)
     assert ((full.label == CAR) & (project(pasted).range == 0)).sum() > 300
     across = np.arctan2(whole.scan.points[:, 1], whole.scan.points[:, 0])
-    post = (
-        np.abs(across - np.median(across)) < 0.03
-    )  # what stood before it when it was recorded
+    # what stood before it when it was recorded
+    post = np.abs(across - np.median(across)) < 0.03
     stripe = paste(background, [whole._replace(scan=whole.scan[~post])])
     closed = project(stripe).range[(full.label == CAR) & (project(stripe).label != CAR)]
     assert len(closed) > 100 and (closed == 0).mean() > 0.97

@@ -113,9 +113,8 @@ def test_projection_equals_a_brute_force_search_for_the_nearest_points(
 ) -> None:
     sensor = presets()[name]
     scan = random_scan(sensor, 4000, seed=3)
-    scan = scan[
-        np.r_[0:4000, 0:4000]
-    ]  # every point twice: the first of the two has to win
+    # every point twice: the first of the two has to win
+    scan = scan[np.r_[0:4000, 0:4000]]
     cells = locate(scan.points, sensor)
     best: dict[int, int] = {}
     for i, (cell, distance) in enumerate(zip(cells.cell, cells.range, strict=True)):

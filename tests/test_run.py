@@ -236,9 +236,8 @@ def test_two_processes_train_as_one(scans: Path, tmp_path: Path) -> None:
     two = state(tmp_path / "two")
     for name in one:
         assert torch.allclose(one[name], two[name], atol=1e-4), name
-    assert (
-        len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1
-    )  # and not a run each
+    # and not a run each
+    assert len(list((tmp_path / "two" / "run" / "logs").iterdir())) == 1
 
 
 def test_minutes_stop_a_run_and_resume_goes_on(

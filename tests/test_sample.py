@@ -22,9 +22,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "form", [name for name in WRITERS if name != "kitti_object"]
-)  # no model gives boxes
+# no model gives boxes
+@pytest.mark.parametrize("form", [name for name in WRITERS if name != "kitti_object"])
 def test_sample_writes_every_format_and_resumes(
     form: str, path: Path, tmp_path: Path
 ) -> None:

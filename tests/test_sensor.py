@@ -85,9 +85,8 @@ def test_rays_are_unit_vectors_in_the_documented_frame(
         middle = s.columns // 2
         # Ahead in the middle, the seam behind.
         assert rays_xyz[0, middle, 0] > 0 and rays_xyz[0, 0, 0] < 0
-        assert (
-            rays_xyz[0, middle + s.columns // 4, 1] < 0
-        )  # clockwise: to the right of ahead is -y
+        # clockwise: to the right of ahead is -y
+        assert rays_xyz[0, middle + s.columns // 4, 1] < 0
         assert not rays_xyz.flags.writeable
 
 

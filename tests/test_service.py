@@ -174,9 +174,8 @@ def test_threads_read_it(bank: RollingBank) -> None:
     for thread in threads:
         thread.join(60)
     assert sorted(found) == sorted(f"small/{SEED}/{n}" for n in range(40))
-    assert (
-        len(lines) == 4
-    )  # answers cannot be mixed up; nor between a process and its fork:
+    # answers cannot be mixed up; nor between a process and its fork:
+    assert len(lines) == 4
     assert {pid for pid, _ in bank._client._connections} == {os.getpid()}
 
 

@@ -194,9 +194,8 @@ def test_a_trainer_that_ends_without_closing_leaves_nothing(
         os.killpg(trainer.pid, signal.SIGINT)  # as a terminal does it
     errors = trainer.communicate(timeout=60)[1]
     assert trainer.returncode == code, errors
-    assert errors.count("Traceback") == (
-        how in ("raise", "interrupt")
-    )  # the generator is silent
+    # the generator is silent
+    assert errors.count("Traceback") == (how in ("raise", "interrupt"))
     assert gone(int(pid))
 
 

@@ -38,9 +38,8 @@ def test_a_student_of_several_numbers_of_steps_is_distilled(
         1,
     ]
     student = load_generator(tmp_path / "run" / "run.safetensors")
-    assert (
-        student.network.ends and student.network.step.out.weight.any()
-    )  # it was trained
+    # it was trained
+    assert student.network.ends and student.network.step.out.weight.any()
     images = [
         student.range_images(0, [1], steps=steps)[0].range for steps in (1, 2, 4, None)
     ]

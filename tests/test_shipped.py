@@ -72,9 +72,8 @@ def test_scans_follow_their_images(tmp_path: Path) -> None:
         Image.fromarray(town.image(i)).save(path := tmp_path / f"{i}.png")
         streets.append(replace(town[i], image_path=path))
     generator = load_generator("town-camera")
-    made = [
-        generator.scans(0, [0], scan, steps=2)[0] for scan in streets
-    ]  # the same noise for all
+    # the same noise for all
+    made = [generator.scans(0, [0], scan, steps=2)[0] for scan in streets]
     assert made[0].sensor == streets[0].sensor
     own, other = (
         sight_agreement(made, some).value
@@ -150,9 +149,8 @@ def test_every_source_gives_the_same_scan(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "policy", [p for p in POLICIES if p not in ("boxes", "paste")]
-)  # the shipped models generate no boxes
+# the shipped models generate no boxes
+@pytest.mark.parametrize("policy", [p for p in POLICIES if p not in ("boxes", "paste")])
 @pytest.mark.parametrize("kind", ["generator", "bank", "rolling", "list"])
 def test_every_source_and_label_policy_mixes_with_real_scans(
     kind: str, policy: str, sources: dict[str, Any], real: Source

@@ -170,9 +170,8 @@ def test_labels_rings_and_boxes_stay_and_points_move_along_their_rays(
 def test_points_stay_in_their_boxes(dressed: list[Scan]) -> None:
     for scan in dressed:
         assert scan.boxes is not None and scan.instance is not None
-        grown = 2 * (
-            0.1 + BOXED
-        )  # 0.1 m on each side, as without a skin, and what a skin may add
+        # 0.1 m on each side, as without a skin, and what a skin may add
+        grown = 2 * (0.1 + BOXED)
         wider = replace(
             scan.boxes,
             values=scan.boxes.values + np.float32([0, 0, 0, grown, grown, grown, 0]),

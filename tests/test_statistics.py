@@ -128,9 +128,8 @@ def test_copies_in_a_resample_are_no_pair_of_the_unbiased_kernel_distance() -> N
     within = (weights * kernel)[~np.eye(len(a), dtype=bool)].sum() / weights[
         ~np.eye(len(a), dtype=bool)
     ].sum()
-    others = (
-        kernel_by_pairs(b, b) + 2 * ((b @ b.T / 3 + 1) ** 3).mean()
-    )  # twice the mean within b
+    # twice the mean within b
+    others = kernel_by_pairs(b, b) + 2 * ((b @ b.T / 3 + 1) ** 3).mean()
     across = (counts @ (a @ b.T / 3 + 1) ** 3).mean() / counts.sum()
     assert value == pytest.approx(within + others / 2 - 2 * across, rel=1e-9)
 

@@ -99,9 +99,8 @@ def test_patches_have_an_inverse(
 
 
 def test_splitting_puts_the_cells_of_a_patch_beside_each_other() -> None:
-    x = torch.arange(2 * 2 * 3, dtype=torch.float32).view(
-        1, 12, 1, 1
-    )  # 2 x 2 cells of 3 channels
+    # 2 x 2 cells of 3 channels
+    x = torch.arange(2 * 2 * 3, dtype=torch.float32).view(1, 12, 1, 1)
     assert split(x, (2, 2))[0, :, 1, 0].tolist() == [6, 7, 8]
     assert split(x, (2, 2))[0, :, 0, 1].tolist() == [3, 4, 5]
 

@@ -74,9 +74,8 @@ def test_scans_read_from_an_exported_town_are_synthetic(
     assert '"domain": 1' in (tmp_path / "page.html").read_text().replace(
         '"domain":1', '"domain": 1'
     )
-    real = MixedScans(
-        read, ratio=0
-    )  # a mixture counts every scan of its real source as real
+    # a mixture counts every scan of its real source as real
+    real = MixedScans(read, ratio=0)
     assert real[0]["domain"] == REAL
 
 

@@ -167,9 +167,8 @@ def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) ->
 
 def test_a_real_street_of_the_town_too() -> None:
     """A scan of a range image has no ring, and rows without a return."""
-    town = Town(seed=5, scans=1, motion=False)[
-        0
-    ]  # few leaves, whose returns have random depths
+    # few leaves, whose returns have random depths
+    town = Town(seed=5, scans=1, motion=False)[0]
     for scan in (town, unproject(project(replace(town, boxes=None, pose=None)))):
         found = Transfer(scan.sensor)(replace(scan, ring=scan.ring))
         ranges = [project(s).range for s in (scan, found)]
@@ -183,9 +182,8 @@ def test_fields_are_those_of_the_surface_that_returns(scan: Scan) -> None:
     inner = (
         np.abs(found.reflectance - np.vectorize(REFLECTANCE.get)(found.label)) < 1e-6
     )
-    assert (
-        inner.mean() > 0.99
-    )  # between two surfaces that touch, reflectance is interpolated
+    # between two surfaces that touch, reflectance is interpolated
+    assert inner.mean() > 0.99
     assert ((found.label == CAR) == (found.instance == 1)).all()
     assert set(found.fields()) == set(scan.fields())
     assert (

@@ -227,9 +227,8 @@ def test_a_click_shows_the_values_of_the_point_under_the_cursor(
     gaps = np.linalg.norm(
         pixels[inside][:, None] - pixels[inside][None], axis=-1
     ) + 1e9 * np.eye(inside.sum())
-    alone = np.flatnonzero(inside)[
-        gaps.min(1) > 9
-    ]  # nothing else is near these on the screen
+    # nothing else is near these on the screen
+    alone = np.flatnonzero(inside)[gaps.min(1) > 9]
     assert len(alone) >= 5
     for i in alone[:5]:
         x, y = np.rint(pixels[i]).astype(int)

@@ -87,9 +87,8 @@ def settings_of(facts: Facts) -> dict[str, Any]:
         "compression": facts.compression,
         "layout": facts.layout,
     }
-    if (
-        facts.condition and "content" in facts.condition
-    ):  # banks of earlier versions do not have it
+    # banks of earlier versions do not have it
+    if facts.condition and "content" in facts.condition:
         others["condition_content"] = facts.condition["content"]
     return dict(sorted((facts.settings | others | facts.software).items()))
 

@@ -70,9 +70,8 @@ def bake_in_processes(
         _report(progress, sum(scans) - reported)
     finally:
         stop.value = 1
-        for worker in filter(
-            attrgetter("pid"), workers
-        ):  # skips workers that were not started
+        # skips workers that were not started
+        for worker in filter(attrgetter("pid"), workers):
             worker.join(_PATIENCE)
             worker.kill()  # it may wait for a lock that a killed worker held
             worker.join()

@@ -160,9 +160,8 @@ def load_checked(job: BakeJob, facts: Facts) -> Generator:
         job.columns,
     )
     generator = _load(*settings)
-    if (
-        generator.hash != facts.checkpoint
-    ):  # maybe the file was replaced since it was loaded
+    # maybe the file was replaced since it was loaded
+    if generator.hash != facts.checkpoint:
         _load.cache_clear()
         generator = _load(*settings)
     if generator.hash != facts.checkpoint:

@@ -241,9 +241,8 @@ class Entry:
     dropped: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "dropped", tuple(self.dropped)
-        )  # a list, where it comes from JSON
+        # a list, where it comes from JSON
+        object.__setattr__(self, "dropped", tuple(self.dropped))
 
     @property
     def kept(self) -> int:
@@ -536,9 +535,8 @@ def _plain(name: str, value: Any) -> Any:
     """The inverse of ``_attribute``."""
     if isinstance(value, float):
         return float(value)
-    if not isinstance(
-        value, str | bytes
-    ):  # bytes(NUMBER) would allocate that many bytes
+    # bytes(NUMBER) would allocate that many bytes
+    if not isinstance(value, str | bytes):
         raise ValueError(f"{name} is a {type(value).__name__}")
     text = value if isinstance(value, str) else value.decode()
     return text if name in _TEXT else _from_json(text)

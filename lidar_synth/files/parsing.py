@@ -243,9 +243,8 @@ def _unzip(
                 name = info.filename.removesuffix(".npy")
                 if only is None or name in only:
                     with archive.open(info) as file:
-                        members[name] = file.read(
-                            info.file_size
-                        )  # read() alone has no limit
+                        # read() alone has no limit
+                        members[name] = file.read(info.file_size)
     except DAMAGED_ZIP as error:
         raise DataError(
             f"{where}: {error or type(error).__name__}", ARRAYS, SKIP_HINT

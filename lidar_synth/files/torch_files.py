@@ -141,9 +141,8 @@ def state_of(content: Any, key: str, path: Path) -> dict[str, Tensor]:
 def _read_zip(file: BinaryIO, where: str) -> Any:
     with zipfile.ZipFile(file) as archive:
         infos = {info.filename: info for info in archive.infolist()}
-        if fault := zip_fault(
-            archive.infolist(), file.seek(0, os.SEEK_END), 0
-        ):  # PyTorch does not compress
+        # PyTorch does not compress
+        if fault := zip_fault(archive.infolist(), file.seek(0, os.SEEK_END), 0):
             raise DataError(f"it {fault}")
         [main] = [
             name
@@ -236,17 +235,15 @@ class _Plain:
             return self._tensor(*call.args[:4])
         if name in ("_rebuild_parameter", "_rebuild_parameter_with_state"):
             return self.value(call.args[0], level)
-        if (
-            name == "torch._tensor._rebuild_from_type_v2"
-        ):  # a tensor with attributes of its own
+        # a tensor with attributes of its own
+        if name == "torch._tensor._rebuild_from_type_v2":
             return self.value(Call(_text_of(call.args[0]), call.args[2]), level)
         if name in _NUMBERS:
             return np.frombuffer(bytes_of(call.args[1]), dtype_of(call.args[0]))[
                 0
             ].item()
-        if (
-            name == "collections.OrderedDict"
-        ):  # its state is no part of its items; Python 2 lists the items
+        # its state is no part of its items; Python 2 lists the items
+        if name == "collections.OrderedDict":
             pairs = dict(call.args[0]) if call.args else {}
             return self._make(pairs | call.items, level)
         for held in (call.items, call.values, call.state):

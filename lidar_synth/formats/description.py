@@ -244,9 +244,8 @@ def _above(folders: Sequence[Path]) -> Description | None:
         if _is_dataset(below):
             return None
         path = folder / NAME
-        if path.is_file() and _FORMATS in read_start(
-            path, LONGEST
-        ):  # other programs have files of this name
+        # other programs have files of this name
+        if path.is_file() and _FORMATS in read_start(path, LONGEST):
             return (
                 None
                 if _is_dataset(folder) or any(folder.glob("*.bin"))
@@ -343,9 +342,8 @@ def to_comments(scan: Scan) -> list[str]:
     text = json.dumps(
         Description(scan.sensor, (Origin.of(scan),)).to_dict(), separators=(",", ":")
     )
-    text = text.replace(
-        " ", r"\u0020"
-    )  # so that no program that trims or splits a line changes it
+    # so that no program that trims or splits a line changes it
+    text = text.replace(" ", r"\u0020")
     return [f"lidar_synth {text[i : i + LINE]}" for i in range(0, len(text), LINE)]
 
 

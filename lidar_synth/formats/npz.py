@@ -83,9 +83,8 @@ def to_stored(
         wanted = np.dtype(TYPES.get(name, values.dtype))
         if values.dtype.kind not in "biuf":
             raise DataError(f"{where}: {name} is {values.dtype}", "numbers")
-        with np.errstate(
-            all="ignore"
-        ):  # what overflows is refused below, or by ``check_scan``
+        # what overflows is refused below, or by ``check_scan``
+        with np.errstate(all="ignore"):
             cast = np.ascontiguousarray(values, wanted)
         if wanted.kind in "iu" and not np.array_equal(cast, values):
             outside = values[cast != values].flat[0]

@@ -386,10 +386,9 @@ class Generator:
             )
         options = self.header.conditioning[self.condition]
         encoder = self.network.encoder
-        if isinstance(given, Tensor) and given.shape[1:] == getattr(
-            encoder, "seen", None
-        ):  # a training keeps these instead of images
-            return given.to(self.device)
+        kept = getattr(encoder, "seen", None)
+        if isinstance(given, Tensor) and given.shape[1:] == kept:
+            return given.to(self.device)  # a training keeps these instead of images
         shape = CONDITIONS[self.condition].shape(encoder)
         return batch_of(
             self.condition, given, count, self.header.sensor, shape, options

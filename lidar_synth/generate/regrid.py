@@ -109,9 +109,8 @@ def regrid(model: Checkpoint, sensor: Sensor) -> tuple[Header, dict[str, nn.Modu
     networks: dict[str, nn.Module] = {}
     parts: dict[str, NetworkSpec] = {}
     state = sensor.shape
-    for name in sorted(
-        model.networks
-    ):  # the autoencoder first: it gives the shape of the states
+    # the autoencoder first: it gives the shape of the states
+    for name in sorted(model.networks):
         part = model.header.networks[name]
         sizes = {"resolution": list(state if name == VELOCITY else sensor.shape)}
         if name == ENCODER:

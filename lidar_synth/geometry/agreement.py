@@ -192,9 +192,8 @@ def _between(
     """Share of points between the beams, with the tilt of each sector that leaves the fewest
     there."""
     step = np.diff(beams)
-    width = (
-        np.minimum(np.r_[step[0], step], np.r_[step, step[-1]]) / 4
-    )  # on either side of a beam
+    # on either side of a beam
+    width = np.minimum(np.r_[step[0], step], np.r_[step, step[-1]]) / 4
     width = width if exact else np.maximum(width, _COARSE)
     low = beams[0] - 3 * TILT
     places = low + _BIN * (np.arange(round((beams[-1] + 3 * TILT - low) / _BIN)) + 0.5)

@@ -185,9 +185,8 @@ def decode_labels(bits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     for bit in bits.unbind(1):
         nearest = 2 * nearest + (bit > 0)
     gap = (bits.abs() - 1).abs().amax(1)
-    if bool(
-        (unused := nearest > NO_LABEL).any()
-    ):  # all codes have the same norm: the nearest has the largest product
+    # all codes have the same norm: the nearest has the largest product
+    if bool((unused := nearest > NO_LABEL).any()):
         powers = 1 << torch.arange(LABEL_BITS, device=bits.device).flip(0)
         corners = (
             torch.arange(NO_LABEL + 1, device=bits.device)[:, None] & powers

@@ -75,9 +75,8 @@ class CurrentEpoch:
         # current epoch; epoch of the latest pass; 1 once it has warned; 1 once the current epoch is
         # used
         self._shared = shared_integers(0, -1, 0, 0)
-        self._fetched = shared_integers(
-            *[0] * _COUNTERS
-        )  # number of positions fetched, by worker
+        # number of positions fetched, by worker
+        self._fetched = shared_integers(*[0] * _COUNTERS)
         self.passed: dict[int, tuple[int, int]] = {}
         """By rank: epoch and position where its latest complete pass by ``batches`` began."""
         # The epoch that this process set, or the current epoch when this process started.

@@ -52,9 +52,8 @@ def to_item(scan: Scan, rng: np.random.Generator) -> Item:
         DataError: on a label that is not a train id.
     """
     points = np.empty((len(scan), 4), np.float32)
-    for column, values in enumerate(
-        (*scan.points.T, scan.reflectance)
-    ):  # numpy is slow at rows of three
+    # numpy is slow at rows of three
+    for column, values in enumerate((*scan.points.T, scan.reflectance)):
         points[:, column] = values
     if scan.label is None:
         label = np.full(len(scan), IGNORE, np.int64)

@@ -37,9 +37,8 @@ from lidar_synth.mixing.schedules import share_of
 VERSION = "lidar-synth-plan/2"
 """Part of every plan's hash; changes when the same mixture gives another order."""
 
-_ORDER, _REALS, _SOURCES = range(
-    3
-)  # streams of the permutations; each source has its own
+# streams of the permutations; each source has its own
+_ORDER, _REALS, _SOURCES = range(3)
 _BLOCK = 256  # number of positions computed together, as most are accessed in order
 _BLOCKS = 8  # number of blocks in the cache
 

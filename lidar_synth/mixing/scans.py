@@ -578,9 +578,8 @@ def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy
 
 
 def _make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
-    from lidar_synth.geometry.transfer import (
-        Transfer,
-    )  # only where a mixture turns its scans
+    # only where a mixture turns its scans
+    from lidar_synth.geometry.transfer import Transfer
 
     if given is None or isinstance(given, Transfer):
         return given

@@ -17,9 +17,8 @@ Schedule = Callable[[int], float]
 """``epoch -> share``: from an epoch, counted from 0, to the share of synthetic samples in [0,
 1]."""
 
-_FINEST = (
-    10**6
-)  # largest denominator of a share: products with positions stay within 64 bits
+# largest denominator of a share: products with positions stay within 64 bits
+_FINEST = 10**6
 
 
 @dataclass(frozen=True)

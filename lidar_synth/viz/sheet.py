@@ -186,9 +186,8 @@ def histograms(
         axes.hist(
             [numbers[~marked], numbers[marked]], bins=60, stacked=True, color=colours
         )
-        axes.set_yscale(
-            "symlog", linthresh=1
-        )  # keeps a single scan among thousands visible
+        # keeps a single scan among thousands visible
+        axes.set_yscale("symlog", linthresh=1)
         style_axes(
             axes,
             name,

@@ -83,9 +83,8 @@ class Cases:
             self._put(name, content)
         if self.target.mend is not None and rng.random() < 0.5:
             self._changed |= set(self.files)
-            with suppress(
-                Exception
-            ):  # what was mutated may have nothing that could be mended
+            # what was mutated may have nothing that could be mended
+            with suppress(Exception):
                 self.target.mend(self.root)
         return self.root
 

@@ -90,9 +90,8 @@ def make_archives(root: Path) -> None:
     with tarfile.open(root / "judge.tar", "w") as tar:
         for path in sorted(folder.iterdir()):
             tar.add(path, f"judge/{path.name}", filter=without_owner)
-    content = (
-        (root / "judge.tar").read_bytes().rstrip(b"\0")
-    )  # without the record of zeros
+    # without the record of zeros
+    content = (root / "judge.tar").read_bytes().rstrip(b"\0")
     content += bytes(-len(content) % 512 + 1024)
     (root / "judge.tar").write_bytes(content)
     packed = gzip.compress(content, mtime=0)
@@ -211,9 +210,8 @@ def take_step(training: Training) -> None:
 def make_states(root: Path) -> None:
     """What runs keep to resume: a training's state, a cache with latents, an outcome of a study, timesteps."""
     run = some_training()
-    with mock.patch.object(
-        type(run), "seconds", 1.0
-    ):  # the same bytes on a busy machine
+    # the same bytes on a busy machine
+    with mock.patch.object(type(run), "seconds", 1.0):
         run.save(root / STATE)
     (root / STATE).write_bytes(in_order((root / STATE).read_bytes()))
     cached(root)

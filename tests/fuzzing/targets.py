@@ -174,9 +174,8 @@ def make_range_arrays(root: Path) -> None:
     image = some_image()
     assert image.reflectance is not None and image.label is not None
     xyz = SENSOR.ray_directions() * image.range[..., None]
-    classes = (image.label + np.uint8(1)).astype(
-        np.float32
-    )  # 255 = ignore becomes 0 = unlabelled
+    # 255 = ignore becomes 0 = unlabelled
+    classes = (image.label + np.uint8(1)).astype(np.float32)
     np.save(root / "one.npy", image.range)
     np.save(root / "two.npy", np.stack([image.range, image.reflectance]))
     stack = np.dstack([xyz, image.reflectance, image.range, classes])

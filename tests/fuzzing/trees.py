@@ -94,9 +94,8 @@ def move(path: Path, to: Path) -> None:
 
 
 def copy(path: Path, to: Path) -> None:
-    inside = Path(
-        os.path.realpath(to.parent)
-    )  # links may lead into the folder that is copied
+    # links may lead into the folder that is copied
+    inside = Path(os.path.realpath(to.parent))
     given = Path(os.path.realpath(path))
     if to == path or given in (inside, *inside.parents) or to in path.parents:
         return

@@ -34,9 +34,8 @@ def write_untrained(path: Path) -> Path:
         "hdit", arguments | {"angles": torch.from_numpy(sensor.ray_angles())}
     )
     for parameter in network.parameters():
-        torch.nn.init.normal_(
-            parameter, std=0.2
-        )  # the output of a fresh network is zero
+        # the output of a fresh network is zero
+        torch.nn.init.normal_(parameter, std=0.2)
     header = Header(
         networks={VELOCITY: NetworkSpec("hdit", arguments)},
         sensor=sensor,

@@ -25,9 +25,8 @@ LEFT_OUT = (
 
 def rows(trial: Trial) -> Iterator[Row]:
     """Two epochs and a resumed one on KITTI; two on nuScenes."""
-    python = trial.environment(
-        "setuptools", "ninja"
-    )  # to compile its functions for a CPU
+    # to compile its functions for a CPU
+    python = trial.environment("setuptools", "ninja")
     trial.type_page("install", python, PAGE, {}, skip=NOT_PIP)
     tree = trial.tree("OPENPCDET_ROOT")
     yield kitti(trial, python, tree)

@@ -190,9 +190,8 @@ def check_grid(grid: Sequence[float] | Tensor) -> Tensor:
 
 def _times(grid: Grid, y: Tensor) -> Tensor:
     """(S + 1, B) times on the device of y."""
-    if (
-        isinstance(grid, Tensor) and grid.ndim == 2
-    ):  # from distillation, already on the device; a check would synchronise
+    # from distillation, already on the device; a check would synchronise
+    if isinstance(grid, Tensor) and grid.ndim == 2:
         return grid
     dtype = torch.promote_types(y.dtype, torch.float32)
     times = check_grid(grid).to(y.device, dtype, non_blocking=True)

@@ -91,9 +91,8 @@ def select_known_boxes(scan: Scan) -> Boxes:
         np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
     ]
     later: set[int] = set()
-    for first, second in overlaps(
-        boxes
-    ):  # in order, so that the first of a pair is kept or dropped already
+    # in order, so that the first of a pair is kept or dropped already
+    for first, second in overlaps(boxes):
         if first not in later:
             later.add(second)
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes

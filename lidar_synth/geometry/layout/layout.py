@@ -199,9 +199,8 @@ def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
     half = np.maximum(values[:, 3:6] - margin, 1e-3) / 2
     c = np.cos(values[:, 6])
     s = np.sin(values[:, 6])
-    axes = np.stack(
-        [np.stack([c, s], -1), np.stack([-s, c], -1)], 1
-    )  # (M, 2 axes, x and y)
+    # (M, 2 axes, x and y)
+    axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)
     found = []
     for i in range(len(values)):
         gap = values[i + 1 :, :3] - values[i, :3]

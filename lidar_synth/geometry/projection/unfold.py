@@ -75,9 +75,8 @@ def unfold(
         ((64, 2048), 'hdl64e_lasers')
     """
     lasers = (sensor or scan.sensor).by_beams()
-    grid = grid_of(lasers)._replace(
-        edges=np.empty(0, np.float32)
-    )  # the rows follow from the rings
+    # the rows follow from the rings
+    grid = grid_of(lasers)._replace(edges=np.empty(0, np.float32))
     cell, distance = cells_of(scan.points, grid)
     put_in_rows(cell, laser_rows(scan, lasers, anchor), lasers.shape[1])
     image, index = nearest_in(cell, distance, lasers)

@@ -104,9 +104,8 @@ def hit_triangles(vertices, triangles, rays, nearest):  # type: ignore[no-untype
     """
     rows = vertices.rows
     for t in range(len(triangles)):
-        i = np.uintp(
-            triangles[t, 0]
-        )  # unsigned: no test whether an index counts from the end
+        # unsigned: no test whether an index counts from the end
+        i = np.uintp(triangles[t, 0])
         j = np.uintp(triangles[t, 1])
         k = np.uintp(triangles[t, 2])
         top = min(rows[i], rows[j], rows[k])

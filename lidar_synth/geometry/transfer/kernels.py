@@ -59,9 +59,8 @@ def find_level(points, below, level):  # type: ignore[no-untyped-def]
             along = np.sqrt((xi - xj) ** 2 + (yi - yj) ** 2)
             if abs(zi - zj) <= 0.12 * along + 0.02 and along > 0.05:
                 level[i] = True
-    for i in range(
-        len(points)
-    ):  # the nearest returns of a surface have no neighbour below
+    # the nearest returns of a surface have no neighbour below
+    for i in range(len(points)):
         j = below[i]
         if j >= 0 and level[i] and below[j] < 0:
             level[j] = True

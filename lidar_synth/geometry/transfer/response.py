@@ -76,9 +76,8 @@ def _matched(
     values, first = np.unique(given, return_index=True)
     if len(values) < 2:
         return (0.0, 1.0), (float(gives.mean()),) * 2
-    means = [
-        part.mean() for part in np.split(gives, first[1:])
-    ]  # a value that many returns have
+    # a value that many returns have
+    means = [part.mean() for part in np.split(gives, first[1:])]
     return tuple(map(float, values)), tuple(map(float, means))
 
 

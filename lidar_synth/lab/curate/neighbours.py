@@ -52,9 +52,8 @@ _SAMPLE = (
     65_536  # signatures from which the centre and scale of the sketches are estimated
 )
 _SPREAD = 4  # standard deviations that the range of a byte covers
-_NUMBERS = (
-    2.0**30
-)  # larger than any scan number; its product with a distance is exact in float64
+# larger than any scan number; its product with a distance is exact in float64
+_NUMBERS = 2.0**30
 _NONE = 2.0**53 - 1  # larger than any key
 
 
@@ -85,17 +84,15 @@ def find_similar(
     ) as steps:
         first = _first_copies(signatures)
         steps.update()
-        own = np.flatnonzero(
-            first == np.arange(count)
-        )  # the first of each group of copies
+        # the first of each group of copies
+        own = np.flatnonzero(first == np.arange(count))
         sketches = _sketches(signatures, own)
         steps.update()
         nearest = _nearest(sketches, steps)
         for part in _parts(count):
             candidates = nearest[np.searchsorted(own, first[part])]
-            found = np.where(
-                candidates < 0, -1, own[candidates]
-            )  # to numbers among all signatures
+            # to numbers among all signatures
+            found = np.where(candidates < 0, -1, own[candidates])
             copies = first[part] < np.arange(part.start, part.stop)
             found[copies] = first[part][copies, None]
             similarity[part], twin[part] = _best(signatures, part, found)

@@ -138,9 +138,8 @@ def measure(bank: Bank, folder: Path, jobs: int, progress: bool) -> Store:
     Raises:
         DataError, FileError: if a scan cannot be read, or the folder cannot be written.
     """
-    own = (
-        folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"
-    )  # not reused by others
+    # not reused by others
+    own = folder / f"{bank.identity[:16]}-{lidar_synth.__version__}"
     store = Store(own, len(bank), supported_measures(bank.fields))
     start = store.stored()
     spans = [

@@ -33,9 +33,8 @@ SENSOR = Sensor(
 """The grid of LiDM's range images."""
 
 _BLOCK = 128  # clouds compared with one another at a time: 20 MB of 200 x 200 maps
-_MOST_CELLS = (
-    1 << 16
-)  # cells of a grid up to which the maps of a block are held and multiplied
+# cells of a grid up to which the maps of a block are held and multiplied
+_MOST_CELLS = 1 << 16
 
 
 def find_occupied(points: NDArray[np.float32], size: float) -> NDArray[np.int32]:

@@ -236,9 +236,8 @@ def polynomial_mmd(real: NDArray[np.floating], fake: NDArray[np.floating]) -> St
             _mean_kernel(kernel, rows[k], counts, rows[k], counts, _BLOCK) * pairs
             - own @ diagonals[k]
         )
-        with np.errstate(
-            divide="ignore", invalid="ignore"
-        ):  # copies of one sample only: there is no pair
+        # copies of one sample only: there is no pair
+        with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(total / (pairs - own.sum(1)))
 
     def at(a: Counts, b: Counts) -> NDArray[np.float64]:

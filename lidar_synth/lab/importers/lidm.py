@@ -452,9 +452,8 @@ def _check_schedule(
 
 def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
     """LiDM's tensor in our order of dimensions and classes."""
-    if (
-        part.architecture == "semantic_map"
-    ):  # LiDM: unlabelled, then 19 classes; ours: 19 classes, then unlabelled
+    # LiDM: unlabelled, then 19 classes; ours: 19 classes, then unlabelled
+    if part.architecture == "semantic_map":
         return tensor[:, [*range(1, len(NAMES) + 1), 0]]
     if ours == "view_embedding":
         return tensor[0]

@@ -192,6 +192,7 @@ def our_name(name: str, levels: int) -> str:
 
 def cosine_grid(steps: int) -> tuple[float, ...]:
     """The times of R2DM's sampler: its cosine schedule at evenly spaced points, from 1 to 0."""
-    low, high = math.atan(math.exp(-LIMIT / 2)), math.atan(math.exp(LIMIT / 2))
+    low = math.atan(math.exp(-LIMIT / 2))
+    high = math.atan(math.exp(LIMIT / 2))
     ratios = [math.tan(low + i / steps * (high - low)) for i in range(1, steps)]
     return (1.0, *(r / (1 + r) for r in reversed(ratios)), 0.0)

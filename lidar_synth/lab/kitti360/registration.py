@@ -33,9 +33,8 @@ _STEPS, _STILL = (
     3,
     2e-3,
 )
-_PRIOR = (
-    np.array([1.0] * 3 + [0.05] * 3) ** -2
-)  # of errors of a pose: metres and radians
+# of errors of a pose: metres and radians
+_PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction
 _GAIN = 1.03  # factor of the score by which a transform has to be better than none
 _THINNED = 3  # of how many points one is used before the last steps

@@ -123,9 +123,8 @@ def group_ious(table: NDArray[np.int64], groups: Groups) -> NDArray[np.float64]:
         group[[TRAIN_ID[name] for name in members]] = i
     small = np.zeros((count + 1, count + 1), np.int64)
     np.add.at(small, (group[:, None], group[None]), table)
-    small = small[
-        :count
-    ]  # labels of no group do not count; predictions of no group do, as errors
+    # labels of no group do not count; predictions of no group do, as errors
+    small = small[:count]
     hits = np.diagonal(small)
     union = small.sum(1) + small[:, :count].sum(0) - hits
     return np.where(small.sum(1) > 0, hits / np.maximum(union, 1), np.nan)

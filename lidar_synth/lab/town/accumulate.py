@@ -116,7 +116,13 @@ def _place(
 ) -> Cloud:
     """Points of a scan in the world, with an error of the pose."""
     a, b, c = rng.normal(0, ANGLE, 3)
-    turn = np.eye(3) + np.array([(0, -c, b), (c, 0, -a), (-b, a, 0)])
+    turn = np.eye(3) + np.array(
+        [
+            (0, -c, b),
+            (c, 0, -a),
+            (-b, a, 0),
+        ]
+    )
     turned = points @ (pose[:3, :3] @ turn).T
     placed = turned + pose[:3, 3] + rng.normal(0, POSITION, 3)
     return dict(zip("xyz", placed.T, strict=True))

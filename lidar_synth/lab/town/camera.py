@@ -21,7 +21,14 @@ def _calibration() -> Calibration:
     s = np.sin(_PITCH)
     level = np.eye(4)
     level[:3, 3] = np.negative(_PLACE)
-    down = np.array([(c, 0, -s, 0), (0, 1, 0, 0), (s, 0, c, 0), (0, 0, 0, 1)])
+    down = np.array(
+        [
+            (c, 0, -s, 0),
+            (0, 1, 0, 0),
+            (s, 0, c, 0),
+            (0, 0, 0, 1),
+        ]
+    )
     projection = np.array(
         [(552.554261, 0, 682.049453, 0), (0, 552.554261, 238.769549, 0), (0, 0, 1, 0)]
     )

@@ -48,7 +48,14 @@ class _Alone(Snapshot):
         s = np.sin(box[6])
         self._prototype = prototype
         self._scale: Floats = (box[3:6] / (high - low)).astype(np.float32)
-        self._turn: Floats = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
+        self._turn: Floats = np.array(
+            [
+                [c, -s, 0],
+                [s, c, 0],
+                [0, 0, 1],
+            ],
+            np.float32,
+        )
         middle = self._turn @ (self._scale * (low + high) / 2)
         self._shift: Floats = (box[:3] - middle).astype(np.float32)
 

@@ -45,9 +45,8 @@ def endless_batches(
         persistent_workers=workers > 0,
     )
     for epoch in count():
-        mixed.set_epoch(
-            epoch
-        )  # another order, fresh synthetic scans; persistent workers are told
+        # another order, fresh synthetic scans; persistent workers are told
+        mixed.set_epoch(epoch)
         yield from loader
 
 

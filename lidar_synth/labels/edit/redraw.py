@@ -129,9 +129,8 @@ def _on_rays(
     if label is not None:
         slope = rays.slope[which]
         meets = (z - rays.height[which]) / np.where(np.abs(slope) < 1e-3, -1e-3, slope)
-        inside = inside & ~(
-            label.reshape(-1)[cell] < THINGS
-        )  # it may draw a new object
+        # it may draw a new object
+        inside = inside & ~(label.reshape(-1)[cell] < THINGS)
         level = GROUND[label.reshape(-1)[cell]] & (np.abs(meets - rho) < BEND * rho)
         rho = np.where(level, meets, rho)
     points = np.where(distance[:, None] > 0, rays.points(which, rho), np.float32(0))

@@ -145,9 +145,8 @@ def returns_of(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
         around[around] = ground.above(scan.points[around], box.values[0]) > FLOOR
     else:
         around &= scan.points[:, 2] > box.values[0, 2] - box.values[0, 5] / 2 + FLOOR
-    if (
-        scan.label is not None
-    ):  # in the box, also returns at the object's edge whose label is another one
+    # in the box, also returns at the object's edge whose label is another one
+    if scan.label is not None:
         same = np.isin(scan.label, np.unique(scan.label[mine])) & (scan.label < THINGS)
         around &= same | (box.contain(scan.points)[0] & ~GROUND[scan.label])
     if scan.instance is not None and mine.any():

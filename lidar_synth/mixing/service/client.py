@@ -93,9 +93,8 @@ class Client:
         except (EOFError, OSError) as error:
             raise error if isinstance(error, ProcessError) else self._died() from error
         finally:
-            if (
-                not answered
-            ):  # a late answer must not be taken for that of another request
+            # a late answer must not be taken for that of another request
+            if not answered:
                 self._connections.pop(_here(), None)
 
     def tell(self, *request: int) -> None:
@@ -109,9 +108,8 @@ class Client:
             self._end()
 
     def __getstate__(self) -> dict[str, Any]:
-        assert_spawning(
-            self
-        )  # in any other pickle the slots would be a copy that no process fills
+        # in any other pickle the slots would be a copy that no process fills
+        assert_spawning(self)
         return {
             k: v for k, v in self.__dict__.items() if k not in ("_process", "_end")
         } | {"_connections": {}}

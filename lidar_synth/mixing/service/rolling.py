@@ -166,9 +166,8 @@ class RollingBank:
         try:
             return served, self._slots.read(slot, served, checksum)
         finally:
-            with suppress(
-                OSError
-            ):  # if the process is dead, the next request raises an error
+            # if the process is dead, the next request raises an error
+            with suppress(OSError):
                 self._client.tell(GIVE_BACK)
 
     def expect(self, numbers: Sequence[int]) -> None:

@@ -76,9 +76,8 @@ def compile_functions(tree: Path) -> Any:
         )
     )
     folder = cache / f"openpcdet_cpu_{torch.__version__}"
-    headers = (
-        folder / "include"
-    )  # its sources for a CPU include CUDA's headers without use
+    # its sources for a CPU include CUDA's headers without use
+    headers = folder / "include"
     headers.mkdir(parents=True, exist_ok=True)
     for name in ("cuda.h", "cuda_runtime_api.h"):
         if not (headers / name).exists():

@@ -39,9 +39,8 @@ def main() -> None:
 
     stay_on_cpu()
     torch.UntypedStorage.cuda = lambda self, *args, **options: self  # type: ignore[method-assign,assignment]
-    count = (
-        torch.histc
-    )  # integers on a GPU only, and Pointcept's evaluation counts classes
+    # integers on a GPU only, and Pointcept's evaluation counts classes
+    count = torch.histc
     torch.histc = lambda values, *args, **options: count(
         values.float(), *args, **options
     )  # type: ignore[assignment]

@@ -99,9 +99,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
                 "range, reflectance and enough bits for the codes; one of "
                 f"{', '.join(NORMALISATIONS)}",
             )
-        if (
-            not 1 <= surfaces <= PATCH[1] // 2
-        ):  # a patch of half the columns has a shared number for each in a row
+        # a patch of half the columns has a shared number for each in a row
+        if not 1 <= surfaces <= PATCH[1] // 2:
             raise ConfigError(f"{surfaces} surfaces", f"1 to {PATCH[1] // 2}")
         if any(not 1 <= reach <= pair(resolution)[1] // DOWN[1] for reach in reaches):
             raise ConfigError(
@@ -137,9 +136,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         self.head = nn.Linear(
             outer, surfaces * (NUMBERS + codes) + cells * (surfaces + PER_CELL)
         )
-        with (
-            torch.no_grad()
-        ):  # starts near and far, facing the sensor, with a wide scale
+        # starts near and far, facing the sensor, with a wide scale
+        with torch.no_grad():
             self.head.weight.mul_(0.5)
             start = self.head.bias.zero_()[: surfaces * (NUMBERS + codes)].view(
                 surfaces, -1

@@ -34,9 +34,8 @@ def relief_fields(uniform_noise: Tensor, merged: int = 1) -> Tensor:
     fields = []
     for first, span in enumerate(SPANS):
         step = span // merged
-        nodes = to_normal(rows[..., first::step]).unsqueeze(
-            -1
-        )  # no number is used twice
+        # no number is used twice
+        nodes = to_normal(rows[..., first::step]).unsqueeze(-1)
         turn = torch.arange(step, device=rows.device) * (math.pi / 2 / step)
         fields.append(
             (nodes * turn.cos() + nodes.roll(-1, -2) * turn.sin()).flatten(-2)

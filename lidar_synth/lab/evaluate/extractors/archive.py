@@ -90,9 +90,8 @@ class Archive:
         least, factor = MOST_PACKED
         most = least + factor * self.path.stat().st_size
         for member in tar:
-            if (
-                member.offset_data + member.size > most
-            ):  # the next one would unpack all of it
+            # the next one would unpack all of it
+            if member.offset_data + member.size > most:
                 raise DataError(
                     f"{self.path}: {member.name[:100]} declares {member.size} bytes",
                     f"an archive that unpacks into at most {most} bytes",

@@ -120,9 +120,8 @@ def load_pointnet(path: Path, prepared: str) -> PerScan:
 
     def describe(scan: Scan, generated: bool) -> Tensor:
         cloud = torch.from_numpy(inputs.cloud(scan, generated)) / METRES
-        if (
-            some(cloud) < CELLS
-        ):  # features are maxima, so that one point at the origin stands for all empty cells
+        # features are maxima, so that one point at the origin stands for all empty cells
+        if some(cloud) < CELLS:
             cloud = torch.cat([cloud, torch.zeros(1, 3)])
         return network(cloud.T[None])[0]  # type: ignore[no-any-return]
 

@@ -142,9 +142,8 @@ def convolve(features: Tensor, kernel: Tensor, pairs: Pairs, count: int) -> Tens
     Returns:
         (M, C_out).
     """
-    own = (
-        kernel.shape[0] == 27
-    )  # then each voxel also contributes to itself, without a gather
+    # then each voxel also contributes to itself, without a gather
+    own = kernel.shape[0] == 27
     total = (
         features @ kernel[_CENTRE]
         if own

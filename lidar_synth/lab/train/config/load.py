@@ -118,9 +118,8 @@ def _check_train(config: TrainConfig) -> None:
             f"recipe.weights {dict(config.recipe.weights)} of a latent model",
             "none: latents are mixed",
         )
-    if (
-        config.init is None and config.codec is None
-    ):  # what a codec makes is in its file
+    # what a codec makes is in its file
+    if config.init is None and config.codec is None:
         resolution = load_sensor(config.sensor).shape
         config.parts((config.tensors().size, *resolution), resolution)
 

@@ -98,9 +98,8 @@ class Data(Section):
             if self.path
             else {"path", "layout", "split", "on_bad"}
         )
-        keys |= (
-            {"motion"} if self.motion else set()
-        )  # caches of earlier versions do not name it
+        # caches of earlier versions do not name it
+        keys |= {"motion"} if self.motion else set()
         keys |= {"cache", "jobs", "flip", "roll", "latents", "seen", "more"}
         facts = self.model_dump(mode="json", exclude=keys)
         if self.more:
