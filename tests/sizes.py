@@ -8,6 +8,7 @@ import ast
 import io
 import tokenize
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,16 +62,20 @@ def tokens_by_line(text: str) -> Counter[int]:
 
 def size_of(files: list[Path]) -> Size:
     """The size of several files together."""
-    lines = 0
-    total = 0
+    sizes = [_size_of_text(path.read_text(encoding="utf-8")) for path in files]
+    return Size(
+        sum(size.lines for size in sizes),
+        sum(size.tokens for size in sizes),
+        sorted(tokens for size in sizes for tokens in size.functions),
+    )
+
+
+@cache
+def _size_of_text(text: str) -> Size:
+    counts = tokens_by_line(text)
     functions = []
-    for path in files:
-        text = path.read_text(encoding="utf-8")
-        counts = tokens_by_line(text)
-        lines += len(counts)
-        total += counts.total()
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                last = node.end_lineno or node.lineno
-                functions.append(sum(counts[n] for n in range(node.lineno, last + 1)))
-    return Size(lines, total, sorted(functions))
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            last = node.end_lineno or node.lineno
+            functions.append(sum(counts[n] for n in range(node.lineno, last + 1)))
+    return Size(len(counts), counts.total(), functions)
