@@ -8,8 +8,9 @@ import pytest
 import torch
 from streets import street
 
-from lidar_synth import MixedScans, MixedStream, Sources, mix
+from lidar_synth import MixedScans, MixedStream, Sources, load_sensor, mix
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.augment import drop_reflectance
 from lidar_synth.mixing import (
     ByDomain,
@@ -116,18 +117,36 @@ def test_a_segmenters_default_takes_synthetic_scans_first(
     assert len(given) != 100 and given.mixture.ratio(0) == 0.25
 
 
-def test_a_segmenters_default_ends_on_real_scans_where_they_are_many_or_of_another_sensor(
+QUARTER = [1.0] * 2 + [0.0] * 6
+
+
+def ratios(mixed: MixedScans) -> list[float]:
+    return [mixed.mixture.ratio(epoch) for epoch in range(8)]
+
+
+def test_a_segmenters_default_ends_on_real_scans_where_they_are_many(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    other = mix(REAL, SYNTHETIC, epochs=8, as_sensor=REAL[0].sensor)
-    assert "measured" not in caplog.text
     some = mix([REAL[0]] * 25, SYNTHETIC, epochs=8)
     assert "more than 24 labelled scans (25 here)" in caplog.text
     assert some.mixture.ratio(5) == 1
-    many = mix([REAL[0]] * 41, SYNTHETIC, epochs=8)
-    for mixed in (other, many):
-        ratios = [mixed.mixture.ratio(epoch) for epoch in range(8)]
-        assert ratios == [1.0] * 2 + [0.0] * 6
+    assert ratios(mix([REAL[0]] * 41, SYNTHETIC, epochs=8)) == QUARTER
+
+
+@pytest.mark.parametrize(
+    ("sensor", "expected"),
+    [("hdl64e_lasers", [1.0] * 6 + [0.5] * 2), ("os1_64", QUARTER)],
+)
+def test_a_segmenters_default_depends_on_lasers_and_not_on_grids(
+    sensor: str, expected: list[float]
+) -> None:
+    """The shipped models are of ``hdl64e_lasers``, KITTI's datasets of the same device on another
+    grid."""
+    kitti, other = (
+        Transfer(load_sensor(name)) for name in ("hdl64e_semantic_kitti", sensor)
+    )
+    mixed = mix([kitti(s) for s in REAL], [other(s) for s in SYNTHETIC], epochs=8)
+    assert ratios(mixed) == expected
 
 
 def test_settings_of_trainers_take_a_schedule_by_name() -> None:

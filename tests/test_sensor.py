@@ -108,6 +108,22 @@ def test_laser_elevations_are_the_beams_or_the_rows() -> None:
     assert linear.by_beams() is linear
 
 
+@pytest.mark.parametrize(
+    ("name", "other", "same"),
+    [
+        ("hdl64e_lasers", "hdl64e_semantic_kitti", True),
+        ("hdl64e_kitti360", "hdl64e_lasers", True),
+        ("hdl32e", "hdl32e_nuscenes", True),
+        ("pandar64", "hdl64e_lasers", False),
+        ("os1_64", "os1_128", False),
+    ],
+)
+def test_one_device_on_two_grids_has_the_same_lasers(
+    name: str, other: str, same: bool
+) -> None:
+    assert load_sensor(name).same_lasers(load_sensor(other)) is same
+
+
 def test_lasers_of_a_fitted_sensor_point_where_they_were_fitted() -> None:
     """Beams are corrected for the height of their laser; the elevations of ``fit_sensor`` are the
     lasers' own."""

@@ -295,6 +295,15 @@ class Sensor:
         )
         return seen - heights / typical, heights
 
+    def same_lasers(self, other: "Sensor") -> bool:
+        """Whether another sensor has the same lasers, within 0.1 degrees and 1 cm. Rows, columns and
+        limits may differ: ``hdl64e_lasers`` and ``hdl64e_semantic_kitti`` are one device on two
+        grids."""
+        if self.shape[0] != other.shape[0]:
+            return False
+        angle, height = np.abs(np.subtract(self.optics(), other.optics())).max(1)
+        return bool(angle <= np.radians(0.1) and height <= 0.01)
+
     @cached_property
     def starts(self) -> NDArray[np.float32]:
         """(H,) metres above the origin at which the rays of each row start; empty where they start

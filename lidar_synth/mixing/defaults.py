@@ -52,7 +52,7 @@ def ends_on_real(real: int, same_sensor: bool) -> bool:
 
     Args:
         real: number of real scans.
-        same_sensor: whether the synthetic scans are of the real scans' sensor without a transfer.
+        same_sensor: whether the synthetic scans are of a sensor with the real one's lasers.
     """
     return real > FEW or not same_sensor
 

@@ -3,6 +3,7 @@
 import inspect
 import os
 from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,8 @@ def mix(
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
     if as_sensor == "auto":
-        as_sensor = None if reals is None else _sensor_for(reals, synthetics)
+        alike = _agree(same_grid, reals, synthetics)
+        as_sensor = None if alike else sensor_of(each(reals)[0][0])
     as_sensor = read_transfer(as_sensor, synthetics)
     choose("task", task, dict.fromkeys(TASKS))
     own = {}
@@ -151,7 +153,8 @@ def mix(
         own = detection_options(reals, epochs)
     elif epochs is not None and ratio is None:
         count = sum(len(source) for source, _ in each(reals))
-        own = segmentation_options(count, epochs, as_sensor is None)
+        alike = _agree(Sensor.same_lasers, reals, synthetics)
+        own = segmentation_options(count, epochs, alike)
     given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}
     own |= {name: value for name, value in given.items() if value is not None}
     known = inspect.signature(MixedScans).parameters
@@ -160,11 +163,12 @@ def mix(
     return MixedScans(reals, synthetics, **(own | options))
 
 
-def _sensor_for(reals: Any, synthetics: Any) -> Sensor | None:
-    """The sensor of the real scans; None if that of the synthetic ones has the same grid."""
-    target = sensor_of(each(reals)[0][0])
-    alike = all(same_grid(target, sensor_of(source)) for source, _ in each(synthetics))
-    return None if alike else target
+def _agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:
+    """Whether a rule holds for the sensors of each real and each synthetic source."""
+    pairs = product(each(reals), each(synthetics))
+    return all(
+        rule(sensor_of(some), sensor_of(other)) for (some, _), (other, _) in pairs
+    )
 
 
 def _open_real(where: Any) -> Any:

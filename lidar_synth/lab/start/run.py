@@ -112,7 +112,7 @@ class StartPlan:
     def ends_on_real(self) -> bool:
         """Whether real scans alone follow the synthetic ones: where they are of one drive, or
         as ``mix`` decides."""
-        alike = self.cast or same_grid(_model_sensor(), self.found.source.sensor)
+        alike = self.cast or _model_sensor().same_lasers(self.found.source.sensor)
         decided = ends_on_real(len(self.found.source), alike)
         if self.task == "segmentation" and decided:
             return True
