@@ -2,6 +2,7 @@
 exactly."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from lidar_synth.geometry.transfer.rays import rays_of
 from lidar_synth.geometry.transfer.surfaces import rings_of
 from lidar_synth.noise import keyed_rng
 
+casting = partial(Transfer, recast=True)
+"""Rays are cast also for scans of the target's own lasers."""
 HDL64E = replace(load_sensor("hdl64e_kitti360"), firings=2000, heights=None)
 UNEVEN = Sensor(
     "uneven",
@@ -64,7 +67,7 @@ def test_it_sees_what_the_target_itself_records(
 ) -> None:
     """Ranges, occlusion and labels: also behind the car, whose shadow moves with the mount."""
     truth = record(TARGETS[target], MOUNTS[mount])
-    found = Transfer(TARGETS[target], MOUNTS[mount])(scan)
+    found = casting(TARGETS[target], MOUNTS[mount])(scan)
     at_truth = image(truth)
     at_found = image(found)
     both = (at_truth >= 0) & (at_found >= 0)
@@ -94,7 +97,7 @@ def test_the_nearer_surface_hides_the_farther_one(scan: Scan) -> None:
     """From further down, the car stands before the part of the wall that was seen over its roof."""
     mount = Mount(-0.9)
     truth = record(HDL64E, mount)
-    found = Transfer(HDL64E, mount)(scan)
+    found = casting(HDL64E, mount)(scan)
     at_truth = image(truth)
     at_found = image(found)
     both = (at_truth >= 0) & (at_found >= 0)
@@ -108,7 +111,7 @@ def test_the_nearer_surface_hides_the_farther_one(scan: Scan) -> None:
 @pytest.mark.parametrize("target", ["uneven", "hdl32e"])
 def test_no_return_hangs_between_surfaces(scan: Scan, target: str) -> None:
     """Between the outline of the car and the wall behind it."""
-    points = Transfer(TARGETS[target])(scan).points.astype(float)
+    points = casting(TARGETS[target])(scan).points.astype(float)
     off = [np.abs(points[:, 2] - GROUND)]
     for box in (CAR_BOX, WALL):
         c = np.cos(box[6])
@@ -149,7 +152,7 @@ def test_returns_lie_on_the_beams_and_firings_of_the_target(
 
 
 def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) -> None:
-    found = Transfer(HDL64E)(scan)
+    found = casting(HDL64E)(scan)
     before = image(scan)
     after = image(found)
     both = (before >= 0) & (after >= 0)
@@ -165,12 +168,46 @@ def test_the_same_sensor_in_the_same_place_changes_nearly_nothing(scan: Scan) ->
     )
 
 
+def test_a_scan_of_the_same_lasers_keeps_its_returns(scan: Scan) -> None:
+    """Within the target's limits; its arrays are its own."""
+    target = replace(HDL64E, columns=512, range_max=20.0, reflectance_levels=4)
+    given = replace(scan, sensor=replace(HDL64E, name="other", firings=2100))
+    before = scan.points.copy()
+    found, seen = Transfer(target).cast(given)
+    near = np.linalg.norm(scan.points, axis=1) <= 20
+    assert 0 < near.sum() < len(scan) and found.sensor == target and seen == 1.0
+    assert np.array_equal(found.points, scan.points[near])
+    assert np.array_equal(found.label, scan.label[near])
+    assert set(np.unique(found.reflectance * 4)) <= {0, 1, 2, 3}
+    found.points[:] = 0
+    found.boxes.values[:] = 1
+    assert np.array_equal(scan.points, before) and (scan.boxes.values != 1).any()
+    front = given[scan.points[:, 0] > np.abs(scan.points[:, 1])]
+    assert abs(Transfer(target).cast(front).seen - 0.25) < 0.02
+
+
+@pytest.mark.parametrize(
+    "transfer",
+    [
+        Transfer(HDL64E, Mount(0.1)),
+        Transfer(HDL64E, measurement=Measurement(loss=0.01)),
+        Transfer(replace(HDL64E, firings=1000)),
+        Transfer(replace(HDL64E, range_step=0.004)),
+        Transfer(replace(HDL64E, beams=tuple(np.array(HDL64E.beams) - 0.2))),
+        Transfer(HDL64E, recast=True),
+    ],
+    ids=["mount", "losses", "firings", "steps", "lasers", "recast"],
+)
+def test_any_other_difference_casts_rays(scan: Scan, transfer: Transfer) -> None:
+    assert not np.isin(transfer(scan).points[:, 0], scan.points[:, 0]).all()
+
+
 def test_a_real_street_of_the_town_too() -> None:
     """A scan of a range image has no ring, and rows without a return."""
     # few leaves, whose returns have random depths
     town = Town(seed=5, scans=1, motion=False)[0]
     for scan in (town, unproject(project(replace(town, boxes=None, pose=None)))):
-        found = Transfer(scan.sensor)(replace(scan, ring=scan.ring))
+        found = casting(scan.sensor)(replace(scan, ring=scan.ring))
         ranges = [project(s).range for s in (scan, found)]
         both = (ranges[0] > 0) & (ranges[1] > 0)
         assert both.sum() > 0.9 * (ranges[0] > 0).sum()
@@ -193,7 +230,7 @@ def test_fields_are_those_of_the_surface_that_returns(scan: Scan) -> None:
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_boxes_and_pose_move_to_the_targets_frame(scan: Scan, mount: str) -> None:
-    found = Transfer(HDL64E, MOUNTS[mount])(scan)
+    found = casting(HDL64E, MOUNTS[mount])(scan)
     np.testing.assert_allclose(found.pose, MOUNTS[mount].matrix)
     slack = 0.03 + 2 * np.sin(np.radians(MOUNTS[mount].pitch)) * CAR_BOX[3] / 2
     grown = replace(
@@ -220,7 +257,7 @@ def test_porous_surfaces_keep_their_share_of_returns() -> None:
     for share in (0.3, 0.6, 1.0):
         some = scan[rng.random(len(scan)) < share]
         for target in (HDL64E, UNEVEN):
-            found = Transfer(target)(some)
+            found = casting(target)(some)
             rays = rays_of(target)
             rows = (np.degrees(np.arctan(rays.slope)) < 2) & (
                 np.degrees(np.arctan(rays.slope)) > -15
@@ -233,7 +270,7 @@ def test_porous_surfaces_keep_their_share_of_returns() -> None:
 def test_a_narrow_pole_stays() -> None:
     pole = (12.0, -4.0, 0.0, 0.1, 0.1, 4.0, 0.0)
     for target in (HDL64E, UNEVEN):
-        found = Transfer(target)(record(HDL64E, car=pole))
+        found = casting(target)(record(HDL64E, car=pole))
         truth = record(target, car=pole)
         assert (
             abs(np.log((found.label == CAR).sum() / (truth.label == CAR).sum())) < 0.35
@@ -242,7 +279,7 @@ def test_a_narrow_pole_stays() -> None:
 
 def test_what_was_not_seen_returns_nothing(scan: Scan) -> None:
     front = scan[scan.points[:, 0] > np.abs(scan.points[:, 1])]
-    found, seen = Transfer(HDL64E).cast(front)
+    found, seen = casting(HDL64E).cast(front)
     assert (found.points[:, 0] > 0.9 * np.abs(found.points[:, 1])).all() and abs(
         seen - 0.25
     ) < 0.02
@@ -254,7 +291,7 @@ def test_what_was_not_seen_returns_nothing(scan: Scan) -> None:
 
 
 def test_surfaces_end_where_rings_are_missing(scan: Scan) -> None:
-    found = Transfer(HDL64E)(scan[(scan.ring < 25) | (scan.ring > 40)])
+    found = casting(HDL64E)(scan[(scan.ring < 25) | (scan.ring > 40)])
     assert not ((found.ring > 25) & (found.ring < 40)).any() and (
         (found.ring < 25).sum(),
         (found.ring > 40).sum(),
@@ -268,7 +305,7 @@ def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
     target = replace(
         UNEVEN, range_min=6.0, range_max=20.0, range_step=0.05, reflectance_levels=8
     )
-    found = Transfer(target)(scan)
+    found = casting(target)(scan)
     steps = np.linalg.norm(found.points.astype(float), axis=1) / 0.05
     assert (
         np.abs(steps - np.rint(steps)).max() < 1e-3
@@ -282,8 +319,8 @@ def test_limits_and_quantisation_are_those_of_the_target(scan: Scan) -> None:
 
 
 def test_noise_and_losses_are_added_and_keyed(scan: Scan) -> None:
-    plain = Transfer(HDL64E)(scan)
-    noisy = Transfer(HDL64E, measurement=Measurement(range_noise=0.05))
+    plain = casting(HDL64E)(scan)
+    noisy = casting(HDL64E, measurement=Measurement(range_noise=0.05))
     first = noisy(scan, keyed_rng(1))
     again = noisy(scan, keyed_rng(1))
     other = noisy(scan, keyed_rng(2))
@@ -292,9 +329,9 @@ def test_noise_and_losses_are_added_and_keyed(scan: Scan) -> None:
     )
     off = np.linalg.norm(first.points, axis=1) - np.linalg.norm(plain.points, axis=1)
     assert abs(off.std() - 0.05) < 0.003
-    fewer = Transfer(HDL64E, measurement=Measurement(loss=0.2))(scan)
+    fewer = casting(HDL64E, measurement=Measurement(loss=0.2))(scan)
     assert abs(len(fewer) / len(plain) - 0.8) < 0.01
-    weak = Transfer(HDL64E, measurement=Measurement(reach=30.0))(scan)
+    weak = casting(HDL64E, measurement=Measurement(reach=30.0))(scan)
     far = [np.mean(np.linalg.norm(s.points, axis=1) > 25) for s in (plain, weak)]
     assert far[1] < 0.5 * far[0]
 
@@ -309,7 +346,7 @@ def test_a_response_gives_the_targets_distribution(scan: Scan) -> None:
         np.array([0.3, 0.6, 0.9]) ** 2 / 3,
         atol=0.01,
     )
-    found = Transfer(HDL64E, measurement=Measurement(response=response))(recorded)
+    found = casting(HDL64E, measurement=Measurement(response=response))(recorded)
     assert found.reflectance.max() < 0.34
     with pytest.raises(DataError, match="no target return between 4 and 40 m"):
         Response.match([scan], [])
@@ -324,8 +361,8 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
     later = record(HDL64E, car=(CAR_BOX[0] + 3, *CAR_BOX[1:]), at=2.0)
     # Neither the car nor what is behind it.
     blind = scan[(scan.points[:, 1] < 1) | (scan.points[:, 0] < 0)]
-    alone = Transfer(HDL64E)(blind)
-    filled = Transfer(HDL64E).cast(blind, sweeps=[later]).scan
+    alone = casting(HDL64E)(blind)
+    filled = casting(HDL64E).cast(blind, sweeps=[later]).scan
     assert len(filled) > 1.1 * len(alone)
     car = filled.points[filled.label == CAR]
     assert len(car) > 300
@@ -336,9 +373,9 @@ def test_sweeps_fill_gaps_and_moving_objects_follow_their_boxes() -> None:
     unknown = replace(
         later, boxes=replace(later.boxes, instance=np.array([9], np.int32))
     )
-    assert not (Transfer(HDL64E).cast(blind, sweeps=[unknown]).scan.label == CAR).any()
+    assert not (casting(HDL64E).cast(blind, sweeps=[unknown]).scan.label == CAR).any()
     with pytest.raises(DataError, match="without a pose; expected poses"):
-        Transfer(HDL64E).cast(scan, sweeps=[replace(later, pose=None)])
+        casting(HDL64E).cast(scan, sweeps=[replace(later, pose=None)])
 
 
 def test_the_own_vehicle_does_not_stand_in_the_way_of_another_mount(scan: Scan) -> None:
@@ -352,13 +389,13 @@ def test_the_own_vehicle_does_not_stand_in_the_way_of_another_mount(scan: Scan) 
         :, None
     ]
     given = replace(scan, points=points)
-    lower = Transfer(HDL64E, Mount(-0.4))
+    lower = casting(HDL64E, Mount(-0.4))
     assert len(lower(given)) > 0.95 * len(
         lower(scan[np.setdiff1d(np.arange(len(scan)), own)])
     )
     assert len(replace(lower, vehicle=(0.0, 0.0))(given)) < 0.98 * len(lower(given))
     near = (
-        np.linalg.norm(Transfer(replace(HDL64E, range_min=0.1))(given).points, axis=1)
+        np.linalg.norm(casting(replace(HDL64E, range_min=0.1))(given).points, axis=1)
         < 1.8
     )
     assert near.sum() > 0.9 * len(own)  # in the same place it stays
@@ -377,7 +414,7 @@ def test_a_source_seen_as_another_sensor(scan: Scan) -> None:
 @pytest.mark.parametrize("name", presets())
 def test_every_preset_is_a_source_and_a_target(name: str) -> None:
     sensor = load_sensor(name)
-    found = Transfer(sensor)(record(sensor))
+    found = casting(sensor)(record(sensor))
     assert len(found) > 0.9 * len(record(sensor))
     assert set(np.unique(found.label)) == {ROAD, BUILDING, CAR}
 
@@ -409,7 +446,7 @@ def test_bad_scans_are_refused(scan: Scan, case: str) -> None:
     change, message = BAD[case]
     low = Sensor("low", 512, 1.0, 50.0, rows=16, fov_up=-10.0, fov_down=-30.0)
     with pytest.raises(DataError, match=message):
-        Transfer(low)(change(scan))
+        casting(low)(change(scan))
 
 
 def test_a_shuffled_scan_finds_its_rings_by_elevation(scan: Scan) -> None:
@@ -476,7 +513,7 @@ def test_returns_are_those_of_the_kernels_before_they_were_made_faster(
     """The returns that version 0.1.0 gave (tests/golden/README.md) on a processor with AVX-512:
     without it, the last bits of a sine decide rays along an edge differently, 1 in 100."""
     target = Sensor("other", 400, 1.0, 80.0, elevations=tuple(np.linspace(3, -16, 12)))
-    found = Transfer(target, MOUNTS[mount])(porous())
+    found = casting(target, MOUNTS[mount])(porous())
     with np.load(golden / "transfer.npz") as file:
         before = {
             name: file[f"{mount} {name}"]

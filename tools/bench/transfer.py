@@ -46,7 +46,7 @@ def main(scan: Annotated[Path | None, Argument()] = None, rounds: int = 20) -> N
     sensor = replace(load_sensor("hdl64e_semantic_kitti"), firings=HDL64E_FIRINGS)
     ways = {f"as {n}": Transfer(load_sensor(preset)) for n, preset in TARGETS.items()}
     same = "as HDL-64E, 64 x 2170"
-    ways[same] = Transfer(sensor)
+    ways[same] = Transfer(sensor, recast=True)
     ways[f"{same}, 1 m higher, pitched by 0.2 degrees"] = Transfer(sensor, MOUNT)
     surfaces = "of which: rings and surfaces"
     cells = partial(project, sensor=load_sensor("os1_128"))

@@ -7,8 +7,9 @@ SemanticKITTI are split in two halves, the street of PandaSet in two ends: train
 on the other, both ways. ARM is one of ``lidar-synth prove``, ``half`` (generated scans for half of
 the training, then real ones alone), or the name of a pool below: the town first, in the skin
 ``pandar64``, ``standing`` (each scan taken at one moment), ``streets`` (standing, one scan a
-street) or ``transferred`` (standing, by another sensor, then turned into scans of the user's).
-``--match`` gives the synthetic scans the quantiles of the labelled scans' reflectance.
+street), ``kept`` or ``recast`` (standing, by the generator's sensor, then turned into scans of the
+user's: its returns, or rays cast at its surfaces). ``--match`` gives the synthetic scans the
+quantiles of the labelled scans' reflectance.
 """
 
 from collections.abc import Callable, Iterator
@@ -40,9 +41,9 @@ def standing_town(task: PoolTask, frames: tuple[int, ...] = FRAMES) -> Iterator[
             yield town[STRETCH_FRAMES * street + frame]
 
 
-def transferred_town(task: PoolTask) -> Iterator[Scan]:
-    """The standing town by the sensor of the generator, as the user's sensor would see it."""
-    change = Transfer(task.sensor)
+def turned_town(task: PoolTask, recast: bool) -> Iterator[Scan]:
+    """The standing town by the sensor of the generator, turned into scans of the user's."""
+    change = Transfer(task.sensor, recast=recast)
     other = replace(task, sensor=load_generator(task.model).sensor)
     for index, scan in enumerate(standing_town(other)):
         yield change(scan, keyed_rng(0, index))
@@ -52,7 +53,8 @@ TOWNS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
     "pandar64": lambda task: town_scans(task, load_skin("pandar64")),
     "standing": standing_town,
     "streets": lambda task: standing_town(task, FRAMES[:1]),
-    "transferred": transferred_town,
+    "kept": lambda task: turned_town(task, False),
+    "recast": lambda task: turned_town(task, True),
 }
 for name, make in TOWNS.items():
     POOLS[name] = make

@@ -58,6 +58,9 @@ class Transfer:
     interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's
     frame.
 
+    A scan of a sensor with the target's lasers, in the same place, keeps its returns: a network
+    learns less from cast ones (docs/research/transfer.md).
+
     Args:
         target: the sensor to imitate: its lasers, firings, limits and quantisation.
         mount: the target's place relative to the recording sensor.
@@ -65,6 +68,7 @@ class Transfer:
         vehicle: (length, width) in metres of the footprint around the recording sensor, below it,
             whose returns are of the vehicle that carries it. If the target has another mount they
             are left out; otherwise they would stand in its way.
+        recast: whether rays are cast for scans of the target's lasers too.
 
     Example:
         >>> from lidar_synth import Town, load_sensor
@@ -79,9 +83,13 @@ class Transfer:
     mount: Mount = field(default_factory=Mount)
     measurement: Measurement = field(default_factory=Measurement)
     vehicle: tuple[float, float] = (4.0, 2.0)
+    recast: bool = False
 
     def __call__(self, scan: Scan, rng: np.random.Generator | None = None) -> Scan:
         """The scan as the target sensor would have recorded it; see ``cast``."""
+        kept = self._kept(scan)
+        if kept is not None:
+            return kept
         return self._seen_by_target(scan, rng or keyed_rng(0), ())[0]
 
     def cast(
@@ -106,8 +114,40 @@ class Transfer:
                 that are not finite; if nothing of it is in the target's field of view; on sweeps
                 without poses.
         """
+        kept = None if sweeps else self._kept(scan)
+        if kept is not None:
+            looked = _looked(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+            return Transferred(kept, float(looked.mean()))
         result, surfaces = self._seen_by_target(scan, rng or keyed_rng(0), sweeps)
         return Transferred(result, _seen(surfaces, self.target, self.mount))
+
+    def _kept(self, scan: Scan) -> Scan | None:
+        """The scan's returns within the limits of the target, if its sensor has fired the same
+        lasers about as often from the same place and measures alike; None if not, or if no return
+        is left or a point is not finite."""
+        fired = sorted(s.firings or s.columns for s in (scan.sensor, self.target))
+        measured = replace(self.measurement, response=None)
+        if (
+            self.recast
+            or self.mount != Mount()
+            or measured != Measurement()
+            or self.target.range_step not in (None, scan.sensor.range_step)
+            or fired[0] < 0.9 * fired[1]
+            or not self.target.same_lasers(scan.sensor)
+        ):
+            return None
+        distance = np.linalg.norm(scan.points, axis=1)
+        nearest, farthest = self.target.range_min, self.target.range_max
+        inside = (distance >= nearest) & (distance <= farthest)
+        if not inside.any() or not np.isfinite(distance).all():
+            return None
+        kept = scan[inside]
+        return replace(
+            kept,
+            sensor=self.target,
+            reflectance=self.measurement.reflectances(kept.reflectance, self.target),
+            boxes=None if scan.boxes is None else scan.boxes[:],
+        )
 
     def _seen_by_target(
         self, scan: Scan, rng: np.random.Generator, sweeps: Sequence[Scan]
@@ -206,7 +246,7 @@ class Transfer:
         """A text of everything that determines the scans."""
         return (
             f"{self.target.to_dict()} {asdict(self.mount)} {asdict(self.measurement)} "
-            f"{self.vehicle}"
+            f"{self.vehicle}{' recast' if self.recast else ''}"
         )
 
 
@@ -279,10 +319,7 @@ def _seen(surfaces: ScanSurfaces, target: Sensor, mount: Mount) -> float:
     """The share of the target's rays that lie in the field of view of the sensor that recorded the
     surfaces."""
     elevation, sector = _views(target, mount)
-    looked = (
-        np.bincount(_sector(-surfaces.azimuth.astype(np.float32)), minlength=SECTORS)
-        > 0
-    )
+    looked = _looked(-surfaces.azimuth.astype(np.float32))
     inside = (elevation >= surfaces.bounds[0]) & (elevation <= surfaces.bounds[1])
     return float((inside & looked.take(sector)).mean())
 
@@ -298,6 +335,11 @@ def _views(
         np.concatenate([rays.directions, slope], -1) @ mount.matrix[:3, :3].T, -1, 0
     )
     return np.arctan2(z, np.hypot(x, y)), _sector(np.arctan2(y, x))
+
+
+def _looked(angle: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """(SECTORS,) whether a scan has returns in a sector, from their angles."""
+    return np.bincount(_sector(angle), minlength=SECTORS) > 0
 
 
 def _sector(angle: NDArray[np.floating]) -> NDArray[np.int64]:

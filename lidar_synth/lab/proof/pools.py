@@ -13,8 +13,6 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.claims import claim
@@ -129,11 +127,10 @@ def learnt_town(task: PoolTask) -> Iterator[Scan]:
 
 
 def _as_sensor(scans: Iterable[Scan], sensor: Sensor) -> Iterator[Scan]:
-    """The scans as a sensor would measure them, where their own has other beams."""
+    """The scans as a sensor would measure them."""
     change = Transfer(sensor)
     for index, scan in enumerate(scans):
-        alike = _alike(scan.sensor, sensor)
-        yield scan if alike else change(scan, keyed_rng(0, index))
+        yield change(scan, keyed_rng(0, index))
 
 
 POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
@@ -233,12 +230,3 @@ def _save_objects(scans: list[Scan], path: Path) -> None:
     bank = ObjectBank.from_scans(scans)
     if set(bank.boxes.names) & set(RARE):
         bank.save(path)
-
-
-def _alike(some: Sensor, other: Sensor) -> bool:
-    """Whether two sensors have beams of the same elevations."""
-    a = some.laser_elevations
-    b = other.laser_elevations
-    if a.shape != b.shape:
-        return False
-    return bool(np.abs(a - b).max() < np.radians(0.1))
