@@ -29,7 +29,6 @@ from lidar_synth.files.parsing import parse_json
 from lidar_synth.formats.description import (
     Description,
     Origin,
-    same_grid,
 )
 from lidar_synth.formats.folder import scan_paths
 from lidar_synth.formats.npz import range_image
@@ -161,7 +160,7 @@ def write_sweeps(path: str | Path, scans: Sequence[Scan]) -> None:
         ('sweeps/000000', 'sweeps/000001')
     """
     grids = {scan.sensor.name for scan in scans}
-    if not scans or not all(same_grid(s.sensor, scans[0].sensor) for s in scans):
+    if not scans or not all(s.sensor.same_grid(scans[0].sensor) for s in scans):
         raise ConfigError(
             f"{len(scans)} scans of {', '.join(sorted(grids)) or 'no sensor'}",
             "scans of one sensor",

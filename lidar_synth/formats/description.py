@@ -25,8 +25,6 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lidar_synth.errors import ConfigError, DataError, shorten, suggest
 from lidar_synth.files.disk import read_start, read_text, write_file
 from lidar_synth.files.parsing import parse_json
@@ -202,14 +200,6 @@ def check_provenance(values: Any) -> dict[str, Any]:
     return values
 
 
-def same_grid(a: Sensor, b: Sensor) -> bool:
-    """Whether two sensors have the same rows and columns, whatever their names, beams and range
-    limits."""
-    return a is b or (
-        a.shape == b.shape and bool(np.allclose(a.edges, b.edges, rtol=0, atol=1e-5))
-    )
-
-
 def read_description(root: Path, plain: bool = False) -> Description | None:
     """The description beside scans, or above the folders of their layout; None if there is none.
 
@@ -319,7 +309,7 @@ def require_grid(root: Path, there: Description, sensor: Sensor) -> None:
     Raises:
         ConfigError: if the grids differ.
     """
-    if there.sensor is not None and not same_grid(sensor, there.sensor):
+    if there.sensor is not None and not sensor.same_grid(there.sensor):
         raise ConfigError(
             f"a scan of {_named(sensor)} for {root}, which holds scans of {_named(there.sensor)}",
             "scans on one grid in one folder",

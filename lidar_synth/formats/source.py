@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 from lidar_synth.errors import ConfigError, DataError, FileError, suggest
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.formats.description import FORMAT, NAME, read_description, same_grid
+from lidar_synth.formats.description import FORMAT, NAME, read_description
 from lidar_synth.formats.points import bad_points_kept, drop_bad_points
 from lidar_synth.geometry.agreement import MOST_OUTSIDE, agreement
 from lidar_synth.geometry.scan import Scan
@@ -93,7 +93,7 @@ class ScanFiles(ABC):
         named = stored if self.description is None else self.description.sensor
         self._given = None if sensor is None else load_sensor(sensor)
         self.sensor = self._given or named or load_sensor(self.default_sensor)
-        if named is not None and not same_grid(self.sensor, named):
+        if named is not None and not named.same_grid(self.sensor):
             warnings.warn(
                 f"{root} says that its scans are of sensor {named.name!r}; they are read as those "
                 f"of {self.sensor.name!r}, which was given",

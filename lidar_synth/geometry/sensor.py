@@ -295,6 +295,14 @@ class Sensor:
         )
         return seen - heights / typical, heights
 
+    def same_grid(self, other: "Sensor") -> bool:
+        """Whether another sensor has the same rows and columns, whatever their names, beams and
+        range limits."""
+        return self is other or (
+            self.shape == other.shape
+            and bool(np.allclose(self.edges, other.edges, rtol=0, atol=1e-5))
+        )
+
     def same_lasers(self, other: "Sensor") -> bool:
         """Whether another sensor has the same lasers, within 0.1 degrees and 1 cm. Rows, columns and
         limits may differ: ``hdl64e_lasers`` and ``hdl64e_semantic_kitti`` are one device on two

@@ -2,7 +2,7 @@
 scans, by task.
 
 Segmentation: synthetic scans first, then half of each batch, where labelled scans are few and of
-the synthetic scans' sensor; otherwise synthetic scans for a quarter of the epochs, then real scans
+the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then real scans
 alone, which gained less there but showed no loss on the street of the labels (docs/research/proof.md).
 Detection: synthetic scans first, then half, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).

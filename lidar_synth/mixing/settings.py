@@ -15,7 +15,6 @@ from lidar_synth.errors import ConfigError, choose, suggest
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.as_sensor import read_transfer
-from lidar_synth.formats.description import same_grid
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.policies import Labels
@@ -120,7 +119,7 @@ def mix(
         task: "segmentation", or "detection", which needs ``epochs``, takes boxes as labels, and
             pastes objects of the real scans into all scans, which it turns, mirrors and scales.
         epochs: of the training. With it the recipe that gained on real scans is the default. With
-            up to 40 real scans of the synthetic scans' sensor: synthetic scans alone in three
+            up to 40 real scans of the synthetic scans' lasers: synthetic scans alone in three
             quarters of the epochs, then half, at a quarter of the learning rate. Otherwise:
             synthetic scans alone in a quarter of the epochs, then real ones alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
@@ -144,7 +143,7 @@ def mix(
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
     if as_sensor == "auto":
-        alike = _agree(same_grid, reals, synthetics)
+        alike = _agree(Sensor.same_grid, reals, synthetics)
         as_sensor = None if alike else sensor_of(each(reals)[0][0])
     as_sensor = read_transfer(as_sensor, synthetics)
     choose("task", task, dict.fromkeys(TASKS))

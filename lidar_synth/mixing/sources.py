@@ -130,9 +130,7 @@ def check_together(
         for source, wanted in zip(sources, as_sensors, strict=True)
     ]
     for sensor in sensors[1:]:
-        if sensor.shape != sensors[0].shape or not np.array_equal(
-            sensor.edges, sensors[0].edges
-        ):
+        if not sensor.same_grid(sensors[0]):
             raise ConfigError(
                 f"sources of the sensors {sensors[0].grid_text()} and {sensor.grid_text()}",
                 "one grid for all real and synthetic scans",

@@ -137,8 +137,8 @@ class Transfer:
         ):
             return None
         distance = np.linalg.norm(scan.points, axis=1)
-        nearest, farthest = self.target.range_min, self.target.range_max
-        inside = (distance >= nearest) & (distance <= farthest)
+        limits = self.target.range_min, self.target.range_max
+        inside = np.clip(distance, *limits) == distance
         if not inside.any() or not np.isfinite(distance).all():
             return None
         kept = scan[inside]

@@ -15,7 +15,6 @@ from lidar_synth.bake.estimate import estimate
 from lidar_synth.errors import ConfigError, DataError, choose
 from lidar_synth.files.claims import claim, hold_writing
 from lidar_synth.files.disk import write_file
-from lidar_synth.formats.description import same_grid
 from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model
 from lidar_synth.geometry.sensor import Sensor, presets, sensor_yaml
@@ -130,7 +129,7 @@ class StartPlan:
             settings["epoch_size"] = 100
         settings = {"synthetic": str(self.synthetic), **settings, "seed": 0}
         sensor = self.found.source.sensor
-        if not self.cast and not same_grid(_model_sensor(), sensor):
+        if not self.cast and not sensor.same_grid(_model_sensor()):
             settings["as_sensor"] = self.sensor_name()
         return settings
 
