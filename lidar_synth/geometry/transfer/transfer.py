@@ -58,8 +58,8 @@ class Transfer:
     interpolated; the ring is the target's laser. Boxes, pose and the rest move to the target's
     frame.
 
-    A scan of a sensor with the target's lasers, in the same place, keeps its returns: a network
-    learns less from cast ones (docs/research/transfer.md).
+    A scan of a sensor with the target's lasers, in the same place, keeps its returns: rays cast at
+    its own surfaces add nothing (docs/research/transfer.md).
 
     Args:
         target: the sensor to imitate: its lasers, firings, limits and quantisation.
