@@ -177,6 +177,7 @@ def test_a_scan_of_the_same_lasers_keeps_its_returns(scan: Scan) -> None:
     near = np.linalg.norm(scan.points, axis=1) <= 20
     assert 0 < near.sum() < len(scan) and found.sensor == target and seen == 1.0
     assert np.array_equal(found.points, scan.points[near])
+    assert np.array_equal(Transfer(target)(given).points, found.points)
     assert np.array_equal(found.label, scan.label[near])
     assert set(np.unique(found.reflectance * 4)) <= {0, 1, 2, 3}
     found.points[:] = 0
