@@ -75,7 +75,8 @@ def compare(
             pools=pools,
             tests=tests,
         )
-        share(folder / "starts", starts)
+        if shared:
+            share(folder / "starts", starts)
         for row in proof.values["arms"]:
             scores.setdefault(row["key"], {}).update(row["miou_by_place"])
     return scores
