@@ -22,7 +22,7 @@ from lidar_synth.lab.evaluate.segmentation import (
     mean_iou,
 )
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
-from lidar_synth.lab.train.segmentation import train_segmenter
+from lidar_synth.lab.train.segmentation import balanced_cross_entropy, train_segmenter
 
 HEIGHT = torch.linspace(0.05, -0.4, 16)[:, None].expand(16, 32)
 
@@ -56,6 +56,21 @@ def test_the_segmenter_learns_as_its_confusion_matrix_shows() -> None:
     assert np.mean(losses[-5:]) < 0.5 * losses[0]
     assert table.sum() == 4 * 2 * 16 * 24, "ignored cells are counted"
     assert mean_iou(table) > max(0.8, untrained)
+
+
+def test_a_rare_class_counts_by_the_square_root_of_its_share() -> None:
+    target = torch.full((1, 4, 25), 8)
+    target[0, 0, :4] = 7
+    target[0, 3] = IGNORE
+    logits = torch.zeros(1, 19, 4, 25)
+    logits[:, 8] = 3.0
+    rare, common = (-logits.log_softmax(1)[0, c, 0, 0] for c in (7, 8))
+    parts = torch.tensor([4.0, 71.0])
+    weights = (parts / 75 + 1e-4) ** -0.5 * parts
+    expected = (weights[0] * rare + weights[1] * common) / weights.sum()
+    loss = balanced_cross_entropy(logits, target)
+    torch.testing.assert_close(loss, expected)
+    assert loss > (4 * rare + 71 * common) / 75, "as if every cell counted alike"
 
 
 def test_ious_by_hand() -> None:

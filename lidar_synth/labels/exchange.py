@@ -16,7 +16,7 @@ from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import find_overlapping
 from lidar_synth.labels.ground import standing
-from lidar_synth.labels.merge import merge_scans, same_lasers
+from lidar_synth.labels.merge import merge_scans
 from lidar_synth.labels.objects import enlarge_boxes
 from lidar_synth.labels.view import refuse_coarser
 
@@ -31,7 +31,7 @@ def thin_scan(scan: Scan, sensor: Sensor) -> Scan:
     """
     refuse_coarser(scan.sensor, sensor)
     point = locate(scan.points, sensor).point
-    ring = scan.ring if same_lasers(scan.sensor, sensor) else None
+    ring = scan.ring if sensor.same_lasers(scan.sensor) else None
     return replace(replace(scan, ring=ring)[np.sort(point[point >= 0])], sensor=sensor)
 
 

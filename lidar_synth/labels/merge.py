@@ -50,15 +50,10 @@ def merge_scans(scan: Scan, others: Sequence[Scan]) -> Scan:
     )
 
 
-def same_lasers(one: Sensor, other: Sensor) -> bool:
-    """Whether ring numbers of one sensor are those of another."""
-    return np.array_equal(one.optics(), other.optics())
-
-
 def _with_rings(part: Scan, sensor: Sensor) -> Scan:
     """The scan with the rings of a sensor: its own if they are of the same lasers, else the
     nearest."""
-    if part.ring is not None and same_lasers(part.sensor, sensor):
+    if part.ring is not None and sensor.same_lasers(part.sensor):
         return part
     return replace(part, ring=assign_beams(part, sensor).ring)
 

@@ -6,7 +6,8 @@ another network. For docs/research/proof.md.
 The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
 and its interval, and adds the scores to OUT/scores.json. ``--polar`` takes polar_network.py
-instead of the range-view segmenter. Call it with other ``--labelled`` for the curve OUT/gain.png.
+instead of the range-view segmenter. Call it with other ``--labelled``, ``--synthetic``,
+``--iterations`` or ``--columns`` for the curves in OUT/gain.png.
 """
 
 import json
@@ -23,6 +24,13 @@ from typer import run
 from lidar_synth import ProofSettings, prove
 from lidar_synth.lab.proof import Trainer, reference
 from lidar_synth.lab.proof.scores import interval
+
+AXES = {
+    "labelled": "labelled frames",
+    "synthetic": "generated scans",
+    "iterations": "iterations of 4",
+}
+"""Settings with a curve, and what they count."""
 
 
 def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
@@ -82,24 +90,43 @@ def compare(
     return scores
 
 
-def draw(scores: dict[int, dict[str, dict[str, float]]], path: Path) -> None:
-    """A curve for each arm: the mean over the places, by the number of labelled frames."""
-    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
-    counts = sorted(scores)
-    for arm, title, colour in (
-        ("pretrain-generator", "generated scans first", "#1f6feb"),
-        ("real", "real scans only", "#7a8494"),
-    ):
-        means = [np.mean([*scores[count][arm].values()]) for count in counts]
-        axes.plot(counts, means, "o-", color=colour, label=title)
-    axes.set(
-        xlabel="labelled frames", ylabel="mean IoU, %", xscale="log", ylim=(0, None)
+def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) -> None:
+    """Curves of the mean over the places: each by one setting, the others as in ``base``."""
+    curves = {}
+    for name in AXES:
+        found = {r[name]: r["arms"] for r in records if not differing(r, base) - {name}}
+        if len(found) > 1:
+            curves[name] = found
+    if not curves:
+        return
+    figure, all_axes = plt.subplots(
+        1,
+        len(curves),
+        figsize=(1.5 + 3.2 * len(curves), 3.4),
+        layout="constrained",
+        sharey=True,
+        squeeze=False,
     )
-    axes.set_xticks(counts, counts)
-    axes.minorticks_off()
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower right", frameon=False)
+    for axes, (name, found) in zip(all_axes[0], curves.items(), strict=True):
+        counts = sorted(found)
+        for arm, title, colour in (
+            ("pretrain-generator", "generated scans first", "#1f6feb"),
+            ("real", "real scans only", "#7a8494"),
+        ):
+            means = [np.mean([*found[count][arm].values()]) for count in counts]
+            axes.plot(counts, means, "o-", color=colour, label=title)
+        axes.set(xlabel=AXES[name], xscale="log", ylim=(0, None))
+        axes.set_xticks(counts, counts)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    all_axes[0, 0].set_ylabel("mean IoU, %")
+    all_axes[0, -1].legend(loc="lower right", frameon=False)
     figure.savefig(path, dpi=150)
+
+
+def differing(record: dict[str, Any], base: dict[str, Any]) -> set[str]:
+    """The settings in which a record is not the base."""
+    return {name for name, value in base.items() if record[name] != value}
 
 
 def main(
@@ -108,7 +135,7 @@ def main(
     beams: int | None = None,
     polar: bool = False,
     labelled: int = 4,
-    iterations: int = 300,
+    iterations: int = 500,
     synthetic: int = 48,
     seeds: int = 1,
     columns: int = 256,
@@ -123,13 +150,21 @@ def main(
         columns=columns,
         beams=beams,
     )
-    group = f"{beams or 'all'}-{'polar' if polar else 'range'}-{iterations}"
+    setting = {
+        "beams": beams,
+        "network": "polar" if polar else "range",
+        "labelled": labelled,
+        "iterations": iterations,
+        "synthetic": synthetic,
+        "columns": columns,
+    }
+    pool = f"{beams or 'all'}-{synthetic}-{columns}"
     scores = compare(
         halves(root, out),
         out,
-        group,
+        f"{pool}-{setting['network']}-{iterations}",
         settings,
-        out / f"pools-{beams or 'all'}",
+        out / f"pools-{pool}",
         learn if polar else reference,
     )
     places = sorted(scores["real"])
@@ -139,14 +174,19 @@ def main(
         f"{p} {g:+.1f}" for p, g in zip(places, first - real, strict=True)
     )
     print(
-        f"{group}, {labelled} labelled, {seeds} seeds: real {real.mean():.1f}, generated first "
+        f"{setting}, {seeds} seeds: real {real.mean():.1f}, generated first "
         f"{first.mean():.1f}, gain {(first - real).mean():+.1f} ({low:.1f} to {high:.1f}); {gains}"
     )
     path = out / "scores.json"
-    kept = json.loads(path.read_text()) if path.is_file() else {}
-    kept.setdefault(group, {})[str(labelled)] = {"seeds": seeds, **scores}
-    path.write_text(json.dumps(kept, indent=1) + "\n")
-    draw({int(count): s for count, s in kept[group].items()}, out / "gain.png")
+    kept = json.loads(path.read_text()) if path.is_file() else []
+    records = [r for r in kept if differing(r, setting)]
+    records.append(setting | {"seeds": seeds, "arms": scores})
+    path.write_text(json.dumps(records, indent=1) + "\n")
+    draw(
+        records,
+        setting | {"labelled": 4, "synthetic": 48, "iterations": 500},
+        out / "gain.png",
+    )
 
 
 if __name__ == "__main__":

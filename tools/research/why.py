@@ -1,6 +1,6 @@
 """Why synthetic scans first help or harm, one change at a time. For docs/research/proof.md.
 
-    python tools/research/why.py LABELLED OUT ARM... [--on pandaset] [--match]
+    python tools/research/why.py LABELLED OUT ARM... [--on pandaset] [--match] [--model town]
 
 LABELLED has semantic_kitti and PandaSet's frames (pandaset/sensor_frame/NN.npz). The places of
 SemanticKITTI are split in two halves, the street of PandaSet in two ends: trained on one, tested
@@ -92,6 +92,7 @@ def main(
     labelled: int = 4,
     iterations: int = 500,
     seeds: int = 1,
+    model: str = "town",
 ) -> None:
     """Prints the arms' figures."""
     settings = ProofSettings(
@@ -101,6 +102,7 @@ def main(
         seeds=seeds,
         synthetic=48,
         columns=256,
+        model=model,
     )
     if on == "pandaset":
         frames = sorted((labelled_scans / "pandaset" / "sensor_frame").glob("*.npz"))

@@ -22,6 +22,8 @@ from lidar_synth.mixing import MixedScans
 
 RATE = 4e-3
 """The highest learning rate."""
+RAREST = 1e-4
+"""Share of a batch's cells below which a class weighs no more than at it."""
 
 
 def endless_batches(
@@ -50,6 +52,22 @@ def endless_batches(
         yield from loader
 
 
+def balanced_cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
+    """Cross-entropy over all labelled cells; the weight of a class is one over the square root of its
+    share of the batch, so that poles and persons count beside roads.
+
+    Args:
+        logits: (B, C, H, W).
+        target: (B, H, W) int64, classes 0 to C - 1 or ``IGNORE``, at least one of them a class.
+
+    Returns:
+        A scalar.
+    """
+    counts = torch.bincount(target[target != IGNORE], minlength=logits.shape[1])
+    weight = (counts / counts.sum() + RAREST).rsqrt()
+    return F.cross_entropy(logits.float(), target, weight, ignore_index=IGNORE)
+
+
 def train_segmenter(
     network: nn.Module,
     batches: Iterable[Images],
@@ -60,7 +78,7 @@ def train_segmenter(
     half: bool = False,
     watch: Callable[[int], object] | None = None,
 ) -> list[float]:
-    """Cross-entropy over all labelled cells, AdamW, one cycle of the learning rate.
+    """``balanced_cross_entropy``, AdamW, one cycle of the learning rate.
 
     Args:
         network: a ``RangeSegmenter``, changed in place and left in evaluation mode.
@@ -99,8 +117,7 @@ def train_segmenter(
         inputs = segmenter_input(batch["range"], batch["reflectance"], height)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=half):
             logits = network(inputs)
-        target = target.to(logits.device)
-        loss = F.cross_entropy(logits.float(), target, ignore_index=IGNORE)
+        loss = balanced_cross_entropy(logits, target.to(logits.device))
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
