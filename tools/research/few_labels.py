@@ -4,10 +4,9 @@ another network. For docs/research/proof.md.
     python tools/research/few_labels.py SEMANTIC_KITTI OUT [--labelled 4] [--beams 16] [--polar]
 
 The places are split in two halves; frames of each half are trained on and the other half is
-tested, so that two trainings of an arm test every place. Prints the difference by place, its mean
-and its interval, and adds the scores to OUT/scores.json. ``--polar`` takes polar_network.py
-instead of the range-view segmenter. Call it with other ``--labelled``, ``--synthetic``,
-``--iterations`` or ``--columns`` for the curves in OUT/gain.png.
+tested, so that two trainings of an arm test every place. Prints the mean gain and its interval,
+and adds the scores by place to OUT/scores.json. ``--polar`` takes polar_network.py instead of the range-view segmenter. Call it
+with other ``--labelled`` and ``--synthetic`` for the curves in OUT/gain.png.
 """
 
 import json
@@ -23,13 +22,10 @@ from typer import run
 
 from lidar_synth import ProofSettings, prove
 from lidar_synth.lab.proof import Trainer, reference
+from lidar_synth.lab.proof.arms import ARMS
 from lidar_synth.lab.proof.scores import interval
 
-AXES = {
-    "labelled": "labelled frames",
-    "synthetic": "generated scans",
-    "iterations": "iterations of 4",
-}
+AXES = {"labelled": "labelled frames", "synthetic": "generated scans"}
 """Settings with a curve, and what they count."""
 
 
@@ -92,41 +88,27 @@ def compare(
 
 def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) -> None:
     """Curves of the mean over the places: each by one setting, the others as in ``base``."""
-    curves = {}
-    for name in AXES:
-        found = {r[name]: r["arms"] for r in records if not differing(r, base) - {name}}
-        if len(found) > 1:
-            curves[name] = found
-    if not curves:
-        return
-    figure, all_axes = plt.subplots(
-        1,
-        len(curves),
-        figsize=(1.5 + 3.2 * len(curves), 3.4),
-        layout="constrained",
-        sharey=True,
-        squeeze=False,
+    figure, both = plt.subplots(
+        1, 2, figsize=(8, 3.4), layout="constrained", sharey=True
     )
-    for axes, (name, found) in zip(all_axes[0], curves.items(), strict=True):
-        counts = sorted(found)
-        for arm, title, colour in (
-            ("pretrain-generator", "generated scans first", "#1f6feb"),
-            ("real", "real scans only", "#7a8494"),
-        ):
-            means = [np.mean([*found[count][arm].values()]) for count in counts]
-            axes.plot(counts, means, "o-", color=colour, label=title)
-        axes.set(xlabel=AXES[name], xscale="log", ylim=(0, None))
-        axes.set_xticks(counts, counts)
-        axes.minorticks_off()
-        axes.grid(alpha=0.3)
-    all_axes[0, 0].set_ylabel("mean IoU, %")
-    all_axes[0, -1].legend(loc="lower right", frameon=False)
-    figure.savefig(path, dpi=150)
+    for axes, (name, title) in zip(both, AXES.items(), strict=True):
+        fixed = {key: value for key, value in base.items() if key != name}
+        plot(axes, {r[name]: r["arms"] for r in records if fixed.items() <= r.items()})
+        axes.set_xlabel(title)
+    both[0].set(ylabel="mean IoU, %", ylim=(0, None))
+    both[1].legend(loc="lower right")
+    figure.savefig(path)
 
 
-def differing(record: dict[str, Any], base: dict[str, Any]) -> set[str]:
-    """The settings in which a record is not the base."""
-    return {name for name, value in base.items() if record[name] != value}
+def plot(axes: Any, found: dict[int, dict[str, dict[str, float]]]) -> None:
+    """A curve for each arm over the counts."""
+    counts = sorted(found)
+    for arm in ("pretrain-generator", "real"):
+        means = [np.mean([*found[count][arm].values()]) for count in counts]
+        axes.plot(counts, means, "o-", label=ARMS[arm].title)
+    axes.set_xscale("log")
+    axes.set_xticks(counts, counts)
+    axes.minorticks_off()
 
 
 def main(
@@ -138,27 +120,19 @@ def main(
     iterations: int = 500,
     synthetic: int = 48,
     seeds: int = 1,
-    columns: int = 256,
 ) -> None:
     """Trains and tests both ways."""
-    settings = ProofSettings(
-        labelled=labelled,
-        arms=("pretrain-generator",),
-        iterations=iterations,
-        seeds=seeds,
-        synthetic=synthetic,
-        columns=columns,
-        beams=beams,
-    )
-    setting = {
+    setting: dict[str, Any] = {
         "beams": beams,
-        "network": "polar" if polar else "range",
         "labelled": labelled,
         "iterations": iterations,
         "synthetic": synthetic,
-        "columns": columns,
     }
-    pool = f"{beams or 'all'}-{synthetic}-{columns}"
+    settings = ProofSettings(
+        arms=("pretrain-generator",), seeds=seeds, columns=256, **setting
+    )
+    setting["network"] = "polar" if polar else "range"
+    pool = f"{beams or 'all'}-{synthetic}"
     scores = compare(
         halves(root, out),
         out,
@@ -167,26 +141,15 @@ def main(
         out / f"pools-{pool}",
         learn if polar else reference,
     )
-    places = sorted(scores["real"])
-    real, first = (np.array([s[p] for p in places]) for s in scores.values())
-    low, high = interval((first - real)[:, None]) or (np.nan, np.nan)
-    gains = ", ".join(
-        f"{p} {g:+.1f}" for p, g in zip(places, first - real, strict=True)
-    )
-    print(
-        f"{setting}, {seeds} seeds: real {real.mean():.1f}, generated first "
-        f"{first.mean():.1f}, gain {(first - real).mean():+.1f} ({low:.1f} to {high:.1f}); {gains}"
-    )
+    real, first = scores.values()
+    gain = np.array([first[place] - real[place] for place in real])
+    low, high = interval(gain[:, None]) or (np.nan, np.nan)
+    print(f"{setting}: gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
     path = out / "scores.json"
     kept = json.loads(path.read_text()) if path.is_file() else []
-    records = [r for r in kept if differing(r, setting)]
-    records.append(setting | {"seeds": seeds, "arms": scores})
+    records = [*kept, setting | {"seeds": seeds, "arms": scores}]
     path.write_text(json.dumps(records, indent=1) + "\n")
-    draw(
-        records,
-        setting | {"labelled": 4, "synthetic": 48, "iterations": 500},
-        out / "gain.png",
-    )
+    draw(records, setting | {"labelled": 4, "synthetic": 48}, out / "gain.png")
 
 
 if __name__ == "__main__":
