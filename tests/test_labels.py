@@ -354,6 +354,13 @@ def test_a_partner_of_other_lasers_lends_no_rings() -> None:
     assert mixed.ring.max() < 64
 
 
+def test_one_device_on_two_grids_keeps_its_rings() -> None:
+    lasers = Town(1, "hdl64e_lasers", scans=1)[0]
+    thinned = thin_scan(lasers, presets()["hdl64e_semantic_kitti"])
+    assert thinned.ring is not None
+    assert set(thinned.ring) <= set(lasers.ring)
+
+
 def test_mixed_in_labels_are_certain_and_the_rest_keeps_its_own(
     synthetic: Scan, real: list[Scan]
 ) -> None:

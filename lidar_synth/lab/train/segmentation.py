@@ -23,7 +23,7 @@ from lidar_synth.mixing import MixedScans
 RATE = 4e-3
 """The highest learning rate."""
 RAREST = 1e-4
-"""Share of a batch's cells below which a class weighs no more than at it."""
+"""Added to the share of each class, so that the rarest weighs at most 100."""
 
 
 def endless_batches(
