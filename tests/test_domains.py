@@ -83,14 +83,24 @@ def test_other_weights_of_sources_are_refused(wrong: list[float]) -> None:
         Sources(SYNTHETIC, SYNTHETIC, loss_weights=wrong)
 
 
-def test_a_named_schedule_ends_on_real_scans() -> None:
-    mixed = MixedScans(REAL, SYNTHETIC, EndOnReal(8), epoch_size=8)
+@pytest.mark.parametrize(
+    ("name", "schedule", "expected"),
+    [
+        ("end_on_real", EndOnReal(8), [8] * 4 + [4] * 2 + [0] * 4),
+        ("synthetic_first", SyntheticFirst(8), [8] * 6 + [4] * 2 + [0] * 2),
+        ("synthetic_first", SyntheticFirst(20), [8] * 15 + [4] * 4 + [0] * 3),
+    ],
+)
+def test_a_named_schedule_ends_on_real_scans(
+    name: str, schedule: SyntheticFirst, expected: list[int]
+) -> None:
+    mixed = MixedScans(REAL, SYNTHETIC, schedule, epoch_size=8)
     found = []
-    for epoch in range(10):
+    for epoch in range(schedule.epochs + 2):
         mixed.set_epoch(epoch)
         found.append(sum(mixed.domain(i) for i in range(len(mixed))))
-    assert found == [8, 8, 8, 8, 4, 4, 0, 0, 0, 0]
-    assert make_schedule({"end_on_real": 8}) == EndOnReal(8)
+    assert found == expected
+    assert make_schedule({name: schedule.epochs}) == schedule
 
 
 @pytest.mark.parametrize("wrong", [{"epochs": 3}, {"epochs": 8, "share": 2}])

@@ -14,7 +14,6 @@ import torch.nn.functional as F
 import yaml
 from conftest import random_scan
 from proofs import SENSOR, Scans, drives, job
-from safetensors.torch import load_file
 from scipy import stats
 from streets import street
 
@@ -46,13 +45,7 @@ from lidar_synth.lab.proof.scores import (
     require_labels,
     t_quantile,
 )
-from lidar_synth.lab.proof.trial import (
-    pretrain,
-    pretraining_seconds,
-    reference,
-    run_trainer,
-    turn_scan,
-)
+from lidar_synth.lab.proof.trial import reference, run_trainer, turn_scan
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
@@ -172,24 +165,35 @@ def test_a_device_that_is_not_there_is_refused() -> None:
         make_plan(drives(), SMALL, None, 1, device="cuda:99")
 
 
-def test_a_shared_pretraining_changes_nothing(tmp_path: Path, one_thread: None) -> None:
-    whole = job("pretrain", tmp_path, iterations=20)
-    pretrain(whole, tmp_path / "start.safetensors")
-    assert 0 < pretraining_seconds(tmp_path / "start.safetensors") < 60
-    other = replace(whole, real=whole.real[::-1], start=tmp_path / "start.safetensors")
-    [shared] = reference(replace(other, real=whole.real)).values()
-    [once] = reference(whole).values()
-    assert np.array_equal(once.table, shared.table)
-    assert [step for step, _ in shared.curve] == [15, 18, 20]
-    pretrain(other, tmp_path / "other.safetensors")  # the labelled scans do not matter
-    assert equal(
-        load_file(tmp_path / "other.safetensors"),
-        load_file(tmp_path / "start.safetensors"),
-    )
+def test_the_learning_rate_has_one_cycle_over_all_stages(
+    tmp_path: Path, one_thread: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    cycle = torch.optim.lr_scheduler.OneCycleLR
+
+    def record(
+        *given: object, **options: object
+    ) -> torch.optim.lr_scheduler.OneCycleLR:
+        made.append(cycle(*given, **options))  # type: ignore[arg-type]
+        return made[-1]
+
+    monkeypatch.setattr(torch.optim.lr_scheduler, "OneCycleLR", record)
+    task = job("pretrain", tmp_path, iterations=20)
+    assert len(list(task.stages())) == 3
+    reference(task)
+    [schedule] = made
+    assert schedule.total_steps == 20 and schedule.last_epoch == 20
 
 
-def equal(some: dict[str, torch.Tensor], others: dict[str, torch.Tensor]) -> bool:
-    return all(torch.equal(some[name], others[name]) for name in some | others)
+def test_the_first_stage_does_not_depend_on_the_labelled_scans(
+    tmp_path: Path, one_thread: None
+) -> None:
+    task = job("pretrain", tmp_path, iterations=20)
+    other = replace(task, real=task.real[::-1])
+    [some] = reference(task).values()
+    [others] = reference(other).values()
+    assert some.losses[:7] == others.losses[:7]  # of 14 iterations
+    assert some.losses[8:] != others.losses[8:]
 
 
 def test_turning_keeps_every_return_in_a_cell() -> None:

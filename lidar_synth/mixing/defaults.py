@@ -1,10 +1,11 @@
 """What ``mix(epochs=...)`` does unless it is told otherwise: the recipe that gained most on real
 scans, by task.
 
-Segmentation: synthetic scans first, then half of each batch, where labelled scans are few and of
-the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then real scans
-alone, which gained less there but showed no loss on the street of the labels (docs/research/proof.md).
-Detection: synthetic scans first, then half, with objects of the real scans pasted into all scans
+Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, where
+labelled scans are few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter of
+the epochs, then real scans alone, which gained less there but showed no loss on the street of the
+labels (docs/research/proof.md).
+Detection: the same schedule, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).
 """
 

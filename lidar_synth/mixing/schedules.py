@@ -101,13 +101,15 @@ class Linear:
 
 @dataclass(frozen=True)
 class SyntheticFirst:
-    """Synthetic scans alone in three quarters of the epochs, then beside real ones.
+    """Synthetic scans alone in three quarters of the epochs, then beside real ones, and real scans
+    alone in the last twentieth, whose statistics batch normalisation then has.
 
     This schedule gained most where labelled scans are few (docs/research/proof.md,
     docs/research/detectors.md).
 
     Args:
-        epochs: number of epochs of the training, at least 4.
+        epochs: number of epochs of the training, at least 4; with fewer than 20 none is of real
+            scans alone: ``settle`` the network.
         share: of synthetic samples beside real ones, in [0, 1].
 
     Raises:
@@ -115,9 +117,9 @@ class SyntheticFirst:
 
     Example:
         >>> from lidar_synth.mixing import SyntheticFirst
-        >>> ratio = SyntheticFirst(epochs=8)
-        >>> [ratio(epoch) for epoch in range(8)]
-        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5]
+        >>> ratio = SyntheticFirst(epochs=40)
+        >>> [ratio(epoch) for epoch in (0, 29, 30, 37, 38, 39)]
+        [1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
     """
 
     epochs: int
@@ -131,10 +133,12 @@ class SyntheticFirst:
     @property
     def constant_from(self) -> int:
         """The epoch from which on the share is constant."""
-        return 3 * self.epochs // 4
+        return self.epochs - self.epochs // 20
 
     def __call__(self, epoch: int) -> float:
-        return 1.0 if epoch < self.constant_from else self.share
+        if epoch < 3 * self.epochs // 4:
+            return 1.0
+        return self.share if epoch < self.constant_from else 0.0
 
 
 @dataclass(frozen=True)
@@ -155,10 +159,15 @@ class EndOnReal(SyntheticFirst):
         [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
     """
 
+    @property
+    def constant_from(self) -> int:
+        """The epoch from which on the share is constant."""
+        return 3 * self.epochs // 4
+
     def __call__(self, epoch: int) -> float:
-        if epoch >= self.constant_from:
-            return 0.0
-        return 1.0 if epoch < self.epochs // 2 else self.share
+        if epoch < self.epochs // 2:
+            return 1.0
+        return self.share if epoch < self.constant_from else 0.0
 
 
 BY_NAME = {"synthetic_first": SyntheticFirst, "end_on_real": EndOnReal}

@@ -120,7 +120,7 @@ def mix(
             pastes objects of the real scans into all scans, which it turns, mirrors and scales.
         epochs: of the training. With it the recipe that gained on real scans is the default. With
             up to 40 real scans of the synthetic scans' lasers: synthetic scans alone in three
-            quarters of the epochs, then half, at a quarter of the learning rate. Otherwise:
+            quarters of the epochs, then half, real ones alone in the last twentieth. Otherwise:
             synthetic scans alone in a quarter of the epochs, then real ones alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
             is another; None leaves them as they are; otherwise as for ``MixedScans``, or
@@ -137,8 +137,8 @@ def mix(
         ...     print(sorted(batch["domain"].tolist()))
         [0, 0, 0, 1]
         >>> train = lidar_synth.mix("demo_out/town", "demo_out/bank", epochs=40)
-        >>> len(train), train.mixture.ratio(0), train.mixture.ratio(39)
-        (100, 1.0, 0.5)
+        >>> len(train), [train.mixture.ratio(epoch) for epoch in (0, 30, 39)]
+        (100, [1.0, 0.5, 0.0])
     """
     reals = _open_real(real)
     synthetics = open_synthetic(synth)

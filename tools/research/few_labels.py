@@ -1,17 +1,16 @@
 """What generated scans first add with a few labelled frames; on a sensor with fewer beams, or with
 another network. For docs/research/proof.md.
 
-    python tools/research/few_labels.py SEMANTIC_KITTI OUT [--labelled 4] [--beams 16] [--polar]
+    python tools/research/few_labels.py SEMANTIC_KITTI OUT [--labelled 4] [--exchange] [--polar]
 
 The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the mean gain and its interval,
 and adds the scores by place to OUT/scores.json. ``--polar`` takes polar_network.py instead of the
-range-view segmenter. Call it with other ``--labelled`` and ``--synthetic`` for the curves in
-OUT/gain.png.
+range-view segmenter, ``--exchange`` adds PolarMix and LaserMix. Call it with other ``--labelled``,
+``--synthetic`` and ``--iterations`` for the curves in OUT/gain.png.
 """
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,14 @@ from lidar_synth.lab.proof import Trainer, reference
 from lidar_synth.lab.proof.arms import ARMS
 from lidar_synth.lab.proof.scores import interval
 
-AXES = {"labelled": "labelled frames", "synthetic": "generated scans"}
+AXES = {
+    "labelled": "labelled frames",
+    "synthetic": "generated scans",
+    "iterations": "iterations",
+}
 """Settings with a curve, and what they count."""
+BASE = {"labelled": 4, "synthetic": 192, "iterations": 500}
+"""The point in which the curves meet."""
 
 
 def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
@@ -42,12 +47,6 @@ def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
     return [(one, other), (other, one)]
 
 
-def share(folder: Path, other: Path) -> None:
-    """Copy the networks after the synthetic scans alone: they do not depend on the labelled ones."""
-    if folder.is_dir():
-        shutil.copytree(folder, other, dirs_exist_ok=True)
-
-
 def compare(
     trials: Sequence[tuple[Any, Any]],
     out: Path,
@@ -55,7 +54,6 @@ def compare(
     settings: ProofSettings,
     pools: Path,
     trainer: Trainer = reference,
-    shared: bool = True,
 ) -> dict[str, dict[str, float]]:
     """The mIoU by arm and place.
 
@@ -63,14 +61,10 @@ def compare(
         trials: scans to train on, and those to test.
         out: folder of all trials.
         group: names those with the same settings except for the number of labelled scans.
-        shared: whether the synthetic scans are the same in all trials of the group.
     """
-    starts = out / f"starts-{group}"
     scores: dict[str, dict[str, float]] = {}
     for number, (training, tests) in enumerate(trials):
         folder = out / f"{group}-{settings.labelled}-{number}"
-        if shared:
-            share(starts, folder / "starts")
         proof = prove(
             training,
             folder,
@@ -80,8 +74,6 @@ def compare(
             pools=pools,
             tests=tests,
         )
-        if shared:
-            share(folder / "starts", starts)
         for row in proof.values["arms"]:
             scores.setdefault(row["key"], {}).update(row["miou_by_place"])
     return scores
@@ -89,15 +81,15 @@ def compare(
 
 def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) -> None:
     """Curves of the mean over the places: each by one setting, the others as in ``base``."""
-    figure, both = plt.subplots(
-        1, 2, figsize=(8, 3.4), layout="constrained", sharey=True
+    figure, panels = plt.subplots(
+        1, len(AXES), figsize=(10, 3.2), layout="constrained", sharey=True
     )
-    for axes, (name, title) in zip(both, AXES.items(), strict=True):
+    for axes, (name, title) in zip(panels, AXES.items(), strict=True):
         fixed = {key: value for key, value in base.items() if key != name}
         plot(axes, {r[name]: r["arms"] for r in records if fixed.items() <= r.items()})
         axes.set_xlabel(title)
-    both[0].set(ylabel="mean IoU, %", ylim=(0, None))
-    both[1].legend(loc="lower right")
+    panels[0].set(ylabel="mean IoU, %", ylim=(0, None))
+    panels[0].legend(loc="lower right")
     figure.savefig(path)
 
 
@@ -117,10 +109,12 @@ def main(
     out: Path,
     beams: int | None = None,
     polar: bool = False,
+    exchange: bool = False,
     labelled: int = 4,
     iterations: int = 500,
-    synthetic: int = 48,
-    seeds: int = 1,
+    synthetic: int = 192,
+    columns: int = 256,
+    seeds: int = 2,
 ) -> None:
     """Trains and tests both ways."""
     setting: dict[str, Any] = {
@@ -128,12 +122,12 @@ def main(
         "labelled": labelled,
         "iterations": iterations,
         "synthetic": synthetic,
+        "columns": columns,
     }
-    settings = ProofSettings(
-        arms=("pretrain-generator",), seeds=seeds, columns=256, **setting
-    )
+    arms = ("pretrain-generator", *["exchange"] * exchange)
+    settings = ProofSettings(arms=arms, seeds=seeds, **setting)
     setting["network"] = "polar" if polar else "range"
-    pool = f"{beams or 'all'}-{synthetic}"
+    pool = f"{beams or 'all'}-{synthetic}-{columns}"
     scores = compare(
         halves(root, out),
         out,
@@ -142,15 +136,16 @@ def main(
         out / f"pools-{pool}",
         learn if polar else reference,
     )
-    real, first = scores.values()
-    gain = np.array([first[place] - real[place] for place in real])
-    low, high = interval(gain[:, None]) or (np.nan, np.nan)
-    print(f"{setting}: gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
+    for arm, found in scores.items():
+        gain = np.array([found[place] - scores["real"][place] for place in found])
+        low, high = interval(gain[:, None]) or (np.nan, np.nan)
+        mean = np.mean([*found.values()])
+        print(f"{arm}: {mean:.1f}, gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
     path = out / "scores.json"
     kept = json.loads(path.read_text()) if path.is_file() else []
     records = [*kept, setting | {"seeds": seeds, "arms": scores}]
     path.write_text(json.dumps(records, indent=1) + "\n")
-    draw(records, setting | {"labelled": 4, "synthetic": 48}, out / "gain.png")
+    draw(records, setting | BASE, out / "gain.png")
 
 
 if __name__ == "__main__":

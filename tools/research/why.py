@@ -24,7 +24,7 @@ from typer import run
 
 from lidar_synth import ProofSettings, Scan, load_generator
 from lidar_synth.geometry.transfer import Response, Transfer
-from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage
+from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage, synthetic_first
 from lidar_synth.lab.proof.pools import FRAMES, POOLS, PoolTask, town_scans
 from lidar_synth.lab.proof.trial import Job, TrialOutcome, reference
 from lidar_synth.lab.town import STRETCH_FRAMES, Town, load_skin
@@ -60,10 +60,7 @@ for name, make in TOWNS.items():
     POOLS[name] = make
     ARMS[name] = Arm(
         f"the town ({name}) first, then half",
-        lambda ratio, name=name: (
-            ArmStage(0.75, 1, name),
-            ArmStage(0.25, 0.5, name, rate=0.25),
-        ),
+        lambda ratio, name=name: synthetic_first(name),
     )
 ARMS["half"] = Arm(
     "generated scans for half, then real scans alone",
@@ -117,7 +114,6 @@ def main(
         settings,
         out / f"pools-{on}",
         learn_matched if match else reference,
-        shared=not match,
     )
     for key, values in scores.items():
         places = ", ".join(f"{place} {value:.1f}" for place, value in values.items())

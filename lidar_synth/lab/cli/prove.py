@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import typer
 
 _ARMS = (
-    "a training to compare, repeatable: real | longer | staged | exchange | town | skin | "
-    "generator | pretrain | pretrain-skin | pretrain-generator | pretrain-generator-real | "
+    "a training to compare, repeatable: real | longer | exchange | town | skin | "
+    "generator | pretrain | pretrain-skin | pretrain-generator | "
     "pretrain-learnt | quarter | quarter-town | paste [exchange, pretrain-generator, quarter]; of "
     "detectors: real | gt_sampling | objects | half | first | quarter | recipe | town"
 )

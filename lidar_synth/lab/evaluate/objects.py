@@ -83,8 +83,9 @@ def crop(found: Object, place: str) -> Crop:
     count = len(points)
     heights = np.histogram(np.clip(height, 0, 2.49), HEIGHTS)[0] / count
     depths = np.histogram(depth, DEPTHS)[0] / count
-    column = np.clip((across - first) / max(width, 1e-3) * ACROSS, 0, ACROSS - 1)
-    profile = [_median(depth[column.astype(int) == i]) for i in range(ACROSS)]
+    position = (across - first) / max(width, 1e-3) * ACROSS
+    column = np.clip(position, 0, ACROSS - 1).astype(int)
+    profile = [_median(depth[column == i]) for i in range(ACROSS)]
     roof = float(np.mean(upright > 0.8))
     side = float(np.mean(upright < 0.3))
     quantiles = np.log(np.quantile(off, (0.25, 0.5, 0.75, 0.9)) + 1e-3)
@@ -129,8 +130,9 @@ def crops(scans: Source, name: str, placed: bool = True) -> list[Crop]:
     for index in range(len(scans)):
         scan = scans[index]
         place = scan.id.rpartition("/")[0] if placed else ""
-        own = [one for one in _objects(scan) if _label(one) == CLASSES[name]]
-        found += [crop(one, place) for one in own]
+        for one in _objects(scan):
+            if _label(one) == CLASSES[name]:
+                found.append(crop(one, place))
     return found
 
 
@@ -154,8 +156,9 @@ def match(real: Sequence[Crop], fake: Sequence[Crop]) -> list[tuple[Crop, Crop]]
     """
     if not real or not fake:
         return []
-    keys = [_seen(side) for side in (real, fake)]
-    pairs = KDTree(keys[0]).sparse_distance_matrix(KDTree(keys[1]), 1.0, p=np.inf)
+    own = KDTree(_seen(real))
+    other = KDTree(_seen(fake))
+    pairs = own.sparse_distance_matrix(other, 1.0, p=np.inf)
     rows = np.array([(d, i, j) for (i, j), d in pairs.items()]).reshape(-1, 3)
     used: tuple[set[int], set[int]] = (set(), set())
     matched = []

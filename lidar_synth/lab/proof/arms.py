@@ -2,18 +2,21 @@
 own.
 
 All arms have the same network, batch size, augmentation and optimiser, and the same number of
-iterations, except where an arm's ``iterations`` says so. Each stage has one cycle of the learning
-rate. To add an arm, enter it in ``ARMS``.
+iterations, except where an arm's ``iterations`` says so. The learning rate has one cycle over all
+stages, as in a trainer that knows nothing of them. To add an arm, enter it in ``ARMS``.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
+from lidar_synth.mixing.defaults import quarter_of
+from lidar_synth.mixing.schedules import Schedule, SyntheticFirst, make_schedule
 
 REAL = "real"
 """The name of the labelled scans themselves, where a stage takes them in the place of synthetic
@@ -31,7 +34,6 @@ class ArmStage:
         labels: their label policy.
         options: of the policy. ``objects: True`` stands for the pasted objects of the pool
             ``skin``.
-        rate: the highest learning rate, as a share of the trainer's own.
     """
 
     share: float = 1.0
@@ -39,7 +41,6 @@ class ArmStage:
     pool: str = ""
     labels: str = "generated"
     options: Mapping[str, Any] = field(default_factory=dict)
-    rate: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,11 @@ class Arm:
 
     def pools(self) -> set[str]:
         """Names of the pools whose scans or objects it needs."""
-        found = {stage.pool for stage in self.stages(0.5)} - {"", REAL}
-        return found | (
-            {"skin"}
-            if any("bank" in stage.options for stage in self.stages(0.5))
-            else set()
-        )
+        stages = self.stages(0.5)
+        found = {stage.pool for stage in stages} - {"", REAL}
+        if any("bank" in stage.options for stage in stages):
+            found.add("skin")
+        return found
 
 
 _RARE = {"bank": True, "turn": 180.0}
@@ -81,21 +81,27 @@ _TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
 GENERATOR_BUDGET = "what the generator was trained on"
 _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
 
-PRETRAINING = 0.75
-"""Share of the iterations on synthetic scans alone, in the arms that begin with them."""
+EPOCHS = 40
+"""Epochs that the stages of a schedule are a part of."""
 
 
-def _then_real(pool: str, *ratios: float) -> tuple[ArmStage, ...]:
-    """Synthetic scans first, then equal parts with these shares of them, at a lower learning
-    rate."""
-    share = (1 - PRETRAINING) / len(ratios)
-    later = [ArmStage(share, ratio, pool, rate=0.25) for ratio in ratios]
-    return ArmStage(PRETRAINING, 1, pool), *later
+def _stages(pool: str, schedule: Schedule) -> tuple[ArmStage, ...]:
+    """The stages of a training of ``EPOCHS`` epochs, as ``mix`` has them."""
+    stages = []
+    for ratio, epochs in groupby(range(EPOCHS), schedule):
+        share = len(list(epochs)) / EPOCHS
+        stages.append(ArmStage(share, ratio, pool if ratio else ""))
+    return tuple(stages)
+
+
+def synthetic_first(pool: str) -> tuple[ArmStage, ...]:
+    """Synthetic scans first, then half, real ones at the end."""
+    return _stages(pool, SyntheticFirst(EPOCHS))
 
 
 def _quarter(pool: str) -> tuple[ArmStage, ...]:
-    """Synthetic scans for a quarter, then real scans alone."""
-    return ArmStage(0.25, 1, pool), ArmStage(0.75)
+    """Synthetic scans for a quarter, then real ones alone."""
+    return _stages(pool, make_schedule(quarter_of(EPOCHS)))
 
 
 ARMS: dict[str, Arm] = {
@@ -104,11 +110,6 @@ ARMS: dict[str, Arm] = {
         "real scans only, twice as long",
         lambda ratio: (ArmStage(),),
         iterations=2,
-        synthetic=False,
-    ),
-    "staged": Arm(
-        "real scans only, the last quarter at a quarter of the rate",
-        lambda ratio: (ArmStage(PRETRAINING), ArmStage(1 - PRETRAINING, rate=0.25)),
         synthetic=False,
     ),
     "exchange": Arm(
@@ -136,22 +137,17 @@ ARMS: dict[str, Arm] = {
     ),
     "pretrain": Arm(
         "the town first, then half your scans",
-        lambda ratio: _then_real("town", 0.5),
+        lambda ratio: synthetic_first("town"),
         budget=_TOWN,
     ),
     "pretrain-skin": Arm(
         "the town in your skin first, then half your scans",
-        lambda ratio: _then_real("skin", 0.5),
+        lambda ratio: synthetic_first("skin"),
         budget=_SKIN,
     ),
     "pretrain-generator": Arm(
         "generated scans first, then half your scans",
-        lambda ratio: _then_real("generator", 0.5),
-        budget=GENERATOR_BUDGET,
-    ),
-    "pretrain-generator-real": Arm(
-        "generated scans first, then half your scans, then your scans alone",
-        lambda ratio: _then_real("generator", 0.5, 0),
+        lambda ratio: synthetic_first("generator"),
         budget=GENERATOR_BUDGET,
     ),
     "quarter": Arm(
@@ -166,7 +162,7 @@ ARMS: dict[str, Arm] = {
     ),
     "pretrain-learnt": Arm(
         "the scans that the generator learnt from first, then half your scans",
-        lambda ratio: _then_real("learnt", 0.5),
+        lambda ratio: synthetic_first("learnt"),
         budget=GENERATOR_BUDGET,
     ),
     "paste": Arm(
@@ -215,13 +211,6 @@ class Row:
     def stages(self) -> tuple[ArmStage, ...]:
         """The stages of the training."""
         return self.arm.stages(0.5 if self.ratio is None else self.ratio)
-
-    @property
-    def pretraining(self) -> ArmStage | None:
-        """The first of several stages if it has no real scan, so that all labelled scans can share
-        it."""
-        first, *later = self.stages()
-        return first if later and first.ratio == 1 else None
 
 
 def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:

@@ -30,12 +30,6 @@ def estimate_minutes(plan: ProofPlan, pairs: Sequence[Pair]) -> float:
     settings = plan.settings
     pools = {pool for row in plan.rows for pool in row.arm.pools()}
     seconds = sum(map(plan.seconds, plan.rows)) * len(plan.trainings(pairs))
-    for row in plan.rows:
-        if (stage := row.pretraining) is not None:
-            starts = (
-                len(pairs) if stage.pool == "skin" else len({seed for _, seed in pairs})
-            )
-            seconds += starts * stage.share * settings.iterations * plan.step
     seconds *= OVERHEAD
     town = settings.synthetic * TOWN_SECONDS
     if "skin" in pools:

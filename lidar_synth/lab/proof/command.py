@@ -119,7 +119,6 @@ def _describe_stage(job: Job, stage: ArmStage, iterations: int) -> dict[str, Any
         if not stage.ratio or folder is None
         else str(folder.resolve()),
         "labels": {stage.labels: options} if options else stage.labels,
-        "rate": stage.rate,
     }
 
 

@@ -21,7 +21,7 @@ from lidar_synth.lab.spread import spread
 Pair = tuple[str, int]
 """The place that is left out, and the seed."""
 
-FORMAT = "lidar-synth-proof/3"
+FORMAT = "lidar-synth-proof/4"
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,8 @@ class ProofPlan:
         return list(served.values())
 
     def seconds(self, row: Row) -> float:
-        """Expected seconds of the iterations of a training, without a pretraining that it shares
-        with others."""
-        shared = row.pretraining.share if row.pretraining and self.step else 0
-        return self.settings.iterations * row.arm.iterations * (1 - shared) * self.step
+        """Expected seconds of the iterations of a training."""
+        return self.settings.iterations * row.arm.iterations * self.step
 
     def identity(self) -> dict[str, Any]:
         """Plain values that determine every training, to tell whether one that exists may be

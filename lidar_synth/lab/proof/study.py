@@ -45,8 +45,6 @@ from lidar_synth.lab.proof.trial import (
     Job,
     Trainer,
     TrialOutcome,
-    pretrain,
-    pretraining_seconds,
     reference,
     run_trainer,
 )
@@ -57,7 +55,6 @@ STUDY = "study.json"
 GENERATOR = "generator.json"
 RUNS = "runs"
 POOLS = "pools"
-STARTS = "starts"
 JOBS = "jobs"
 PAGE = "index.html"
 RESULTS = "results.json"
@@ -104,26 +101,6 @@ class Trainings:
         number = sorted(self.plan.places).index(place)
         return self.pools / (f"skin-{number:03d}" if own else kind)
 
-    def start(self, row: Row, pair: Pair) -> Path | None:
-        """The file of the reference network after the row's pretraining, which all places of a seed
-        share."""
-        stage, (place, seed) = row.pretraining, pair
-        if stage is None or self.trainer is not reference:
-            return None
-        return (
-            self.out
-            / STARTS
-            / f"{row.key}-{self.pool_folder(stage.pool, place).name}-{seed}.safetensors"
-        )
-
-    def pretrain(self, task: Task) -> None:
-        """Write the file of ``start``."""
-        row, pairs = task
-        path = self.start(row, pairs[0])
-        assert path is not None
-        with _one_thread():
-            pretrain(self._job(row, pairs), path)
-
     def __call__(self, task: Task) -> bool:
         """Train and write the outcomes, unless the time is over; returns whether it did."""
         row, pairs = task
@@ -159,7 +136,6 @@ class Trainings:
             half=plan.half,
             folder=self.out / JOBS / row.key / self.path(row, pairs[0]).stem,
             pool_folders=folders,
-            start=self.start(row, pairs[0]),
             device=plan.device,
         )
 
@@ -278,7 +254,6 @@ def prove(
         for row in plan.rows
         if not all(_is_there(work.path(row, pair), read_outcome) for pair in pairs)
     ]
-    _pretrain(work, tasks, progress)
     _run_all(work, tasks, jobs, "trainings", progress)
     return report(work, named, seen)
 
@@ -405,19 +380,6 @@ def _make_pools(work: Trainings, source: Source, progress: bool) -> None:
     )
 
 
-def _pretrain(work: Trainings, tasks: Sequence[Task], progress: bool) -> None:
-    """Make the pretrained networks that the trainings begin with."""
-    needed = {
-        path: (row, pairs)
-        for row, pairs in tasks
-        if (path := work.start(row, pairs[0])) is not None
-        and not _is_there(path, pretraining_seconds)
-    }
-    _run_all(
-        work.pretrain, list(needed.values()), work.plan.jobs, "pretraining", progress
-    )
-
-
 def _run_all(
     work: Callable[[Any], object],
     tasks: Sequence[Any],
@@ -448,18 +410,9 @@ def _scans(source: Source, indices: Sequence[int], beams: int | None) -> list[Sc
 
 
 def _preparation(work: Trainings, row: Row) -> float:
-    """Seconds that the pools and the pretraining of an arm took; the mean over places for skins."""
+    """Seconds that the pools of an arm took; the mean over places for skins."""
     total = 0.0
     for kind in row.arm.pools():
         folders = {work.pool_folder(kind, place) for place, _ in work.plan.pairs}
         total += float(np.mean([seconds_of(folder) for folder in folders]))
-    starts = {
-        path
-        for pair in work.plan.pairs
-        if (path := work.start(row, pair)) is not None and path.is_file()
-    }
-    return total + (
-        float(np.mean([pretraining_seconds(path) for path in starts]))
-        if starts
-        else 0.0
-    )
+    return total

@@ -14,21 +14,17 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import DataError
-from lidar_synth.files.disk import write_file
-from lidar_synth.generate.checkpoint import weights_hash
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.segmentation import Images, confusion
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
-from lidar_synth.lab.train.segmentation import RATE, endless_batches, train_segmenter
+from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.augment import mirror_scan, rotate_scan
 from lidar_synth.mixing import MixedScans, settle
@@ -39,7 +35,6 @@ SETTLING = 16
 SETTLING_LOOK = 4
 """Batches of real scans over which the statistics of the normalisation are taken, after a training
 and during it."""
-SECONDS = "seconds"
 
 
 @dataclass(frozen=True)
@@ -59,7 +54,6 @@ class Job:
         half: whether the reference network computes in bfloat16.
         folder: where a trainer may write files.
         pool_folders: {name: folder} of the pools, in SemanticKITTI's layout.
-        start: the reference network after the first stage, if ``pretrain`` has written it.
         device: on which the reference network computes.
     """
 
@@ -75,7 +69,6 @@ class Job:
     half: bool
     folder: Path
     pool_folders: dict[str, Path] = field(default_factory=dict)
-    start: Path | None = None
     device: str = "cpu"
 
     @property
@@ -214,7 +207,6 @@ def reference(job: Job) -> dict[str, TrialOutcome]:
         job.iterations
     }
     curve: list[tuple[int, Tables]] = []
-    losses: list[float] = []
 
     def test(batches: int) -> Tables:
         settled = _settled(network, job, height, batches)
@@ -224,19 +216,18 @@ def reference(job: Job) -> dict[str, TrialOutcome]:
         }
 
     def watch(step: int) -> None:
-        if done + step in looks:
-            curve.append((done + step, test(SETTLING_LOOK)))
+        if step in looks:
+            curve.append((step, test(SETTLING_LOOK)))
 
-    done = 0
-    for (stage, count), (mixed, _) in zip(
-        job.stages(), job.mixtures(collate="range"), strict=True
-    ):
-        if job.start is not None and not done:
-            network.load_state_dict(load_file(job.start))
-            curve.append((count, test(SETTLING_LOOK)))
-        else:
-            losses += _learn(network, job, stage, mixed, count, height, watch)
-        done += count
+    losses = train_segmenter(
+        network,
+        _batches(job),
+        height,
+        job.iterations,
+        progress=False,
+        half=job.half,
+        watch=watch,
+    )
     curve.append((job.iterations, test(SETTLING)))
     parts = [float(np.mean(part)) for part in np.array_split(losses, 10) if len(part)]
     outcomes = {}
@@ -246,41 +237,10 @@ def reference(job: Job) -> dict[str, TrialOutcome]:
     return outcomes
 
 
-def pretrain(job: Job, path: Path) -> None:
-    """Write the reference network after a job's first stage, which has no real scan, and the
-    seconds that it took.
-
-    Raises:
-        FileError: if it cannot be written.
-    """
-    start = time.monotonic()
-    network, height = _fresh(job)
-    stage, count = next(job.stages())
-    mixed, _ = next(job.mixtures(collate="range"))
-    _learn(network, job, stage, mixed, count, height)
-    state = {n: value.cpu().contiguous() for n, value in network.state_dict().items()}
-    facts = {SECONDS: str(time.monotonic() - start), "weights": weights_hash(state)}
-    write_file(path, save(state, facts))
-
-
-def pretraining_seconds(path: Path) -> float:
-    """How long ``pretrain`` took for a file of its own.
-
-    Raises:
-        DataError: if the file is damaged.
-    """
-    try:
-        with safe_open(path, "pt") as file:
-            facts = file.metadata()
-        if facts["weights"] == weights_hash(load_file(path)):
-            return float(facts[SECONDS])
-    except (SafetensorError, LookupError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{path} is damaged ({error})", "a pretrained network"
-        ) from error
-    raise DataError(
-        f"{path} is damaged (the sum of its weights differs)", "a pretrained network"
-    )
+def _batches(job: Job) -> Iterator[Images]:
+    """The batches of all stages, one after the other."""
+    for mixed, count in job.mixtures(collate="range"):
+        yield from islice(endless_batches(mixed, job.batch), count)
 
 
 def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
@@ -288,30 +248,6 @@ def _fresh(job: Job) -> tuple[RangeSegmenter, Tensor]:
     torch.manual_seed(job.seed)
     network = RangeSegmenter(widths=job.widths).to(job.device)
     return network, torch.from_numpy(np.sin(job.sensor.ray_angles()[0])).to(job.device)
-
-
-def _learn(
-    network: RangeSegmenter,
-    job: Job,
-    stage: ArmStage,
-    mixed: MixedScans,
-    count: int,
-    height: Tensor,
-    watch: Callable[[int], object] | None = None,
-) -> list[float]:
-    """Train one stage; returns its losses."""
-    batches = endless_batches(mixed, job.batch)
-    rate = RATE * stage.rate
-    return train_segmenter(
-        network,
-        batches,
-        height,
-        count,
-        rate,
-        progress=False,
-        half=job.half,
-        watch=watch,
-    )
 
 
 def images(scans: Sequence[Scan], sensor: Sensor) -> list[Images]:

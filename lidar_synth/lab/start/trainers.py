@@ -158,7 +158,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 """Settings of the recipes that gained, for 40 epochs: synthetic scans alone in three quarters of
-them, then half and half (docs/research/proof.md, docs/research/detectors.md)."""
+them, then half and half, real ones at the end (docs/research/proof.md,
+docs/research/detectors.md)."""
 
 
 def write_mixture(settings: dict[str, Any]) -> str:
