@@ -6,9 +6,11 @@ import json
 import re
 import runpy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from layouts import MAKERS
 from logs import LOGS, ouster, write_log
@@ -72,6 +74,18 @@ def test_the_sensor_of_a_vendors_logs_is_fitted(vendor: str, tmp_path: Path) -> 
     assert found.source.sensor.shape[0] == lidar_synth.load_sensor(sensor).shape[0]
 
 
+class _Mean(torch.nn.Module):
+    """A network that normalises the heights of a batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = torch.nn.BatchNorm1d(1)
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        heights: torch.Tensor = self.norm(batch["points"][:, 2:3])
+        return heights
+
+
 @pytest.mark.slow
 def test_from_logs_without_labels_to_a_mixture(logs: Path, tmp_path: Path) -> None:
     out = tmp_path / "start"
@@ -80,14 +94,21 @@ def test_from_logs_without_labels_to_a_mixture(logs: Path, tmp_path: Path) -> No
     assert made is not None
     assert "labels   none" in made.found[1] and "fitted to 4 scans" in made.found[3]
     assert said[0].splitlines() == list(made.found) and len(made.found) == 5
-    assert len(made.code.splitlines()) == 6
+    assert len(made.code.splitlines()) == 8
+    network = _Mean()
     batches: list[dict[str, np.ndarray]] = []
     short = made.code.replace("range(40)", "range(1)").replace(
         "...", "batches.append(batch)"
     )
-    exec(short, {"batches": batches})
+    names: dict[str, Any] = {"batches": batches, "network": network}
+    exec(short, names)
     synthetic = np.concatenate([batch["domain"] for batch in batches])
-    assert set(synthetic.tolist()) == {0, 1}
+    assert set(synthetic.tolist()) == {1}
+    assert all((batch["label"] != 255).any() for batch in batches)
+    settled = names["network"].norm
+    real = [torch.from_numpy(names["real"][i].points[:, 2]).mean() for i in range(4)]
+    assert settled.running_mean.item() == pytest.approx(np.mean(real), abs=0.05)
+    assert network.norm.running_mean.item() == 0
     times = {path: path.stat().st_mtime_ns for path in (out / "town").iterdir()}
     again = lidar_synth.start(logs, out, scans=2, jobs=1, say=said.append)
     assert again is not None and "as fitted" in again.found[3]

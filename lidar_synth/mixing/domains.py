@@ -41,11 +41,13 @@ def settle(
     evaluation mode.
 
     Those of a training on a mixture are of real and synthetic scans together; a network that is
-    used on real scans wants those of real scans. They need no labels.
+    used on real scans wants those of real scans, which need no labels. A training that ends on real
+    scans, as by ``mix(epochs=40)``, has them already.
 
     Args:
         model: the trained network; it stays as it is.
-        batches: of real scans, such as 20 of ``MixedScans(real, ratio=0).loader(4)``.
+        batches: of real scans, such as 20 of ``MixedScans(real, ratio=0,
+            unlabelled="allow").loader(4)``.
         forward: runs the network on a batch; by default ``model(batch)``.
 
     Raises:

@@ -89,6 +89,7 @@ def main(
     labelled: int = 4,
     iterations: int = 500,
     seeds: int = 1,
+    synthetic: int = 48,
     model: str = "town",
 ) -> None:
     """Prints the arms' figures."""
@@ -97,7 +98,7 @@ def main(
         arms=tuple(arm),
         iterations=iterations,
         seeds=seeds,
-        synthetic=48,
+        synthetic=synthetic,
         columns=256,
         model=model,
     )
@@ -110,9 +111,9 @@ def main(
     scores = compare(
         trials,
         out,
-        f"{on}-{'match' if match else 'keep'}-{iterations}",
+        f"{on}-{'match' if match else 'keep'}-{synthetic}-{iterations}",
         settings,
-        out / f"pools-{on}",
+        out / f"pools-{on}-{synthetic}",
         learn_matched if match else reference,
     )
     for key, values in scores.items():
