@@ -19,7 +19,7 @@ from lidar_synth.lab.proof.trial import TrialOutcome
 
 PERSON = TRAIN_ID["person"]
 ROAD = TRAIN_ID["road"]
-FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600}
+FOUND = {"real": 300, "exchange": 320, "town": 200, "pretrain": 600, "alone": 100}
 """Persons of 1,000 that each arm finds."""
 
 
@@ -69,6 +69,8 @@ def test_a_place_without_the_scored_class_does_not_count() -> None:
     assert by_key["pretrain"]["better_in"] == "6 of 6 places"
     assert by_key["pretrain"]["difference"] == pytest.approx(30)
     assert by_key["pretrain"]["by_place"]["p6"] is None
+    assert by_key["pretrain"]["budget"].startswith("1 labelled scans; ")
+    assert by_key["alone"]["budget"].startswith("1 unlabelled scans; ")
     chosen = values["chosen_elsewhere"]
     assert chosen["arms"] == ["pretrain"] * 7 and chosen["difference"] == pytest.approx(
         30

@@ -1,12 +1,12 @@
 """What generated scans first add with a few labelled frames; on a sensor with fewer beams, or with
 another network. For docs/research/proof.md.
 
-    python tools/research/few_labels.py SEMANTIC_KITTI OUT [--labelled 4] [--exchange] [--polar]
+    python tools/research/few_labels.py SEMANTIC_KITTI OUT [--arm exchange] [--labelled 4] [--polar]
 
 The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the mean gain and its interval,
 and adds the scores by place to OUT/scores.json. ``--polar`` takes polar_network.py instead of the
-range-view segmenter, ``--exchange`` adds PolarMix and LaserMix. Call it with other ``--labelled``,
+range-view segmenter, ``--arm`` others of ``lidar-synth prove``. Call it with other ``--labelled``,
 ``--synthetic`` and ``--iterations`` for the curves in OUT/gain.png.
 """
 
@@ -33,6 +33,7 @@ AXES = {
 """Settings with a curve, and what they count."""
 BASE = {"labelled": 4, "synthetic": 192, "iterations": 500}
 """The point in which the curves meet."""
+ARM = ["pretrain-generator"]
 
 
 def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
@@ -107,9 +108,9 @@ def plot(axes: Any, found: dict[int, dict[str, dict[str, float]]]) -> None:
 def main(
     root: Path,
     out: Path,
+    arm: list[str] = ARM,
     beams: int | None = None,
     polar: bool = False,
-    exchange: bool = False,
     labelled: int = 4,
     iterations: int = 500,
     synthetic: int = 192,
@@ -124,8 +125,7 @@ def main(
         "synthetic": synthetic,
         "columns": columns,
     }
-    arms = ("pretrain-generator", *["exchange"] * exchange)
-    settings = ProofSettings(arms=arms, seeds=seeds, **setting)
+    settings = ProofSettings(arms=tuple(arm), seeds=seeds, **setting)
     setting["network"] = "polar" if polar else "range"
     pool = f"{beams or 'all'}-{synthetic}-{columns}"
     scores = compare(
@@ -136,11 +136,11 @@ def main(
         out / f"pools-{pool}",
         learn if polar else reference,
     )
-    for arm, found in scores.items():
+    for name, found in scores.items():
         gain = np.array([found[place] - scores["real"][place] for place in found])
         low, high = interval(gain[:, None]) or (np.nan, np.nan)
         mean = np.mean([*found.values()])
-        print(f"{arm}: {mean:.1f}, gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
+        print(f"{name}: {mean:.1f}, gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
     path = out / "scores.json"
     kept = json.loads(path.read_text()) if path.is_file() else []
     records = [*kept, setting | {"seeds": seeds, "arms": scores}]

@@ -150,6 +150,11 @@ ARMS: dict[str, Arm] = {
         lambda ratio: synthetic_first("generator"),
         budget=GENERATOR_BUDGET,
     ),
+    "alone": Arm(
+        "generated scans alone, your scans without labels",
+        lambda ratio: (ArmStage(1, 1, "generator"),),
+        budget=GENERATOR_BUDGET,
+    ),
     "quarter": Arm(
         "generated scans for a quarter, then your scans alone",
         lambda ratio: _quarter("generator"),

@@ -207,7 +207,8 @@ def _known(value: float) -> float | None:
 
 
 def _budget(plan: ProofPlan, row: Row) -> str:
-    text = f"{plan.budget} labelled scans"
+    real = any(stage.ratio < 1 for stage in row.stages())
+    text = f"{plan.budget} {'labelled' if real else 'unlabelled'} scans"
     if not row.arm.budget:
         return text
     extra = row.arm.budget
