@@ -74,7 +74,8 @@ def write_infos(
             ratio}; on ``view=True`` without a camera.
         DataError: on a list without entries, or of another format; for detection, on synthetic
             scans without boxes.
-        FileError: if the scan of the first entry does not exist.
+        FileError: if the scan of the first entry, or its labels, do not exist and the ratio is
+            below 1.
     """
     out = Path(out).resolve()
     given = _read(real)
@@ -89,7 +90,8 @@ def write_infos(
     camera = _camera(entries[0], real, view) if detects else None
     for entry in entries:
         _make_absolute(entry, Path(data_root).resolve(), points, sweeps)
-    _check_files(entries[0])
+    if settings.get("ratio") != 1:  # otherwise no real scan is read, and it may have no labels
+        _check_files(entries[0])
     if balance:
         entries = _balanced(entries, int(settings.get("seed", 0)))
     facts: dict[str, Any] = {

@@ -2,13 +2,14 @@
 
 import json
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from layouts import write_all
+from layouts import MAKERS, write_all
 from lidar_synth.integrations.detection import write_gt_database
 from lidar_synth.integrations.mmdet3d_infos import write_infos
 from lidar_synth.integrations.mmdet3d_lists import kitti_list, semantic_kitti_list
@@ -190,6 +191,21 @@ def test_balanced_lists_hold_each_class_as_often(scans: Path, tmp_path: Path) ->
     entries = json.loads(path.read_text())["data_list"]
     labels = [e["instances"][0]["bbox_label_3d"] for e in entries if e["instances"]]
     assert sorted(labels) == [0, 0, 7, 7] and len(entries) == 8
+
+
+def test_with_synthetic_scans_alone_real_ones_need_no_labels(
+    scans: Path, tmp_path: Path
+) -> None:
+    MAKERS["semantic_kitti"](tmp_path / "real")
+    for labels in (tmp_path / "real").rglob("labels"):
+        shutil.rmtree(labels)
+    listed = semantic_kitti_list(tmp_path / "real", tmp_path / "train.json")
+    settings = MIX | {"synthetic": scans, "epoch_size": 4}
+    where = {"data_root": tmp_path / "real"}
+    with pytest.raises(FileError, match=r"labels/\d+.label, of the first entry"):
+        write_infos(tmp_path / "some", listed, settings | {"ratio": 0.5}, **where)
+    path = write_infos(tmp_path / "all", listed, settings | {"ratio": 1.0}, **where)
+    assert len(json.loads(path.read_text())["data_list"]) == 3 + 4
 
 
 def test_lists_that_do_not_fit_are_refused(scans: Path, tmp_path: Path) -> None:

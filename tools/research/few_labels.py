@@ -83,11 +83,15 @@ def compare(
 def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) -> None:
     """Curves of the mean over the places: each by one setting, the others as in ``base``."""
     figure, panels = plt.subplots(
-        1, len(AXES), figsize=(10, 3.2), layout="constrained", sharey=True
+        1, 3, figsize=(10, 3.2), layout="constrained", sharey=True
     )
     for axes, (name, title) in zip(panels, AXES.items(), strict=True):
         fixed = {key: value for key, value in base.items() if key != name}
-        plot(axes, {r[name]: r["arms"] for r in records if fixed.items() <= r.items()})
+        found: dict[int, dict[str, Any]] = {}
+        for record in records:
+            if fixed.items() <= record.items():
+                found.setdefault(record[name], {}).update(record["arms"])
+        plot(axes, found)
         axes.set_xlabel(title)
     panels[0].set(ylabel="mean IoU, %", ylim=(0, None))
     panels[0].legend(loc="lower right")
@@ -96,8 +100,8 @@ def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) ->
 
 def plot(axes: Any, found: dict[int, dict[str, dict[str, float]]]) -> None:
     """A curve for each arm over the counts."""
-    counts = sorted(found)
     for arm in ("pretrain-generator", "real"):
+        counts = sorted(count for count in found if arm in found[count])
         means = [np.mean([*found[count][arm].values()]) for count in counts]
         axes.plot(counts, means, "o-", label=ARMS[arm].title)
     axes.set_xscale("log")

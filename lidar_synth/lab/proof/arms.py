@@ -82,7 +82,7 @@ GENERATOR_BUDGET = "what the generator was trained on"
 _SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
 
 EPOCHS = 40
-"""Epochs that the stages of a schedule are a part of."""
+"""Epochs of the training whose schedule gives the stages."""
 
 
 def _stages(pool: str, schedule: Schedule) -> tuple[ArmStage, ...]:
