@@ -27,7 +27,7 @@ from lidar_synth.lab.proof.scores import interval
 
 AXES = {"labelled": "labelled frames", "synthetic": "generated scans"}
 """Settings with a curve, and what they count."""
-BASE = {"labelled": 4, "synthetic": 192, "iterations": 500}
+BASE = {"labelled": 4, "synthetic": 192}
 """The point in which the curves meet."""
 ARM = ["pretrain-generator"]
 
@@ -95,7 +95,7 @@ def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) ->
     figure.savefig(path)
 
 
-def plot(axes: Any, found: dict[int, dict[str, dict[str, float]]]) -> None:
+def plot(axes: Any, found: dict[int, dict[str, Any]]) -> None:
     """A curve for each arm over the counts."""
     for arm in ("pretrain-generator", "alone", "real"):
         counts = sorted(count for count in found if arm in found[count])
