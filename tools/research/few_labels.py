@@ -45,7 +45,7 @@ def halves(root: Path, out: Path) -> list[tuple[Path, Path]]:
 
 
 def compare(
-    trials: Sequence[tuple[Any, Any]],
+    trials: Sequence[Any],
     out: Path,
     group: str,
     settings: ProofSettings,
@@ -55,7 +55,7 @@ def compare(
     """The mIoU by arm and place.
 
     Args:
-        trials: scans to train on, and those to test.
+        trials: pairs of scans to train on and scans to test.
         out: folder of all trials.
         group: names those with the same settings except for the number of labelled scans.
     """
