@@ -90,7 +90,8 @@ def write_infos(
     camera = _camera(entries[0], real, view) if detects else None
     for entry in entries:
         _make_absolute(entry, Path(data_root).resolve(), points, sweeps)
-    if settings.get("ratio") != 1:  # otherwise no real scan is read, and it may have no labels
+    # With synthetic scans alone no real scan is read, and it may have no labels.
+    if settings.get("ratio") != 1:
         _check_files(entries[0])
     if balance:
         entries = _balanced(entries, int(settings.get("seed", 0)))
