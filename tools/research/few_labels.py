@@ -95,14 +95,14 @@ def draw(records: Sequence[dict[str, Any]], base: dict[str, Any], path: Path) ->
     figure.savefig(path)
 
 
-def plot(axes: Any, found: dict[int, dict[str, Any]]) -> None:
+def plot(axes: Any, found: dict[int, Any]) -> None:
     """A curve for each arm over the counts."""
     for arm in ("pretrain-generator", "alone", "real"):
         counts = sorted(count for count in found if arm in found[count])
         means = [np.mean([*found[count][arm].values()]) for count in counts]
         axes.plot(counts, means, "o-", label=ARMS[arm].title)
     axes.set_xscale("log")
-    axes.set_xticks(counts, counts)  # of "real", which every call has
+    axes.set_xticks(sorted(found), sorted(found))
     axes.minorticks_off()
 
 

@@ -16,7 +16,7 @@ from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
 from lidar_synth.mixing.defaults import quarter_of
-from lidar_synth.mixing.schedules import Schedule, SyntheticFirst, make_schedule
+from lidar_synth.mixing.schedules import SyntheticFirst, make_schedule
 
 REAL = "real"
 """The name of the labelled scans themselves, where a stage takes them in the place of synthetic
@@ -85,10 +85,10 @@ EPOCHS = 40
 """Epochs of the training whose schedule gives the stages."""
 
 
-def _stages(pool: str, schedule: Schedule) -> tuple[ArmStage, ...]:
-    """The stages of a training of ``EPOCHS`` epochs, as ``mix`` has them."""
+def _stages(pool: str, given: Any) -> tuple[ArmStage, ...]:
+    """The stages of a training of ``EPOCHS`` epochs with a ratio as of ``mix``."""
     stages = []
-    for ratio, epochs in groupby(range(EPOCHS), schedule):
+    for ratio, epochs in groupby(range(EPOCHS), make_schedule(given)):
         share = len(list(epochs)) / EPOCHS
         stages.append(ArmStage(share, ratio, pool if ratio else ""))
     return tuple(stages)
@@ -101,7 +101,7 @@ def synthetic_first(pool: str) -> tuple[ArmStage, ...]:
 
 def _quarter(pool: str) -> tuple[ArmStage, ...]:
     """Synthetic scans for a quarter, then real ones alone."""
-    return _stages(pool, make_schedule(quarter_of(EPOCHS)))
+    return _stages(pool, quarter_of(EPOCHS))
 
 
 ARMS: dict[str, Arm] = {
