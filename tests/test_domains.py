@@ -1,6 +1,7 @@
 """Real and synthetic scans as two domains: weights of the loss, the schedule that ends on real
 scans, statistics and layers by domain."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,15 @@ def test_a_segmenters_default_ends_on_real_scans_where_they_are_many(
     assert "more than 24 labelled scans (25 here)" in caplog.text
     assert some.mixture.ratio(5) == 1
     assert ratios(mix([REAL[0]] * 41, SYNTHETIC, epochs=8)) == QUARTER
+
+
+def test_a_segmenters_default_needs_labels() -> None:
+    blank = [replace(scan, label=None, instance=None) for scan in REAL]
+    for real in (blank, Sources(REAL, blank)):
+        with pytest.raises(ConfigError, match=r"without labels.*ratio=1\.0"):
+            mix(real, SYNTHETIC, epochs=8)
+    alone = mix(blank, SYNTHETIC, ratio=1.0, epoch_size=400)
+    assert sum(alone.domain(i) for i in range(400)) == 400
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ class Notices:
 
     def real(self, scan: Scan) -> None:
         """Note whether real scans have boxes and labels, and their numbers of points."""
-        self._real_boxes = self._real_boxes or scan.boxes is not None
+        self._real_boxes |= scan.boxes is not None
         if self._unlabelled is None and (
             scan.label is None or not (scan.label != IGNORE).any()
         ):
@@ -95,8 +95,7 @@ class Notices:
                 )
 
     def _warn(self, message: str, *values: object) -> None:
-        worker = get_worker_info()
-        if worker is None or worker.id == 0:
+        if _is_first():
             log.warning(message, *values)
 
     def synthetic(self, given: Scan, scan: Scan) -> None:
@@ -113,8 +112,7 @@ class Notices:
         if self._told or (scan.boxes is None and not self._real_boxes):
             return
         self._told = True
-        worker = get_worker_info()
-        if worker is not None and worker.id:
+        if not _is_first():
             return
         if scan.boxes is None:
             log.warning(
@@ -133,3 +131,8 @@ class Notices:
                 given.id,
                 found,
             )
+
+
+def _is_first() -> bool:
+    worker = get_worker_info()
+    return not (worker and worker.id)

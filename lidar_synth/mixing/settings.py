@@ -128,7 +128,8 @@ def mix(
         options: further arguments of ``MixedScans``.
 
     Raises:
-        ConfigError, FileError, DataError: if a source cannot be opened; as ``MixedScans``.
+        ConfigError, FileError, DataError: if a source cannot be opened; as ``MixedScans``; with
+            ``epochs`` and no ``ratio`` also for a segmenter's real scans without labels.
 
     Example:
         >>> import lidar_synth
@@ -151,7 +152,15 @@ def mix(
     if task == "detection":
         own = detection_options(reals, epochs)
     elif epochs is not None and ratio is None:
-        count = sum(len(source) for source, _ in each(reals))
+        count = 0
+        for source, _ in each(reals):
+            if source[0].label is None:
+                raise ConfigError(
+                    f"epochs={epochs} with a source of real scans without labels",
+                    "labelled scans, or synthetic ones alone: ratio=1.0, epoch_size=400",
+                    "Then settle the network on the real scans (docs/how-to/mix.md).",
+                )
+            count += len(source)
         alike = _agree(Sensor.same_lasers, reals, synthetics)
         own = segmentation_options(count, epochs, alike)
     given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}

@@ -114,6 +114,7 @@ def main(
     polar: bool = False,
     labelled: int = 4,
     iterations: int = 500,
+    columns: int = 256,
     synthetic: int = 192,
     seeds: int = 2,
 ) -> None:
@@ -122,11 +123,13 @@ def main(
         "beams": beams,
         "labelled": labelled,
         "iterations": iterations,
+        "columns": columns,
         "synthetic": synthetic,
+        "seeds": seeds,
     }
-    settings = ProofSettings(arms=tuple(arm), seeds=seeds, columns=256, **setting)
+    settings = ProofSettings(arms=tuple(arm), **setting)
     setting["network"] = "polar" if polar else "range"
-    pool = f"{beams or 'all'}-{synthetic}"
+    pool = f"{beams or 'all'}-{columns}-{synthetic}"
     scores = compare(
         halves(root, out),
         out,
@@ -142,7 +145,7 @@ def main(
         print(f"{name}: {mean:.1f}, gain {gain.mean():+.1f} ({low:.1f} to {high:.1f})")
     path = out / "scores.json"
     kept = json.loads(path.read_text()) if path.is_file() else []
-    records = [*kept, setting | {"seeds": seeds, "arms": scores}]
+    records = [*kept, setting | {"arms": scores}]
     path.write_text(json.dumps(records, indent=1) + "\n")
     draw(records, setting | BASE, out / "gain.png")
 
