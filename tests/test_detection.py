@@ -9,12 +9,13 @@ import pytest
 from streets import street
 from typer.testing import CliRunner
 
-from lidar_synth import ObjectBank, Scan
+from lidar_synth import Scan
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.npz import write_scan
+from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection import ARMS, DetectionSettings, prove_detection
-from lidar_synth.lab.proof.detection.arms import PHASES, make_mixture
+from lidar_synth.lab.proof.detection.arms import make_mixture
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.scores import Criterion, Truth, judge, precision_of
 from lidar_synth.lab.proof.detection.study import half_of
@@ -106,17 +107,21 @@ def test_few_places_give_no_interval() -> None:
 
 @pytest.mark.parametrize(
     ("arm", "expected"),
-    [("recipe", [8, 8, 4, 0]), ("first", [8, 8, 8, 4]), ("gt_sampling", [0] * 4)],
+    [
+        ("first", [8] * 30 + [4] * 8 + [0] * 2),
+        ("quarter", [8] * 10 + [0] * 30),
+        ("town", [8] * 40),
+        ("gt_sampling", [0] * 40),
+    ],
 )
-def test_an_arm_has_its_shares_of_the_town_by_phase(
+def test_an_arm_has_its_shares_of_the_town_by_epoch(
     arm: str, expected: list[int]
 ) -> None:
     labelled = [street(i) for i in range(2)]
     town = [street(10 + i) for i in range(2)]
-    objects = ObjectBank.from_scans(town)
-    mixed = make_mixture(ARMS[arm], labelled, town, objects, 0, 8 * PHASES)
+    mixed = make_mixture(ARMS[arm], labelled, town, None, 0, 8)
     shares = []
-    for epoch in range(PHASES):
+    for epoch in range(EPOCHS):
         mixed.set_epoch(epoch)
         shares.append(sum(mixed.domain(i) for i in range(len(mixed))))
     assert shares == expected
@@ -148,7 +153,10 @@ def test_a_comparison_from_scans_to_page(places: Path, tmp_path: Path) -> None:
     folders = ["--out", str(tmp_path / "out"), "--pools", str(pool)]
     command = ["prove", str(places), *options, *folders]
     result = CliRunner().invoke(app, command)
-    assert "| GT sampling |" in result.output and "half, GT sampling |" in result.output
+    assert (
+        "| GT sampling |" in result.output
+        and "real scans last, GT sampling |" in result.output
+    )
     made = json.loads((tmp_path / "out" / "results-2.json").read_text())
     assert set(made["places"]) == {f"place{i}" for i in range(4)}
     page = (tmp_path / "out" / "index.html").read_text()
@@ -188,7 +196,7 @@ def test_a_dry_run_says_what_would_be_trained(places: Path, tmp_path: Path) -> N
     assert "4 scans in 4 places: place0 (1), place1 (1)" in result.output
     assert "4 trainings of 1000 iterations of 2:" in result.output
     assert "seed 1: 2 labelled scans, tested on place" in result.output
-    assert "the town first, then half, GT sampling" in result.output
+    assert "the town first, then half, real scans last, GT sampling" in result.output
     assert not out.exists()
 
 

@@ -225,14 +225,15 @@ def test_a_trial_from_scans_to_table(
 
 
 @pytest.mark.parametrize(
-    ("arm", "shares"), [("layout_first", [8, 8, 8, 4]), ("layout_gt", [16])]
+    ("arm", "shares"),
+    [("town_first", [8] * 30 + [4] * 8 + [0] * 2), ("layout_gt", [4] * 2)],
 )
 def test_synthetic_scans_come_first_or_in_half_of_each_batch(
     trial: ModuleType, arm: str, shares: list[int]
 ) -> None:
     labelled = [street(i) for i in range(2)]
     pool = [street(10 + i) for i in range(2)]
-    mixed = trial.mixture(trial.ARMS[arm], labelled, pool, 0, 32)
+    mixed = trial.mixture(trial.ARMS[arm], labelled, pool, 0, 8)
     found = []
     for epoch in range(len(shares)):
         mixed.set_epoch(epoch)

@@ -41,8 +41,9 @@ def settle(
     evaluation mode.
 
     Those of a training on a mixture are of real and synthetic scans together; a network that is
-    used on real scans wants those of real scans, which need no labels. A training that ends on real
-    scans, as by ``mix(epochs=40)``, has them already.
+    used on real scans wants those of real scans, which need no labels. A segmenter that ends on real
+    scans, as by ``mix(epochs=40)``, has them already; a detector trained in batches of 2 has noisy
+    ones and gains 5 AP (docs/research/detectors.md).
 
     Args:
         model: the trained network; it stays as it is.

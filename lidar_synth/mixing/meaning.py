@@ -363,29 +363,29 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     distance = _distance(ours, theirs)
     if distance <= OTHER_SHARES:
         return
+    left = {}
     for reason, numbers in _renumberings():
         renumbered = {numbers.get(value, -1): look for value, look in ours.items()}
-        if _distance(renumbered, theirs) < EXPLAINED * distance:
-            largest = sorted(
-                ours.keys() & numbers.keys(), key=lambda value: -ours[value].share
-            )[:4]
-            text = "; ".join(
-                f"class {value} looks like your {numbers[value]}" for value in largest
-            )
-            yield Contradiction(f"{text}: {reason}", True)
-            return
+        left[_distance(renumbered, theirs)] = reason, numbers
+    explained = min(left) < EXPLAINED * distance
     pairs = dict(_matches(theirs, ours))
+    if explained:
+        reason, numbers = left[min(left)]
+        known = sorted(ours.keys() & numbers, key=lambda value: -ours[value].share)
+        pairs = {value: numbers[value] for value in known}
+    text = "; ".join(
+        f"class {value} looks like your {other}"
+        for value, other in [*pairs.items()][:4]
+    )
+    if explained:
+        yield Contradiction(f"{text}: {reason}", True)
+        return
     unseen = sum(look.share for value, look in ours.items() if value not in theirs)
     moved = sum(ours[value].share for value in pairs)
-    text = f"classes differ for {distance:.0%} of the points"
-    if pairs:
-        text = "; ".join(
-            f"class {value} looks like your {other}"
-            for value, other in list(pairs.items())[:4]
-        )
-    elif unseen > OTHER_SHARES:
+    if not pairs and unseen > OTHER_SHARES:
         missing = sorted(set(ours) - set(theirs))[:4]
         text = f"classes {missing}, {unseen:.0%} of the points, are in no real sample"
+    text = text or f"classes differ for {distance:.0%} of the points"
     yield Contradiction(text, moved > 0.4 or unseen > OTHER_SHARES)
 
 

@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from lidar_synth import MixedScans, ObjectBank, Source, load_generator
 from lidar_synth.files.disk import write_file
+from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.bev import view
 from lidar_synth.lab.proof.detection.boxes import CLASSES
 from lidar_synth.lab.proof.detection.network import (
@@ -41,7 +42,7 @@ from lidar_synth.lab.proof.detection.network import (
 from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
-from lidar_synth.mixing import Sources, settle
+from lidar_synth.mixing import Sources, SyntheticFirst, settle
 
 LABELLED = 30
 TRAIN_TOWN = 7
@@ -52,9 +53,6 @@ LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town"
 BATCH = 2
 RATE = 3e-3
-PHASES = 4
-"""Epochs of a training, of which an arm with synthetic scans first has them alone in all but the
-last."""
 SETTLING = 24
 """Batches of labelled scans for the statistics of the batch normalisation."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
@@ -76,7 +74,7 @@ class Arm:
         pool: of the synthetic half of each batch, a name of ``Work.pool``; "" for none.
         labels: the label policy of these scans.
         pasted: whether objects of the 30 scans are pasted into all scans.
-        first: whether the first three quarters of the training have synthetic scans alone.
+        first: whether its schedule is that of ``SyntheticFirst``.
         share: of synthetic scans in a batch.
     """
 
@@ -118,9 +116,6 @@ ARMS = {
         "layout",
         pasted=True,
         share=0.25,
-    ),
-    "layout_first": Arm(
-        "layout scans first, GT sampling", _LAYOUT, "layout", pasted=True, first=True
     ),
     "town": Arm("town scans of the same layouts (upper bound)", _TOWN, "town"),
     "town_gt": Arm(
@@ -206,16 +201,16 @@ class Work:
 
 
 def mixture(
-    arm: Arm, labelled: Source, pool: Source | None, seed: int, count: int
+    arm: Arm, labelled: Source, pool: Source | None, seed: int, epoch_size: int
 ) -> MixedScans:
-    """The training set of an arm, of ``count`` samples, as a user of the package makes it."""
+    """The training set of an arm, as a user of the package makes it."""
     objects = ObjectBank.from_scans(labelled)
     there = {name: most for name, most in PASTED.items() if name in objects.boxes.names}
     options = {"bank": objects, "count": there, "turn": 180.0, "clear": False}
     steps: list[Any] = [{"yaw": {"limit": 45}}, "flip_x", "flip_y", "scale"]
     if arm.pasted:
         steps.insert(0, {"paste": options})
-    share = {0: 1.0, PHASES - 1: arm.share} if arm.first else arm.share
+    share = SyntheticFirst(EPOCHS) if arm.first else arm.share
     return MixedScans(
         labelled,
         pool,
@@ -223,7 +218,7 @@ def mixture(
         {"paste": options} if arm.labels == "paste" else arm.labels,
         seed=seed,
         balanced=True,
-        epoch_size=count // PHASES if arm.first else count,
+        epoch_size=epoch_size,
         augment=steps,
         augment_real=True,
         to_sample=sample,
@@ -241,7 +236,8 @@ def run(work: Work, name: str, seed: int, test: Test) -> dict[str, Any]:
     start = time.process_time()
     torch.manual_seed(seed)
     network = Detector()
-    mixed = mixture(arm, labelled, pool, seed, work.iterations * BATCH)
+    epoch_size = BATCH * max(1, work.iterations // EPOCHS)
+    mixed = mixture(arm, labelled, pool, seed, epoch_size)
     batches = endless_batches(mixed, BATCH)
     losses = train(network, batches, work.iterations, RATE, f"{name} {seed}")
     seconds = time.process_time() - start

@@ -9,7 +9,7 @@ _ARMS = (
     "a training to compare, repeatable: real | longer | exchange | town | skin | "
     "generator | pretrain | pretrain-skin | pretrain-generator | alone | "
     "pretrain-learnt | quarter | quarter-town | paste [exchange, pretrain-generator, quarter]; of "
-    "detectors: real | gt_sampling | objects | half | first | quarter | recipe | town"
+    "detectors: real | gt_sampling | objects | half | first | quarter | town"
 )
 
 

@@ -1,21 +1,22 @@
 """The trainings of a detector that are compared, and their training sets.
 
-All arms have the same network, iterations, batch, augmentation, optimiser and test. A training has
-``PHASES`` equal parts, each with its own share of synthetic scans. To add an arm, enter it in
-``ARMS``.
+All arms have the same network, iterations, batch, augmentation, optimiser and test. To add an arm,
+enter it in ``ARMS``.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.network import collate, sample
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
-from lidar_synth.mixing.defaults import augment_boxes
+from lidar_synth.mixing.defaults import augment_boxes, quarter_of
+from lidar_synth.mixing.schedules import SyntheticFirst
 
-PHASES = 4
 BASE = "gt_sampling"
 """The arm with which the others are compared."""
 OWN = "own"
@@ -30,13 +31,13 @@ class DetectionArm:
         title: its row in tables.
         pasted: the objects that are pasted into all scans: those of the labelled scans
             (``OWN``), of the town (``TOWN``), or both.
-        shares: of scans of the town in the ``PHASES`` parts of the training.
+        ratio: share of scans of the town, as ``mix`` takes it.
         budget: what it uses besides the labelled scans.
     """
 
     title: str
     pasted: tuple[str, ...] = ()
-    shares: tuple[float, float, float, float] = (0, 0, 0, 0)
+    ratio: Any = 0.0
     budget: str = "none"
 
 
@@ -45,27 +46,29 @@ ARMS = {
     "real": DetectionArm("real scans only"),
     "gt_sampling": DetectionArm("GT sampling", (OWN,)),
     "objects": DetectionArm(
-        "objects of the town beside GT sampling", (OWN, TOWN), budget=_TOWN
+        "objects of the town beside GT sampling",
+        (OWN, TOWN),
+        budget=_TOWN,
     ),
     "half": DetectionArm(
-        "the town in half of each batch, GT sampling", (OWN,), (0.5,) * 4, _TOWN
+        "the town in half of each batch, GT sampling",
+        (OWN,),
+        0.5,
+        _TOWN,
     ),
     "first": DetectionArm(
-        "the town first, then half, GT sampling", (OWN,), (1, 1, 1, 0.5), _TOWN
+        "the town first, then half, real scans last, GT sampling",
+        (OWN,),
+        SyntheticFirst(EPOCHS),
+        _TOWN,
     ),
     "quarter": DetectionArm(
         "the town for a quarter, then real scans alone, GT sampling",
         (OWN,),
-        (1, 0, 0, 0),
+        quarter_of(EPOCHS),
         _TOWN,
     ),
-    "recipe": DetectionArm(
-        "the town first, then half, real scans last; objects of both",
-        (OWN, TOWN),
-        (1, 1, 0.5, 0),
-        _TOWN,
-    ),
-    "town": DetectionArm("the town only (no real box)", (), (1, 1, 1, 1), _TOWN),
+    "town": DetectionArm("the town only (no real box)", (), 1.0, _TOWN),
 }
 """Arms by name."""
 
@@ -76,7 +79,7 @@ def make_mixture(
     town: Source | None,
     objects: ObjectBank | None,
     seed: int,
-    count: int,
+    epoch_size: int,
 ) -> MixedScans:
     """The training set of an arm, as a user of the package makes it.
 
@@ -86,19 +89,18 @@ def make_mixture(
         town: scans of the town.
         objects: those of the town.
         seed: of the mixture.
-        count: number of samples in the whole training; an epoch has ``PHASES`` parts of it.
+        epoch_size: number of samples of each of ``EPOCHS`` epochs.
     """
     banks = {OWN: ObjectBank.from_scans(labelled), TOWN: objects}
     pasted = [bank for name in arm.pasted if (bank := banks[name]) is not None]
-    synthetic = any(arm.shares)
     return MixedScans(
-        None if min(arm.shares) == 1 else labelled,
-        town if synthetic else None,
-        dict(enumerate(arm.shares)) if synthetic else 0,
+        None if arm.ratio == 1 else labelled,
+        town if arm.ratio != 0 else None,
+        arm.ratio,
         "boxes",
         seed=seed,
         balanced=True,
-        epoch_size=count // PHASES,
+        epoch_size=epoch_size,
         augment=augment_boxes(pasted),
         augment_real=True,
         to_sample=sample,

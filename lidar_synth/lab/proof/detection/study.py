@@ -22,6 +22,7 @@ from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
 from lidar_synth.geometry.scan import Scan, Source
+from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.arms import (
     ARMS,
     BASE,
@@ -75,7 +76,7 @@ class DetectionSettings:
     """
 
     labelled: int = 4
-    arms: tuple[str, ...] = ("objects", "first", "recipe", "town")
+    arms: tuple[str, ...] = ("objects", "first", "town")
     iterations: int = 800
     batch: int = 2
     seeds: int = 2
@@ -194,8 +195,8 @@ class DetectionWork:
         torch.manual_seed(seed)
         network = Detector().to(self.device)
         labelled = self.labelled(seed)
-        count = self.settings.iterations * self.settings.batch
-        town = self.town if any(arm.shares) else None
+        epoch_size = self.settings.batch * max(1, self.settings.iterations // EPOCHS)
+        town = self.town if arm.ratio != 0 else None
         objects = self.objects if set(arm.pasted) - {OWN} else None
         mixed = make_mixture(
             arm,
@@ -203,7 +204,7 @@ class DetectionWork:
             town,
             objects,
             seed,
-            count,
+            epoch_size,
         )
         batches: Iterator[Any] = endless_batches(mixed, self.settings.batch)
         losses = train(
@@ -220,7 +221,7 @@ class DetectionWork:
             None,
             None,
             seed,
-            count,
+            epoch_size,
         )
         settling = islice(endless_batches(base, self.settings.batch), SETTLING)
         return {
@@ -352,7 +353,8 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
     own = asdict(work.settings)
     for name in ("arms", "seeds", "labelled"):  # they add trainings
         del own[name]
-    return {"scans": hash_of_names(names_of(work.source)), **own}
+    scans = hash_of_names(names_of(work.source))
+    return {"scans": scans, "epochs": EPOCHS, **own}
 
 
 def report(
