@@ -21,7 +21,12 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.formats import WRITERS, open_scans
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
-from lidar_synth.mixing.meaning import contradictions, measure_tables, table_of
+from lidar_synth.mixing.meaning import (
+    ClassLook,
+    contradictions,
+    measure_tables,
+    table_of,
+)
 
 Arrays = tuple[np.ndarray, np.ndarray]
 """(N, 4) float32 x, y, z, reflectance, and (N,) int64 labels."""
@@ -153,6 +158,25 @@ MISTAKES: dict[str, tuple[Callable[[np.ndarray, np.ndarray], Arrays], str]] = {
     "z inverted": (scaled(1, 1, -1, 1), "z points down"),
     "centimetres": (scaled(100, 100, 100, 1), "another (unit|scale)"),
 }
+
+
+@pytest.mark.parametrize("step", [-1, 1])
+def test_of_two_directions_the_one_that_explains_more_is_told(step: int) -> None:
+    [scan, *_] = streets(1)
+    measured = measure_tables([table_of(scan)], [IGNORE])
+    shares = {8: 0.5, 8 - 2 * step: 0.4, 8 - 4 * step: 0.1}
+    real, synthetic = (
+        replace(
+            measured,
+            classes={
+                k + by: ClassLook(share, 0.0, 10.0) for k, share in shares.items()
+            },
+        )
+        for by in (0, step)
+    )
+    [found] = contradictions(real, synthetic)
+    assert f"class {8 + step} looks like your 8" in found.text
+    assert "off by one" in found.text
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

@@ -363,14 +363,14 @@ def _classes(real: Meaning, synthetic: Meaning) -> Iterator[Contradiction]:
     distance = _distance(ours, theirs)
     if distance <= OTHER_SHARES:
         return
-    left = {}
+    remaining = {}  # by the distance that each renumbering leaves
     for reason, numbers in _renumberings():
         renumbered = {numbers.get(value, -1): look for value, look in ours.items()}
-        left[_distance(renumbered, theirs)] = reason, numbers
-    explained = min(left) < EXPLAINED * distance
+        remaining[_distance(renumbered, theirs)] = reason, numbers
+    explained = min(remaining) < EXPLAINED * distance
     pairs = dict(_matches(theirs, ours))
     if explained:
-        reason, numbers = left[min(left)]
+        reason, numbers = remaining[min(remaining)]
         known = sorted(ours.keys() & numbers, key=lambda value: -ours[value].share)
         pairs = {value: numbers[value] for value in known}
     text = "; ".join(

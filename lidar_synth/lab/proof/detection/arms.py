@@ -6,7 +6,6 @@ enter it in ``ARMS``.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.arms import EPOCHS
@@ -15,6 +14,7 @@ from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels import ObjectBank
 from lidar_synth.mixing import MixedScans
 from lidar_synth.mixing.defaults import augment_boxes, quarter_of
+from lidar_synth.mixing.scans import Ratio
 from lidar_synth.mixing.schedules import SyntheticFirst
 
 BASE = "gt_sampling"
@@ -37,7 +37,7 @@ class DetectionArm:
 
     title: str
     pasted: tuple[str, ...] = ()
-    ratio: Any = 0.0
+    ratio: Ratio = 0.0
     budget: str = "none"
 
 

@@ -354,6 +354,7 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
     for name in ("arms", "seeds", "labelled"):  # they add trainings
         del own[name]
     scans = hash_of_names(names_of(work.source))
+    # Folders of the earlier schedule, of four parts, have no "epochs" and are refused.
     return {"scans": scans, "epochs": EPOCHS, **own}
 
 
