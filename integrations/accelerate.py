@@ -1,6 +1,8 @@
 """Accelerate: a loader of a mixture for its training loop::
 
-    loader = DataLoader(train, batch_sampler=train.batches(4), collate_fn=train.collate, num_workers=2)
+    loader = DataLoader(
+        train, batch_sampler=train.batches(4), collate_fn=train.collate, num_workers=2
+    )
     loader = prepare(accelerator, loader)
     for epoch in range(first, epochs):
         train.set_epoch(epoch)

@@ -1,7 +1,9 @@
 """Lightning: a ``LightningDataModule`` for mixtures, optionally with synthesis on the GPU after the
 batch transfer::
 
-    data = MixedData(train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4)
+    data = MixedData(
+        train=MixedScans(real, synth, ratio=0.25), val=val_scans, batch_size=8, num_workers=4
+    )
     trainer.fit(model, data)
 
 Set ``Trainer(use_distributed_sampler=False)``, because the batch sampler divides the plan among
@@ -182,7 +184,8 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
                 for i, item in enumerate(batch)
                 if isinstance(item, Pending) and item.source == number
             ]
-            scans = source.scans([batch[i].number for i in wanted]) if wanted else []  # type: ignore[attr-defined]
+            numbers = [batch[i].number for i in wanted]
+            scans = source.scans(numbers) if numbers else []  # type: ignore[attr-defined]
             for i, scan in zip(wanted, scans, strict=True):
                 batch[i] = self.train.finish(scan, batch[i].epoch, batch[i].position)
         device = self.trainer.strategy.root_device if self.trainer else "cpu"

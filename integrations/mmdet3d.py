@@ -3,7 +3,9 @@ configuration imports this module::
 
     custom_imports = dict(imports=["lidar_synth.integrations.mmdet3d"])
     custom_hooks = [dict(type="SynthEpochHook")]
-    train_dataloader = dict(sampler=dict(_delete_=True, type="SynthSampler"), dataset=dict(ann_file=...))
+    train_dataloader = dict(
+        sampler=dict(_delete_=True, type="SynthSampler"), dataset=dict(ann_file=...)
+    )
 
 Segmentation uses the trainer's own datasets: the file backend serves points and labels of synthetic
 entries. Detection needs ``SynthKittiDataset`` or ``SynthNuScenesDataset``, whose synthetic entries

@@ -2,8 +2,8 @@
 
 ``write_infos`` writes into one folder::
 
-    infos.json      the trainer's list: its own entries with absolute paths, then a slot for each synthetic sample of an
-                    epoch, see ``mmdet3d_slots``
+    infos.json      the trainer's list: its own entries with absolute paths, then a slot for each
+                    synthetic sample of an epoch, see ``mmdet3d_slots``
     mixture.json    the settings of the mixture
 
 Real and synthetic scans must be in one list, because LaserMix, PolarMix and FrustumMix sample

@@ -2,7 +2,9 @@
 
     import open3d.ml.torch as ml3d
     from lidar_synth.integrations.open3d_ml import dataset_class
-    dataset = dataset_class()(dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25})
+    dataset = dataset_class()(
+        dataset_path="/data/SemanticKitti", mixture={"synthetic": "bank/", "ratio": 0.25}
+    )
     pipeline = ml3d.pipelines.SemanticSegmentation(model, dataset=dataset, ...)
 
 Its cache identifies samples by name and would keep the synthetic scans of one epoch for ever:
@@ -171,7 +173,10 @@ def _library() -> Any:
                 "needs."
             )
         elif isinstance(error, RuntimeError):
-            hint = "Each release of Open3D has operators for one release of torch: install that one."
+            hint = (
+                "Each release of Open3D has operators for one release of torch: install that "
+                "one."
+            )
         else:
             hint = (
                 "Open3D's operators for CUDA do not load with a torch for CPUs: pip install "

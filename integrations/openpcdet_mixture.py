@@ -87,7 +87,8 @@ class MixedDetection:
         self._current = index % len(self.mixed)
         try:
             sample = self.mixed[self._current]
-            make = self._synthetic if isinstance(sample, Scan) else super().__getitem__  # type: ignore[misc]
+            synthetic = isinstance(sample, Scan)
+            make = self._synthetic if synthetic else super().__getitem__  # type: ignore[misc]
             made = make(sample)
             if self.weighed:
                 made[KEY] = np.float32(self.mixed.loss_weight(self._current))
@@ -111,7 +112,10 @@ class MixedDetection:
 
     def _check_boxes(self, known: Collection[str]) -> None:
         """Check that the first synthetic scans have boxes, and only of known classes."""
-        hint = "labels: paste with a bank of objects gives a scan boxes, labels: boxes keeps its own."
+        hint = (
+            "labels: paste with a bank of objects gives a scan boxes, labels: boxes keeps its "
+            "own."
+        )
         used = False
         for position in np.flatnonzero(self.mixed.plan().domain)[:LOOKED_AT]:
             scan = self.mixed[int(position)]

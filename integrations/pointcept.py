@@ -1,7 +1,9 @@
 """Pointcept: SemanticKITTI mixed with synthetic scans, registered when a configuration imports this
 module::
 
-    custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
+    custom_imports = dict(
+        imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False
+    )
     hooks = [dict(type="SynthEpoch"), ...]
     data["train"] |= dict(type="MixedSemanticKITTI", mixture=dict(synthetic="bank/", ratio=0.25))
 

@@ -2,7 +2,8 @@
 on a mixture::
 
     cd train/tasks/semantic    # CENet: its root
-    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py -d DATASET -ac ARCH.yaml ...
+    LIDAR_SYNTH_MIX=/data/mix.yaml python -m lidar_synth.integrations.rangenet train.py \\
+        -d DATASET -ac ARCH.yaml ...
 
 The trainer's own parser reads every scan: a synthetic one is passed through a temporary file in
 memory (``/dev/shm`` on Linux). Validation, and scripts other than ``train.py``, see only real
@@ -274,7 +275,8 @@ def register() -> None:
 
     if parser:
         # A class of this name beside the trainer's own would end up in its super(Parser, self).
-        sys.modules[parser.__name__] = SimpleNamespace(Parser=make_parser(parser))  # type: ignore[assignment]
+        made = SimpleNamespace(Parser=make_parser(parser))
+        sys.modules[parser.__name__] = made  # type: ignore[assignment]
     else:
         module.imp = _loader(module.imp.load_source)
     module.Trainer.train_epoch = train_epoch

@@ -1,7 +1,7 @@
 """Weights of samples in the losses of OpenPCDet's and MMDetection3D's anchor heads.
 
-Both compute a loss for each anchor of each sample before they add them up, so that a sample's can be
-multiplied by its weight (``loss_weight`` of the mixture). Other heads add up inside of the loss.
+Both compute a loss for each anchor of each sample before they add them up, so that a sample's can
+be multiplied by its weight (``loss_weight`` of the mixture). Other heads add up inside of the loss.
 """
 
 from collections.abc import Callable

@@ -144,10 +144,14 @@ class Page:
     def situation(self) -> dict[str, Any]:
         """Everything that a key could change."""
         situation: dict[str, Any] = self.run("""
-            const texts = (selector) => [...document.querySelectorAll(selector)].map((e) => e.textContent);
-            const pressed = [...document.querySelectorAll("button")].map((e) => e.getAttribute("aria-pressed"));
-            return { camera: JSON.stringify(state.camera), captions: texts(".caption"), pressed, size: state.size,
-                     picked: [...document.querySelectorAll(".picked")].map((e) => e.hidden ? "" : e.textContent) };
+            const all = (selector, one) => [...document.querySelectorAll(selector)].map(one);
+            return {
+                camera: JSON.stringify(state.camera),
+                captions: all(".caption", (e) => e.textContent),
+                pressed: all("button", (e) => e.getAttribute("aria-pressed")),
+                size: state.size,
+                picked: all(".picked", (e) => e.hidden ? "" : e.textContent),
+            };
         """)
         return situation
 

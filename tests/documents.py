@@ -19,7 +19,10 @@ from pathlib import Path
 
 from project import ROOT
 
-TRAINERS = "MMDetection3D|OpenPCDet|Pointcept|RangeNet\\+\\+|SalsaNext|Cylinder3D|Open3D-ML|WaffleIron|FRNet"
+TRAINERS = (
+    "MMDetection3D|OpenPCDet|Pointcept|RangeNet\\+\\+|SalsaNext|Cylinder3D|Open3D-ML|"
+    "WaffleIron|FRNet"
+)
 
 REASONS = (
     f"needs the source tree of ({TRAINERS})",

@@ -1,4 +1,5 @@
-"""A small release of R2DM: its own names and shapes, with the random weights of tests/golden/r2dm.*."""
+"""A small release of R2DM: its own names and shapes, with the random weights of
+tests/golden/r2dm.*."""
 
 import copy
 import json

@@ -75,7 +75,8 @@ def main():
         compare(folder.name, found, dict(np.load(str(folder / "expected.npz"))))
     heavy = {"torch", "numba", "deflate", "lidar_synth"} & set(sys.modules)
     assert not heavy, heavy
-    versions = f"Python {sys.version.split()[0]}, numpy {np.__version__}, h5py {reader.h5py.__version__}"
+    python, h5py = sys.version.split()[0], reader.h5py.__version__
+    versions = f"Python {python}, numpy {np.__version__}, h5py {h5py}"
     print(f"{versions}: {scans} scans and {samples} samples are equal, bit for bit")
 
 

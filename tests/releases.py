@@ -1,4 +1,5 @@
-"""Small releases of other projects, with random weights: R2Flow's and LiDM's checkpoints as users download them."""
+"""Small releases of other projects, with random weights: R2Flow's and LiDM's checkpoints as users
+download them."""
 
 import copy
 from pathlib import Path

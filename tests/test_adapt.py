@@ -337,11 +337,14 @@ def test_a_killed_adaptation_is_resumed(
     stopped."""
     out = tmp_path / "mine.safetensors"
     code = tmp_path / "run.py"
+    overrides = {
+        name: SHORT | {"held_out": {"samples": 4, "patience": 99}} for name in STAGES
+    }
     code.write_text(
         "import torch; torch.set_num_threads(1)\nfrom lidar_synth import adapt\n"
         f"adapt({str(model)!r}, {str(scans)!r}, {str(out)!r}, minutes=5, town=0, licence='CC0',\n"
         "      "
-        f"overrides={ {name: SHORT | {'held_out': {'samples': 4, 'patience': 99}} for name in STAGES}!r})\n"
+        f"overrides={overrides!r})\n"
     )
     process = subprocess.Popen(
         [sys.executable, str(code)], env=os.environ | {"OMP_NUM_THREADS": "1"}
@@ -469,7 +472,8 @@ def test_a_folder_without_scans_is_refused(model: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     {
-        "town-layout": "the condition layout; expected an unconditional model, or the condition semantic",
+        "town-layout": "the condition layout; expected an unconditional model, or the condition "
+        "semantic",
         "nothing": "model 'nothing'; expected a shipped one",
     }.items(),
 )

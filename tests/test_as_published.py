@@ -280,8 +280,8 @@ UNSTATED = {
     "kitti360_codec": {"recipe.iterations"},
     "semantic_kitti_codec": {"recipe.iterations"},
 }
-"""What neither the paper nor the project that it follows there states, by recipe; of all others, how
-they are optimised."""
+"""What neither the paper nor the project that it follows there states, by recipe; of all others,
+how they are optimised."""
 
 
 def flat(config: Run) -> dict[str, Any]:

@@ -437,7 +437,8 @@ def test_a_tar_member_larger_than_any_file(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(
         DataError,
-        match=rf"{path.name} is truncated, damaged or not a tar file \(a member of 9223372036854775807",
+        match=rf"{path.name} is truncated, damaged or not a tar file "
+        r"\(a member of 9223372036854775807",
     ):
         open_scans(path)
 

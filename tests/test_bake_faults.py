@@ -223,7 +223,10 @@ def test_temporary_files_of_killed_processes_are_removed(
     halves = [plan.out / f".shard-0000{k}.h5.abcd.part" for k in range(2)]
     for path in halves:
         path.touch()
-    hold = f"from lidar_synth.files.lock import lock_shared; from pathlib import Path\nwith lock_shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"  # noqa: E501
+    hold = (
+        "from lidar_synth.files.lock import lock_shared; from pathlib import Path\n"
+        f"with lock_shared(Path({str(plan.out / SETTINGS)!r})): print(flush=True); input()"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", hold],
         stdin=subprocess.PIPE,

@@ -196,7 +196,8 @@ def test_few_files_are_open_and_each_shard_is_parsed_once(
     first = bank.shard(0)
     for i in (0, 4, 1, 3, 2):
         assert bank[i].id == f"small/5/{i}"
-        assert sum(shard._file._descriptor >= 0 for shard in bank._shards.values()) == 1  # type: ignore[attr-defined]
+        files = [shard._file for shard in bank._shards.values()]
+        assert sum(file._descriptor >= 0 for file in files) == 1  # type: ignore[attr-defined]
     assert bank.shard(0) is first
     bank.close()
     assert bank[2].id == "small/5/2"

@@ -150,7 +150,8 @@ def test_another_version_is_refused(root: Path) -> None:
     (root / INDEX).write_text(text.replace(FORMAT, "lidar-synth-bank/3"))
     with pytest.raises(
         DataError,
-        match=r"is of format 'lidar-synth-bank/3'; expected 'lidar-synth-bank/1' or 'lidar-synth-bank/2'. Use the",
+        match=r"is of format 'lidar-synth-bank/3'; expected 'lidar-synth-bank/1' or "
+        r"'lidar-synth-bank/2'. Use the",
     ):
         Bank(root)
     (root / INDEX).write_text(text)

@@ -65,7 +65,8 @@ SHARED = {
     "bird's-eye JSD": ("", "4 steps", "bird's-eye JSD"),
     "mIoU, town segmenter, %": ("", "4 steps", "mIoU with the segmenter, %"),
 }
-"""Rows of cards whose figure stands on the page of quality: (model, its own if empty; steps; row)."""
+"""Rows of cards whose figure stands on the page of quality: (model, its own if empty; steps;
+row)."""
 
 
 @pytest.mark.parametrize("name", ["town-camera", "town-layout", "town-semantic"])

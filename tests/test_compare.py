@@ -46,7 +46,8 @@ class Theirs:
         label = rng.integers(0, 19, 12)
         if index >= self.first_ignored:
             label[:3] = self.ignored
-        random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002 - trainers draw from global generators
+        # Trainers draw from global generators.
+        random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002
         return self.form(rng.random((12, 4), np.float32), label)
 
 

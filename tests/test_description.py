@@ -146,14 +146,18 @@ def test_a_town_of_any_sensor_is_read_as_what_it_is(
     assert source.sensor == sensor and Origin.of(source[0]) == Origin.of(expected)
     convert(source, WRITERS["range"](tmp_path / "range"), progress=False)
     read = open_scans(tmp_path / "range")
-    assert np.array_equal(read.image(0).range, project(expected).range)  # type: ignore[attr-defined]
+    image = read.image(0)  # type: ignore[attr-defined]
+    assert np.array_equal(image.range, project(expected).range)
 
 
 @pytest.mark.parametrize("to", BESIDE)
 def test_a_scan_on_another_grid_is_refused(tmp_path: Path, to: str) -> None:
     write_all(to, tmp_path, [a_scan()])
     before = files(tmp_path)
-    message = r"sensor 'hdl64e_kitti360' \(64 x 1024\) for .* 'os1_128' \(128 x 1024\).*--as-sensor os1_128"
+    message = (
+        r"sensor 'hdl64e_kitti360' \(64 x 1024\) for .* 'os1_128' \(128 x 1024\).*"
+        r"--as-sensor os1_128"
+    )
     for index in (0, 1):
         with pytest.raises(ConfigError, match=message):
             WRITERS[to](tmp_path).write(a_scan(SENSORS["beams"]), index)

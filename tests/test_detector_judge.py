@@ -105,7 +105,7 @@ def test_centres_are_decoded_in_the_frame_of_the_scan(tmp_path: Path) -> None:
     maps["rot"][0] = -1
     centres = decode_centres(maps)
     none = torch.zeros(0, 7), torch.zeros(0), torch.zeros(0)
-    network.forward = lambda _: [centres, none, none, none, none, none]  # type: ignore[method-assign]
+    network.forward = lambda _: [centres, *[none] * 5]  # type: ignore[method-assign]
     found = network.find(scan_of((10, 0, -1, 4, 1.8, 1.5, 0), names=("Car",)))
     expected = [[10, 0, 0, 1, 1, 1, np.pi / 2]]
     assert np.allclose(found.boxes, expected, atol=1e-5)

@@ -82,13 +82,15 @@ WRONG_PYTHON = {
     "a missing name": "from lidar_synth import MixedScanz",
     "a missing module": "from lidar_synth.mixer import Generated",
     "a missing name of an adapter": "from lidar_synth.integrations.pointcept import Nothing",
-    "a missing module in a configuration": 'custom_imports = dict(imports=["lidar_synth.integrations.darknet"])',
+    "a missing module in a configuration": "custom_imports = dict("
+    'imports=["lidar_synth.integrations.darknet"])',
     "a type that nobody registers": 'hooks = [dict(type="SynthEpochs")]',
 }
 
 WRONG_YAML = {
     "an unknown key": "synthetic: bank\nratios: 0.25\n",
-    "a sensor of no beams": "mine: {rows: 0, fov_up: 15, fov_down: -25, columns: 64, range_min: 1, range_max: 120}\n",
+    "a sensor of no beams": "mine: {rows: 0, fov_up: 15, fov_down: -25, columns: 64, "
+    "range_min: 1, range_max: 120}\n",
     "a recipe on no base": "base: town_huge\n",
     "a list": "- 1\n",
 }
@@ -145,9 +147,11 @@ def test_the_blocks_of_a_page_share_a_folder_and_a_namespace(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (
-        '```python\nimport os\nnumber = 3\nassert os.listdir() == []\n```\n```yaml title="mix.yaml"\nratio: 0.5\n```\n'
+        "```python\nimport os\nnumber = 3\nassert os.listdir() == []\n```\n"
+        '```yaml title="mix.yaml"\nratio: 0.5\n```\n'
         "```sh\nexport WORD=here\ncat mix.yaml > copy.yaml\n```\n"
-        '```python\nassert number == 3 and os.environ["WORD"] == "here" and "copy.yaml" in os.listdir()\n```\n'
+        '```python\nassert number == 3 and os.environ["WORD"] == "here" '
+        'and "copy.yaml" in os.listdir()\n```\n'
     )
     read(Path("page.md"), blocks_of(text), Reader(tmp_path, monkeypatch))
 

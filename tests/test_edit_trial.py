@@ -1,5 +1,5 @@
-"""Edited scans keep their boxes true; ``tools/research/edit_trial.py --inserts 500`` measures the same on
-more scans."""
+"""Edited scans keep their boxes true; ``tools/research/edit_trial.py --inserts 500`` measures the
+same on more scans."""
 
 import sys
 

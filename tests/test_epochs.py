@@ -21,7 +21,10 @@ from lidar_synth.mixing.epochs import Position
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 REAL = 200
-LATE = r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before iter.*batch_sampler=train.batches"
+LATE = (
+    r"set_epoch\(1\) while a DataLoader was iterating over epoch 0.*before iter.*"
+    r"batch_sampler=train.batches"
+)
 
 
 def mixed(real: int = REAL, ratio: Any = 0.25, **options: Any) -> MixedScans:

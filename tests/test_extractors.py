@@ -282,7 +282,10 @@ def test_the_archive_may_be_packed(
         load_extractor("lidm_minkowski", packed)
 
 
-def _edit(file: str, change: Callable[[dict], object]) -> Callable[[Path], None]:  # type: ignore[type-arg]
+Change = Callable[[dict], object]  # type: ignore[type-arg]
+
+
+def _edit(file: str, change: Change) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         settings = yaml.safe_load((folder / file).read_text())
         change(settings)
@@ -291,7 +294,7 @@ def _edit(file: str, change: Callable[[dict], object]) -> Callable[[Path], None]
     return apply
 
 
-def _reweigh(file: str, change: Callable[[dict], object]) -> Callable[[Path], None]:  # type: ignore[type-arg]
+def _reweigh(file: str, change: Change) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         content = torch.load(folder / file, weights_only=True)
         change(content)

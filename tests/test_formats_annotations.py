@@ -285,10 +285,11 @@ def test_static_kitti360_boxes_are_listed_near_their_window(tmp_path: Path) -> N
     from lidar_synth.formats.kitti360_boxes import MARGIN, read_boxes
 
     entry = (
-        "<object{0}><index>{0}</index><label>{1}</label>{2}<instanceId>7</instanceId><start_frame>500</start_frame>"
-        "<end_frame>700</end_frame><timestamp>{3}</timestamp><transform><rows>4</rows><cols>4</cols><dt>d</dt><data>"
-        "0 -2 0 10 4 0 0 0 0 0 1.5 0 0 0 0 "
-        "1</data></transform><vertices><data>{4}</data></vertices></object{0}>"
+        "<object{0}><index>{0}</index><label>{1}</label>{2}<instanceId>7</instanceId>"
+        "<start_frame>500</start_frame><end_frame>700</end_frame><timestamp>{3}</timestamp>"
+        "<transform><rows>4</rows><cols>4</cols><dt>d</dt>"
+        "<data>0 -2 0 10 4 0 0 0 0 0 1.5 0 0 0 0 1</data></transform>"
+        "<vertices><data>{4}</data></vertices></object{0}>"
     )
     cube = " ".join(
         str(v) for corner in np.ndindex(2, 2, 2) for v in np.array(corner) - 0.5

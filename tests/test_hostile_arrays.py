@@ -215,8 +215,8 @@ def changed(path: Path, **arrays: object) -> None:
         ("sensor", '{"name": "x", "columns": 1e999}', "without|columns"),
         (
             "sensor",
-            '{"name": "x", "columns": 2000000000, "rows": 2000000000, "range_min": 1, "range_max": 80, '
-            '"fov_up": 3, "fov_down": -25}',
+            '{"name": "x", "columns": 2000000000, "rows": 2000000000, "range_min": 1, '
+            '"range_max": 80, "fov_up": 3, "fov_down": -25}',
             "at most 4194304 cells",
         ),
         ("box_names", 3.0, "the boxes' names"),

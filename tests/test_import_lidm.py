@@ -191,7 +191,7 @@ def test_all_keys_of_the_published_networks_are_imported(
 
 
 # --- invalid files
-# ---------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def drop(weights: dict[str, Tensor]) -> None:
@@ -223,7 +223,8 @@ def reschedule(weights: dict[str, Tensor]) -> None:
     [
         (
             drop,
-            r"missing keys \['first_stage_model.decoder.up.1.block.0.norm1.bias'\], unexpected keys \[\]",
+            r"missing keys \['first_stage_model.decoder.up.1.block.0.norm1.bias'\], "
+            r"unexpected keys \[\]",
         ),
         (drop_average, r"missing keys \['model.diffusion_model.out.2.bias'\]"),
         (add, r"missing keys \[\], unexpected keys \['model.extra.weight'\]"),

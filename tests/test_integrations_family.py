@@ -45,9 +45,13 @@ class LaserScan:
 class SemanticKitti:
     def __init__(self, root, sequences, **options):
         self.__dict__ |= options
-        self.sensor_img_H, self.sensor_img_W, self.sensor_fov_up, self.sensor_fov_down = 4, 8, 3, -25
+        self.sensor_img_H, self.sensor_img_W = 4, 8
+        self.sensor_fov_up, self.sensor_fov_down = 3, -25
         self.scan_files = sorted(map(str, Path(root).glob("sequences/*/velodyne/*.bin")))
-        self.label_files = [path.replace("velodyne", "labels").replace(".bin", ".label") for path in self.scan_files]
+        self.label_files = [
+            path.replace("velodyne", "labels").replace(".bin", ".label")
+            for path in self.scan_files
+        ]
 
     def __len__(self):
         return len(self.scan_files)
@@ -59,7 +63,8 @@ class Parser:
     def __init__(self):
         super(Parser, self).__init__()
         raw = SEMANTIC_KITTI.from_train
-        self.root, self.train_sequences, self.batch_size, self.workers, self.shuffle_train = "sk", [0], 2, 0, True
+        self.root, self.train_sequences = "sk", [0]
+        self.batch_size, self.workers, self.shuffle_train = 2, 0, True
         options = {"labels": {}, "color_map": {}, "sensor": None, "max_points": 9**6, "gt": True}
         options["learning_map"] = {k: i + 1 for i, k in enumerate(raw)} | {0: 0}
         options["learning_map_inv"] = {i + 1: k for i, k in enumerate(raw)} | {0: 0}

@@ -247,7 +247,8 @@ def test_labels_arrive_in_the_trainers_ids(made: Path) -> None:
         points = sample["inputs"]["points"]
         mask = sample["data_samples"].gt_pts_seg.pts_semantic_mask
         assert np.array_equal(points, np.c_[scan.points, scan.reflectance])
-        assert np.array_equal(mask, np.where(scan.label == IGNORE, 19, scan.label))  # type: ignore[arg-type]
+        expected = np.where(scan.label == IGNORE, 19, scan.label)  # type: ignore[arg-type]
+        assert np.array_equal(mask, expected)
 
 
 def inside(sample: Any) -> list[int]:

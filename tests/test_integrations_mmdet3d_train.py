@@ -30,7 +30,8 @@ if find_spec("mmcv._ext") is None:
 from streets import kitti, synthetic
 
 SCRIPTS = Path(__file__).parent.parent / "tools" / "trainers" / "scripts"
-TRAIN = Path(find_spec("mmdet3d").origin or "").parent / ".mim" / "tools" / "train.py"  # type: ignore[union-attr]
+TRAINER = Path(find_spec("mmdet3d").origin or "").parent  # type: ignore[union-attr]
+TRAIN = TRAINER / ".mim" / "tools" / "train.py"
 
 
 ENVIRONMENT = {"PYTHONPATH": str(SCRIPTS), "NUMBA_ENABLE_CUDASIM": "1"}

@@ -74,7 +74,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     add_camera(root / "nuscenes" / VERSION / VERSION)
     create_nuscenes_info(VERSION, root / "nuscenes", root / "nuscenes", SWEEPS)
     add_recorded(root / "nuscenes" / VERSION)
-    torch.Tensor.cuda = lambda self, *args, **options: self  # type: ignore[method-assign]  # it counts points on a GPU
+    # It counts points on a GPU.
+    torch.Tensor.cuda = lambda self, *args, **options: self  # type: ignore[method-assign]
     plain(root).create_groundtruth_database(max_sweeps=SWEEPS)
     town = Town(seed=7, sensor="hdl32e_nuscenes", scans=6)
     write_all("npz", root / "synthetic", [town[i] for i in range(6)])

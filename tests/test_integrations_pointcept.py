@@ -264,7 +264,8 @@ def test_invalid_settings_are_refused(made: Path) -> None:
 
 
 SMALL = """
-seed, batch_size, num_worker, mix_prob, enable_wandb, epoch, eval_epoch = 1, 2, 2, 0, False, {epochs}, {epochs}
+seed, batch_size, num_worker, mix_prob, enable_wandb = 1, 2, 2, 0, False
+epoch, eval_epoch = {epochs}, {epochs}
 data = dict(train=dict(data_root={data!r}, mixture=dict(
     synthetic={synthetic!r}, ratio={ratio}, seed=3, labels={labels!r})))
 """
@@ -272,8 +273,8 @@ SEGMENTATION = """
 _base_ = [{stock!r}]
 custom_imports = dict(imports=["lidar_synth.integrations.pointcept"], allow_failed_imports=False)
 hooks = [dict(type="SynthEpoch"), *[dict(type=name) for name in (
-    "CheckpointLoader", "ModelHook", "IterationTimer", "InformationWriter", "SemSegEvaluator", "CheckpointSaver",
-    "PreciseEvaluator")]]
+    "CheckpointLoader", "ModelHook", "IterationTimer", "InformationWriter", "SemSegEvaluator",
+    "CheckpointSaver", "PreciseEvaluator")]]
 hooks[-2]["save_freq"] = 1
 model = dict(backbone=dict(channels=(8,) * 8, layers=(1,) * 8))
 {small}
@@ -283,8 +284,9 @@ data |= dict(val=dict(data_root={data!r}), test=dict(data_root={data!r}))
 PRETRAINING = """
 _base_ = [{stock!r}]
 model = dict(backbone=dict(
-    enc_depths=(1,) * 5, enc_channels=(12, 12, 24, 24, 48), enc_num_head=(1,) * 5, enc_patch_size=(64,) * 5,
-    enable_flash=False), head_in_channels=96, head_hidden_channels=32, head_embed_channels=16, head_num_prototypes=32)
+    enc_depths=(1,) * 5, enc_channels=(12, 12, 24, 24, 48), enc_num_head=(1,) * 5,
+    enc_patch_size=(64,) * 5, enable_flash=False),
+    head_in_channels=96, head_hidden_channels=32, head_embed_channels=16, head_num_prototypes=32)
 param_dicts = [dict(keyword="enc0", lr=0.004)]
 scheduler = dict(max_lr=[0.004, 0.004])
 {small}

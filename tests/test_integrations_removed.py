@@ -20,14 +20,16 @@ assert made.Parser().answer() == 42 and sys.modules["parserModule"] is made
 import numpy as np
 import tensorflow as tf
 writer = tf.summary.FileWriter("logs")
-writer.add_summary(tf.Summary(value=[tf.Summary.Value(tag="loss", simple_value=np.float64(0.5))]), 3)
+loss = tf.Summary.Value(tag="loss", simple_value=np.float64(0.5))
+writer.add_summary(tf.Summary(value=[loss]), 3)
 histogram = tf.HistogramProto()
 histogram.bucket_limit.append(1.0)
 writer.add_summary(tf.Summary(value=[tf.Summary.Value(tag="weights", histo=histogram)]), 3)
 writer.flush()
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 events = EventAccumulator("logs").Reload()
-assert [(e.step, e.value) for e in events.Scalars("loss")] == [(3, 0.5)] and events.Histograms("weights")
+assert [(e.step, e.value) for e in events.Scalars("loss")] == [(3, 0.5)]
+assert events.Histograms("weights")
 """,
     "torchvision": "import torchvision.transforms as transforms",
     "torch.load": """

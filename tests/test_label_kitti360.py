@@ -126,7 +126,8 @@ def test_confidence_tells_wrong_labels_from_right_ones(
 def test_a_segmenter_gets_only_scans_with_labels(
     root: Path, labelled: tuple[Path, LabelReport]
 ) -> None:
-    label_file(labelled[0], DRIVE, f"{5:010d}").rename(labelled[0] / "kept")  # type: ignore[union-attr]
+    moved = label_file(labelled[0], DRIVE, f"{5:010d}")
+    moved.rename(labelled[0] / "kept")  # type: ignore[union-attr]
     scans = KITTI360(root, labels=labelled[0])
     (labelled[0] / "kept").rename(labels_folder(labelled[0], DRIVE) / f"{5:010d}.label")
     assert len(scans) == SCANS - 1 and f"{DRIVE}/{5:010d}" not in scans.ids

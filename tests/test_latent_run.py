@@ -48,7 +48,8 @@ def test_an_autoencoder_is_a_checkpoint_without_a_flow(codec: Path) -> None:
     header, networks, _ = load_checkpoint(codec)
     assert set(networks) == {CODEC}
     assert header.channels == ("range", "reflectance", "label")
-    assert float(networks[CODEC].scale.mean()) != 1  # type: ignore[arg-type, union-attr]  # the latents' statistics
+    # The latents' statistics.
+    assert float(networks[CODEC].scale.mean()) != 1  # type: ignore[arg-type, union-attr]
     with pytest.raises(
         DataError, match="is an autoencoder; expected a model that generates"
     ):

@@ -355,7 +355,8 @@ def test_a_file_is_the_layout_that_it_describes(tmp_path: Path) -> None:
         (-20, 8, -1.6 + 3.05 / 2, 11.8, 2.55, 3.05, 0),
         atol=1e-4,
     )
-    assert layout.outlines[1].low[0] == np.float32(0.3) and layout.reach == 20  # type: ignore[index]
+    assert layout.outlines[1].low[0] == np.float32(0.3)  # type: ignore[index]
+    assert layout.reach == 20
     image = layout_image(layout, load_sensor("hdl64e_lasers"))
     assert {
         0,

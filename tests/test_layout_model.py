@@ -227,7 +227,8 @@ def test_banks_with_boxes_are_split_merged_and_repaired(
         assert not verify(tmp_path / name, progress=False) and len(again) == count
         for i in range(count):
             assert again[i].boxes.names == opened[i].boxes.names  # type: ignore[union-attr]
-            assert np.array_equal(again[i].boxes.values, opened[i].boxes.values)  # type: ignore[union-attr]
+            values = again[i].boxes.values, opened[i].boxes.values  # type: ignore[union-attr]
+            assert np.array_equal(*values)
     before = files(tmp_path / "both")
     damaged = tmp_path / "both" / "shard-00000.h5"
     content = damaged.read_bytes()
@@ -395,7 +396,8 @@ def test_ground_in_a_box_belongs_to_no_object() -> None:
     )
     scan = unproject(made)
     assert scan.boxes is not None and len(scan.boxes) == 1 and scan.instance is not None
-    assert (scan.instance > 0).any() and (scan.label[scan.instance > 0] == 0).all()  # type: ignore[index]
+    assert (scan.instance > 0).any()
+    assert (scan.label[scan.instance > 0] == 0).all()  # type: ignore[index]
 
 
 def test_a_reduced_layout_keeps_its_boxes_and_stays_with_its_scan(

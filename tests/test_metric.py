@@ -175,11 +175,13 @@ def test_intervals_hold_the_values_and_features_get_them_with_enough_scans() -> 
 
 
 # --- bad input
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_features_that_are_not_finite_name_their_scan() -> None:
-    broken = lambda scans: np.where([[s.id == REAL[1].id] for s in scans], np.nan, 1.0)  # noqa: E731
+    def broken(scans: Sequence[Scan]) -> np.ndarray:
+        return np.where([[s.id == REAL[1].id] for s in scans], np.nan, 1.0)
+
     with pytest.raises(
         DataError, match=f"scan {REAL[1].id!r}: features that are not finite"
     ):
@@ -239,7 +241,7 @@ def test_measures_of_classes_are_left_out_without_labels() -> None:
 
 
 # --- the cache
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 class Counting:

@@ -9,7 +9,7 @@ from banks import SENSOR, some_image, write_bank
 from mixtures import Endless, Scans
 
 import lidar_synth
-from lidar_synth.errors import ConfigError, FileError
+from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.formats import WRITERS
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.mixing import Linear, MixedScans
@@ -49,6 +49,8 @@ def test_two_folders_are_mixed_by_their_paths(tmp_path: Path) -> None:
         lidar_synth.mix("no/such", tmp_path / "bank")
     with pytest.raises(ConfigError, match="model 'tow'.*town"):
         lidar_synth.mix(tmp_path / "real", "tow")
+    with pytest.raises(DataError, match="a source without scans"):
+        lidar_synth.mix([], tmp_path / "bank")
 
 
 def test_synthetic_scans_come_out_on_the_sensor_of_the_real_ones() -> None:

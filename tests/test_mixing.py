@@ -225,18 +225,21 @@ def test_a_sample_that_is_changed_in_place_changes_no_scan(by: str) -> None:
     """Of sources that keep their scans in memory."""
     real = Scans("r", 4)
     kept = Scans("s", 4, domain=SYNTHETIC)
-    before = [(scan.points.tobytes(), scan.label.tobytes()) for scan in (*real, *kept)]  # type: ignore[union-attr]
+
+    def content() -> list[tuple[bytes, bytes]]:
+        scans = (*real, *kept)
+        return [(s.points.tobytes(), s.label.tobytes()) for s in scans]  # type: ignore[union-attr]
 
     def flip(scan: Scan, rng: np.random.Generator) -> Scan:
         scan.points[:, 1] *= -1
         scan.label[:] = IGNORE  # type: ignore[index]
         return scan
 
+    before = content()
     train = MixedScans(real, kept, 0.5, augment_real=True, **{by: flip})
     for i in range(len(train)):
         train[i]
-    after = [(scan.points.tobytes(), scan.label.tobytes()) for scan in (*real, *kept)]  # type: ignore[union-attr]
-    assert before == after
+    assert before == content()
 
 
 def test_wrap_returns_samples_of_the_wrapped_dataset_unchanged() -> None:
@@ -344,7 +347,12 @@ def test_forms_of_batches() -> None:
     items = [MixedScans(Scans("r", 2), Endless(), 0.5)[i] for i in range(3)]
     sizes = [len(item["points"]) for item in items]
     forms = {
-        form: MixedScans(Scans("r", 2), Endless(), 0.5, collate=form).collate(items)  # type: ignore[arg-type]
+        form: MixedScans(
+            Scans("r", 2),
+            Endless(),
+            0.5,
+            collate=form,  # type: ignore[arg-type]
+        ).collate(items)
         for form in ("offsets", "padded", "range")
     }
     offsets, padded, images = forms.values()

@@ -357,8 +357,9 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     ),
     "a stage of an override": (
         ["town", "techer.recipe.batch=4"],
-        r"override 'techer.recipe.batch=4'; expected STAGE.KEY=VALUE for a stage of town \(codec, teacher, "
-        r"student, decoder\), output=FOLDER, or a key of all its recipes \(licence, data, .*Such as codec.recipe.batch",
+        r"override 'techer.recipe.batch=4'; expected STAGE.KEY=VALUE for a stage of town "
+        r"\(codec, teacher, student, decoder\), output=FOLDER, or a key of all its recipes "
+        r"\(licence, data, .*Such as codec.recipe.batch",
     ),
     "a key": (
         ["town", "teacher.recipe.batches=4"],
@@ -371,18 +372,19 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     ),
     "too few minutes": (
         ["town", "--minutes", "0.01"],
-        r"--minutes 0.01 for the stages codec, teacher, student, decoder of town; expected at least 0.12. "
-        r"lidar-synth train town --dry-run prints",
+        r"--minutes 0.01 for the stages codec, teacher, student, decoder of town; expected at "
+        r"least 0.12. lidar-synth train town --dry-run prints",
     ),
     "a schedule": (
         ["town", "codec.recipe.schedule=cosine"],
-        r"codec.recipe.schedule=cosine with a limit of time; expected trapezoid. Or give codec.recipe.iterations=N",
+        r"codec.recipe.schedule=cosine with a limit of time; expected trapezoid. Or give "
+        r"codec.recipe.iterations=N",
     ),
     "a start": (
         ["town-layout", "output=elsewhere/town-layout"],
-        r"teacher.init=elsewhere/town/teacher/teacher.safetensors, which does not exist; expected the checkpoint "
-        r"of the stage teacher of town. Type `lidar-synth train town --until teacher "
-        r"output=elsewhere/town` first, or give teacher.init=FILE.safetensors",
+        r"teacher.init=elsewhere/town/teacher/teacher.safetensors, which does not exist; expected "
+        r"the checkpoint of the stage teacher of town. Type `lidar-synth train town --until "
+        r"teacher output=elsewhere/town` first, or give teacher.init=FILE.safetensors",
     ),
     "a start in runs": (
         ["town-camera"],

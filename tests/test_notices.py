@@ -50,7 +50,8 @@ def test_a_like_density_or_range_images_are_not_reported(
     collate: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     real = Dense(12) if collate == "range" else Scans("r", 12)
-    assert not logged(MixedScans(real, Endless(), 0.5, collate=collate), caplog)  # type: ignore[arg-type]
+    train = MixedScans(real, Endless(), 0.5, collate=collate)  # type: ignore[arg-type]
+    assert not logged(train, caplog)
 
 
 def test_a_tiny_bank_is_reported(caplog: pytest.LogCaptureFixture) -> None:

@@ -101,7 +101,8 @@ def test_only_similar_objects_are_paired_and_each_once() -> None:
 
 
 def test_a_place_that_is_asked_about_is_never_seen() -> None:
-    """A mark that tells the two sides apart at each place by another sign is of no use elsewhere."""
+    """A mark that tells the two sides apart at each place by another sign is of no use
+    elsewhere."""
     rng = np.random.default_rng(0)
 
     def marked(place: str, value: float) -> Crop:

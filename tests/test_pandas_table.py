@@ -197,9 +197,10 @@ def test_no_code_runs(
     assert made.exists(), "the pickle does nothing even in Python's own reader"
 
 
-NAMES = """posix.system nt.system subprocess.Popen builtins.__import__ builtins.getattr builtins.open runpy.run_path
-    importlib.import_module operator.attrgetter functools.partial types.CodeType copyreg.__newobj__ torch.load
-    numpy.load numpy.core.multiarray.scalar numpy.core._internal._ctypes numpy.testing.rundocs numpy.f2py.compile
+NAMES = """posix.system nt.system subprocess.Popen builtins.__import__ builtins.getattr
+    builtins.open runpy.run_path importlib.import_module operator.attrgetter functools.partial
+    types.CodeType copyreg.__newobj__ torch.load numpy.load numpy.core.multiarray.scalar
+    numpy.core._internal._ctypes numpy.testing.rundocs numpy.f2py.compile
     pandas.read_pickle pandas.io.pickle.read_pickle pandas.eval pandas.core.computation.eval.eval
     pandas.io.common.urlopen pandas.core.internals.managers.BlockManager.__init__""".split()
 """Functions of Python, numpy and pandas that no table names."""

@@ -143,7 +143,8 @@ def test_every_source_gets_its_share_over_epochs(
         tuple(PlannedSource(3 + i, w) for i, w in enumerate(real)),
         tuple(PlannedSource(None, w) for w in synthetic),
     )
-    mixed = Mixture(*parts, make_schedule(ratio), epoch_size=size, balanced=balanced)  # type: ignore[arg-type]
+    schedule = make_schedule(ratio)
+    mixed = Mixture(*parts, schedule, epoch_size=size, balanced=balanced)  # type: ignore[arg-type]
     given_so_far = np.zeros(len(real + synthetic), int)
     exact = Fraction(0)
     for epoch in range(12):
@@ -386,7 +387,8 @@ def test_schedules(ratio: object, expected: list[float]) -> None:
     before = (0, 0)
     for epoch in range(5):
         assert count_before(mixed, epoch) == before
-        before = tuple(np.add(before, count_samples(mixed, epoch)).tolist())  # type: ignore[assignment]
+        total = np.add(before, count_samples(mixed, epoch))
+        before = tuple(total.tolist())  # type: ignore[assignment]
         assert before[1] == ceil(
             sum(exact_synthetic(mixed, earlier) for earlier in range(epoch + 1))
         )

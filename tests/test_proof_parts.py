@@ -436,8 +436,8 @@ real, seen = SemanticKITTI(job["real"]), 0
 for stage in job["stages"]:
     synth = SemanticKITTI(stage["synthetic"]) if stage["synthetic"] else None
     size = stage["iterations"] * job["batch"]
-    mixed = MixedScans(None if stage["ratio"] == 1 else real, synth, stage["ratio"], labels=stage["labels"],
-                       seed=job["seed"], epoch_size=size)
+    mixed = MixedScans(None if stage["ratio"] == 1 else real, synth, stage["ratio"],
+                       labels=stage["labels"], seed=job["seed"], epoch_size=size)
     seen += sum(len(mixed[i]["points"]) > 0 for i in range(2)) > 0
 assert seen == len(job["stages"])
 held_out = SemanticKITTI(job["held_out"])

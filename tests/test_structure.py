@@ -16,11 +16,11 @@ from lidar_synth.labels import POLICIES
 ORDER = """
 errors files datasets noise geometry weather generate.models generate.flow generate labels bank
 formats mixing bake viz cli
-lab lab.importers lab.fitting lab.kitti360 lab.town lab.evaluate lab.curate lab.train lab.proof lab.start lab.reproduce
-lab.cli
+lab lab.importers lab.fitting lab.kitti360 lab.town lab.evaluate lab.curate lab.train lab.proof
+lab.start lab.reproduce lab.cli
 """.split()
-"""A module may import only from those before it and its own: the plugin (before ``lab``) never imports
-the laboratory."""
+"""A module may import only from those before it and its own: the plugin (before ``lab``) never
+imports the laboratory."""
 
 PACKAGE = Path(lidar_synth.__file__).parent
 INTEGRATIONS = PACKAGE.parent / "integrations"

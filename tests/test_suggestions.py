@@ -1,5 +1,5 @@
-"""75 mistakes of newcomers, on the command line, in Python and in YAML: each is answered in one line
-that names the option or what was expected and, for names, the nearest ones."""
+"""75 mistakes of newcomers, on the command line, in Python and in YAML: each is answered in one
+line that names the option or what was expected and, for names, the nearest ones."""
 
 import re
 import warnings
@@ -79,7 +79,8 @@ COMMANDS = {
     "start SCANS --trainer mmdet": "Did you mean 'mmdet3d'",
     "sensor fit SCANS --out my.json": "a file that ends in .yaml",
 }
-"""By command line: what the answer says. ``OUT`` is a new folder, ``SCANS`` and ``BANK`` are there."""
+"""By command line: what the answer says. ``OUT`` is a new folder, ``SCANS`` and ``BANK`` are
+there."""
 
 PYTHON = {
     "lidar_synth.Towm": "Did you mean 'Town'",

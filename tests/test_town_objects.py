@@ -1,4 +1,5 @@
-"""Objects of the town as GT samples: they are cast where they are pasted, by the rays of that scan."""
+"""Objects of the town as GT samples: they are cast where they are pasted, by the rays of that
+scan."""
 
 import pickle
 from pathlib import Path
@@ -118,7 +119,8 @@ def test_an_object_hides_and_is_hidden(bank: TownObjects, street: Scan) -> None:
         box = np.array([[x, 0, floor + size[2] / 2, *size, np.pi / 2]], np.float32)
         scan = found.cast(Boxes(box, ("Car",)), street.sensor)  # type: ignore[misc]
         objects.append(found._replace(scan=scan, ground=floor))
-    alone = len(paste(flat, objects[1:]).boxes.contain(objects[1].scan.points)[0])  # type: ignore[union-attr]
+    pasted = paste(flat, objects[1:])
+    alone = len(pasted.boxes.contain(objects[1].scan.points)[0])  # type: ignore[union-attr]
     both = paste(flat, objects, least=1)
     assert both.boxes is not None
     returns = both.boxes.contain(both.points, above_floor=0.1).sum(1)

@@ -116,8 +116,9 @@ def test_low_confidence_does_not_hide_an_object() -> None:
     ).any()
     item = mixed(scan, labels=KeepLabels(threshold=0.5))
     assert len(item["points"]) > 0  # type: ignore[arg-type]
-    near = np.linalg.norm(np.asarray(item["points"])[:, :2] - (10, -5), axis=1) < 1.2  # type: ignore[call-overload]
-    assert not (np.asarray(item["points"])[near, 2] > -1.2).any()  # type: ignore[call-overload]
+    points = np.asarray(item["points"])
+    near = np.linalg.norm(points[:, :2] - (10, -5), axis=1) < 1.2  # type: ignore[call-overload]
+    assert not (points[near, 2] > -1.2).any()  # type: ignore[call-overload]
 
 
 def test_scans_without_boxes_keep_their_objects() -> None:

@@ -44,8 +44,8 @@ EPOCHS = 40
 """Epochs of the training for which scans are mixed."""
 
 _SYNTHETIC = (
-    "The synthetic scans are four of the shipped model, which has learnt a procedural town, and four "
-    "of another such town: they look like the town. For scans like yours, adapt the model "
+    "The synthetic scans are four of the shipped model, which has learnt a procedural town, and "
+    "four of another such town: they look like the town. For scans like yours, adapt the model "
     "(lidar-synth adapt)."
 )
 _RECORDED = (

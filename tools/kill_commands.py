@@ -82,7 +82,8 @@ TIMES = {
 """Fields of JSON and of the metadata of tensors that differ between two undisturbed runs."""
 
 UNCOMPARED = {"train": {"logs"}, "prove": {"index.html"}}
-"""Files and folders that tell the time: TensorBoard's, and the page, which shows what ``results.json`` holds."""
+"""Files and folders that tell the time: TensorBoard's, and the page, which shows what
+``results.json`` holds."""
 
 DONE, FAILED, REFUSED = range(3)
 """How a run ended: well, with an exception, or with one of the package's errors."""
@@ -257,7 +258,7 @@ def fill_disk(trial: Trial, times: int, rng: random.Random) -> None:
 
 
 def become_nobody(cache: Path) -> None:
-    """Give up the right to write anywhere but into ``cache``, where numba keeps what it compiles."""
+    """Give up the right to write anywhere but in ``cache``, where numba keeps what it compiles."""
     setattr(numba.config, "CACHE_DIR", str(cache))  # noqa: B010 - no attribute for mypy
     os.setuid(NOBODY)
 

@@ -1,7 +1,8 @@
 """Read banks and plans by ``integrations/reader.py`` alone, on old versions of Python, numpy and
 h5py.
 
-    python tools/test_reader_versions.py --python python3.8 numpy==1.23.5 --python python3.10 numpy==1.23.5 h5py==3.8.0
+    python tools/test_reader_versions.py --python python3.8 numpy==1.23.5
+        --python python3.10 numpy==1.23.5 h5py==3.8.0
 
 The package writes the banks and plans of ``tests/reader_cases.py`` and its own reading of them;
 each environment, made anew with the given packages and without this one, has to read the same bits.

@@ -41,7 +41,9 @@ class BakeJob(BaseModel):
     first: int = Field(0, ge=0, lt=2**62, description="index of the first scan")
     shard_size: Count | None = Field(
         None,
-        description="scans per file, which an interrupted bake keeps [an eighth of all, 64 to 1024]",
+        description=(
+            "scans per file, which an interrupted bake keeps [an eighth of all, 64 to 1024]"
+        ),
     )
     steps: Count | None = Field(None, description="number of steps [the model's own]")
     solver: str = Field("euler", description="ODE solver: euler | heun")
@@ -61,8 +63,8 @@ class BakeJob(BaseModel):
     objects: Literal["town", "drawn"] | None = Field(
         None,
         description=(
-            "what stands in the boxes of layouts: town, objects that are cast there | drawn, by the "
-            "model [town]"
+            "what stands in the boxes of layouts: town, objects that are cast there | "
+            "drawn, by the model [town]"
         ),
     )
     guidance: float = Field(

@@ -222,7 +222,7 @@ class ShardCache:
             yield
 
     def _claim(self, entry: Entry, now: bool) -> "_Claim | None":
-        """A place for a copy of a shard, with as many bytes, if there is to be one; see ``fetch``."""
+        """A place for a copy of a shard, as many bytes, if there is to be one; see ``fetch``."""
         name = self._path(entry).name
         while not self._has(entry):
             with self._alone():

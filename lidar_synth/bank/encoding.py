@@ -223,8 +223,9 @@ def _train_ids(label: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 @numba.njit(nogil=True, cache=True)
-def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-def]  # (N,) float32, compiled
-    """Steps of 1 / inverse metres; False where a range is outside near to far and not 0."""
+def _encode_range(metres, inverse, near, far, out):  # type: ignore[no-untyped-def]
+    """Steps of 1 / inverse metres, of (N,) float32; False where a range is outside near to far and
+    not 0."""
     sound = True
     for i in range(len(metres)):
         seen = metres[i] != 0

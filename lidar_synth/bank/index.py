@@ -3,12 +3,13 @@ size and hash.
 
 ``index.json``::
 
-    format     "lidar-synth-bank/1", or "lidar-synth-bank/2" where scans have boxes and instances; readers refuse
-               every other value
+    format     "lidar-synth-bank/1", or "lidar-synth-bank/2" where scans have boxes and instances;
+               readers refuse every other value
     scans      number of scans
     sources    the facts of each bake; more than one after a merge
-    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes, sha256; in a
-               curated bank also ``dropped``: positions in the file of the scans that are left out
+    shards     in order: file, seed, first index, scans, source (a position in ``sources``), bytes,
+               sha256; in a curated bank also ``dropped``: positions in the file of the scans that
+               are left out
     repairs    descriptions of the shards that a repair wrote with different bytes
     curation   in a curated bank: why scans were left out
     files      sha256 of the other files of the bank; missing in banks of older versions
@@ -18,9 +19,12 @@ The root attributes of each shard repeat the facts and have to agree with them; 
 stored directly, everything else as JSON::
 
     sensor         as in sensors.yaml; scale = range_max / 65535, metres per step of ``range``
-    fields         what is stored beside the range: reflectance, label, confidence; in /2 instance, boxes
-    model          the checkpoint's name, or that of a data set; checkpoint: its hash, empty for recorded scans
-    provenance     its header's provenance; of recorded scans their data, and their terms if there are any
+    fields         what is stored beside the range: reflectance, label, confidence; in /2 instance,
+                   boxes
+    model          the checkpoint's name, or that of a data set; checkpoint: its hash, empty for
+                   recorded scans
+    provenance     its header's provenance; of recorded scans their data, and their terms if there
+                   are any
     settings       of the bake: everything else that determines the scans
     label_policy   "generated", "condition", "annotated" (recorded scans), or "none"
     condition      the dataset that the scans are conditioned on, or null

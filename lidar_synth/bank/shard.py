@@ -7,15 +7,15 @@ An HDF5 file. The root attributes are the bank's facts (see ``index``) and ``see
     instance                                (scans, H, W), in "lidar-synth-bank/2"
     boxes                                   (scans, 256, 9), see ``boxes``; in "lidar-synth-bank/2"
     seed, index                             (scans,) uint64: seed and index of the scan's noise
-    condition                               (scans,) text, in conditional banks: name of the conditioning scan
-    crc                                     (scans,) uint32: CRC-32 of a scan's seed, index, condition and arrays
+    condition                               (scans,) text, in conditional banks: name of the
+                                            conditioning scan
+    crc                                     (scans,) uint32: CRC-32 of a scan's seed, index,
+                                            condition and arrays
 
 A chunk holds one array of one scan: shuffled, deflated (level 1), and followed by its Fletcher-32
 checksum, as HDF5's own filters write it, so that any HDF5 library reads it. The file format is that
-of HDF5 1.10, whose metadata has
-checksums: in older formats a flipped bit in an attribute, such as the scale, would stay undetected.
-    No byte of a file
-depends on the time of writing.
+of HDF5 1.10, whose metadata has checksums: in older formats a flipped bit in an attribute, such as
+the scale, would stay undetected. No byte of a file depends on the time of writing.
 
 When a shard is opened, HDF5 reads the attributes and the addresses of the chunks once (``layout``).
 Scans are then read directly from the file, with a single read where their chunks are adjacent.

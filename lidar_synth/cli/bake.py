@@ -86,9 +86,11 @@ def bake(
       lidar-synth bake bank --config bake_town --dry-run
       lidar-synth bake s3://bucket/bank --count 1000000 --shard-index auto --num-shards 64
       lidar-synth bake bank --count 1000000 --device cuda --engine ray --address auto --workers 8
-      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI --condition-split train
+      lidar-synth bake bank --model semantic.safetensors --condition SemanticKITTI \\
+          --condition-split train
       lidar-synth bake bank --count 100000 --shard-index 2 --num-shards 4
-      torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 --device cuda --engine torchrun
+      torchrun --nproc-per-node 8 -m lidar_synth bake bank --count 100000 \\
+          --device cuda --engine torchrun
     """
     from lidar_synth.bake import bake as run
     from lidar_synth.bake import make_plan
@@ -164,8 +166,8 @@ def _report_unboxed(bank: str, scans: int = 8) -> None:
     found = measure(opened[i] for i in range(min(scans, len(opened))))
     if found.objects:
         typer.echo(
-            f"  {found}; a detector needs labels: paste, which removes them and pastes objects with "
-            "boxes"
+            f"  {found}; a detector needs labels: paste, which removes them and pastes "
+            "objects with boxes"
         )
 
 

@@ -53,8 +53,8 @@ def sample(
         str | None,
         typer.Option(
             help=(
-                "what stands in the boxes of layouts: town, objects that are cast there | drawn, by "
-                "the model [town]"
+                "what stands in the boxes of layouts: town, objects that are cast there | "
+                "drawn, by the model [town]"
             )
         ),
     ] = None,
@@ -90,7 +90,8 @@ def sample(
       lidar-synth sample out
       lidar-synth sample out --count 100 --seed 7 --to semantic_kitti
       lidar-synth sample out --model runs/town_teacher/town_teacher.safetensors --steps 50
-      lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI --condition-split val
+      lidar-synth sample out --model semantic.safetensors --condition SemanticKITTI \\
+          --condition-split val
       lidar-synth sample out --model town-layout --condition behind_a_van.yaml
     """
     import torch

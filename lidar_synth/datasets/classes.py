@@ -84,7 +84,7 @@ class Taxonomy:
     Example:
         >>> import numpy as np
         >>> from lidar_synth.datasets.classes import SEMANTIC_KITTI
-        >>> train = SEMANTIC_KITTI.decode(np.array([10, 252, 40, 0]))  # car, moving car, road, unlabelled
+        >>> train = SEMANTIC_KITTI.decode(np.array([10, 252, 40, 0]))  # car, moving car, road, none
         >>> train
         array([  0,   0,   8, 255], dtype=uint8)
         >>> SEMANTIC_KITTI.encode(train)

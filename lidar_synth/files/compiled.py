@@ -15,7 +15,8 @@ def keep_compiled_code() -> None:
     Raises:
         FileError: if no folder may be written to.
     """
-    user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111 - Path raises without a home
+    # Path raises without a home.
+    user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
     own = Path(__file__).parent / "__pycache__"
     named = "NUMBA_CACHE_DIR" in os.environ
     if named or _may_write(own) or _may_write(Path(user, "numba")):

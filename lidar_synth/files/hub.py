@@ -1,8 +1,8 @@
 """Models and banks on the Hugging Face hub: their names, cards and uploads (extra ``hub``).
 
-``hf://user/model`` names a model and ``hf://datasets/user/bank`` a bank; ``@REVISION`` behind it is a
-branch, a tag or the hash of a commit. Everything is read from one commit, so that what others push
-meanwhile is not mixed in. Only such names lead to a request.
+``hf://user/model`` names a model and ``hf://datasets/user/bank`` a bank; ``@REVISION`` behind it is
+a branch, a tag or the hash of a commit. Everything is read from one commit, so that what others
+push meanwhile is not mixed in. Only such names lead to a request.
 """
 
 import json

@@ -28,8 +28,8 @@ else:
     import fcntl
 
     def _lock(file: BinaryIO, alone: bool) -> bool:
-        """Take the lock: shared after waiting, or exclusive (``try_lock``) without waiting; False if
-        unavailable."""
+        """Take the lock: shared after waiting, or exclusive (``try_lock``) without waiting; False
+        if unavailable."""
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if alone else fcntl.LOCK_SH)
             return True

@@ -295,7 +295,8 @@ class TarMember(tarfile.TarInfo):
 
 
 _DESCRIPTION = re.compile(
-    r"""\{(?:(?:['"]descr['"]:(?:['"](?P<descr>[^'"]*)['"])|['"]fortran_order['"]:(?P<fortran>True|False)"""
+    r"""\{(?:(?:['"]descr['"]:(?:['"](?P<descr>[^'"]*)['"])"""
+    r"""|['"]fortran_order['"]:(?P<fortran>True|False)"""
     r"""|['"]shape['"]:\((?P<shape>(?:[0-9]{1,12}L?(?:,|(?=\))))*)\)),?){3}\}"""
 )
 """The header of numpy's format, without white space: a dictionary of these three, in any order."""

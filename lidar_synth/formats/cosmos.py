@@ -1,16 +1,17 @@
-"""LiDAR tensors of NVIDIA's Cosmos models in ``.safetensors`` files: what Cosmos3-Nano-Transfer-Auto
-takes as ``lidar.control_path`` and ``lidar.condition_path``, and returns.
+"""LiDAR tensors of NVIDIA's Cosmos models in ``.safetensors`` files: what
+Cosmos3-Nano-Transfer-Auto takes as ``lidar.control_path`` and ``lidar.condition_path``, and
+returns.
 
-One tensor ``frames`` of shape (3, T, 128, 1800), float32, holds T sweeps: range in metres, intensity
-and validity, both from 0 to 1
+One tensor ``frames`` of shape (3, T, 128, 1800), float32, holds T sweeps: range in metres,
+intensity and validity, both from 0 to 1
 (https://github.com/vllm-project/vllm-omni/blob/main/recipes/cosmos3/Cosmos3-Nano-Transfer-Auto.md).
 Columns run clockwise from behind the sensor, and rows are the elevations of a Hesai Pandar128
 (https://github.com/nv-tlabs/Cosmos-Drive-Dreams, ``cosmos-transfer-lidargen``): the preset
 ``pandar128``. Its code casts the rays of a cell through the cell's left edge, this package through
 the centre, 0.1 degrees further.
 
-A scan is written on its own sensor's grid, with its description in the file's metadata; Cosmos takes
-those of ``convert --as-sensor pandar128``. Labels, boxes and poses are lost.
+A scan is written on its own sensor's grid, with its description in the file's metadata; Cosmos
+takes those of ``convert --as-sensor pandar128``. Labels, boxes and poses are lost.
 """
 
 import json

@@ -7,7 +7,8 @@ banks. For all others it stands in ``scans.json`` in the root of their folder::
     {"format": "lidar-synth-scans/1",
      "sensor": {"name": "os1_128", "rows": 128, ...},            the keys of sensors.yaml
      "grid": [128, 1024],                                        rows and columns of the sensor
-     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town", "checkpoint": "9f...", "seed": 7}]}
+     "origins": [{"domain": "synthetic", "made_by": "model", "model": "town",
+                  "checkpoint": "9f...", "seed": 7}]}
 
 An origin is the domain of some of the scans (``real`` or ``synthetic``) with their
 ``Scan.provenance``. A folder has several if scans of several were written into it; then it does not
@@ -52,7 +53,8 @@ _MOST_FACTS = 32
 _LONGEST_TEXT = 1000
 
 _OF_A_LAYOUT = re.compile(
-    r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d|training|testing"
+    r"velodyne(_points|_reduced)?|data|data_3d_raw|2013_05_28_drive_\d{4}_sync|sequences|\d\d"
+    r"|training|testing"
 )
 
 _OF_A_DATASET = (

@@ -2,14 +2,17 @@
 
 Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
-    data_3d_raw/DRIVE/velodyne_points/data/FFFFFFFFFF.bin       float32 x, y, z, reflectance; sensor frame
-    data_2d_raw/DRIVE/image_00/data_rect/FFFFFFFFFF.png         rectified left camera
-    data_poses/DRIVE/poses.txt                                  F and 12 numbers: the car's IMU at frame F to world
-    data_3d_bboxes/train/DRIVE.xml                              boxes, see kitti360_boxes.py
-    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label        labels per scan, see below
-    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin      uint8 per point, 255 = certain
-    calibration/perspective.txt                                 P_rect_00, R_rect_00
-    calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt    camera 0 to velodyne; each camera to the IMU
+    data_3d_raw/DRIVE/velodyne_points/data/FFFFFFFFFF.bin      float32 x, y, z, reflectance;
+                                                               sensor frame
+    data_2d_raw/DRIVE/image_00/data_rect/FFFFFFFFFF.png        rectified left camera
+    data_poses/DRIVE/poses.txt                                 F and 12 numbers: the car's IMU at
+                                                               frame F to world
+    data_3d_bboxes/train/DRIVE.xml                             boxes, see kitti360_boxes.py
+    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label       labels per scan, see below
+    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin     uint8 per point, 255 = certain
+    calibration/perspective.txt                                P_rect_00, R_rect_00
+    calibration/calib_cam_to_velo.txt, calib_cam_to_pose.txt   camera 0 to velodyne; each camera to
+                                                               the IMU
 
 The dataset publishes labels of accumulated clouds only. ``lidar-synth label kitti360`` recovers
 labels per scan from them (kitti360_labels.py), and so does

@@ -2,11 +2,11 @@
 
 Files (https://www.cvlibs.net/datasets/kitti-360/documentation.php)::
 
-    calibration/perspective.txt          P_rect_00, R_rect_00, S_rect_00
-    calibration/calib_cam_to_velo.txt    12 numbers: camera 0, unrectified, to velodyne
-    calibration/calib_cam_to_pose.txt    image_00: camera 0, unrectified, to IMU
-    data_poses/DRIVE/poses.txt           a frame and 12 numbers per line: IMU to world
-    data_poses/DRIVE/cam0_to_world.txt   a frame and 16 numbers per line: rectified camera 0 to world
+    calibration/perspective.txt         P_rect_00, R_rect_00, S_rect_00
+    calibration/calib_cam_to_velo.txt   12 numbers: camera 0, unrectified, to velodyne
+    calibration/calib_cam_to_pose.txt   image_00: camera 0, unrectified, to IMU
+    data_poses/DRIVE/poses.txt          a frame and 12 numbers per line: IMU to world
+    data_poses/DRIVE/cam0_to_world.txt  a frame and 16 numbers per line: rectified camera 0 to world
 """
 
 from collections.abc import Iterable, Mapping

@@ -2,14 +2,14 @@
 
 Layout (https://www.cvlibs.net/datasets/kitti/raw_data.php)::
 
-    DATE/DATE_drive_NNNN_sync/velodyne_points/data/FFFFFFFFFF.bin     float32 x, y, z, reflectance
-    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml                     boxes of the whole drive, velodyne frame
-    DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png            left colour camera
+    DATE/DATE_drive_NNNN_sync/velodyne_points/data/FFFFFFFFFF.bin   float32 x, y, z, reflectance
+    DATE/DATE_drive_NNNN_sync/tracklet_labels.xml                   boxes of the whole drive,
+                                                                    velodyne frame
+    DATE/DATE_drive_NNNN_sync/image_02/data/FFFFFFFFFF.png          left colour camera
     DATE/calib_velo_to_cam.txt, DATE/calib_cam_to_cam.txt
 
 A tracklet is one object: its size, and from ``first_frame`` on one pose per frame, with x, y, z the
-    centre of the
-box's *floor* and rz the yaw. The package reads this layout and does not write it.
+centre of the box's *floor* and rz the yaw. The package reads this layout and does not write it.
 """
 
 import xml.etree.ElementTree as ElementTree

@@ -2,12 +2,15 @@
 
 Layout (https://github.com/scaleapi/pandaset-devkit), a folder for each sequence::
 
-    NNN/lidar/FF.pkl.gz                  table x, y, z (world, metres), i 0..255, t (seconds), d (0 Pandar64, 1 GT)
-    NNN/lidar/poses.json                 for each frame position and heading (w, x, y, z): vehicle to world
-    NNN/lidar/timestamps.json            seconds, one for each frame
-    NNN/annotations/semseg/FF.pkl.gz     table class, a row for each point; not for every sequence
-    NNN/annotations/cuboids/FF.pkl.gz    table of boxes in the world frame
-    NNN/camera/NAME/FF.jpg               six cameras, with poses.json, timestamps.json, intrinsics.json
+    NNN/lidar/FF.pkl.gz                 table x, y, z (world, metres), i 0..255, t (seconds),
+                                        d (0 Pandar64, 1 GT)
+    NNN/lidar/poses.json                for each frame position and heading (w, x, y, z): vehicle to
+                                        world
+    NNN/lidar/timestamps.json           seconds, one for each frame
+    NNN/annotations/semseg/FF.pkl.gz    table class, a row for each point; not for every sequence
+    NNN/annotations/cuboids/FF.pkl.gz   table of boxes in the world frame
+    NNN/camera/NAME/FF.jpg              six cameras, with poses.json, timestamps.json,
+                                        intrinsics.json
 
 The tables are pickled by pandas; ``pandas_table`` reads them without running their code. The points
 are compensated for the motion of the vehicle: each is in the world frame. By default the reader

@@ -161,9 +161,8 @@ def _header(text: str, where: str) -> tuple[list[Field], int]:
         *(header[key] for key in _PER_FIELD), strict=True
     ):
         if size not in _SIZES.get(kind, "") or int(count) < 1:
-            given = f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}"
             raise DataError(
-                given,
+                f"{where}: field {name[:50]!r} of TYPE {kind[:20]}, SIZE {size} and COUNT {count}",
                 "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8, at least one value",
                 SKIP_HINT,
             )

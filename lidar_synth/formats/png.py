@@ -4,7 +4,8 @@ Layout::
 
     range/NAME.png          16 bit grey: range in steps of ``scale`` metres, 0 = no return
     reflectance/NAME.png    16 bit grey: reflectance * 65535
-    label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only with labels
+    label/NAME.png          8 bit palette in SemanticKITTI's colours: train id, 255 = ignore; only
+                            with labels
 
 ``range`` carries a text chunk ``lidar_synth``: JSON with ``scale``, ``sensor`` (the keys of
 sensors.yaml), ``id`` and ``domain``. The format is lossy: rounding errors are at most half a step,

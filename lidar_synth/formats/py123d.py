@@ -51,15 +51,15 @@ LABELS = {"NuScenes": NUSCENES, "Pandaset": PANDASET, "WODPerception": WAYMO}
 
 OBJECTS = {
     "Default": "- Car Tram Misc Pedestrian - - - - - - -",
-    "AV2Sensor": "- Misc Misc Cyclist - Truck Misc - - - Misc Misc - Misc Cyclist Pedestrian Pedestrian "
-    "Tram Car Misc - - - Misc Truck Truck Misc Misc Misc Cyclist",
+    "AV2Sensor": "- Misc Misc Cyclist - Truck Misc - - - Misc Misc - Misc Cyclist Pedestrian "
+    "Pedestrian Tram Car Misc - - - Misc Truck Truck Misc Misc Misc Cyclist",
     "KITTI360": "Misc - Misc Car Misc - Misc Pedestrian - Cyclist - - - - Misc Tram - Truck -",
     "NuPlan": "Car Cyclist Pedestrian - - - -",
     "Nureasoning": "Car Cyclist Pedestrian - - - - Truck Misc Misc Misc Pedestrian -",
-    "NuScenes": "Car Truck Misc Misc Misc Misc Misc Misc Misc Misc Pedestrian Pedestrian Pedestrian "
-    "Misc Pedestrian Misc Misc - - - - - -",
-    "Pandaset": "- - Misc Misc Car - - Misc Truck Misc Misc Misc Misc Misc Pedestrian Pedestrian Misc "
-    "Truck - - - Truck - - Misc Tram Tram",
+    "NuScenes": "Car Truck Misc Misc Misc Misc Misc Misc Misc Misc Pedestrian Pedestrian "
+    "Pedestrian Misc Pedestrian Misc Misc - - - - - -",
+    "Pandaset": "- - Misc Misc Car - - Misc Truck Misc Misc Misc Misc Misc Pedestrian Pedestrian "
+    "Misc Truck - - - Truck - - Misc Tram Tram",
     "WODPerception": "- Car Pedestrian - Cyclist",
     "PhysicalAIAV": "Car Pedestrian Misc Truck Misc - Cyclist - Misc - Tram Misc",
     "Griffin": "Pedestrian Car Truck Misc Misc Misc",

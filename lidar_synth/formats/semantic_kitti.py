@@ -2,12 +2,12 @@
 
 Layout (http://www.semantic-kitti.org/dataset.html)::
 
-    sequences/NN/velodyne/FFFFFF.bin     float32 x, y, z, reflectance; sensor frame
-    sequences/NN/labels/FFFFFF.label     uint32 per point: class below, instance in the upper 16 bits
-    sequences/NN/image_2/FFFFFF.png      left colour camera
-    sequences/NN/calib.txt               P0..P3 and Tr: rectified camera 0 from velodyne
-    sequences/NN/poses.txt               line F: camera 0 at frame F to world, 12 numbers
-    sequences/NN/times.txt               line F: seconds
+    sequences/NN/velodyne/FFFFFF.bin    float32 x, y, z, reflectance; sensor frame
+    sequences/NN/labels/FFFFFF.label    uint32 per point: class below, instance in the upper 16 bits
+    sequences/NN/image_2/FFFFFF.png     left colour camera
+    sequences/NN/calib.txt              P0..P3 and Tr: rectified camera 0 from velodyne
+    sequences/NN/poses.txt              line F: camera 0 at frame F to world, 12 numbers
+    sequences/NN/times.txt              line F: seconds
 
 The pose of a ``Scan`` is sensor to world: Tr^-1 pose Tr.
 """

@@ -23,8 +23,8 @@ or drop points that are NaN or infinite and count them."""
 _TRIED = 8  # scans of which the first readable one is compared with the sensor
 _NAME_IT = (
     "Name the sensor that recorded the scans, even if it is this one: --sensor NAME|FILE.yaml "
-    "(sensor=...), or "
-    f'{{"format": "{FORMAT}", "sensor": "NAME"}} in {NAME} in their folder. If no preset fits: lidar-synth sensor fit.'
+    f'(sensor=...), or {{"format": "{FORMAT}", "sensor": "NAME"}} in {NAME} in their folder. '
+    "If no preset fits: lidar-synth sensor fit."
 )
 
 

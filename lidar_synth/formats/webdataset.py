@@ -4,11 +4,13 @@ The members of a scan are stored consecutively; their names begin with its key, 
 dots and % encoded as %2E and %25::
 
     scans-000000.tar          the first 1000 scans, and so on
-      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml); if known also
-                              provenance, pose (4 x 4, sensor to world) and names of the boxes
+      KEY.json                id, domain (0 real, 1 synthetic), sensor (the keys of sensors.yaml);
+                              if known also provenance, pose (4 x 4, sensor to world) and names of
+                              the boxes
       KEY.points.npy          (N, 4) float32: x, y, z in metres, reflectance in [0, 1]
-      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples have the same keys,
-                              with "labelled": false in KEY.json if the scan has no labels
+      KEY.label.npy           (N,) uint8 train ids, 255 = ignore; always written, so that samples
+                              have the same keys, with "labelled": false in KEY.json if the scan has
+                              no labels
       KEY.confidence.npy      and other known fields per point: raw_label, instance, ring
       KEY.boxes.npy           (M, 7) float32, if there are boxes: x, y, z, l, w, h, yaw
 
@@ -169,7 +171,10 @@ class WebDatasetWriter(Writer):
         for number, paths in parts.items():
             shard = self.root / f"scans-{number:06d}{SUFFIX}"
             members = _merge(shard, {self._key_of(path): path for path in paths})
-            write_file(shard, lambda file, members=members: _write_tar(file, members))  # type: ignore[misc]
+            write_file(
+                shard,
+                lambda file, members=members: _write_tar(file, members),  # type: ignore[misc]
+            )
         clear_notes(self.root)
         self._there = None
 

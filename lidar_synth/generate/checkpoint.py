@@ -6,17 +6,20 @@ generation needs::
 
     format          "lidar-synth-checkpoint/2"; others are refused
     convention      "t=1 noise, t=0 data, v=noise-data": the convention of times and velocities
-    networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the autoencoder of a latent
-                    model (the only part of an autoencoder's checkpoint), "condition" the encoder of a condition
+    networks        {part: {architecture, arguments}}; "velocity" is the flow, "codec" the
+                    autoencoder of a latent model (the only part of an autoencoder's checkpoint),
+                    "condition" the encoder of a condition
     sensor          the sensor, as in sensors.yaml
     normalisation   the normalisation of the range
     channels        channels of the network's data, in order, each a key of ``normalize.CHANNELS``
     label_encoding  the encoding of labels in channels, or null
-    conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options: ``dropout``, share of
-                    blank conditions in training; ``image``, rows and columns of the camera's images
+    conditioning    {key of conditions.CONDITIONS: its options}; empty = unconditional. Options:
+                    ``dropout``, share of blank conditions in training; ``image``, rows and columns
+                    of the camera's images
     time_grid       times descending from 1 to 0: the steps that the weights were trained for
     other_grids     those for other numbers of steps, if there are any
-    provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher, recipe, metrics
+    provenance      ``data``, ``data_licence`` and ``licence`` (of the weights) at least; teacher,
+                    recipe, metrics
     weights         sha256 of all tensors
     checksum        sha256 of all other keys, as JSON with sorted keys
 

@@ -2,11 +2,12 @@
 
 A condition is an array of integers, a ``Layout``, or a real ``Scan`` that provides it::
 
-    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor (``RangeImage.label``)
-    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the image at
-               ``Scan.image_path``, which is resized
-    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``); a scan with boxes
-               provides its own layout
+    semantic   (H, W) uint8 train ids 0..18, 255 = unknown, on the model's sensor
+               (``RangeImage.label``)
+    camera     (3, h, w) uint8 red, green, blue, of the size that the model's encoder takes; or the
+               image at ``Scan.image_path``, which is resized
+    layout     a ``Layout``, or (5, H, W) uint8, its image on the model's sensor (``layout_image``);
+               a scan with boxes provides its own layout
 
 An encoder (``models.encoders``), trained with the velocity network, encodes it as the ``cond`` of
 that network. A model that was also trained with blank conditions (``dropout``) can be guided: see
@@ -270,7 +271,8 @@ class LayoutImage:
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """(5, H, W)."""
-        return (len(CHANNELS), *encoder.resolution)  # type: ignore[misc]  # every encoder has a resolution
+        # Every encoder has a resolution.
+        return (len(CHANNELS), *encoder.resolution)  # type: ignore[misc]
 
     def read(
         self,
@@ -411,7 +413,8 @@ def batch_of(
         given = given[name]
     readable = (Scan, Layout) if name == "layout" else Scan
     if isinstance(given, readable):
-        given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]  # a layout for layouts only
+        # A layout for layouts only.
+        given = condition.read(given, sensor, shape, options)  # type: ignore[arg-type]
     elif (
         isinstance(given, Sequence)
         and given

@@ -31,7 +31,8 @@ def check_device(device: str | torch.device) -> torch.device:
     except (RuntimeError, TypeError) as error:  # an unknown name, or not a string
         raise _missing(device, available_devices()) from error
     if given.type == "cpu" and not given.index:
-        return given  # without querying GPUs: after CUDA is initialised, forked children cannot use it
+        # Without querying GPUs: after CUDA is initialised, forked children cannot use it.
+        return given
     available = available_devices()
     kinds = {name.partition(":")[0] for name in available}
     if str(given) not in available and (

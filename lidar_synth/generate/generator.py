@@ -419,7 +419,7 @@ class Generated:
         >>> from lidar_synth import load_generator, open_scans
         >>> from lidar_synth.generate.generator import Generated
         >>> real = open_scans("demo_out/town")
-        >>> synth = Generated(load_generator("town-semantic"), condition=real)  # for MixedScans(real, synth, ...)
+        >>> synth = Generated(load_generator("town-semantic"), condition=real)  # for MixedScans
         >>> sorted(synth[0].fields())
         ['confidence', 'label', 'reflectance']
     """

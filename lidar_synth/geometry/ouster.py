@@ -4,13 +4,15 @@ The file (https://static.ouster.dev/sensor-docs/, "sensor metadata") has the cal
 sensor. Firmware before 3 and the SDK's "legacy" form have all keys in one object; the newer form
 groups them::
 
-    beam_intrinsics.beam_altitude_angles     degrees, one per row of the image, highest first
-    beam_intrinsics.beam_azimuth_angles      degrees, clockwise seen from above, away from the direction of the firing
-    lidar_intrinsics.lidar_to_sensor_transform   4 x 4, millimetres, row by row: the lasers above the sensor's base
-    lidar_data_format.columns_per_frame      firings of a turn ("data_format" in the legacy form)
-    lidar_data_format.udp_profile_lidar      resolution of range and reflectance
-    config_params.lidar_mode                 1024x10: firings of a turn, turns a second
-    sensor_info.prod_line                    OS-1-128
+    beam_intrinsics.beam_altitude_angles        degrees, one per row of the image, highest first
+    beam_intrinsics.beam_azimuth_angles         degrees, clockwise seen from above, away from the
+                                                direction of the firing
+    lidar_intrinsics.lidar_to_sensor_transform  4 x 4, millimetres, row by row: the lasers above the
+                                                sensor's base
+    lidar_data_format.columns_per_frame         firings of a turn ("data_format" in the legacy form)
+    lidar_data_format.udp_profile_lidar         resolution of range and reflectance
+    config_params.lidar_mode                    1024x10: firings of a turn, turns a second
+    sensor_info.prod_line                       OS-1-128
 
 The turn is complete in ``Sensor``, whatever window of azimuths the recording was limited to.
 """

@@ -218,7 +218,8 @@ class Scan:
         >>> import numpy as np
         >>> from lidar_synth import Scan, load_sensor
         >>> points = np.array([(10, 0, -1), (10, 2, -1), (40, -3, 1)], np.float32)
-        >>> scan = Scan(points, np.full(3, 0.3, np.float32), load_sensor("hdl64e_kitti"), label=np.uint8([8, 8, 12]))
+        >>> grey, label = np.full(3, 0.3, np.float32), np.uint8([8, 8, 12])
+        >>> scan = Scan(points, grey, load_sensor("hdl64e_kitti"), label=label)
         >>> list(scan.fields())
         ['reflectance', 'label']
         >>> scan[scan.label == 8].points[:, 1]
@@ -377,8 +378,8 @@ class Source(Protocol):
     Example:
         >>> from lidar_synth import Source, open_scans
         >>> scans = open_scans("demo_out/town")
-        >>> isinstance(scans, Source), isinstance([scans[0]], Source), isinstance(iter(scans), Source)
-        (True, True, False)
+        >>> [isinstance(each, Source) for each in (scans, [scans[0]], iter(scans))]
+        [True, True, False]
     """
 
     def __len__(self) -> int: ...

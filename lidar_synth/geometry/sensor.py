@@ -78,7 +78,8 @@ class Sensor:
 
     Example:
         >>> from lidar_synth import Sensor
-        >>> sensor = Sensor("mine", columns=2048, range_min=1.0, range_max=120.0, rows=32, fov_up=15.0, fov_down=-25.0)
+        >>> beams = {"rows": 32, "fov_up": 15.0, "fov_down": -25.0}
+        >>> sensor = Sensor("mine", columns=2048, range_min=1.0, range_max=120.0, **beams)
         >>> sensor.shape
         (32, 2048)
         >>> sensor.ray_directions().shape
@@ -304,8 +305,8 @@ class Sensor:
         )
 
     def same_lasers(self, other: "Sensor") -> bool:
-        """Whether another sensor has the same lasers, within 0.1 degrees and 1 cm. Rows, columns and
-        limits may differ: ``hdl64e_lasers`` and ``hdl64e_semantic_kitti`` are one device on two
+        """Whether another sensor has the same lasers, within 0.1 degrees and 1 cm. Rows, columns
+        and limits may differ: ``hdl64e_lasers`` and ``hdl64e_semantic_kitti`` are one device on two
         grids."""
         if self.shape[0] != other.shape[0]:
             return False
@@ -441,7 +442,8 @@ def _plain(value: Any) -> Any:
 
 def _is_finite(value: object) -> bool:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]  # isfinite fails on very large integers
+    # isfinite fails on very large integers.
+    return bool(is_number and -1e300 < value < 1e300)  # type: ignore[operator]
 
 
 def _is_nan(value: object) -> bool:
@@ -510,9 +512,9 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
         >>> sensor = load_sensor("os1_128")
         >>> sensor.shape, sensor.range_max
         ((128, 1024), 170.0)
-        >>> entry = "mine: {rows: 32, fov_up: 15, fov_down: -25, columns: 2048, range_min: 1, range_max: 120}"
         >>> with open("mine.yaml", "w") as file:
-        ...     _ = file.write(entry)
+        ...     _ = file.write("mine: {rows: 32, fov_up: 15, fov_down: -25, columns: 2048, ")
+        ...     _ = file.write("range_min: 1, range_max: 120}")
         >>> load_sensor("mine.yaml").shape
         (32, 2048)
     """
@@ -528,9 +530,10 @@ def load_sensor(sensor: "str | Path | Sensor") -> Sensor:
     if path.suffix == ".json":
         return Sensor.from_dict(read_metadata(path))
     if path.suffix not in (".yaml", ".yml"):
-        expected = f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file"
         raise ConfigError(
-            f"sensor {str(sensor)!r}", expected, suggest(sensor, presets())
+            f"sensor {str(sensor)!r}",
+            f"one of {', '.join(presets())}, the metadata .json of an Ouster, or a .yaml file",
+            suggest(sensor, presets()),
         )
     entries = _entries(
         read_yaml(path, "a file with a sensor, such as sensors.yaml"), str(path)

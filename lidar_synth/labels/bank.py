@@ -2,15 +2,16 @@
 
 Arrays of the file (numpy's format, never pickled), for M objects with P points in total::
 
-    format                       "lidar-synth-objects/1"
-    sensor                       JSON, the keys of sensors.yaml: the sensor that recorded the objects
-    scan                         (M,) text, id of the scan that contains the object
-    number                       (M,) int32, index of its box in that scan
-    ground                       (M,) float32, metres: height of the ground under it, in that scan's frame
-    box_values, box_names ...    the fields of ``Boxes``, in that scan's frame
-    start                        (M + 1,) int64, object i has the points start[i] to start[i + 1]
-    points                       (P, 3) float32, metres from the box's centre, axes of the sensor
-    reflectance, label           (P,) float32 in [0, 1]; (P,) uint8 train ids
+    format                      "lidar-synth-objects/1"
+    sensor                      JSON, the keys of sensors.yaml: the sensor that recorded the objects
+    scan                        (M,) text, id of the scan that contains the object
+    number                      (M,) int32, index of its box in that scan
+    ground                      (M,) float32, metres: height of the ground under it, in that scan's
+                                frame
+    box_values, box_names ...   the fields of ``Boxes``, in that scan's frame
+    start                       (M + 1,) int64, object i has the points start[i] to start[i + 1]
+    points                      (P, 3) float32, metres from the box's centre, axes of the sensor
+    reflectance, label          (P,) float32 in [0, 1]; (P,) uint8 train ids
 """
 
 import json

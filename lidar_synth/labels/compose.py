@@ -130,7 +130,7 @@ class Compose:
         >>> from lidar_synth import Compose, Town
         >>> from lidar_synth.labels.augment import yaw
         >>> from lidar_synth.noise import keyed_rng
-        >>> augment = Compose([{"fog": {"visibility": [50, 500], "p": 0.5}}, partial(yaw, limit=45), "scale"])
+        >>> augment = Compose([{"fog": {"visibility": [50, 500]}}, partial(yaw, limit=45), "scale"])
         >>> scan = augment(Town(seed=0, scans=1)[0], keyed_rng(0, 3, 17))  # seed, epoch, position
         >>> [name for step in scan.augmented for name in step]
         ['fog', 'yaw', 'scale']

@@ -274,7 +274,9 @@ def _gap(inside, step):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_votes(found, squared, values, confidence, value, share, trust, distance):  # type: ignore[no-untyped-def]
+def _count_votes(  # type: ignore[no-untyped-def]
+    found, squared, values, confidence, value, share, trust, distance
+):
     for i in range(len(found)):
         total = best = np.float32(0)
         for a in range(found.shape[1]):

@@ -292,7 +292,10 @@ def _unknown_values(dataset: Any, real: Any, synthetic: Any) -> Iterator[str]:
             unknown = _not_classes(place, unknown, known)
         if unknown:
             values = ", ".join(map(str, sorted(unknown)[:4]))
-            yield f"{place} holds {values}, which no real sample does ({min(known)} to {max(known)})"
+            yield (
+                f"{place} holds {values}, which no real sample does "
+                f"({min(known)} to {max(known)})"
+            )
 
 
 def _not_classes(place: str, values: set[int], known: set[int]) -> set[int]:
@@ -444,8 +447,13 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
 @contextmanager
 def _preserved_generators() -> Iterator[None]:
     """Restore the global random generators of Python, numpy and torch afterwards."""
-    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - the generator that trainers use
-    devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []  # type: ignore[no-untyped-call]
+    # numpy's is the generator that trainers use.
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    devices = (
+        [torch.cuda.current_device()]
+        if torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+        else []
+    )
     with torch.random.fork_rng(devices):
         try:
             yield

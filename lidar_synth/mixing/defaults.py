@@ -2,9 +2,9 @@
 scans, by task.
 
 Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, where
-labelled scans are few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter of
-the epochs, then real scans alone, which gained less there but showed no loss on the street of the
-labels (docs/research/proof.md).
+labelled scans are few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter
+of the epochs, then real scans alone, which gained less there but showed no loss on the street of
+the labels (docs/research/proof.md).
 Detection: the same schedule, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).
 """

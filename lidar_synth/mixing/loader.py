@@ -11,9 +11,9 @@ from lidar_synth.mixing.batches import MixedBatches
 class MixedLoader(DataLoader[Any]):
     """A ``DataLoader`` of a mixture that sets its own epoch and can resume.
 
-    Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of the
-    loader or of the mixture chooses another. A pass that is left early is begun again by the next
-    one. In a distributed training each rank gets its share.
+    Each pass is one epoch, from the mixture's own or that of a loaded state on; ``set_epoch`` of
+    the loader or of the mixture chooses another. A pass that is left early is begun again by the
+    next one. In a distributed training each rank gets its share.
 
     Args:
         dataset: a ``MixedScans``.

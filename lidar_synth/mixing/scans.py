@@ -124,7 +124,7 @@ class MixedScans(Dataset[Any]):
     Example:
         >>> from lidar_synth import Bank, MixedScans, open_scans
         >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.25)
-        >>> len(train), sum(train.domain(i) for i in range(len(train)))  # three real scans, one synthetic
+        >>> len(train), sum(train.domain(i) for i in range(len(train)))  # three real, one synthetic
         (4, 1)
         >>> list(train[0])
         ['points', 'label', 'confidence', 'boxes', 'names', 'domain', 'loss_weight', 'id']
@@ -263,10 +263,11 @@ class MixedScans(Dataset[Any]):
         Example:
             >>> import torch
             >>> from lidar_synth import Bank, MixedScans, open_scans
-            >>> yours = [torch.from_numpy(scan.points) for scan in open_scans("demo_out/town")]  # any dataset
+            >>> mine = [torch.from_numpy(s.points) for s in open_scans("demo_out/town")]  # any data
             >>> def to_sample(scan, rng):
             ...     return torch.from_numpy(scan.points)
-            >>> train = MixedScans.wrap(yours, Bank("demo_out/bank"), ratio=0.25, to_sample=to_sample)
+            >>> synth = Bank("demo_out/bank")
+            >>> train = MixedScans.wrap(mine, synth, ratio=0.25, to_sample=to_sample)
             >>> [train[i].shape[1] for i in range(len(train))]
             [3, 3, 3, 3]
         """
@@ -507,7 +508,8 @@ class MixedScans(Dataset[Any]):
         Example:
             >>> from torch.utils.data import DataLoader
             >>> from lidar_synth import Bank, MixedScans, open_scans
-            >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5, balanced=True)
+            >>> real, synth = open_scans("demo_out/town"), Bank("demo_out/bank")
+            >>> train = MixedScans(real, synth, ratio=0.5, balanced=True)
             >>> loader = DataLoader(train, batch_sampler=train.batches(2), collate_fn=train.collate)
             >>> [sorted(batch["domain"].tolist()) for batch in loader]
             [[0, 1], [0, 1], [0, 1]]

@@ -1,8 +1,8 @@
 """The share of synthetic samples, epoch by epoch.
 
 A schedule is a function from the epoch to a share in [0, 1]. The schedules of this module have an
-attribute ``constant_from``, the epoch from which on the share is constant, so that earlier samples can be
-counted without visiting every epoch.
+attribute ``constant_from``, the epoch from which on the share is constant, so that earlier samples
+can be counted without visiting every epoch.
 """
 
 from collections.abc import Callable, Mapping, Sequence

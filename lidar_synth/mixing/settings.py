@@ -231,9 +231,9 @@ def mix_for_trainer(
             "a mixture without synthetic scans",
             "synthetic: a bank's folder, a checkpoint or a folder",
         )
-    options = {key: value for key, value in settings.items() if key != "synthetic"}
-    synthetic = open_synthetic(settings["synthetic"])
-    options["as_sensor"] = read_transfer(settings.get("as_sensor"), synthetic)
+    options = dict(settings)
+    synthetic = open_synthetic(options.pop("synthetic"))
+    options["as_sensor"] = read_transfer(options.get("as_sensor"), synthetic)
     # Numbers, no samples.
     return MixedScans.wrap(
         range(real), synthetic, to_sample=to_sample, compare=False, **options

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lidar_synth.datasets.classes import NAMES
-from lidar_synth.errors import ConfigError
+from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.own import check_share
@@ -31,7 +31,7 @@ class Sources:
         >>> from lidar_synth import Bank, MixedScans, Sources, load_generator
         >>> synth = Sources(Bank("demo_out/bank"), load_generator("town"), weights=[3, 1])
         >>> train = MixedScans(None, synth, ratio=1.0, epoch_size=4)
-        >>> sorted(train[i]["id"] for i in range(4))  # one of the generator (seed 0), three of the bank (seed 1)
+        >>> sorted(train[i]["id"] for i in range(4))  # seed 0: the generator, 1: the bank
         ['town/0/0', 'town/1/0', 'town/1/1', 'town/1/2']
     """
 
@@ -94,10 +94,13 @@ def sensor_of(source: Any) -> Sensor:
 
     Raises:
         ConfigError: if its samples are not scans.
+        DataError: if it is empty.
     """
     sensor = getattr(source, "sensor", None)
     if isinstance(sensor, Sensor):
         return sensor
+    if not len(source):
+        raise DataError("a source without scans", "at least one scan")
     first = source[0]
     if not isinstance(first, Scan):
         raise ConfigError(

@@ -52,7 +52,8 @@ class MixedStream(IterableDataset[Any]):
     Example:
         >>> from torch.utils.data import DataLoader
         >>> from lidar_synth import Bank, MixedScans, MixedStream, open_scans
-        >>> train = MixedScans(open_scans("demo_out/town"), Bank("demo_out/bank"), ratio=0.5, balanced=True)
+        >>> real, synth = open_scans("demo_out/town"), Bank("demo_out/bank")
+        >>> train = MixedScans(real, synth, ratio=0.5, balanced=True)
         >>> stream = MixedStream(train, batch_size=2, endless=False)
         >>> loader = DataLoader(stream, batch_size=2, collate_fn=stream.collate)
         >>> [sorted(batch["domain"].tolist()) for batch in loader]

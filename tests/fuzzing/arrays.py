@@ -144,7 +144,10 @@ def lie_in_header(content: bytes, rng: Random) -> bytes:
         if rng.random() < 0.3
         else repr(told)
     )
-    header = f"{{'descr': {kind}, 'fortran_order': {rng.choice((False, False, True, 2))}, 'shape': {shape}, }}".encode()
+    fortran = rng.choice((False, False, True, 2))
+    header = (
+        f"{{'descr': {kind}, 'fortran_order': {fortran}, 'shape': {shape}, }}".encode()
+    )
     return join(version, header, body)
 
 

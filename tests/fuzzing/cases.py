@@ -8,7 +8,8 @@ from fnmatch import fnmatch
 from pathlib import Path
 from random import Random
 
-from fuzzing import arrays, containers, hdf5, pickled, pictures, text, weights  # noqa: F401 - they enter their mutators
+# They enter their mutators.
+from fuzzing import arrays, containers, hdf5, pickled, pictures, text, weights  # noqa: F401
 from fuzzing.mutators import mutate
 from fuzzing.targets import Target
 

@@ -184,7 +184,7 @@ def replace_member(content: bytes, name: str, body: bytes, size: int) -> bytes:
 
 def untar(content: bytes) -> Members:
     with tarfile.open(fileobj=BytesIO(content)) as opened:
-        return [(member.name, opened.extractfile(member).read()) for member in opened]  # type: ignore[union-attr]
+        return [(m.name, opened.extractfile(m).read()) for m in opened]  # type: ignore[union-attr]
 
 
 LARGEST = 16 * LIMIT

@@ -111,7 +111,8 @@ def set_argument(content: bytes, rng: Random) -> bytes:
 
 
 def opcodes(content: bytes) -> tuple[list[bytes], bytes]:
-    """The opcodes of all pickles that stand one behind the other at the beginning, and what follows them."""
+    """The opcodes of all pickles that stand one behind the other at the beginning, and what
+    follows them."""
     parts: list[bytes] = []
     stream = BytesIO(content)
     end = 0

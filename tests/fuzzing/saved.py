@@ -66,7 +66,8 @@ SETTINGS = {"intervals": 2, "teacher": "abc"}
 
 
 def make_archives(root: Path) -> None:
-    """Weights in both formats of PyTorch, and a judge's archive as a tar and as a compressed one."""
+    """Weights in both formats of PyTorch, and a judge's archive as a tar and as a compressed
+    one."""
     folder = root / "judge"
     folder.mkdir(parents=True)
     flat = torch.randn(15, generator=torch.Generator().manual_seed(0))
@@ -208,7 +209,8 @@ def take_step(training: Training) -> None:
 
 
 def make_states(root: Path) -> None:
-    """What runs keep to resume: a training's state, a cache with latents, an outcome of a study, timesteps."""
+    """What runs keep to resume: a training's state, a cache with latents, an outcome of a study,
+    timesteps."""
     run = some_training()
     # the same bytes on a busy machine
     with mock.patch.object(type(run), "seconds", 1.0):

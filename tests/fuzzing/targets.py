@@ -300,7 +300,8 @@ def read_mixture(root: Path) -> list[Any]:
 
 
 def make_described(root: Path) -> None:
-    """Folders with a description of their scans: a full one, a short one, and two of earlier versions."""
+    """Folders with a description of their scans: a full one, a short one, and two of earlier
+    versions."""
     for name in ("full", "short", "town", "mark"):
         write("kitti", root / name)
         if name != "full":

@@ -1,6 +1,7 @@
 """How large a bank of town scans is, and how fast it is written and read, on one core.
 
-    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N] [--tree SHARDS]
+    python tools/bench/bank.py [SCAN.bin] [--scans N] [--model NAME|FILE] [--generated N]
+        [--tree SHARDS]
 
 Reading is compared with SCAN.bin, a KITTI-360 scan, or by default with a random scan of 120,000
 points. The figures are processor time, so that they hardly change on a busy machine. Scans of the
@@ -291,8 +292,11 @@ def random_reads(root: Path, shards: int, reads: int = 20_000) -> None:
         later = seconds(partial(read_all, bank, order)) / reads
         base = base or later
         memory = peak_memory() - before
-        values = f"{1e3 * opened:.2f} | {1e3 * later:.3f} | {1e3 * (later - base):.3f} | {memory:.0f}"
-        print(f"| {count:,} | {count * LARGE:,} | {values} |", flush=True)
+        print(
+            f"| {count:,} | {count * LARGE:,} | {1e3 * opened:.2f} | {1e3 * later:.3f} | "
+            f"{1e3 * (later - base):.3f} | {memory:.0f} |",
+            flush=True,
+        )
 
 
 def read_all(bank: Bank, order: Sequence[int]) -> None:

@@ -1,6 +1,7 @@
 """Scans per second of shipped models, and of a network of R2Flow's size, on a GPU.
 
-    python tools/bench/gpu.py [MODEL ...] [--batch 1 --batch 16] [--dtype bfloat16] [--rounds N] [--device cuda]
+    python tools/bench/gpu.py [MODEL ...] [--batch 1 --batch 16] [--dtype bfloat16] [--rounds N]
+        [--device cuda]
 
 From noise to the tensors of labelled scans: the flow's steps and the decoder, eager and compiled,
 in turns. The network of R2Flow's size is this package's HDiT with random weights in 4 steps, as

@@ -1,6 +1,7 @@
 """Scans over a slow link: a bank with a cache beside MDS shards of ``mosaicml-streaming``.
 
-    python tools/bench/link.py [--scans N] [--shard N] [--rates 250 --rates 1000] [--delay MS] [--other PYTHON]
+    python tools/bench/link.py [--scans N] [--shard N] [--rates 250 --rates 1000] [--delay MS]
+        [--other PYTHON]
 
 A server on this machine answers every request ``--delay`` milliseconds late, and sends all answers
 together at the rate of the link, Mbit/s. One process reads every scan once in order, as arrays of
@@ -230,7 +231,8 @@ def main(
             limit = shard * sum(values.nbytes for values in stored[0].values())
             other(other_python, "write", root / "mds", root / "arrays.npz", limit)
         print(
-            f"\n### {scans} scans in shards of {shard}, {size / 1e6:.0f} MB, {delay:g} ms\n\n{machine()}\n"
+            f"\n### {scans} scans in shards of {shard}, {size / 1e6:.0f} MB, {delay:g} ms\n\n"
+            f"{machine()}\n"
         )
         print("| Mbit/s | what | scans/s | share of the link |\n|---:|---|---:|---:|")
         print(f"| | bank on a disk | {scans / disk:.0f} | |", flush=True)

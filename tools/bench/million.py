@@ -29,7 +29,8 @@ ACTIONS = {
     "open": OPEN,
     "open, 1,000 random reads": f"{OPEN}; [bank[n * 999_983 % len(bank)] for n in range(1000)]",
     "import of mixing": "from lidar_synth import MixedScans",
-    "open, plan of an epoch": f"{MIX}; len(MixedScans(None, bank, 1.0, epoch_size=len(bank)).plan(0))",
+    "open, plan of an epoch": f"{MIX}; "
+    "len(MixedScans(None, bank, 1.0, epoch_size=len(bank)).plan(0))",
     "`lidar-synth info`": ["info", "{root}"],
     "`lidar-synth verify`": ["verify", "{root}"],
     "`lidar-synth bake --dry-run`": [

@@ -1,6 +1,7 @@
 """Time and memory of a labelled scan by model, steps and columns, against a large matrix product.
 
-    python tools/bench/scans.py [MODEL ...] [--steps 4 --steps 2] [--rounds N] [--threads N] [--busy]
+    python tools/bench/scans.py [MODEL ...] [--steps 4 --steps 2] [--rounds N] [--threads N]
+        [--busy]
 
 MODEL is a shipped model or a checkpoint, by default "town". Each scan is generated from its noise
 to points with labels. All measurements of the first table take turns. With --busy, processor time

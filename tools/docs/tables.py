@@ -170,16 +170,19 @@ def recipe_keys() -> str:
     return "\n\n".join(parts)
 
 
-def _keys(model: type) -> Iterator[str]:
+def _keys(model: type[Any]) -> Iterator[str]:
     """A row for each key that the docstring of a model explains."""
-    fields = getattr(model, "model_fields", None) or model.__dataclass_fields__  # type: ignore[attr-defined]
+    fields = getattr(model, "model_fields", None) or model.__dataclass_fields__
     docstring = griffe.Docstring(inspect.getdoc(model) or "").parse(
         "google", warnings=False
     )
     for section in docstring:
         if section.kind is griffe.DocstringSectionKind.parameters:
             for one in section.value:
-                yield f"| `{one.name}` | {_default(fields, one.name)} | {' '.join(one.description.split())} |"
+                yield (
+                    f"| `{one.name}` | {_default(fields, one.name)} | "
+                    f"{' '.join(one.description.split())} |"
+                )
 
 
 def _default(fields: Any, names: str) -> str:

@@ -3,8 +3,8 @@ from.
 
     python tools/research/adapt_quality.py pandaset FRAMES OUT
     lidar-synth adapt town --scans OUT/adapt --out mine.safetensors
-    python tools/research/adapt_quality.py measure mine.safetensors --train OUT/adapt --test OUT/test
-        [--before town] [--judge FOLDER] [--count 60]
+    python tools/research/adapt_quality.py measure mine.safetensors --train OUT/adapt
+        --test OUT/test [--before town] [--judge FOLDER] [--count 60]
 
 FRAMES is a folder of Pandar64 scans from PandaSet as NN.npz (points, reflectance 0..255, ring,
 label) in the sensor's frame; the first command writes frames 00 to 30 to OUT/adapt and frames from
@@ -56,7 +56,7 @@ Features = Callable[[Sequence[Scan]], NDArray[np.floating]]
 
 
 def pandaset(frames: Path, out: Path) -> None:
-    """Write the frames of PandaSet to adapt to, and those to test on, as the package's own scans."""
+    """Write the frames of PandaSet to adapt to, and those to test on, as the package's scans."""
     sensor = load_sensor("pandar64")
     writers = {part: WRITERS["npz"](out / part) for part in ("adapt", "test")}
     for path in sorted(frames.glob("[0-9][0-9].npz")):

@@ -3,7 +3,8 @@ docs/research/autoencoder.md.
 
     python tools/research/codec_card.py NAME=MODEL ... [--count 24]
 
-    python tools/research/codec_card.py "as it ships=town" "mine=runs/town_codec/town_codec.safetensors"
+    python tools/research/codec_card.py "as it ships=town" \\
+        "mine=runs/town_codec/town_codec.safetensors"
 
 The scans are from a town that no model was trained on, each on another street. They are encoded,
 and decoded to the mode of the predicted distributions. A flow on these latents cannot be more

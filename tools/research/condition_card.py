@@ -1,8 +1,8 @@
 """Does a model follow its condition? The figures and images of conditional models in
 docs/research/conditions.md.
 
-    python tools/research/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val] [--count 64]
-        [--picture OUT.png]
+    python tools/research/condition_card.py NAME=MODEL[:STEPS] ... [--root ROOT] [--split val]
+        [--count 64] [--picture OUT.png]
 
     python tools/research/condition_card.py "student, 4 steps=town-semantic" \\
         "teacher, 50 steps=RUN/teacher.safetensors:50"

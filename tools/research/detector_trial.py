@@ -1,8 +1,8 @@
 """Does a detector gain from synthetic scans? Trained on 30 labelled scans of one town, tested on
 two others.
 
-    python tools/research/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3] [--iterations 1600]
-                                        [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
+    python tools/research/detector_trial.py WORK [--arm real --arm gt_sampling ...] [--seeds 3]
+        [--iterations 1600] [--layout-model CHECKPOINT] [--minutes M] [--out TABLE.md]
 
 All arms have the same network, iterations, augmentation (turned, mirrored, scaled) and test. Half
 of each batch of an arm with synthetic scans is synthetic, unless its row says otherwise. Each seed

@@ -6,8 +6,8 @@ another network. For docs/research/proof.md.
 The places are split in two halves; frames of each half are trained on and the other half is
 tested, so that two trainings of an arm test every place. Prints the mean gain and its interval,
 and adds the scores by place to OUT/scores.json. ``--polar`` takes polar_network.py instead of the
-range-view segmenter, ``--arm`` others of ``lidar-synth prove``. Call it with other ``--labelled`` and
-``--synthetic`` for the curves in OUT/gain.png.
+range-view segmenter, ``--arm`` others of ``lidar-synth prove``. Call it with other ``--labelled``
+and ``--synthetic`` for the curves in OUT/gain.png.
 """
 
 import json

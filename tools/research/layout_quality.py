@@ -1,8 +1,7 @@
 """Does a layout model do what its layouts say? Figures and images of unseen layouts.
 
-    python tools/research/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1] [--guidance 1]
-                                   [--cast] [--picture OUT.png]
-                                   [--dump OUT.json] [--intervals 200]
+    python tools/research/layout_quality.py NAME=MODEL[:STEPS] ... [--count 64] [--seed 1]
+        [--guidance 1] [--cast] [--picture OUT.png] [--dump OUT.json] [--intervals 200]
 
 Layouts are those of scans of a town that no model was trained on, each from another stretch of
 road; --cast casts their objects, as the commands do. The first row is the town's own scans: boxes

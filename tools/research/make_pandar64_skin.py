@@ -32,7 +32,10 @@ LICENCE = (
     "CC BY 4.0 with the PandaSet Dataset Terms: attribution to Scale AI and Hesai; no use of "
     "their names or marks beyond attribution; no attempt to identify persons"
 )
-SOURCE = "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, frames 00 to 30"
+SOURCE = (
+    "PandaSet by Scale AI and Hesai (https://pandaset.org), sequence 002, Pandar64, "
+    "frames 00 to 30"
+)
 
 
 def frames(folder: Path, sensor: Sensor, first: int, last: int) -> list[Scan]:

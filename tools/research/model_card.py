@@ -1,10 +1,11 @@
 """The figures and images of docs/research/quality.md: how close generated scans are to scans of the
 town.
 
-    python tools/research/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ... [--count 512] [--real A B]
-        [--pictures OUT]
+    python tools/research/model_card.py NAME=MODEL[:STEPS[:WEAKER:SCALE:LOW:HIGH]] ...
+        [--count 512] [--real A B] [--pictures OUT]
 
-    python tools/research/model_card.py "student, 4 steps=town" "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
+    python tools/research/model_card.py "student, 4 steps=town" \\
+        "teacher, 50 steps=RUN/town_teacher.safetensors:50" \\
         "teacher, 4 steps=RUN/town_teacher.safetensors:4" --pictures docs/models
 
 Every model generates scans from the same noise. They are compared with scans of a town that no

@@ -1,5 +1,5 @@
-"""A second network for ``prove``: points in polar pillars, a small U-Net over the bird's-eye view of
-them, and a perceptron of each point and its pillar (after PolarNet). No range image.
+"""A second network for ``prove``: points in polar pillars, a small U-Net over the bird's-eye view
+of them, and a perceptron of each point and its pillar (after PolarNet). No range image.
 
 ``learn`` is a trainer of ``prove``; few_labels.py --polar runs it.
 """

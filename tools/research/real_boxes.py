@@ -2,10 +2,10 @@
 
     python tools/research/real_boxes.py OUT [--kitti360 FOLDER] [--kitti FOLDER ...]
 
-OUT/PLACE/FRAME.npz, for ``lidar-synth prove OUT --task detection``. KITTI-360's frames have the boxes of
-``bboxes_3D_cam0/BBoxes_FRAME.json`` (eight corners in the frame of camera 0). KITTI labels only what its
-camera sees: scans are cut to that view, so that no other car counts as background. Only boxes of cars and
-vans are kept.
+OUT/PLACE/FRAME.npz, for ``lidar-synth prove OUT --task detection``. KITTI-360's frames have the
+boxes of ``bboxes_3D_cam0/BBoxes_FRAME.json`` (eight corners in the frame of camera 0). KITTI labels
+only what its camera sees: scans are cut to that view, so that no other car counts as background.
+Only boxes of cars and vans are kept.
 """
 
 import json

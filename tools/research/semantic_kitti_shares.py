@@ -1,8 +1,8 @@
 """Lists of SemanticKITTI at 1, 10 and 20 % of its labels, real and mixed, for MMDetection3D's
 configurations.
 
-    python tools/research/semantic_kitti_shares.py SEMANTIC_KITTI BANK OUT [--share 10] [--order uniform]
-        [--ratio 0.5]
+    python tools/research/semantic_kitti_shares.py SEMANTIC_KITTI BANK OUT [--share 10]
+        [--order uniform] [--ratio 0.5]
 
 BANK is a bank, a folder of labelled scans or a model's name. For each share and order, OUT gets a
 mixed list, and one of real scans alone in which every scan occurs often enough for as many

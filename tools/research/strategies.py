@@ -1,13 +1,14 @@
-"""The paper's Table 4 on what ships: students of the shipped teacher by strategy, over several seeds.
+"""The paper's Table 4 on what ships: students of the shipped teacher by strategy, over several
+seeds.
 
     python tools/research/strategies.py OUT [KEY=VALUE ...] [--seeds 5] [--count 64]
 
-Each student starts as tools/stages/town_teacher.safetensors and learns by the recipe town_student in
-4 steps; KEY=VALUE changes it (recipe.iterations=300, data.town=500). A student's error is the squared
-difference of its states and the teacher's of the same noise in 50 steps, over the variance of the
-teacher's, in percent; isolated returns and mIoU with the town's segmenter are those of model_card.py. The
-figures stand as mean and standard deviation over the seeds, with the p-value of a paired t-test over them
-against adaptive piecewise distillation. The same command resumes.
+Each student starts as tools/stages/town_teacher.safetensors and learns by the recipe town_student
+in 4 steps; KEY=VALUE changes it (recipe.iterations=300, data.town=500). A student's error is the
+squared difference of its states and the teacher's of the same noise in 50 steps, over the variance
+of the teacher's, in percent; isolated returns and mIoU with the town's segmenter are those of
+model_card.py. The figures stand as mean and standard deviation over the seeds, with the p-value of
+a paired t-test over them against adaptive piecewise distillation. The same command resumes.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Train a segmenter on real scans mixed with synthetic ones, and measure it on held-out scans.
 
-    python tools/research/train_segmenter.py [ROOT] [--split train] [--val-split val] [--ratio 0.25] [--model town]
-        [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
+    python tools/research/train_segmenter.py [ROOT] [--split train] [--val-split val] [--ratio 0.25]
+        [--model town] [--steps 400] [--batch 4] [--workers 0] [--seed 0] [--save FILE.safetensors]
 
 Without ROOT, scans of the town take the place of real ones, and scans of another town are held out.
 ROOT is any dataset with labels per scan, SemanticKITTI for instance. The training loop is in

@@ -69,7 +69,7 @@ ARMS["half"] = Arm(
 
 
 def learn_matched(job: Job) -> dict[str, TrialOutcome]:
-    """The reference training with the synthetic scans' reflectance as the labelled scans have it."""
+    """The reference training; synthetic scans get the reflectance of the labelled scans."""
     matched = {}
     for name, part in job.pools.items():
         response = Response.match(part, job.real)

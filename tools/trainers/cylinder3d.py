@@ -54,6 +54,8 @@ def rows(trial: Trial) -> Iterator[Row]:
     )
     if not model.is_file():
         raise Failed("no checkpoint")
-    left_out = "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch"
-    script = "cylinder3d train_cylinder_asym.py"
-    yield trial.row(script, ["training", "validation", "checkpoint"], left_out)
+    yield trial.row(
+        "cylinder3d train_cylinder_asym.py",
+        ["training", "validation", "checkpoint"],
+        "the stock grid of 480 x 360 x 32 and width: memory and time; it cannot resume an epoch",
+    )

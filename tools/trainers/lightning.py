@@ -31,7 +31,8 @@ def rows(trial: Trial) -> Iterator[Row]:
             "demo_out/bank": trial.data.bank,
             "import lightning": "import lightning\nfrom segmenter import Segmenter",
             "max_epochs=1": f"{limit}, {OPTIONS.format(folder=str(folder))}",
-            "# then trainer.fit(model, data)": f"\ntrainer.fit(Segmenter(), data, ckpt_path={checkpoint!r})",
+            "# then trainer.fit(model, data)": "\ntrainer.fit(Segmenter(), data, "
+            f"ckpt_path={checkpoint!r})",
         }
         env = {"PYTHONPATH": str(SCRIPTS)}
         expect = [r"validation loss \d"] if out == "whole" else []

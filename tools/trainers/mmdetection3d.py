@@ -28,7 +28,8 @@ RUNS = {
 """Our configurations, and what their validation prints."""
 LEFT_OUT = {
     "pointpillars_kitti.py": "KITTI's metrics are CUDA kernels: numba's simulator ran them",
-    "centerpoint_voxel_nuscenes.py": "spconv asks for a CUDA stream, unused on a CPU: `scripts/spconv_on_cpu.py`",
+    "centerpoint_voxel_nuscenes.py": "spconv asks for a CUDA stream, unused on a CPU: "
+    "`scripts/spconv_on_cpu.py`",
     "frnet_semantickitti.py": "MinkUNet, whose voxelisation sends tensors to CUDA",
 }
 ENVIRONMENT = {"NUMBA_ENABLE_CUDASIM": "1"}

@@ -33,9 +33,10 @@ def rows(trial: Trial) -> Iterator[Row]:
     trial.type_page("train", python, PAGE, names, skip=PIP, expect=expect, minutes=90)
     if not list(trial.folder.rglob("ckpt_00001.pth")):
         raise Failed("no checkpoint")
-    left_out = "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch"
     yield trial.row(
-        "pipeline.run_train()", ["training", "validation", "checkpoint"], left_out
+        "pipeline.run_train()",
+        ["training", "validation", "checkpoint"],
+        "open3d with CUDA: a GPU; stock 45,056 points: time; its pipeline cannot resume an epoch",
     )
 
 

@@ -117,8 +117,11 @@ def nuscenes(trial: Trial, python: Path, tree: Path) -> Row:
     )
     if not list((trial.folder / "nus").rglob("checkpoint_epoch_1.pth")):
         raise Failed("no checkpoint")
-    script = "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml"
-    return trial.row(script, ["training", "validation", "checkpoint"], LEFT_OUT)
+    return trial.row(
+        "openpcdet train.py --cfg_file cfgs/nuscenes_models/cbgs_voxel01_res3d_centerpoint.yaml",
+        ["training", "validation", "checkpoint"],
+        LEFT_OUT,
+    )
 
 
 def type_training(

@@ -24,8 +24,9 @@ data = dict(train=dict(data_root={root!r}), val=dict(data_root={root!r}))
 PRETRAINING = """
 _base_ = [{stock!r}]
 model = dict(backbone=dict(
-    enc_depths=(1,) * 5, enc_channels=(12, 12, 24, 24, 48), enc_num_head=(1,) * 5, enc_patch_size=(64,) * 5,
-    enable_flash=False), head_in_channels=96, head_hidden_channels=32, head_embed_channels=16, head_num_prototypes=32)
+    enc_depths=(1,) * 5, enc_channels=(12, 12, 24, 24, 48), enc_num_head=(1,) * 5,
+    enc_patch_size=(64,) * 5, enable_flash=False),
+    head_in_channels=96, head_hidden_channels=32, head_embed_channels=16, head_num_prototypes=32)
 param_dicts = [dict(keyword="enc0", lr=0.004)]
 scheduler = dict(max_lr=[0.004, 0.004])
 seed, batch_size, num_worker, mix_prob, enable_wandb, epoch, eval_epoch = 1, 2, 2, 0, False, 1, 1

@@ -5,12 +5,12 @@ velocities that the student is trained to predict there. The strategies differ i
 training and in the part of the teacher's trajectory that the student approximates by a straight
 line::
 
-    strategy               time of training                                straightened part       source
-    adaptive_piecewise     starts of the intervals of the selected grid    interval's start -> end   Algorithm 1
-    uniform_piecewise      starts of the intervals of a uniform grid       interval's start -> end   its ablation
-    piecewise_reflow       anywhere in an interval                         interval's start -> end   PeRFlow
-    reflow                 anywhere in [0, 1]                              noise -> data             2-RF
-    timestep_distillation  starts of the intervals of a uniform grid       noise -> data             k-TD of R2Flow
+    strategy               time of training                 straightened part        source
+    adaptive_piecewise     starts of selected intervals     interval's start -> end  Algorithm 1
+    uniform_piecewise      starts of equal intervals        interval's start -> end  its ablation
+    piecewise_reflow       anywhere in an interval          interval's start -> end  PeRFlow
+    reflow                 anywhere in [0, 1]               noise -> data            2-RF
+    timestep_distillation  starts of equal intervals        noise -> data            k-TD of R2Flow
 
 Euler steps of the teacher give the end of each part; the example counts the evaluations. Sources:
 LiDAR-Flow (the paper, Eq. 6); Yan et al., "PeRFlow", NeurIPS 2024; Liu et al., "Flow Straight and

@@ -139,7 +139,7 @@ def solve(
     Example:
         >>> import torch
         >>> from lidar_synth.generate.flow.solvers import solve, uniform_grid
-        >>> def velocity(y, t, cond):  # dy/dt = y, so that from t = 1 to t = 0 the state shrinks by the factor e
+        >>> def velocity(y, t, cond):  # dy/dt = y: from t = 1 to t = 0 the state shrinks to 1/e
         ...     return y
         >>> solve(velocity, torch.ones(1), uniform_grid(100), solver="heun")
         tensor([0.3679])

@@ -166,4 +166,6 @@ def assemble(
     )
     # Convolutions would otherwise convert their weights at every call; other weights have no such
     # layout.
-    return network.to(device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]
+    return network.to(  # type: ignore[call-overload, no-any-return]
+        device, memory_format=torch.channels_last
+    ).eval()

@@ -1,8 +1,8 @@
-"""R2DM's U-Net (Nakashima and Kurazume, "LiDAR Data Synthesis with Denoising Diffusion Probabilistic
-Models", ICRA 2024) as the velocity network of a rectified flow.
+"""R2DM's U-Net (Nakashima and Kurazume, "LiDAR Data Synthesis with Denoising Diffusion
+Probabilistic Models", ICRA 2024) as the velocity network of a rectified flow.
 
-The network is an Efficient U-Net (Saharia et al., "Imagen", NeurIPS 2022) with circular columns that
-is given features of the ray angles. It was trained as a continuous-time diffusion model: at a
+The network is an Efficient U-Net (Saharia et al., "Imagen", NeurIPS 2022) with circular columns
+that is given features of the ray angles. It was trained as a continuous-time diffusion model: at a
 logarithmic signal-to-noise ratio l it sees x = a y0 + s e with a^2 = sigmoid(l), s^2 = sigmoid(-l).
 A state y = (1 - t) y0 + t e of the rectified path is the same up to scale::
 

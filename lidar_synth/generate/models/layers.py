@@ -65,7 +65,9 @@ class Exact(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # Viewed as integers, the buffers move between devices, but casts of floats do not apply to
         # them.
-        super()._apply(lambda t: fn(t.view(torch.int32)).view(torch.float32), recurse)  # type: ignore[no-untyped-call]
+        super()._apply(  # type: ignore[no-untyped-call]
+            lambda t: fn(t.view(torch.int32)).view(torch.float32), recurse
+        )
         return self
 
 

@@ -39,7 +39,8 @@ class Losses:
         ConfigError: on a negative weight.
     """
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
+    # Used when a configuration is validated.
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012
 
     commitment: float = 0.25
     codebook: float = 1.0

@@ -5,8 +5,10 @@
     ground: -1.73                     # metres; 0 is the height of the sensor
     reach: 15                         # metres up to which the ground is known
     objects:
-      - {class: Van, at: [12, 0]}     # x forward, y left, metres; default: the size of its class, on the ground
-      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}  # degrees counter-clockwise from x
+      # x forward, y left, metres; default: the size of its class, on the ground
+      - {class: Van, at: [12, 0]}
+      # degrees counter-clockwise from x
+      - {class: Cyclist, at: [16.5, 0.4], heading: 180, size: [1.8, 0.6, 1.7]}
     outlines:
       - {kind: building, line: [[-10, 9], [40, 9]], height: 8}
       - {kind: vegetation, line: [[5, -7], [12, -7]], from: 2, height: 6}  # metres above the ground
@@ -80,8 +82,8 @@ def load_layout(path: str | Path) -> Layout:
 
     Example:
         >>> from lidar_synth import load_layout
-        >>> with open("behind.yaml", "w") as file:
-        ...     _ = file.write("objects: [{class: Van, at: [12, 0]}, {class: Cyclist, at: [17, 0.5]}]")
+        >>> with open("behind.yaml", "w") as f:
+        ...     _ = f.write("objects: [{class: Van, at: [12, 0]}, {class: Cyclist, at: [17, 0.5]}]")
         >>> load_layout("behind.yaml").boxes.names
         ('Van', 'Cyclist')
     """

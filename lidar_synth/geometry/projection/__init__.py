@@ -1,5 +1,5 @@
-"""Points to range image and back (geometry only: no networks, no files); ``batch`` does it with torch,
-on any device."""
+"""Points to range image and back (geometry only: no networks, no files); ``batch`` does it with
+torch, on any device."""
 
 from lidar_synth.geometry.projection.rings import ring_numbers
 from lidar_synth.geometry.projection.spherical import (

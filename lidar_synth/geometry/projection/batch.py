@@ -88,8 +88,8 @@ def project_batch(
         >>> import torch
         >>> from lidar_synth import load_sensor
         >>> from lidar_synth.geometry.projection.batch import project_batch
-        >>> points = torch.tensor([[10.0, 0.1, -1.0, 0.3], [12.0, 4.0, 0.5, 0.9], [7.0, -2.0, -1.0, 0.2]])
-        >>> images = project_batch(points, torch.tensor([0, 2, 3]), load_sensor("hdl64e_kitti"))  # 2 points, 1 point
+        >>> points = torch.tensor([[10, 0.1, -1, 0.3], [12, 4, 0.5, 0.9], [7, -2, -1, 0.2]])
+        >>> images = project_batch(points, torch.tensor([0, 2, 3]), load_sensor("hdl64e_kitti"))
         >>> images.range.shape, images.channels.shape
         (torch.Size([2, 64, 1024]), torch.Size([2, 1, 64, 1024]))
         >>> (images.range > 0).sum((1, 2))

@@ -148,7 +148,9 @@ def _cut(vertices, rays, laser, p, q):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _hit_segment(vertices, corners, start, end, normal, rays, laser, nearest):  # type: ignore[no-untyped-def]
+def _hit_segment(  # type: ignore[no-untyped-def]
+    vertices, corners, start, end, normal, rays, laser, nearest
+):
     """Hit a triangle with the firings of a laser between the two cuts of its edges from the first
     corner."""
     alone, one, other = corners
@@ -219,7 +221,9 @@ def _normal(points, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def hit_footprints(vertices, which, reach, shape, upright, rays, front, nearest):  # type: ignore[no-untyped-def]
+def hit_footprints(  # type: ignore[no-untyped-def]
+    vertices, which, reach, shape, upright, rays, front, nearest
+):
     """Find the first footprint that each ray hits: the patch of a surface that one return of the
     source stands for.
 

@@ -76,7 +76,8 @@ def curate(
       lidar-synth curate bank --plot scores.png
       lidar-synth curate bank --sort -confidence --limit 20
       lidar-synth curate bank --drop "confidence < 0.5" --drop "duplicate > 0.99" --out good
-      lidar-synth curate bank --reference KITTI-360 --split r2flow/train --drop "range > 0.3 and empty > 0.4"
+      lidar-synth curate bank --reference KITTI-360 --split r2flow/train \\
+          --drop "range > 0.3 and empty > 0.4"
     """
     import numpy as np
 
@@ -241,6 +242,11 @@ def _plot(
     from lidar_synth.lab.curate import MEANINGS
     from lidar_synth.viz import histograms
 
-    title = f"{Path(bank).resolve().name}: {len(dropped)} scans, {dropped.sum()} match the rules (orange)"
-    figure = histograms(scores.values, MEANINGS, dropped, title)
+    figure = histograms(
+        scores.values,
+        MEANINGS,
+        dropped,
+        f"{Path(bank).resolve().name}: {len(dropped)} scans, "
+        f"{dropped.sum()} match the rules (orange)",
+    )
     write_file(path, lambda file: figure.savefig(file, format="png"))

@@ -113,8 +113,10 @@ def evaluate(
 
     \b
     Examples:
-      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test --weights metrics --beside
-      lidar-synth town town --scans 500 --seed 1 && lidar-synth evaluate town samples --protocol town --json
+      lidar-synth evaluate KITTI-360 samples --protocol r2flow --split r2flow/test \\
+          --weights metrics --beside
+      lidar-synth town town --scans 500 --seed 1 && \\
+          lidar-synth evaluate town samples --protocol town --json
       lidar-synth evaluate SemanticKITTI town --judge squeezeseg --columns 1024
       lidar-synth evaluate SemanticKITTI town --objects
       lidar-synth evaluate KITTI town --detector pointpillar_7728.pth

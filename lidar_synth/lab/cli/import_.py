@@ -44,7 +44,8 @@ def import_(
 
       lidar-synth sample scans --model r2flow-1rf.safetensors --count 16 --steps 32
 
-      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm     (config.yaml beside model.ckpt)
+      lidar-synth import lidm/uncond/model.ckpt lidm.safetensors --peer lidm
+      (config.yaml beside model.ckpt)
 
       lidar-synth import diffusion_0000300000.pth r2dm.safetensors --peer r2dm
     """

@@ -118,7 +118,8 @@ def prove(
       lidar-synth prove SemanticKITTI --labelled 24 --minutes 60
       lidar-synth prove SemanticKITTI --split train --labelled 24 --tests validation_scans
       lidar-synth prove KITTI --task detection --labelled 8 --arm objects --arm first
-      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain --ratio 0.25 --ratio 0.5 --dry-run
+      lidar-synth prove SemanticKITTI --arm exchange --arm town --arm pretrain \\
+          --ratio 0.25 --ratio 0.5 --dry-run
     """
     import os
 

@@ -91,9 +91,13 @@ def _values(found: "SensorFit") -> dict[str, object]:
         "beams": f"{len(elevations)}, from {elevations[0]:.2f} to {elevations[-1]:.2f} degrees",
         "looks like": found.vendor or "no sensor of the table of vendors",
         "rings from": found.source,
-        "points on a beam": f"{found.share:.1%} within 0.05 degrees; the worst beam {found.within.min():.1%}",
+        "points on a beam": (
+            f"{found.share:.1%} within 0.05 degrees; the worst beam {found.within.min():.1%}"
+        ),
         "spread of a beam": f"{np.median(found.spread):.4f} degrees (median)",
-        "place of the sensor": f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees",
+        "place of the sensor": (
+            f"{x:.3f}, {y:.3f}, {z:.3f} m in the frame of the points, tilted {tilt:.2f} degrees"
+        ),
         "firings per turn": f"{sensor.firings or 'not known'}",
         "azimuth offsets": f"known by {found.azimuths.known}"
         if found.azimuths.known

@@ -45,15 +45,17 @@ def stress(
     seed: Annotated[int, typer.Option(help="of the corruptions", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Corrupts labelled scans by weather and failing sensors at three severities, and prints how much
-    of its mIoU a network keeps, as the Robo3D benchmark measures it: RR is the share of the clean
-    mIoU, CE the error divided by that of a baseline; the mean is over the benchmark's corruptions.
+    """Corrupts labelled scans by weather and failing sensors at three severities, and prints how
+    much of its mIoU a network keeps, as the Robo3D benchmark measures it: RR is the share of the
+    clean mIoU, CE the error divided by that of a baseline; the mean is over the benchmark's
+    corruptions.
 
     module:function is called with each scan (points, reflectance) and returns the classes of its
     points, 0 to 18. A network that runs elsewhere predicts the scans of --out, which have
     SemanticKITTI's layout; MODEL is then the folder of its predictions, fog/heavy/**/000000.label.
 
-    Published figures are of other scans: for a fair CE give the --baseline of a network of your own.
+    Published figures are of other scans: for a fair CE give the --baseline of a network of your
+    own.
 
     \b
     Examples:

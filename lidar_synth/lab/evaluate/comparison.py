@@ -110,7 +110,8 @@ def check_counts(protocol: Protocol, real: int, generated: int) -> None:
             raise DataError(
                 f"{count} {name} scans",
                 f"{least}, as the {protocol.name} protocol compares them",
-                "anyway=True (--anyway) measures them; the figures do not stand beside the paper's.",
+                "anyway=True (--anyway) measures them; the figures do not stand beside the "
+                "paper's.",
             )
 
 

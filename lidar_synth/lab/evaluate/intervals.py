@@ -16,7 +16,7 @@ _BATCH = 50  # resamples that are evaluated at a time
 
 
 class Interval(NamedTuple):
-    """A confidence interval, both ends included, and the value without the bias of its resamples."""
+    """A confidence interval, ends included, and the value without the bias of its resamples."""
 
     low: float
     high: float

@@ -230,8 +230,8 @@ def _rows(
 
 
 def find_floor(real: Sequence[Crop]) -> float | None:
-    """What ``separate`` gives for the real objects of some places against those of others; mean over
-    ``TURNS`` divisions of the places."""
+    """What ``separate`` gives for the real objects of some places against those of others; mean
+    over ``TURNS`` divisions of the places."""
     places = sorted({one.place for one in real})
     areas = []
     for seed in range(TURNS):

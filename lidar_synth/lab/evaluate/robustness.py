@@ -1,8 +1,8 @@
 """Robustness of a segmentation network: its mIoU under weather and failing sensors, in the measures
 of the Robo3D benchmark (Kong et al., ICCV 2023).
 
-For a corruption, RR = mean mIoU of its severities / clean mIoU, and CE = mean error (1 - mIoU) of its
-severities / that of a baseline. mRR and mCE are their means over the benchmark's corruptions.
+For a corruption, RR = mean mIoU of its severities / clean mIoU, and CE = mean error (1 - mIoU) of
+its severities / that of a baseline. mRR and mCE are their means over the benchmark's corruptions.
 """
 
 import sys
@@ -31,8 +31,8 @@ from lidar_synth.weather import BENCHMARK, CORRUPTIONS, SEVERITIES
 
 Table = NDArray[np.int64]
 Model = Callable[[Iterable[Scan], str], Table]
-"""Counts labelled points by label (row, 19) and prediction (column; a 20th one is no class) over the
-scans of a case, "clean" or such as "fog/heavy"."""
+"""Counts labelled points by label (row, 19) and prediction (column; a 20th one is no class) over
+the scans of a case, "clean" or such as "fog/heavy"."""
 
 NAMES_OF_BENCHMARK = tuple(kind.name for kind in BENCHMARK)
 PUBLISHED = {

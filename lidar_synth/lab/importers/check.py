@@ -1,4 +1,4 @@
-"""A look at imported weights: scans of ten steps, which noise or a wrong convention would give away."""
+"""A look at imported weights: scans of ten steps would show noise or a wrong convention."""
 
 from collections.abc import Iterator
 from pathlib import Path

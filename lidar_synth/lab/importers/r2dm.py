@@ -1,9 +1,10 @@
 """R2DM's released weights (https://github.com/kazuto1011/r2dm) as a checkpoint of this package.
 
-R2DM is a continuous-time diffusion model; ``models.efficient_unet`` converts what its network predicts
-to the velocity of a rectified flow, so that it can be sampled and distilled without training. The
-averaged weights are taken. Buffers that follow from the configuration (the taps of the resampling,
-the factors of the residuals, the octaves of the position features) are checked and left out.
+R2DM is a continuous-time diffusion model; ``models.efficient_unet`` converts what its network
+predicts to the velocity of a rectified flow, so that it can be sampled and distilled without
+training. The averaged weights are taken. Buffers that follow from the configuration (the taps of
+the resampling, the factors of the residuals, the octaves of the position features) are checked and
+left out.
 """
 
 import math

@@ -4,8 +4,8 @@ R2Flow's network predicts u(s, x) = data - noise at s = 1 - t, so that ours is v
 y). Both changes are linear and are folded into the weights::
 
     sign   the last layer is negated
-    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise the sine:
-           the layer after the Fourier features of time absorbs this rotation
+    time   cos(2 pi f (1 - t)) = cos(2 pi f) cos(2 pi f t) + sin(2 pi f) sin(2 pi f t), and likewise
+           the sine: the layer after the Fourier features of time absorbs this rotation
 
 R2Flow stores the rotary harmonics in every block; here they are stored once per level.
 """
@@ -151,7 +151,7 @@ def _normalisation(data: Mapping[str, Any], path: Path) -> Normalisation:
 
 
 def sensor_of(data: Mapping[str, Any]) -> Sensor:
-    """The HDL-64E with the grid of the network's training; R2DM's configuration has the same keys."""
+    """The HDL-64E on the grid of the network's training; R2DM's configuration has the same keys."""
     sensor = presets()[DATA[data["dataset"]][1]]
     if data["projection"].startswith("unfolding"):
         sensor = sensor.by_beams()

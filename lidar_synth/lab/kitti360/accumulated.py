@@ -2,8 +2,8 @@
 
 Layout (https://www.cvlibs.net/datasets/kitti-360/documentation.php, "3D Data Format")::
 
-    data_3d_semantics/train/DRIVE/static/FFFFFFFFFF_LLLLLLLLLL.ply     what stands still
-    data_3d_semantics/train/DRIVE/dynamic/FFFFFFFFFF_LLLLLLLLLL.ply    what moves; may have no points
+    data_3d_semantics/train/DRIVE/static/FFFFFFFFFF_LLLLLLLLLL.ply    what stands still
+    data_3d_semantics/train/DRIVE/dynamic/FFFFFFFFFF_LLLLLLLLLL.ply   what moves; may have no points
 
 A window covers the frames FFFFFFFFFF to LLLLLLLLLL, about 200 m of road, and overlaps its
 neighbours by about 10 m. Early releases have no folder ``train``. Each point has ``float x, y, z``,

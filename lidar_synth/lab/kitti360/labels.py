@@ -2,10 +2,13 @@
 
 Output, which ``KITTI360(root, labels=out)`` reads::
 
-    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label     uint32 per point: KITTI-360's id, instance above; 0 = none
-    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin   uint8 per point: 255 times the confidence of the label
-    data_3d_semantics_scan/DRIVE/windows/WINDOW.json         counts of a complete window, and what it was made of
-    data_3d_semantics_scan/report.json                       counts of all windows
+    data_3d_semantics_scan/DRIVE/labels/FFFFFFFFFF.label    uint32 per point: KITTI-360's id,
+                                                            instance above; 0 = none
+    data_3d_semantics_scan/DRIVE/confidence/FFFFFFFFFF.bin  uint8 per point: 255 times the
+                                                            confidence of the label
+    data_3d_semantics_scan/DRIVE/windows/WINDOW.json        counts of a complete window, and what it
+                                                            was made of
+    data_3d_semantics_scan/report.json                      counts of all windows
 
 The unit of work is a window. A rerun repeats windows without a record, and those whose clouds,
 poses or boxes changed. A frame gets labels if a window covers it, it has a pose (or the car hardly

@@ -41,28 +41,28 @@ def differences(arms: Sequence[Mapping[str, Any]]) -> str:
 
     height = ROW * len(shown) + 30
     parts = [
-        f'<div class="scroll"><svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="differences">'
+        f'<div class="scroll"><svg viewBox="0 0 {WIDTH} {height}" '
+        'role="img" aria-label="differences">'
     ]
     for tick in ticks(low, high):
         colour, width = ("var(--ink)", 1.4) if tick == 0 else ("var(--line)", 1)
         parts.append(
-            f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="4" y2="{height - 22}" stroke="{colour}" '
-            f'stroke-width="{width}"/>'
-        )
-        parts.append(
-            f'<text x="{x(tick):.1f}" y="{height - 6}" text-anchor="middle" fill="var(--dim)">{tick:+g}</text>'
+            f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="4" y2="{height - 22}" '
+            f'stroke="{colour}" stroke-width="{width}"/><text x="{x(tick):.1f}" '
+            f'y="{height - 6}" text-anchor="middle" fill="var(--dim)">{tick:+g}</text>'
         )
     for number, row in enumerate(shown):
         y = 4 + ROW * (number + 0.5)
         colour = "#1f6feb" if row["synthetic"] else "#7a8494"
         parts.append(
-            f'<text x="{LEFT - 14}" y="{y + 4:.1f}" text-anchor="end">{html.escape(row["title"])}</text>'
+            f'<text x="{LEFT - 14}" y="{y + 4:.1f}" text-anchor="end">'
+            f"{html.escape(row['title'])}</text>"
         )
         if row["interval"] is not None:
             a, b = row["interval"]
             parts.append(
-                f'<line x1="{x(a):.1f}" x2="{x(b):.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{colour}" '
-                'stroke-width="5" stroke-opacity=".35" stroke-linecap="round"/>'
+                f'<line x1="{x(a):.1f}" x2="{x(b):.1f}" y1="{y:.1f}" y2="{y:.1f}" '
+                f'stroke="{colour}" stroke-width="5" stroke-opacity=".35" stroke-linecap="round"/>'
             )
         parts += [
             f'<circle cx="{x(v):.1f}" cy="{y:.1f}" r="2.5" fill="{colour}" fill-opacity=".45"/>'
@@ -98,18 +98,19 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
     for tick in ticks(0, top):
         y = bottom - height * tick / top
         parts.append(
-            f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" stroke="var(--line)"/>'
-        )
-        parts.append(
-            f'<text x="{left - 8}" y="{y + 4:.1f}" text-anchor="end" fill="var(--dim)">{tick:g}</text>'
+            f'<line x1="{left}" x2="{left + width}" y1="{y:.1f}" y2="{y:.1f}" '
+            f'stroke="var(--line)"/><text x="{left - 8}" y="{y + 4:.1f}" '
+            f'text-anchor="end" fill="var(--dim)">{tick:g}</text>'
         )
     for tick in ticks(0, last):
         x = left + width * tick / last
         parts.append(
-            f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" fill="var(--dim)">{tick:g}</text>'
+            f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle" '
+            f'fill="var(--dim)">{tick:g}</text>'
         )
     parts.append(
-        f'<text x="{left + width / 2}" y="{bottom + 33}" text-anchor="middle" fill="var(--dim)">iterations</text>'
+        f'<text x="{left + width / 2}" y="{bottom + 33}" text-anchor="middle" '
+        'fill="var(--dim)">iterations</text>'
     )
     for number, row in enumerate(shown):
         colour = COLOURS[number % len(COLOURS)]
@@ -120,8 +121,8 @@ def curves(arms: Sequence[Mapping[str, Any]]) -> str:
         )
         y = 18 + 24 * number
         parts.append(
-            f'<line x1="{left + width + 24}" x2="{left + width + 50}" y1="{y}" y2="{y}" stroke="{colour}" '
-            f'stroke-width="2"{dash}/>'
+            f'<line x1="{left + width + 24}" x2="{left + width + 50}" y1="{y}" y2="{y}" '
+            f'stroke="{colour}" stroke-width="2"{dash}/>'
         )
         words = html.escape(
             row["title"] if len(row["title"]) < 48 else row["title"][:46] + " …"

@@ -86,9 +86,9 @@ def what_was_done(values: Values) -> str:
     return (
         f"The same small network was trained in {len(values['arms'])} ways on the same "
         f"{values['labelled']} labelled scans, and tested on places that it had not seen: {where}, "
-        f"with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same iterations and "
-        "augmentation, unless the table says otherwise. mIoU is the mean over classes of the "
-        "share of correctly labelled returns (intersection over union)."
+        f"with {values['seeds']} seed{'s' * (values['seeds'] != 1)}. All trainings have the same "
+        "iterations and augmentation, unless the table says otherwise. mIoU is the mean over "
+        "classes of the share of correctly labelled returns (intersection over union)."
     )
 
 
@@ -192,7 +192,10 @@ def make_grid(head: Sequence[str], rows: Sequence[str]) -> str:
     names = "".join(
         f"<th{' class=text' * (name == _USES)}>{escape(name)}</th>" for name in head
     )
-    return f'<div class="scroll"><table><thead><tr>{names}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+    return (
+        f'<div class="scroll"><table><thead><tr>{names}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
 
 
 def make_section(title: str, content: str, note: str = "") -> str:

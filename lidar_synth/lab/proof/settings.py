@@ -39,7 +39,8 @@ class ProofSettings:
 
     Example:
         >>> from lidar_synth import ProofSettings
-        >>> settings = ProofSettings(labelled=24, arms=("exchange", "skin", "pretrain"), ratios=(0.25, 0.5))
+        >>> arms = ("exchange", "skin", "pretrain")
+        >>> settings = ProofSettings(labelled=24, arms=arms, ratios=(0.25, 0.5))
         >>> settings.iterations, settings.seeds
         (1000, 2)
     """

@@ -213,7 +213,7 @@ def prove(
 
     Example:
         >>> from lidar_synth import ProofSettings, prove
-        >>> short = {"iterations": 10, "batch": 1, "seeds": 1, "columns": 64}  # to be fast; leave it out
+        >>> short = {"iterations": 10, "batch": 1, "seeds": 1, "columns": 64}  # only to be fast
         >>> settings = ProofSettings(arms=("real", "exchange"), places="stretch:2", **short)
         >>> proof = prove("demo_out/town", "proof", settings, jobs=1, progress=False)
         >>> proof.values["tested_places"], len(proof.values["arms"])

@@ -323,7 +323,10 @@ def headline(values: Mapping[str, Any]) -> str:
             f"changes the mIoU by {change}, from {base['miou']:.1f} %."
         )
     if over["real"] != base["title"]:
-        text += f" Against “{over['real']}”: {format_signed(over['difference'])} {span(over['interval'])}."
+        text += (
+            f" Against “{over['real']}”: {format_signed(over['difference'])} "
+            f"{span(over['interval'])}."
+        )
     if "longer" in arms:
         longer = arms["longer"]
         gain = format_signed(longer["difference"])

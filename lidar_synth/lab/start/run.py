@@ -162,8 +162,8 @@ _ONE_DRIVE = (
 )
 
 _QUARTERS = {
-    "segmentation": "alone for 10 of 40 epochs, then your scans alone (no gain or loss shown on the "
-    "street of the labels, gained 1 mIoU on unseen streets)",
+    "segmentation": "alone for 10 of 40 epochs, then your scans alone (no gain or loss shown on "
+    "the street of the labels, gained 1 mIoU on unseen streets)",
     "detection": "alone for 10 of 40 epochs, then your scans alone, your objects pasted into all "
     "(lost 1 AP on the street of the labels, gained 4 on unseen streets)",
 }
@@ -226,7 +226,9 @@ def start(
 
     Example:
         >>> import lidar_synth
-        >>> made = lidar_synth.start("demo_out/town", "begin", scans=2, minutes=0, jobs=1, say=lambda line: None)
+        >>> made = lidar_synth.start(
+        ...     "demo_out/town", "begin", scans=2, minutes=0, jobs=1, say=lambda line: None
+        ... )
         >>> print(made.code)  # doctest: +ELLIPSIS
         import lidar_synth
         ...

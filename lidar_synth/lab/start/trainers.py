@@ -1,8 +1,9 @@
 """Configurations of trainers for a mixture: the files that a user of each would write.
 
-``ROOT`` stands for the folder of the real scans, ``OPTIONS`` for those of ``open_scans``, ``MIX`` for
-the settings of the mixture, and ``HERE`` for the folder of these files. To add a trainer, enter its
-files in ``TRAINERS``; every one begins with a comment that says where it belongs and what to type.
+``ROOT`` stands for the folder of the real scans, ``OPTIONS`` for those of ``open_scans``, ``MIX``
+for the settings of the mixture, and ``HERE`` for the folder of these files. To add a trainer, enter
+its files in ``TRAINERS``; every one begins with a comment that says where it belongs and what to
+type.
 """
 
 import re
@@ -81,7 +82,8 @@ hooks = [dict(type="SynthEpoch"), dict(type="CheckpointLoader"), dict(type="Mode
 data = dict(train=dict(type="MixedSemanticKITTI", data_root="ROOT", mixture="MIX"))
 """
 
-_RANGENET = """# in train/tasks/semantic of lidar-bonnetal or SalsaNext, or in CENet: bash HERE/train.sh
+_RANGENET = """# in train/tasks/semantic of lidar-bonnetal or SalsaNext, or in CENet:
+# bash HERE/train.sh
 export LIDAR_SYNTH_MIX=MIX
 python -m lidar_synth.integrations.rangenet train.py -d ROOT -ac ARCH.yaml \\
     -dc config/labels/semantic-kitti.yaml -l HERE/log

@@ -24,8 +24,8 @@ TABLES = _read_tables()
 
 
 def pick(options: dict[Option, float] | Sequence[Option], rng: Rng) -> Option:
-    """One of the options: of a sequence, each is as likely; of a dictionary, a key is as likely as its
-    share. The shares need not sum to 1."""
+    """One of the options: of a sequence, each is as likely; of a dictionary, a key is as likely as
+    its share. The shares need not sum to 1."""
     if not isinstance(options, dict):
         return options[int(rng.integers(len(options)))]
     shares = np.array(list(options.values()))

@@ -41,14 +41,15 @@ SEQUENCES = {"kitti360": 4, "semantic_kitti": 0}
 SETTINGS = "town.json"
 _README = """# Synthetic street scans
 
-These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package lidar_synth). They are
-not KITTI-360, SemanticKITTI or KITTI, and contain nothing of them; only the layout of the files is theirs, so that
-the same readers and trainers take them.
+These scans are **synthetic**: rays cast into a procedural town by `lidar-synth town` (package
+lidar_synth). They are not KITTI-360, SemanticKITTI or KITTI, and contain nothing of them; only the
+layout of the files is theirs, so that the same readers and trainers take them.
 
 - layout: {layout}; sensor: {sensor}; seed: {seed}; {interval} s between neighbouring scans
-- {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and stretches lie
-  1 km apart in the poses
-- `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an interrupted run
+- {frames} neighbouring scans share a stretch of road; instance numbers count within a stretch, and
+  stretches lie 1 km apart in the poses
+- `{settings}` holds the settings; `lidar-synth town` with the same settings resumes an interrupted
+  run
 """
 
 

@@ -147,7 +147,7 @@ def _near_kerb(
     margin: float,
     bay: float,
 ) -> float:
-    """|t| of a place ``margin`` behind the kerb, or behind parking bays of depth ``bay``, metres."""
+    """|t| of a place ``margin`` behind the kerb, or behind bays of depth ``bay``, metres."""
     parked = street.parking[side] in ("bay", "kerb")
     return street.edge[side] + margin + (bay if parked else 0.0)
 

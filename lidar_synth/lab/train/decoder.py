@@ -31,7 +31,8 @@ class Decoding(Autoencoding):
 
     network: BoundedAutoencoder
 
-    def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]  # it does not make its latents
+    # It does not make its latents.
+    def forward(self, z: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
         """The loss of images (B, C, H, W) under what latents (B, *latent_shape) say, a scalar."""
         return self.network.decoder_loss(z, x, self.objective)
 

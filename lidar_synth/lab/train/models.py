@@ -84,12 +84,12 @@ def _check_starts(plan: ModelPlan, name: str) -> None:
         if key in stage.of_others:
             model, _, other = stage.of_others[key].partition("/")
             expected = f"the checkpoint of the stage {other} of {model}"
-            own = (
+            at = (
                 ""
                 if path.parents[1] == Path("runs", model)
                 else f" output={path.parents[1]}"
             )
-            hint = f"Type `lidar-synth train {model} --until {other}{own}` first, or give {hint[5:]}"
+            hint = f"Type `lidar-synth train {model} --until {other}{at}` first, or give {hint[5:]}"
         raise ConfigError(f"{name}.{key}={path}, which does not exist", expected, hint)
 
 

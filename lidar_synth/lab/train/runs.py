@@ -7,7 +7,8 @@ The folder holds::
     selection.npz            a student's timesteps, or how far their selection has come
     state.safetensors        the state from which an interrupted run resumes
     held_out.json            losses on held-out scans, if there are any
-    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are held-out scans
+    <folder>.safetensors     the checkpoint: the averaged weights; the best ones, if there are
+                             held-out scans
     samples/, logs/          pictures; scalars for TensorBoard
 """
 
@@ -82,8 +83,8 @@ def run(
 
     Example:
         >>> from lidar_synth.lab.train import TrainConfig, load_config, run
-        >>> changes = ["recipe.iterations=1", "recipe.batch=1", "data.town=2", "samples.every=0", "output=runs/mine"]
-        >>> run(load_config(TrainConfig, "town_tiny", changes)).as_posix()
+        >>> changes = ["recipe.iterations=1", "recipe.batch=1", "data.town=2", "samples.every=0"]
+        >>> run(load_config(TrainConfig, "town_tiny", [*changes, "output=runs/mine"])).as_posix()
         'runs/mine/mine.safetensors'
     """
     state = config.output / STATE
@@ -256,7 +257,7 @@ def _train(
     keeper: "_Keeper | None",
     minutes: float | None,
 ) -> None:
-    """The steps of a stage, of any kind, until the end of the recipe, of the time or of patience."""
+    """The steps of a stage of any kind, until the end of the recipe, of the time or of patience."""
     end = math.inf if minutes is None else time.monotonic() + 60 * minutes
     interrupted = False
     with first_signal() as received:

@@ -53,8 +53,8 @@ def endless_batches(
 
 
 def balanced_cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross-entropy over all labelled cells; the weight of a class is one over the square root of its
-    share of the batch, so that poles and persons count beside roads.
+    """Cross-entropy over all labelled cells; the weight of a class is one over the square root of
+    its share of the batch, so that poles and persons count beside roads.
 
     Args:
         logits: (B, C, H, W).

@@ -62,7 +62,8 @@ class Recipe:
         ConfigError: on an unknown name or a number below 1.
     """
 
-    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012  # used when a configuration is validated
+    # Used when a configuration is validated.
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012
 
     iterations: int
     batch: int = 8
@@ -322,7 +323,8 @@ def _read(path: Path) -> tuple[Progress, dict[str, Tensor]]:
     them."""
     with _opened(path) as file:
         facts = dict(file.metadata())
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        # The file is no mapping.
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if facts.pop("checksum") != checksum_of(facts, tensors):
             raise ValueError("its checksum differs")
         return _progress(file), tensors

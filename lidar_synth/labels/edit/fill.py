@@ -86,7 +86,9 @@ def continue_surfaces(
 
 
 @numba.njit(cache=True)
-def _ring(step, hole, known, rho, near, far, ground, thing, donor, out):  # type: ignore[no-untyped-def]
+def _ring(  # type: ignore[no-untyped-def]
+    step, hole, known, rho, near, far, ground, thing, donor, out
+):
     """Fill the holes of one ring, whose last ray is followed by its first."""
     count = len(hole)
     left = np.empty(SIDE, np.int64)

@@ -110,7 +110,8 @@ def insert(
         >>> from lidar_synth import Town
         >>> from lidar_synth.labels import edit, objects_of
         >>> town = Town(seed=8, scans=1)[0]
-        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> found = objects_of(town, 200).items()
+        >>> number, car = next((i, o) for i, o in found if o.scan.boxes.names == ("Car",))
         >>> emptied = edit.remove(town, number)
         >>> back = edit.insert(emptied, car)  # at its old place
         >>> len(back.boxes) - len(emptied.boxes), back.boxes.names[-1]
@@ -195,7 +196,8 @@ def move(
         >>> from lidar_synth import Town
         >>> from lidar_synth.labels import edit, objects_of
         >>> town = Town(seed=8, scans=1)[0]
-        >>> number, car = next((i, o) for i, o in objects_of(town, 200).items() if o.scan.boxes.names == ("Car",))
+        >>> found = objects_of(town, 200).items()
+        >>> number, car = next((i, o) for i, o in found if o.scan.boxes.names == ("Car",))
         >>> moved = edit.move(town, number, car.box[:2] * 1.02)  # a little further away
         >>> moved.boxes.names[-1], len(moved.boxes) == len(town.boxes)
         ('Car', True)

@@ -119,7 +119,10 @@ class RollingBank:
         self.fields = frozenset(channels - {"range"} | {"reflectance"})
         dtype = str(options.get("dtype", "torch.float32"))
         precision = "" if dtype.endswith("float32") else f":{dtype}"
-        self.identity = f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:{starved}:{replaced}{precision}"
+        self.identity = (
+            f"rolling:{checksum}:{seed}:{steps or 'own'}:{solver}:"
+            f"{starved}:{replaced}{precision}"
+        )
         self._name = f"{path.stem}/{seed}"
         self._slots = Slots(Encoding(header.sensor, channels), slots + replaced)
         plan = GeneratorJob(

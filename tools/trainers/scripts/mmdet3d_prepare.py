@@ -1,8 +1,8 @@
 """Prepare short trainings of MMDetection3D: lists, mixed lists, databases of objects, and short
 configurations.
 
-    python tools/trainers/scripts/mmdet3d_prepare.py OUT [CONFIG ...] --kitti KITTI --nuscenes NUSCENES
-        [--frame NUSCENES_FRAME]
+    python tools/trainers/scripts/mmdet3d_prepare.py OUT [CONFIG ...] --kitti KITTI
+        --nuscenes NUSCENES [--frame NUSCENES_FRAME]
 
 Datasets are copied to OUT/data, where the stock configurations look for them; run the trainer in
 OUT. KITTI is mixed with generated scans of its own layouts, which have boxes, the other datasets

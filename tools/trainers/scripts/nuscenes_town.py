@@ -46,8 +46,8 @@ class Tables:
     """The tables of a version, as lists of rows with tokens."""
 
     def __init__(self) -> None:
-        names = """attribute calibrated_sensor category ego_pose instance log map sample sample_annotation sample_data
-        scene sensor visibility"""
+        names = """attribute calibrated_sensor category ego_pose instance log map sample
+        sample_annotation sample_data scene sensor visibility"""
         self.rows: dict[str, list[dict[str, Any]]] = {
             name: [] for name in names.split()
         }

@@ -142,7 +142,8 @@ def main() -> None:
     os.environ["LIDAR_SYNTH_CPU"] = "1"
     torch.cuda.FloatTensor = torch.FloatTensor
     wait = time.sleep
-    time.sleep = lambda seconds: wait(min(seconds, 0.1))  # type: ignore[assignment]  # evaluation waits for checkpoints
+    # Evaluation waits for checkpoints.
+    time.sleep = lambda seconds: wait(min(seconds, 0.1))  # type: ignore[assignment]
 
     import pcdet.config
     import pcdet.models

@@ -38,7 +38,8 @@ def main() -> None:
     from lidar_synth.integrations.launcher import stay_on_cpu
 
     stay_on_cpu()
-    torch.UntypedStorage.cuda = lambda self, *args, **options: self  # type: ignore[method-assign,assignment]
+    storage = torch.UntypedStorage
+    storage.cuda = lambda self, *args, **options: self  # type: ignore[method-assign,assignment]
     # integers on a GPU only, and Pointcept's evaluation counts classes
     count = torch.histc
     torch.histc = lambda values, *args, **options: count(

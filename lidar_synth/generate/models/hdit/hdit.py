@@ -217,7 +217,8 @@ class HDiT(Network):
         its tokens."""
         cosine, sine = self.rotary[i](angles)
         near = self.near[i] if i < len(self.near) else None
-        return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]  # the elements of a ModuleList have no type
+        # The elements of a ModuleList have no type.
+        return Level(cosine.to(dtype), sine.to(dtype), near)  # type: ignore[arg-type]
 
     def _run(self, blocks: nn.Module, x: Tensor, time: Tensor, level: Level) -> Tensor:
         for block in blocks.children():

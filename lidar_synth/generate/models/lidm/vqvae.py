@@ -321,7 +321,9 @@ class ImageEncoder(nn.Module):
         x = run(self.levels[0], checkpointing, self.stem(x))
         for down, level in zip(self.down, list(self.levels)[1:], strict=True):
             x = run(level, checkpointing, down(x))
-        return self.head(activate(self.norm(run(self.middle, checkpointing, x))))  # type: ignore[no-any-return]
+        return self.head(  # type: ignore[no-any-return]
+            activate(self.norm(run(self.middle, checkpointing, x)))
+        )
 
 
 class Decoder(nn.Module):

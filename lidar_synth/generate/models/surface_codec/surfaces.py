@@ -4,8 +4,9 @@ A patch of a few rows and columns shows K surfaces. A surface is a plane with a 
 and a probability of a return; each cell of the patch shows one of them. The likelihood of a cell is
 that of the mixture, so that the range, the label and the reflectance of a cell belong together::
 
-    p(cell) = sum_k  w_k  (1 - q_k)                                                    without a return
-    p(cell) = sum_k  w_k  q_k  Laplace(range)  ZeroInflatedLogistic(reflectance)  p_k(class)     with one
+    p(cell) = sum_k w_k (1 - q_k)                                            without a return
+    p(cell) = sum_k w_k q_k Laplace(range) ZeroInflatedLogistic(reflectance) p_k(class)
+                                                                             with one
 
 Seen from a laser, the inverse range of a plane is linear in the ray's direction, and within a patch
 in row and column: three numbers describe it.

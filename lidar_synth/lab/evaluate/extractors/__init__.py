@@ -40,7 +40,9 @@ _LIDM = (
 _R2FLOW = "https://github.com/kazuto1011/r2flow, release 'weights'"
 _R3DPA = "https://github.com/valeoai/R3DPA, its releases"
 _SEMANTIC_KITTI = "that of SemanticKITTI: CC BY-NC-SA 4.0, non-commercial"
-_UNSTATED = "none stated for the weights (code: MIT); trained on SemanticKITTI, which is CC BY-NC-SA 4.0"
+_UNSTATED = (
+    "none stated for the weights (code: MIT); trained on SemanticKITTI, CC BY-NC-SA 4.0"
+)
 
 _SEGMENTER = (
     "arch_cfg.yaml",

@@ -16,8 +16,9 @@ from lidar_synth.lab.proof.summary import format_signed, span
 
 Values = Mapping[str, Any]
 NOTE = (
-    "Percentage points of the average precision at an overlap of 0.5, against GT sampling. A dot is the "
-    "mean over seeds, the bar its 95 % interval (bootstrap over the tested places of each seed)."
+    "Percentage points of the average precision at an overlap of 0.5, against GT sampling. A dot "
+    "is the mean over seeds, the bar its 95 % interval (bootstrap over the tested places of "
+    "each seed)."
 )
 
 
@@ -46,8 +47,8 @@ def describe(values: Values) -> str:
     """One paragraph for a reader who has never seen such a comparison."""
     return (
         f"The same small detector was trained in {len(values['arms'])} ways on the same "
-        f"{values['labelled']} real scans with boxes, and tested on places that it had not seen. Each "
-        "seed leaves out one half of the places, so that two seeds test on all."
+        f"{values['labelled']} real scans with boxes, and tested on places that it had not seen. "
+        "Each seed leaves out one half of the places, so that two seeds test on all."
     )
 
 
@@ -102,7 +103,8 @@ def format_table(values: Values) -> str:
     lines = []
     for name, found in values["classes"].items():
         lines += [
-            f"| {name} ({sum(found['boxes'])} boxes) | AP by seed | AP, {MAIN} | difference | 95 % interval |",
+            f"| {name} ({sum(found['boxes'])} boxes) | AP by seed | AP, {MAIN} | difference "
+            "| 95 % interval |",
             "|---|---|---:|---:|---|",
         ]
         for arm in values["arms"]:

@@ -245,7 +245,10 @@ def _train(work: Work, start: Path, minutes: float) -> Work:
             start = work.train(name, start, minutes)
             if name == "labels":
                 codec = load_checkpoint(start)
-                latent: Any = Latent(codec.networks[CODEC], codec.header.tensors)  # type: ignore[arg-type]
+                latent: Any = Latent(
+                    codec.networks[CODEC],  # type: ignore[arg-type]
+                    codec.header.tensors,
+                )
                 work = replace(
                     work, scans=label(work.scans, latent, work.folder / "labelled")
                 )
