@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from streets import street
 from typer.testing import CliRunner
 
@@ -16,7 +17,8 @@ from lidar_synth.formats.npz import write_scan
 from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection import ARMS, DetectionSettings, prove_detection
 from lidar_synth.lab.proof.detection.arms import make_mixture
-from lidar_synth.lab.proof.detection.bev import Found
+from lidar_synth.lab.proof.detection.bev import CHANNELS, Found
+from lidar_synth.lab.proof.detection.network import Detector, detect
 from lidar_synth.lab.proof.detection.scores import Criterion, Truth, judge, precision_of
 from lidar_synth.lab.proof.detection.study import half_of
 from lidar_synth.lab.proof.detection.summary import interval_of, summarise
@@ -59,6 +61,16 @@ def test_a_criterion_says_what_is_right_and_what_counts(case: str) -> None:
     shifted = (CAR[0] + 0.8, *CAR[1:])
     judged = judge(found(FAR, shifted), truth(CAR, FAR), 0, criterion)
     assert precision_of([judged]) == pytest.approx(expected, nan_ok=True)
+
+
+def test_a_network_is_not_tested_by_the_statistics_of_one_scan() -> None:
+    torch.manual_seed(0)
+    network = Detector()
+    some = torch.randint(0, 255, (64, 64, CHANNELS), dtype=torch.uint8)
+    [expected] = detect(network.eval(), lambda i: some, 1)
+    [after_training] = detect(network.train(), lambda i: some, 1)
+    assert len(expected.scores)
+    assert np.array_equal(after_training.scores, expected.scores)
 
 
 def test_two_seeds_test_every_place_once() -> None:

@@ -79,7 +79,7 @@ def _reflectance(finish: Finish) -> float:
     material = MATERIALS[finish.material]
     if finish.colour is None or not material.colour_dependent:
         return material.reflectance
-    # Dark paints and cloths are mostly dark at 905 nm too; red ones are bright.
+    # Dark paints are mostly dark at 905 nm too; red ones are bright.
     red, green, blue = finish.colour
     bright = 0.55 * red + 0.3 * green + 0.15 * blue
     low = 0.03 if material.gloss > 0.5 else 0.45

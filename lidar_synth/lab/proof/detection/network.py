@@ -188,7 +188,8 @@ def detect(
     views: Callable[[int], Tensor],
     count: int,
 ) -> list[Found]:
-    """The boxes that a network in evaluation mode finds in views 0 to ``count`` - 1."""
+    """The boxes that a network finds in views 0 to ``count`` - 1; it is left in evaluation mode."""
+    network.eval()
     every = []
     with torch.no_grad():
         for i in range(count):
