@@ -198,7 +198,6 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "LABELLED": 1,
         "TESTED": 1,
         "TEST_TOWNS": (8,),
-        "SETTLING": 1,
     }.items():
         monkeypatch.setattr(detector_trial, name, value)
     monkeypatch.setattr(detector_trial.pools, "FRAMES", (4,))
@@ -213,7 +212,7 @@ def test_a_trial_from_scans_to_table(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     trial.main(tmp_path, ["gt_sampling"], seeds=1, iterations=2)
-    [result] = (tmp_path / "results-2").iterdir()
+    [result] = (tmp_path / "runs-2").iterdir()
     assert (
         result.name == "gt_sampling-0.json"
         and len(json.loads(result.read_text())["ap"]) == 3

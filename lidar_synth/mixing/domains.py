@@ -41,9 +41,8 @@ def settle(
     evaluation mode.
 
     Those of a training on a mixture are of real and synthetic scans together; a network that is
-    used on real scans wants those of real scans, which need no labels. A segmenter that ends on
-    real scans, as by ``mix(epochs=40)``, has them already; those of a detector that was trained in
-    batches of 2 are noisy, and settling it gained 4 to 7 AP (docs/research/detectors.md).
+    used on real scans wants those of real scans, which need no labels. A training that ends on
+    real scans, as by ``mix(epochs=40)``, leaves them already.
 
     Args:
         model: the trained network; it stays as it is.

@@ -12,7 +12,7 @@ WORK: the same command resumes. docs/research/detectors.md has the protocol.
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -32,8 +32,6 @@ from lidar_synth.lab.proof.detection.bev import view
 from lidar_synth.lab.proof.detection.boxes import CLASSES
 from lidar_synth.lab.proof.detection.network import (
     Detector,
-    Sample,
-    answer_batch,
     collate,
     detect,
     sample,
@@ -42,7 +40,7 @@ from lidar_synth.lab.proof.detection.network import (
 from lidar_synth.lab.proof.detection.scores import Truth, precisions
 from lidar_synth.lab.proof.machine import machine
 from lidar_synth.lab.train.segmentation import endless_batches
-from lidar_synth.mixing import Sources, SyntheticFirst, settle
+from lidar_synth.mixing import Sources, SyntheticFirst
 
 LABELLED = 30
 TRAIN_TOWN = 7
@@ -53,8 +51,6 @@ LAYOUT_TOWNS = (20, 21)
 UNBOXED_MODEL = "town"
 BATCH = 2
 RATE = 3e-3
-SETTLING = 24
-"""Batches of labelled scans for the statistics of the batch normalisation."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects that GT sampling pastes into a scan."""
 BASE = "gt_sampling"
@@ -197,7 +193,7 @@ class Work:
     def result(self, arm: str, seed: int) -> Path:
         """The file of a finished training."""
         key = f"{arm}-{self.tag}" if ARMS[arm].pool == "layout" else arm
-        return self.folder / f"results-{self.iterations}" / f"{key}-{seed}.json"
+        return self.folder / f"runs-{self.iterations}" / f"{key}-{seed}.json"
 
 
 def mixture(
@@ -241,8 +237,7 @@ def run(work: Work, name: str, seed: int, test: Test) -> dict[str, Any]:
     batches = endless_batches(mixed, BATCH)
     losses = train(network, batches, work.iterations, RATE, f"{name} {seed}")
     seconds = time.process_time() - start
-    base = mixture(ARMS["real"], labelled, None, seed, SETTLING * BATCH)
-    found = test(settle(network, _one_epoch(base), answer_batch))
+    found = test(network)
     tenths = [part for part in np.array_split(losses, 10) if len(part)]
     return {
         "arm": name,
@@ -251,11 +246,6 @@ def run(work: Work, name: str, seed: int, test: Test) -> dict[str, Any]:
         "losses": [round(float(part.mean()), 3) for part in tenths],
         "seconds": round(seconds, 1),
     }
-
-
-def _one_epoch(mixed: MixedScans) -> Iterator[Sample]:
-    batches = endless_batches(mixed, BATCH)
-    return (next(batches) for _ in range(SETTLING))
 
 
 def make_test(work: Work) -> Test:

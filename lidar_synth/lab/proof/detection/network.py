@@ -103,14 +103,6 @@ class Detector(nn.Module):
         return out[:, : len(CLASSES)], out[:, len(CLASSES) :]
 
 
-def answer_batch(
-    network: nn.Module,
-    batch: Sample,
-) -> tuple[Tensor, Tensor]:
-    """The network on the views of a batch."""
-    return answer(network, batch[0])
-
-
 def answer(
     network: nn.Module,
     views: Tensor,

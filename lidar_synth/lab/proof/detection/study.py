@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,6 @@ from lidar_synth.lab.proof.detection.bev import Found, view
 from lidar_synth.lab.proof.detection.boxes import with_points
 from lidar_synth.lab.proof.detection.network import (
     Detector,
-    answer_batch,
     detect,
     train,
 )
@@ -47,11 +45,8 @@ from lidar_synth.lab.proof.pools import TOWN_SEED
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
-from lidar_synth.mixing import settle
 
 RATE = 3e-3
-SETTLING = 16
-"""Batches of labelled scans for the statistics of the batch normalisation."""
 MOMENTS = (3, 10, 17)
 """The scans of each stretch of the town in its pool."""
 
@@ -215,17 +210,8 @@ class DetectionWork:
             name,
         )
         seconds = time.monotonic() - start
-        base = make_mixture(
-            ARMS["real"],
-            labelled,
-            None,
-            None,
-            seed,
-            epoch_size,
-        )
-        settling = islice(endless_batches(base, self.settings.batch), SETTLING)
         return {
-            "found": self._detect(settle(network, settling, answer_batch), seed),
+            "found": self._detect(network, seed),
             "losses": [float(part.mean()) for part in np.array_split(losses, 10)],
             "seconds": seconds,
         }
@@ -354,8 +340,8 @@ def _identity(work: DetectionWork) -> dict[str, Any]:
     for name in ("arms", "seeds", "labelled"):  # they add trainings
         del own[name]
     scans = hash_of_names(names_of(work.source))
-    # Folders of the earlier schedule, of four parts, have no "epochs" and are refused.
-    return {"scans": scans, "epochs": EPOCHS, **own}
+    # Protocol 1 had another schedule; 2 settled each network. Their folders are refused.
+    return {"scans": scans, "protocol": 3, **own}
 
 
 def report(
