@@ -12,10 +12,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_synth.datasets.classes import IGNORE, NAMES
+from lidar_synth.datasets.classes import NAMES
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.evaluate.segmenter import CircularConv
 from lidar_synth.lab.proof import Job
+from lidar_synth.lab.train.segmentation import balanced_cross_entropy
 
 RINGS = 64
 SECTORS = 128
@@ -102,27 +103,23 @@ def learn(job: Job) -> dict[str, NDArray[np.int64]]:
     """Train as a job says; {place: (19, 19) confusion table}."""
     torch.manual_seed(job.seed)
     network = PolarNetwork()
-    mixtures = job.mixtures(to_sample=lambda scan, rng: scan)
-    for (mixed, count), (stage, _) in zip(mixtures, job.stages(), strict=True):
-        starts = range(0, count * job.batch, job.batch)
-        batches = (
-            [mixed[number] for number in range(start, start + job.batch)]
-            for start in starts
-        )
-        train(network, batches, count, RATE * stage.rate)
+    batches = (
+        [mixed[number] for number in range(start, start + job.batch)]
+        for mixed, count in job.mixtures(to_sample=lambda scan, rng: scan)
+        for start in range(0, count * job.batch, job.batch)
+    )
+    train(network, batches, job.iterations)
     network.eval()
     return {place: table_of(network, scans) for place, scans in job.held_out.items()}
 
 
-def train(
-    network: nn.Module, batches: Iterable[list[Scan]], count: int, rate: float
-) -> None:
-    """One cycle of the learning rate over a number of batches."""
-    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.01)
-    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, count)
+def train(network: nn.Module, batches: Iterable[list[Scan]], count: int) -> None:
+    """One cycle of the learning rate over a number of batches; the loss of ``reference``."""
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=0.01)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, count)
     for scans in batches:
         label = torch.from_numpy(np.concatenate([s.label for s in scans])).long()
-        loss = F.cross_entropy(network(scans), label, ignore_index=IGNORE)
+        loss = balanced_cross_entropy(network(scans), label)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
