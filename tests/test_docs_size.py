@@ -9,6 +9,7 @@ from project import ROOT
 
 LIMITS = {
     "README.md": 800,
+    "CHANGELOG.md": 1_100,
     "docs/index.md": 210,
     "docs/start/install.md": 150,
     "docs/start/tutorial.md": 460,
@@ -88,7 +89,8 @@ def test_a_page_keeps_to_its_limit(name: str) -> None:
 
 def test_every_page_has_a_limit() -> None:
     assert {page.relative_to(ROOT).as_posix() for page in PAGES} == set(LIMITS) - {
-        "README.md"
+        "README.md",
+        "CHANGELOG.md",
     }
 
 
