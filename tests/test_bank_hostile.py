@@ -15,8 +15,8 @@ from hostile import MARKUP, tags_of
 
 from lidar_synth.bank import INDEX, Bank, Index, ShardReader
 from lidar_synth.bank.card import dataset_card
-from lidar_synth.bank.index import _sum
 from lidar_synth.errors import DataError, LidarSynthError
+from lidar_synth.files.parsing import json_checksum
 
 LIMIT = 50 << 20  # bytes of memory that a refusal may use
 
@@ -310,7 +310,7 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
         for wrong in WRONG:
             edited = with_value(values, path, wrong)
             (tmp_path / INDEX).write_text(
-                json.dumps(edited | {"checksum": _sum(edited)})
+                json.dumps(edited | {"checksum": json_checksum(edited)})
             )
             try:
                 use(tmp_path)
@@ -341,7 +341,9 @@ def test_a_deeply_nested_index_is_refused(tmp_path: Path) -> None:
         values["sources"][0]["settings"] = json.loads(
             '{"a":' * depth + "1" + "}" * depth
         )
-        (tmp_path / INDEX).write_text(json.dumps(values | {"checksum": _sum(values)}))
+        (tmp_path / INDEX).write_text(
+            json.dumps(values | {"checksum": json_checksum(values)})
+        )
         with pytest.raises(LidarSynthError):  # the shard says something else
             use(tmp_path)
 

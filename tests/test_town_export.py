@@ -266,6 +266,20 @@ def test_a_folder_is_not_continued_by_a_town_whose_scans_differ(
         )
 
 
+def test_a_folder_is_not_continued_by_a_town_of_other_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = Town(5, "pandar64", 0)
+    export_town(before, tmp_path, "kitti", camera=False, progress=False)
+    identity = before.identity
+    monkeypatch.setattr("lidar_synth.lab.town.town.TABLES_HASH", "other clothes")
+    assert before.identity != identity
+    with pytest.raises(ConfigError, match=r"was filled with .*'tables'"):
+        export_town(
+            Town(5, "pandar64", 1), tmp_path, "kitti", camera=False, progress=False
+        )
+
+
 def test_scans_name_their_skin_and_its_licence() -> None:
     scan = Town(5, "pandar64", 1, skin="pandar64")[0]
     assert "PandaSet" in scan.provenance["skin_licence"]

@@ -33,7 +33,6 @@ stored directly, everything else as JSON::
     compression    "gzip" or "blosc2"; layout "plain" or "paged"
 """
 
-import hashlib
 import json
 import re
 from bisect import bisect_right
@@ -51,6 +50,7 @@ from lidar_synth.bank.chunks import FILTERS
 from lidar_synth.bank.encoding import RANGE_STEPS, Encoding
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
+from lidar_synth.files.parsing import json_checksum
 from lidar_synth.geometry.sensor import Sensor
 
 FORMAT = "lidar-synth-bank/1"
@@ -394,13 +394,15 @@ class Index:
     def checksum(self) -> str:
         """The bank's identity: the sha256 of all values but ``files``, one of which contains this
         checksum."""
-        return _sum(self._values())
+        return json_checksum(self._values())
 
     def to_json(self) -> bytes:
         """The content of ``index.json``."""
         values = self._values() | ({"files": self.files} if self.files else {})
         return (
-            json.dumps(values | {"checksum": _sum(values)}, indent=1, sort_keys=True)
+            json.dumps(
+                values | {"checksum": json_checksum(values)}, indent=1, sort_keys=True
+            )
             + "\n"
         ).encode()
 
@@ -415,7 +417,7 @@ class Index:
             values = _from_json(text)
             _check_format(values.get("format"), where)
             given = values.pop("checksum", None)
-            if given != _sum(values):
+            if given != json_checksum(values):
                 raise DataError(
                     f"{where} does not match its checksum: it was damaged or edited",
                     "an index",
@@ -506,12 +508,6 @@ def _sensor(values: Any) -> Sensor:
     if not all(type(number) is int for number in numbers) or sensor.to_dict() != values:
         raise TypeError(f"sensor {str(values)[:200]}")
     return sensor
-
-
-def _sum(values: Any) -> str:
-    return hashlib.sha256(
-        json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
 
 
 def _check_format(given: Any, where: str) -> None:

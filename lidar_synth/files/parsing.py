@@ -113,7 +113,7 @@ def read_facts(path: Path, expected: str) -> dict[str, Any]:
 
 def seal(values: Mapping[str, Any]) -> bytes:
     """Values as JSON with a checksum; the inverse of ``read_sealed``."""
-    return json.dumps({**values, "checksum": _checksum(values)}).encode()
+    return json.dumps({**values, "checksum": json_checksum(values)}).encode()
 
 
 def read_sealed(path: Path, expected: str) -> dict[str, Any]:
@@ -124,12 +124,13 @@ def read_sealed(path: Path, expected: str) -> dict[str, Any]:
         DataError: if it is damaged, or its checksum differs.
     """
     values = read_facts(path, expected)
-    if values.pop("checksum", None) != _checksum(values):
+    if values.pop("checksum", None) != json_checksum(values):
         raise DataError(f"{path} is damaged (its checksum differs)", expected)
     return values
 
 
-def _checksum(values: Mapping[str, Any]) -> str:
+def json_checksum(values: Mapping[str, Any]) -> str:
+    """SHA-256 of plain values, in hexadecimal; the same for every order of the keys."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()
 

@@ -28,6 +28,7 @@ from lidar_synth.lab.evaluate.leakage import town
 from lidar_synth.lab.proof.arms import RARE
 from lidar_synth.lab.spread import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
+from lidar_synth.lab.town.catalogue import TABLES_HASH
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
@@ -196,14 +197,13 @@ def town_seed(recordings: Recordings) -> int:
 
 
 def _settings(task: PoolTask) -> dict[str, Any]:
-    grid = None if task.grid is None else task.grid.to_dict()
     plain = {
         "kind": task.kind,
         "sensor": task.sensor.to_dict(),
-        "grid": grid,
+        "grid": task.grid and task.grid.to_dict(),
         "count": task.count,
     }
-    streets = {"seed": task.town_seed}
+    streets = {"seed": task.town_seed, "tables": TABLES_HASH}
     if task.kind in OF_GENERATOR:
         header, checkpoint = read_header(find_model(task.model))
         return (
@@ -211,8 +211,9 @@ def _settings(task: PoolTask) -> dict[str, Any]:
             | {"model": task.model, "checkpoint": checkpoint}
             | (streets if header.conditioning else {})
         )
-    learnt = hash_of_names(task.learnt)
-    return plain | streets | ({"learnt_from": learnt} if task.kind == "skin" else {})
+    if task.kind == "skin":
+        streets["learnt_from"] = hash_of_names(task.learnt)
+    return plain | streets
 
 
 def town_scans(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:

@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
+from lidar_synth.files.parsing import json_checksum
+
 Rng = np.random.Generator
 RGB = tuple[float, float, float]
 Option = TypeVar("Option")
@@ -15,12 +17,13 @@ Option = TypeVar("Option")
 def _read_tables() -> dict[str, Any]:
     text = files("lidar_synth.lab.town").joinpath("catalogue.yaml").read_text("utf-8")
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    tables: dict[str, Any] = yaml.load(text, loader)
-    return tables
+    return dict(yaml.load(text, loader))
 
 
 TABLES = _read_tables()
 """The tables by name; the file says what their columns are."""
+TABLES_HASH = json_checksum(TABLES)[:16]
+"""Tells a town from one of other tables, whose scans differ."""
 
 
 def pick(options: dict[Option, float] | Sequence[Option], rng: Rng) -> Option:

@@ -5,8 +5,6 @@ kilometre apart in the world frame of the poses, so that accumulating scans by p
 of them.
 """
 
-import hashlib
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,13 +14,14 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import SEMANTIC_KITTI
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.parsing import json_checksum
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.geometry.scan import SYNTHETIC, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.lab.town.boxes import boxes_of
 from lidar_synth.lab.town.camera import CAMERA
 from lidar_synth.lab.town.cast import SceneHits, Snapshot
-from lidar_synth.lab.town.catalogue import Rng
+from lidar_synth.lab.town.catalogue import TABLES_HASH, Rng
 from lidar_synth.lab.town.ego import HEIGHT, free_rays, point_rays
 from lidar_synth.lab.town.materials import SurfaceTable
 from lidar_synth.lab.town.meshes import Floats, Ints
@@ -156,14 +155,13 @@ class Town:
             "noise": asdict(self._noise),
             "motion": self._motion,
             "skin": self.skin and self.skin.digest,
+            "tables": TABLES_HASH,
         }
 
     @property
     def identity(self) -> str:
         """A text that tells it from other towns."""
-        text = json.dumps(self.settings, sort_keys=True)
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        return f"town:{len(self)}:{digest[:16]}"
+        return f"town:{len(self)}:{json_checksum(self.settings)[:16]}"
 
     @property
     def calibration(self) -> Calibration:
