@@ -14,8 +14,6 @@ from lidar_synth.lab.proof import Job, Row
 from lidar_synth.lab.proof.command import write_scans
 from lidar_synth.lab.proof.pools import POOLS, read_pool
 from lidar_synth.lab.town import STRETCH_FRAMES, Town
-from lidar_synth.labels import ObjectBank
-from lidar_synth.labels.objects import LABELS
 
 TOWN_SENSOR = Sensor(
     "small town",
@@ -57,18 +55,10 @@ def drives(count: int = 3, scans: int = 4, first: int = 0) -> Scans:
 def job(
     name: str, folder: Path, iterations: int = 20, ratio: float | None = None
 ) -> Job:
-    """A training on four scans, with pools of other scans and a bank of their cars as
-    pedestrians."""
+    """A training on four scans, with pools of other scans."""
     real = [street(i, boxes=False) for i in range(4)]
     other = [street(100 + i) for i in range(3)]
     write_scans(other, folder / "pool")
-    bank = ObjectBank.from_scans(other)
-    named = replace(
-        bank,
-        boxes=replace(bank.boxes, names=("Pedestrian",) * len(bank)),
-        label=np.full_like(bank.label, LABELS["Pedestrian"]),
-    )
-    named.save(folder / "pool" / "objects.npz")
     pool = read_pool(folder / "pool")
     pools = dict.fromkeys(POOLS, pool)
     return Job(
@@ -77,7 +67,6 @@ def job(
         real,
         {"left out": [street(9, boxes=False)]},
         pools,
-        named,
         iterations,
         2,
         (4, 8),

@@ -4,6 +4,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from banks import SENSOR, some_image, write_bank
 from mixtures import Endless, Scans
@@ -66,6 +67,23 @@ def test_synthetic_scans_come_out_on_the_sensor_of_the_real_ones() -> None:
     assert len(alone) == 4 and alone[0]["domain"] == 1
     same = lidar_synth.mix(Scans("r", 4), Endless(), ratio=0.5)
     assert same.mixture == MixedScans(Scans("r", 4), Endless(), ratio=0.5).mixture
+
+
+@pytest.mark.parametrize("alike", [True, False], ids=["same lasers", "others"])
+def test_synthetic_scans_of_other_lasers_get_the_reflectance_of_the_real_ones(
+    alike: bool,
+) -> None:
+    town = lidar_synth.Town(seed=0, scans=4, sensor="town")
+    sensor = "hdl64e_semantic_kitti" if alike else "pandar64"
+    real = list(lidar_synth.Town(seed=1, scans=4, sensor=sensor))
+    for scan in real:
+        scan.reflectance = 0.5 + scan.reflectance / 2
+    train = lidar_synth.mix(
+        real, town, ratio=0.5, to_sample=lambda scan, rng: scan, collate=list
+    )
+    scans = [train[i] for i in range(len(train)) if train.domain(i)]
+    middle = np.median(np.concatenate([scan.reflectance for scan in scans]))
+    assert (middle > 0.6) != alike
 
 
 @WORKERS

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from lidar_synth import ProofSettings, prove
 from lidar_synth.cli import app
-from lidar_synth.datasets.classes import PANDASET
+from lidar_synth.datasets.classes import PANDASET, TRAIN_ID
 from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
@@ -78,7 +78,6 @@ def test_the_town_is_proved_with_every_arm(proof: tuple[Path, Proof]) -> None:
         "pretrain",
         "pretrain-skin",
         "quarter-town",
-        "paste",
     ]
     for row in values["arms"]:
         assert (
@@ -246,6 +245,53 @@ def test_the_scans_that_a_generator_learnt_from_are_those_of_its_town(
     other = write_model(tmp_path / "mine.safetensors")
     with pytest.raises(ConfigError, match="did not learn from the town"):
         make_pool(replace(task, folder=tmp_path / "other", model=str(other)))
+
+
+def test_persons_of_the_town_are_added_to_generated_scans_and_no_car_is_lost(
+    tmp_path: Path,
+) -> None:
+    sensor = load_generator("town").sensor
+    task = PoolTask("generator", tmp_path / "generator", sensor, None, 3)
+    plain = pools.read_pool(make_pool(task))
+    crowded = replace(task, kind="persons", folder=tmp_path / "persons")
+    person = TRAIN_ID["person"]
+    car = TRAIN_ID["car"]
+    for before, after in zip(plain, pools.read_pool(make_pool(crowded)), strict=True):
+        assert (after.label == person).sum() > (before.label == person).sum() + 30
+        # what stands behind a person is hidden
+        assert (after.label == car).sum() > 0.7 * (before.label == car).sum()
+
+
+def test_generated_scans_of_other_lasers_get_the_reflectance_of_the_labelled_ones(
+    tmp_path: Path,
+) -> None:
+    assert pools.has_lasers("town", load_sensor("hdl64e_semantic_kitti"))
+    model = str(write_model(tmp_path / "mine.safetensors"))
+    assert not pools.has_lasers(model, SENSOR)
+    trained: list[Job] = []
+
+    def keep(job: Job) -> np.ndarray:
+        trained.append(job)
+        return perfect(job)
+
+    asked = replace(SMALL, arms=("generator",), model=model)
+    for beams in (None, 16):
+        settings = replace(asked, beams=beams)
+        out = tmp_path / f"{beams}"
+        prove(drives(2, 2), out, settings, jobs=1, trainer=keep, progress=False)
+        job = trained[-1]
+        given = job.pools["generator"]
+        made = pools.read_pool(job.pool_folders["generator"])
+        same = [
+            np.array_equal(one.reflectance, other.reflectance)
+            for one, other in zip(given, made, strict=True)
+        ]
+        assert same == [beams == 16] * 3
+    matched = pools.match_reflectance(made, job.real)
+    middle = np.median(np.concatenate([scan.reflectance for scan in matched]))
+    assert middle == pytest.approx(
+        np.median(np.concatenate([scan.reflectance for scan in job.real])), abs=0.03
+    )
 
 
 def test_a_generator_that_saw_the_tested_places_is_refused_by_drive_and_frame(

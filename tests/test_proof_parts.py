@@ -47,7 +47,6 @@ from lidar_synth.lab.proof.scores import (
 )
 from lidar_synth.lab.proof.trial import reference, run_trainer, turn_scan
 from lidar_synth.lab.town import Town
-from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
 from lidar_synth.noise import keyed_rng
 
@@ -135,7 +134,7 @@ def test_an_arm_trains_for_its_iterations_with_its_shares(
     assert (batch["label"] != 255).any()
 
 
-@pytest.mark.parametrize("name", ["pretrain", "paste"])
+@pytest.mark.parametrize("name", ["pretrain", "persons"])
 def test_the_reference_trainer_learns_and_repeats_itself(
     name: str, tmp_path: Path, one_thread: None
 ) -> None:
@@ -449,7 +448,7 @@ for i in range(len(held_out)):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pretrain", "paste"])
+@pytest.mark.parametrize("name", ["pretrain", "persons"])
 def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(TRAINER)
     task = job(name, tmp_path)
@@ -467,14 +466,6 @@ def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) 
         table = tables[place]
         assert table.sum() == (label != 255).sum() == table[:, road].sum()
         assert table[road, road] == (label == road).sum()
-
-
-def test_the_command_pastes_what_the_reference_pastes(tmp_path: Path) -> None:
-    task = job("paste", tmp_path)
-    [stage] = describe(task)["stages"]
-    pasting = stage["labels"]["paste"]
-    assert pasting["count"] == {"Pedestrian": 3}
-    assert ObjectBank.load(pasting["bank"]).boxes.names == task.objects.boxes.names
 
 
 def test_scans_without_instances_exchange_parts_without_whole_objects(
@@ -560,7 +551,7 @@ def test_real_scans_without_instances_exchange_no_objects() -> None:
     scan = Town(1, scans=1)[0]
     bare = [replace(scan, instance=None, boxes=None)]
     [stage] = ARMS["exchange"].stages(0.5)
-    assert options_of(stage, bare, None) == {"objects": 0}
-    policy = policy_of(stage, bare, None, frozenset({"label"}))
+    assert options_of(stage, bare) == {"objects": 0}
+    policy = policy_of(stage, bare, frozenset({"label"}))
     assert len(policy(bare[0], keyed_rng(0))) > 0
-    assert options_of(stage, [scan], None) == {}
+    assert options_of(stage, [scan]) == {}

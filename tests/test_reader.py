@@ -21,9 +21,9 @@ from test_bank_hostile import HARMFUL, WRONG, harmful, places, with_value
 from torch.utils.data import DataLoader
 
 from lidar_synth.bank.chunks import checksum
-from lidar_synth.bank.index import _sum
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.disk import sha256
+from lidar_synth.files.parsing import json_checksum
 
 SOURCE = Path(reader.__file__)
 STANDARD = {
@@ -94,7 +94,9 @@ def resealed(root: Path, change: Callable[[dict[str, Any]], None]) -> None:
     values = json.loads((root / "index.json").read_text())
     del values["checksum"]
     change(values)
-    (root / "index.json").write_text(json.dumps({**values, "checksum": _sum(values)}))
+    (root / "index.json").write_text(
+        json.dumps({**values, "checksum": json_checksum(values)})
+    )
 
 
 def registered(bank: Path, shard: Path) -> Bank:
@@ -205,7 +207,7 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     values["shards"][0]["dropped"] = [1]
     values["scans"] -= 1
     (tmp_path / "index.json").write_text(
-        json.dumps({**values, "checksum": _sum(values)})
+        json.dumps({**values, "checksum": json_checksum(values)})
     )
     assert len(Bank(tmp_path)) == 2
     refused = 0
@@ -213,7 +215,7 @@ def test_an_edited_index_is_read_or_refused(tmp_path: Path) -> None:
     for path, wrong in tried[::3]:
         edited = with_value(values, path, wrong)
         (tmp_path / "index.json").write_text(
-            json.dumps({**edited, "checksum": _sum(edited)})
+            json.dumps({**edited, "checksum": json_checksum(edited)})
         )
         try:
             bank = Bank(tmp_path)

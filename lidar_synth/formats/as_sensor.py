@@ -10,7 +10,7 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.source import ScanFiles
 from lidar_synth.geometry.scan import Scan, Source
-from lidar_synth.geometry.sensor import load_sensor
+from lidar_synth.geometry.sensor import Sensor, load_sensor
 from lidar_synth.geometry.transfer import (
     Measurement,
     Mount,
@@ -101,19 +101,19 @@ def _sequence(source: Source, index: int) -> str:
 
 
 def make_transfer(
-    sensor: str,
+    sensor: str | Sensor,
     mount: tuple[float, float],
-    like: str | Path | None,
+    like: str | Path | Source | None,
     scans: Any,
     **measured: Any,
 ) -> Transfer:
     """The transfer of scans to a sensor.
 
     Args:
-        sensor: a preset's name or a YAML file.
+        sensor: as ``load_sensor`` takes it.
         mount: metres higher, degrees looking further down.
-        like: real scans of that sensor, in any layout, whose distribution of reflectance the
-            transfer gives.
+        like: real scans of that sensor, or their folder in any layout, whose distribution of
+            reflectance the transfer gives.
         scans: the scans that will be turned: by index, or of a generator.
         measured: other arguments of ``Measurement``.
 
@@ -125,7 +125,9 @@ def make_transfer(
     target = load_sensor(sensor)
     response = None
     if like is not None:
-        response = Response.match(_some(scans), _some(open_scans(like, sensor=target)))
+        if isinstance(like, str | Path):
+            like = open_scans(like, sensor=target)
+        response = Response.match(_some(scans), _some(like))
     return Transfer(target, Mount(*mount), Measurement(**measured, response=response))
 
 

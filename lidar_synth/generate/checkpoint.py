@@ -405,7 +405,8 @@ def _verified(values: dict[str, Any]) -> str:
 
 def _checksum(values: Mapping[str, Any]) -> str:
     """sha256 of plain values, independent of the order of keys."""
-    return _hash(json.dumps(values, sort_keys=True, allow_nan=False))
+    text = json.dumps(values, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _check_finite(tensors: Mapping[str, Tensor], what: str) -> None:
@@ -441,7 +442,3 @@ def weights_hash(tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{key} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _hash(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()

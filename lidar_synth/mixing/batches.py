@@ -16,11 +16,10 @@ from lidar_synth.errors import ConfigError
 from lidar_synth.mixing.epochs import REPEATED, SHARED_TWICE, CurrentEpoch, Position
 from lidar_synth.mixing.quotas import Mixture
 from lidar_synth.mixing.state import (
+    Divided,
     after_epoch,
     check_state,
-    check_unshared,
     make_state,
-    place,
 )
 
 AHEAD = 1 << 20
@@ -129,7 +128,7 @@ def go_to(dataset: Epochs, epoch: int, position: int) -> None:
         dataset.set_epoch(epoch)
 
 
-class MixedBatches(Sampler[list[int]]):
+class MixedBatches(Divided, Sampler[list[int]]):
     """A batch sampler in the order of the plan, for one rank or several, that can resume from any
     step.
 
@@ -150,6 +149,8 @@ class MixedBatches(Sampler[list[int]]):
             where an ``Accelerator`` is set up for several processes.
     """
 
+    call = "train.batches(...)"
+
     def __init__(
         self,
         dataset: Epochs,
@@ -164,8 +165,7 @@ class MixedBatches(Sampler[list[int]]):
         self.dataset = dataset
         self.batch_size = batch_size
         self.drop_last = drop_last
-        self.rank, self.world_size = place(rank, world_size)
-        self._by_default = rank is None
+        self.divide(rank, world_size)
         self._start = (0, 0)  # epoch and position of the loaded state
         self._taken = (0, 0)  # epoch, and number of its batches taken so far
         self._warned = False
@@ -269,15 +269,6 @@ class MixedBatches(Sampler[list[int]]):
                 yield [Position(position, epoch) for position in share]
         self.dataset.current.passed[self.rank] = (epoch, steps.start)
         self._fetched = (before, yielded)
-
-    def divide(self, rank: int, world_size: int) -> None:
-        """Change the rank of this process and the number of ranks, before iterating."""
-        self.rank, self.world_size = place(rank, world_size)
-        self._by_default = False
-
-    def _check(self) -> None:
-        if self._by_default:
-            check_unshared("train.batches(...)", self.rank, self.world_size)
 
     def _steps(self) -> CutSteps:
         epoch = self.dataset.epoch

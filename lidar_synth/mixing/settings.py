@@ -14,9 +14,10 @@ from lidar_synth.bank.storage import is_url
 from lidar_synth.errors import ConfigError, choose, suggest
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.formats import open_scans
-from lidar_synth.formats.as_sensor import read_transfer
+from lidar_synth.formats.as_sensor import make_transfer, read_transfer
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.defaults import detection_options, segmentation_options
 from lidar_synth.mixing.scans import MixedScans, Ratio
@@ -123,8 +124,9 @@ def mix(
             quarters of the epochs, then half, real ones alone in the last twentieth. Otherwise:
             synthetic scans alone in a quarter of the epochs, then real ones alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
-            is another; None leaves them as they are; otherwise as for ``MixedScans``, or
-            ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``.
+            is another, and where its lasers are others gives them the distribution of
+            reflectance of ten real scans; None leaves them as they are; otherwise as for
+            ``MixedScans``, or ``{"sensor": NAME, "mount": [Z, PITCH], "like": FOLDER}``.
         options: further arguments of ``MixedScans``.
 
     Raises:
@@ -144,8 +146,7 @@ def mix(
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
     if as_sensor == "auto":
-        alike = _agree(Sensor.same_grid, reals, synthetics)
-        as_sensor = None if alike else sensor_of(each(reals)[0][0])
+        as_sensor = _transfer(reals, synthetics)
     as_sensor = read_transfer(as_sensor, synthetics)
     choose("task", task, dict.fromkeys(TASKS))
     own = {}
@@ -169,6 +170,17 @@ def mix(
     for name in options:
         choose("argument of mix", name, known)
     return MixedScans(reals, synthetics, **(own | options))
+
+
+def _transfer(reals: Any, synthetics: Any) -> Transfer | None:
+    """Turns synthetic scans into scans of the real ones' sensor; None if they are. Scans of other
+    lasers get the distribution of the real scans' reflectance."""
+    if _agree(Sensor.same_grid, reals, synthetics):
+        return None
+    [real, _], *_ = each(reals)
+    [made, _], *_ = each(synthetics)
+    like = None if _agree(Sensor.same_lasers, reals, synthetics) else real
+    return make_transfer(sensor_of(real), (0.0, 0.0), like, made)
 
 
 def _agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:

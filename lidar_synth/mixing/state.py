@@ -57,23 +57,38 @@ def count_accelerated() -> int:
     )
 
 
-def check_unshared(what: str, rank: int, world_size: int) -> None:
-    """Refuse default ranks if an ``Accelerator`` may divide the batches among the same processes a
-    second time.
+class Divided:
+    """What is divided among ranks. ``Accelerator`` may divide batches among the same processes a
+    second time."""
 
-    Raises:
-        ConfigError: if an ``Accelerator`` is set up for several processes.
-    """
-    if world_size > 1 and count_accelerated() > 1:
-        raise ConfigError(
-            f"{what} with the default rank {rank} of {world_size} and an Accelerator, which "
-            "divides prepared loaders "
-            "among the same processes again: most samples would never be seen",
-            "only one of the two to divide the samples",
-            "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, "
-            f"loader); if it is not prepared, call {what} with rank=accelerator.process_index, "
-            "world_size=accelerator.num_processes.",
-        )
+    call: str
+    """What was called, for an error."""
+    rank: int
+    world_size: int
+    _by_default: bool
+
+    def divide(self, rank: int | None, world_size: int | None) -> None:
+        """Change the rank of this process and the number of ranks, before iterating; arguments as
+        of ``place``."""
+        self.rank, self.world_size = place(rank, world_size)
+        self._by_default = rank is None
+
+    def _check(self) -> None:
+        """Refuse default ranks.
+
+        Raises:
+            ConfigError: if an ``Accelerator`` is set up for several processes.
+        """
+        if self._by_default and self.world_size > 1 and count_accelerated() > 1:
+            raise ConfigError(
+                f"{self.call} with the default rank {self.rank} of {self.world_size} and an "
+                "Accelerator, which divides prepared loaders among the same processes again: most "
+                "samples would never be seen",
+                "only one of the two to divide the samples",
+                "Prepare the loader by lidar_synth.integrations.accelerate.prepare(accelerator, "
+                f"loader); if it is not prepared, call {self.call} with "
+                "rank=accelerator.process_index, world_size=accelerator.num_processes.",
+            )
 
 
 def make_state(mixture: Mixture, epoch: int, position: int) -> dict[str, Any]:

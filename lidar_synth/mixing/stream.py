@@ -12,15 +12,14 @@ from lidar_synth.mixing.batches import AHEAD, CutSteps, cut_steps, go_to, rank_s
 from lidar_synth.mixing.epochs import check_pass, shared_integers
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.state import (
+    Divided,
     after_epoch,
     check_state,
-    check_unshared,
     make_state,
-    place,
 )
 
 
-class MixedStream(IterableDataset[Any]):
+class MixedStream(Divided, IterableDataset[Any]):
     """The samples of a ``MixedScans`` as an iterable dataset, in the order of its plan.
 
     Worker w of W yields every W-th batch, so that ``DataLoader(stream, batch_size=B,
@@ -60,6 +59,8 @@ class MixedStream(IterableDataset[Any]):
         [[0, 1], [0, 1], [0, 1]]
     """
 
+    call = "MixedStream(...)"
+
     def __init__(
         self,
         scans: MixedScans,
@@ -77,8 +78,7 @@ class MixedStream(IterableDataset[Any]):
         self.endless = endless
         self.drop_last = drop_last
         self.collate = scans.collate
-        self.rank, self.world_size = place(rank, world_size)
-        self._by_default = rank is None
+        self.divide(rank, world_size)
         self._process = os.getpid()  # the process that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
         self._given = (
@@ -250,15 +250,6 @@ class MixedStream(IterableDataset[Any]):
             cut = self._steps(0, len(self.scans) - position)
             steps = (cut[i] for i in range(since // size, len(cut)))
         return (rank_share(step, self.rank, self.world_size) for step in steps)
-
-    def divide(self, rank: int, world_size: int) -> None:
-        """Change the rank of this process and the number of ranks, before iterating."""
-        self.rank, self.world_size = place(rank, world_size)
-        self._by_default = False
-
-    def _check(self) -> None:
-        if self._by_default:
-            check_unshared("MixedStream(...)", self.rank, self.world_size)
 
     def __getstate__(self) -> dict[str, Any]:
         self._check()  # here, because spawned workers do not see the Accelerator

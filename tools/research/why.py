@@ -9,7 +9,8 @@ the training, then real ones alone), or the name of a pool below: the town first
 ``pandar64``, ``standing`` (each scan taken at one moment), ``streets`` (standing, one scan a
 street), ``kept`` or ``recast`` (standing, by the generator's sensor, then turned into scans of the
 user's: its returns, or rays cast at its surfaces). ``--match`` gives the synthetic scans the
-quantiles of the labelled scans' reflectance.
+quantiles of the labelled scans' reflectance, as ``prove`` does where the generator's lasers are
+others.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,9 +24,15 @@ from other_sensor import read_frame
 from typer import run
 
 from lidar_synth import ProofSettings, Scan, load_generator
-from lidar_synth.geometry.transfer import Response, Transfer
+from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage, synthetic_first
-from lidar_synth.lab.proof.pools import FRAMES, POOLS, PoolTask, town_scans
+from lidar_synth.lab.proof.pools import (
+    FRAMES,
+    POOLS,
+    PoolTask,
+    match_reflectance,
+    town_scans,
+)
 from lidar_synth.lab.proof.trial import Job, TrialOutcome, reference
 from lidar_synth.lab.town import STRETCH_FRAMES, Town, load_skin
 from lidar_synth.noise import keyed_rng
@@ -70,13 +77,7 @@ ARMS["half"] = Arm(
 
 def learn_matched(job: Job) -> dict[str, TrialOutcome]:
     """The reference training; synthetic scans get the reflectance of the labelled scans."""
-    matched = {}
-    for name, part in job.pools.items():
-        response = Response.match(part, job.real)
-        matched[name] = [
-            replace(s, reflectance=response(s.reflectance).astype(np.float32))
-            for s in part
-        ]
+    matched = {n: match_reflectance(part, job.real) for n, part in job.pools.items()}
     return reference(replace(job, pools=matched))
 
 

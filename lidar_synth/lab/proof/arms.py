@@ -6,14 +6,13 @@ iterations, except where an arm's ``iterations`` says so. The learning rate has 
 stages, as in a trainer that knows nothing of them. To add an arm, enter it in ``ARMS``.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.lab.town.returns import CALIBRATED_ON
-from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.policies import LabelPolicy, make_policy
 from lidar_synth.mixing.defaults import quarter_of
 from lidar_synth.mixing.schedules import SyntheticFirst, make_schedule
@@ -32,15 +31,12 @@ class ArmStage:
         ratio: share of synthetic samples in each batch, 0 to 1.
         pool: of the synthetic scans: a name of ``POOLS``, or ``REAL``.
         labels: their label policy.
-        options: of the policy. ``objects: True`` stands for the pasted objects of the pool
-            ``skin``.
     """
 
     share: float = 1.0
     ratio: float = 0.0
     pool: str = ""
     labels: str = "generated"
-    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -65,17 +61,9 @@ class Arm:
     budget: str = ""
 
     def pools(self) -> set[str]:
-        """Names of the pools whose scans or objects it needs."""
-        stages = self.stages(0.5)
-        found = {stage.pool for stage in stages} - {"", REAL}
-        if any("bank" in stage.options for stage in stages):
-            found.add("skin")
-        return found
+        """Names of the pools whose scans it needs."""
+        return {stage.pool for stage in self.stages(0.5)} - {"", REAL}
 
-
-_RARE = {"bank": True, "turn": 180.0}
-RARE = {"Pedestrian": 3, "Person_sitting": 1, "Cyclist": 2, "Truck": 1, "Tram": 1}
-"""Largest number of pasted objects in a scan by name of their boxes."""
 
 _TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
 GENERATOR_BUDGET = "what the generator was trained on"
@@ -170,10 +158,10 @@ ARMS: dict[str, Arm] = {
         lambda ratio: synthetic_first("learnt"),
         budget=GENERATOR_BUDGET,
     ),
-    "paste": Arm(
-        "real scans, rare objects pasted",
-        lambda ratio: (ArmStage(1, 0.5, REAL, "paste", _RARE),),
-        budget=_SKIN,
+    "persons": Arm(
+        "generated scans with pedestrians of the town first, then half your scans",
+        lambda ratio: synthetic_first("persons"),
+        budget=f"{GENERATOR_BUDGET}; {_TOWN}",
     ),
 }
 """Arms by name."""
@@ -242,38 +230,21 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
     ]
 
 
-def policy_of(
-    stage: ArmStage, real: Any, objects: ObjectBank | None, fields: frozenset[str]
-) -> LabelPolicy:
+def policy_of(stage: ArmStage, real: Any, fields: frozenset[str]) -> LabelPolicy:
     """The label policy of a stage.
 
     Args:
         stage: the stage.
         real: the labelled scans.
-        objects: those to paste.
         fields: the fields of the synthetic scans.
     """
     return make_policy(
-        stage.labels, real=real, fields=fields, **options_of(stage, real, objects)
+        stage.labels, real=real, fields=fields, **options_of(stage, real)
     )
 
 
-def options_of(
-    stage: ArmStage, real: Any, objects: ObjectBank | None
-) -> dict[str, Any]:
+def options_of(stage: ArmStage, real: Any) -> dict[str, Any]:
     """The options of the label policy of a stage; arguments as for ``policy_of``."""
-    options = dict(stage.options)
-    if options.pop("bank", False):
-        assert objects is not None
-        there = {
-            n
-            for n, points in zip(objects.boxes.names, objects.counts, strict=True)
-            if points >= 5
-        }
-        options |= {
-            "bank": objects,
-            "count": {name: most for name, most in RARE.items() if name in there},
-        }
-    elif stage.labels == "polarmix_or_lasermix" and real[0].instance is None:
-        options["objects"] = 0  # PolarMix turns whole objects, which needs instances
-    return options
+    if stage.labels == "polarmix_or_lasermix" and real[0].instance is None:
+        return {"objects": 0}  # PolarMix turns whole objects, which needs instances
+    return {}

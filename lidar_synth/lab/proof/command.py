@@ -18,9 +18,7 @@ from lidar_synth.files.disk import read_values, write_file
 from lidar_synth.formats.semantic_kitti import SemanticKITTIWriter
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.proof.arms import REAL, ArmStage, options_of
-from lidar_synth.lab.proof.pools import OBJECTS
 from lidar_synth.lab.proof.trial import Job
-from lidar_synth.labels import ObjectBank
 
 FIELD = "{job}"
 _TAIL = 2000
@@ -109,9 +107,7 @@ def _describe_stage(job: Job, stage: ArmStage, iterations: int) -> dict[str, Any
     folder = (
         job.folder / "real" if stage.pool == REAL else job.pool_folders.get(stage.pool)
     )
-    options = options_of(stage, list(job.real), job.objects)
-    if isinstance(options.get("bank"), ObjectBank):
-        options["bank"] = str((job.pool_folders["skin"] / OBJECTS).resolve())
+    options = options_of(stage, list(job.real))
     return {
         "iterations": iterations,
         "ratio": float(stage.ratio),

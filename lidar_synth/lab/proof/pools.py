@@ -1,8 +1,7 @@
 """Pools of synthetic scans, which all arms and seeds share: made once, kept in SemanticKITTI's
 layout.
 
-A pool is a folder; ``objects.npz`` in the pool ``skin`` holds the objects that are pasted. An
-interrupted pool is continued where it stopped.
+A pool is a folder. An interrupted pool is continued where it stopped.
 """
 
 import json
@@ -12,6 +11,8 @@ from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lidar_synth.datasets.recordings import Recordings
 from lidar_synth.errors import ConfigError, DataError
@@ -23,26 +24,27 @@ from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.geometry.transfer import Transfer
+from lidar_synth.geometry.transfer import Response, Transfer
 from lidar_synth.lab.evaluate.leakage import town
-from lidar_synth.lab.proof.arms import RARE
 from lidar_synth.lab.spread import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.catalogue import TABLES_HASH
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
 from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
+from lidar_synth.labels.mix import PasteObjects
 from lidar_synth.noise import keyed_rng
 
 FRAMES = (4, 10, 16)
 """The scans of each street of the town that a pool has."""
 TOWN_SEED = 4242
 """Seed of the towns in pools; the next one is taken where the dataset is that town."""
+PERSONS = {"Pedestrian": 4}
+"""Pedestrians of the town that are pasted into a generated scan, at most."""
 MOST_SKIN_SCANS = 60
 SKIN_STREETS = 16
 SETTINGS = "pool.json"
 DONE = "complete"
-OBJECTS = "objects.npz"
 SKIN = "own.skin"
 
 
@@ -105,6 +107,18 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
     yield from _as_sensor(made, task.sensor)
 
 
+def add_persons(task: PoolTask) -> Iterator[Scan]:
+    """Scans of a generator with pedestrians of the town, which it draws too seldom."""
+    [name] = PERSONS
+    objects = ObjectBank.from_town(
+        task.grid or task.sensor, [name], seed=task.town_seed
+    )
+    # The other objects of the generated scans have no boxes, and stay.
+    paste = PasteObjects(objects, PERSONS, clear=False)
+    for index, scan in enumerate(make_generated(task)):
+        yield paste(scan, keyed_rng(0, index))
+
+
 def learnt_town(task: PoolTask) -> Iterator[Scan]:
     """Scans of the town that the generator learnt from, evenly spread, turned into scans of the
     user's sensor where the generator's is another one.
@@ -139,9 +153,10 @@ POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
     "skin": make_skinned_town,
     "generator": make_generated,
     "learnt": learnt_town,
+    "persons": add_persons,
 }
 """Makers of pools by name."""
-OF_GENERATOR = {"generator", "learnt"}
+OF_GENERATOR = {"generator", "learnt", "persons"}
 """Pools that depend on the generator."""
 
 
@@ -158,14 +173,10 @@ def make_pool(task: PoolTask) -> Path:
         return task.folder
     writer = SemanticKITTIWriter(task.folder)
     made = 0
-    boxed = []
     for scan in POOLS[task.kind](task):
         kept = scan if task.grid is None else thin_scan(scan, task.grid)
         writer.write(kept, made, name=f"00/{made:06d}")
         made += 1
-        boxed += [kept] if task.kind == "skin" and kept.boxes is not None else []
-    if boxed:
-        _save_objects(boxed, task.folder / OBJECTS)
     write_file(
         task.folder / DONE,
         json.dumps({"scans": made, "seconds": time.monotonic() - start}).encode(),
@@ -183,9 +194,18 @@ def read_pool(folder: Path) -> list[Scan]:
     return list(SemanticKITTI(folder))
 
 
-def read_objects(folder: Path) -> ObjectBank | None:
-    """The objects to paste; None if the scans of the pool have none."""
-    return ObjectBank.load(folder / OBJECTS) if (folder / OBJECTS).is_file() else None
+def has_lasers(model: str, sensor: Sensor) -> bool:
+    """Whether a model's scans are of a sensor's lasers."""
+    return read_header(find_model(model))[0].sensor.same_lasers(sensor)
+
+
+def match_reflectance(scans: Sequence[Scan], real: Sequence[Scan]) -> list[Scan]:
+    """The scans with the distribution of the reflectance of real ones."""
+    response = Response.match(scans, real)
+    return [
+        replace(s, reflectance=response(s.reflectance).astype(np.float32))
+        for s in scans
+    ]
 
 
 def town_seed(recordings: Recordings) -> int:
@@ -225,9 +245,3 @@ def town_scans(task: PoolTask, skin: Skin | None) -> Iterator[Scan]:
     ]
     for place in places[: task.count]:
         yield made[place]
-
-
-def _save_objects(scans: list[Scan], path: Path) -> None:
-    bank = ObjectBank.from_scans(scans)
-    if set(bank.boxes.names) & set(RARE):
-        bank.save(path)

@@ -33,8 +33,9 @@ from lidar_synth.lab.proof.planning import locate, make_plan
 from lidar_synth.lab.proof.pools import (
     OF_GENERATOR,
     PoolTask,
+    has_lasers,
     make_pool,
-    read_objects,
+    match_reflectance,
     read_pool,
     seconds_of,
     town_seed,
@@ -49,7 +50,6 @@ from lidar_synth.lab.proof.trial import (
     run_trainer,
 )
 from lidar_synth.lab.town.returns import CALIBRATED_ON
-from lidar_synth.labels import ObjectBank
 
 STUDY = "study.json"
 GENERATOR = "generator.json"
@@ -119,17 +119,20 @@ class Trainings:
         kinds = row.arm.pools()
         folders = {kind: self.pool_folder(kind, place) for kind in kinds}
         used = {stage.pool for stage in row.stages()}
+        pools = {kind: _pool(folders[kind]) for kind in kinds if kind in used}
+        real = [self.scans[i] for i in plan.labelled[pairs[0]]]
+        whole = plan.settings.beams is None
+        for kind in OF_GENERATOR & pools.keys():
+            if whole and not has_lasers(plan.settings.model, plan.sensor):
+                pools[kind] = match_reflectance(pools[kind], real)
         return Job(
             row,
             seed,
-            real=[self.scans[i] for i in plan.labelled[pairs[0]]],
+            real,
             held_out={
                 name: [self.scans[i] for i in plan.tested[name]] for name, _ in pairs
             },
-            pools={
-                kind: _pool(folder) for kind, folder in folders.items() if kind in used
-            },
-            objects=_objects(folders["skin"]) if row.name == "paste" else None,
+            pools=pools,
             iterations=round(plan.settings.iterations * row.arm.iterations),
             batch=plan.settings.batch,
             widths=plan.settings.widths,
@@ -152,17 +155,6 @@ def _one_thread() -> Iterator[None]:
 
 
 _pool = lru_cache(maxsize=2)(read_pool)
-
-
-def _objects(folder: Path) -> ObjectBank | None:
-    bank = read_objects(folder)
-    if bank is None:
-        raise DataError(
-            f"{folder} without objects to paste",
-            "people, cyclists or trucks in the scans of the town",
-            "Use more --synthetic scans, or leave out the arm 'paste'.",
-        )
-    return bank
 
 
 def prove(

@@ -25,7 +25,6 @@ from lidar_synth.lab.evaluate.segmentation import Images, confusion
 from lidar_synth.lab.evaluate.segmenter import RangeSegmenter, segmenter_input
 from lidar_synth.lab.proof.arms import REAL, ArmStage, Row, policy_of
 from lidar_synth.lab.train.segmentation import endless_batches, train_segmenter
-from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.augment import mirror_scan, rotate_scan
 from lidar_synth.mixing import MixedScans, settle
 
@@ -47,7 +46,6 @@ class Job:
         real: the labelled scans.
         held_out: {place: scans} to test on.
         pools: {name: synthetic scans} of the arm.
-        objects: to paste, if the arm pastes any.
         iterations: of the arm.
         batch: samples of an iteration.
         widths: channels of the reference network by level.
@@ -62,7 +60,6 @@ class Job:
     real: Sequence[Scan]
     held_out: Mapping[str, Sequence[Scan]]
     pools: dict[str, list[Scan]]
-    objects: ObjectBank | None
     iterations: int
     batch: int
     widths: tuple[int, ...]
@@ -103,10 +100,7 @@ class Job:
                     list(self.real) if stage.pool == REAL else self.pools[stage.pool]
                 )
                 labels = policy_of(
-                    stage,
-                    list(self.real),
-                    self.objects,
-                    frozenset(synthetic[0].fields()),
+                    stage, list(self.real), frozenset(synthetic[0].fields())
                 )
             yield (
                 MixedScans(

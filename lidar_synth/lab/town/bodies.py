@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_synth.lab.town.catalogue import TABLES
-from lidar_synth.lab.town.materials import Finish, read_finishes
+from lidar_synth.lab.town.materials import read_finishes
 from lidar_synth.lab.town.meshes import Array, Mesh, ball, boxes, merge, tube
 from lidar_synth.lab.town.objects import Prototype, assemble
-from lidar_synth.lab.town.vehicles import FINISHES
+from lidar_synth.lab.town.vehicles import vehicles
 
 TOP, TROUSERS, SKIN, HAIR, SHOE, BAG = range(6)
 PHASES = 8
@@ -31,28 +31,28 @@ def _torso(hip: ArrayLike, neck: ArrayLike) -> Mesh:
     up = n - h
     skull = n + up / np.linalg.norm(up) * 0.16 + np.array((0.02, 0, 0))
     spine = [h - 0.12 * up, h, h + 0.62 * up, h + 0.9 * up, n, skull]
-    trunk = tube(spine, (0.12, 0.155, 0.19, 0.17, 0.07, 0.05), 8, TOP)
-    flat = ((trunk.triangles - h) * (0.72, 1.0, 1.0) + h).astype(np.float32)
+    trunk = tube(spine, (0.15, 0.18, 0.205, 0.165, 0.085, 0.06), 8, TOP)
+    flat = ((trunk.triangles - h) * (0.8, 1.0, 1.0) + h).astype(np.float32)
     hair = skull - (0.02, 0, -0.035)
     return merge(
         [
             Mesh(flat, trunk.slot),
-            ball(skull, (0.10, 0.085, 0.13), SKIN, 5, 8),
-            ball(hair, (0.105, 0.095, 0.12), HAIR, 4, 8),
+            ball(skull, (0.11, 0.10, 0.135), SKIN, 5, 8),
+            ball(hair, (0.115, 0.11, 0.125), HAIR, 4, 8),
         ]
     )
 
 
 def _thigh(*joints: Any) -> Mesh:
-    return tube(joints, (0.085, 0.06, 0.045), 6, TROUSERS)
+    return tube(joints, (0.115, 0.09, 0.075), 6, TROUSERS)
 
 
 def _shoe(*ends: Any) -> Mesh:
-    return tube(ends, (0.04, 0.03), 5, SHOE)
+    return tube(ends, (0.05, 0.04), 5, SHOE)
 
 
 def _arm(*joints: Any) -> Mesh:
-    return tube(joints, (0.055, 0.045, 0.035), 5, TOP)
+    return tube(joints, (0.07, 0.06, 0.05), 5, TOP)
 
 
 def _leg(
@@ -64,7 +64,7 @@ def _leg(
     """The leg and the shoe of a walker on one side; ``height`` is that of the hip."""
     swing = stride * 0.42 * np.sin(turn)
     bend = swing - stride * 0.55 * max(0.0, np.cos(turn))
-    y = side * 0.10
+    y = side * 0.12
     x = 0.44 * np.sin(swing)
     z = height - 0.44 * np.cos(swing)
     foot = x + 0.42 * np.sin(bend)
@@ -79,13 +79,13 @@ def _swinging_arm(side: int, turn: float, stride: float) -> list[Mesh]:
     """The arm and the hand of a walker on one side."""
     arm = -stride * 0.38 * np.sin(turn)
     x = 0.02 + 0.29 * np.sin(arm)
-    z = 1.40 - 0.29 * np.cos(arm)
+    z = 1.37 - 0.29 * np.cos(arm)
     bent = arm + 0.3
     forward = x + 0.25 * np.sin(bent)
     up = z - 0.25 * np.cos(bent)
-    hand = (forward, side * 0.24, up)
+    hand = (forward, side * 0.26, up)
     return [
-        _arm((0.02, side * 0.19, 1.41), (x, side * 0.23, z), hand),
+        _arm((0.02, side * 0.20, 1.37), (x, side * 0.25, z), hand),
         ball(hand, 0.045, SKIN, 3, 5),
     ]
 
@@ -106,7 +106,7 @@ def _walker(phase: float, stride: float, bag: bool) -> Mesh:
 @cache
 def walker(phase: int, standing: bool = False, bag: bool = False) -> Prototype:
     """A pedestrian in pose number ``phase`` of the ``PHASES`` poses of a stride."""
-    mesh = _walker(2 * np.pi * phase / PHASES, 0.12 if standing else 1.0, bag)
+    mesh = _walker(2 * np.pi * phase / PHASES, 0.5 if standing else 1.0, bag)
     return Prototype(mesh, _BODY, "Pedestrian", (30, 254))
 
 
@@ -174,7 +174,7 @@ def _mount(
     raw: tuple[int, int],
 ) -> Prototype:
     """The prototype of a rider together with the bicycle or motorcycle."""
-    below = assemble(machine)
-    mesh = merge([person, Mesh(below.triangles, below.slot + len(_BODY))])
-    frame = Finish("paint", (0.2, 0.22, 0.26))
-    return Prototype(mesh, (*_BODY, frame, *FINISHES[1:]), name, raw)
+    below = vehicles()[machine]
+    parts = Mesh(below.mesh.triangles, below.mesh.slot + len(_BODY))
+    finishes = (*_BODY, *below.painted((0.2, 0.22, 0.26)))
+    return Prototype(merge([person, parts]), finishes, name, raw)

@@ -24,7 +24,8 @@ from lidar_synth.lab.town.materials import read_finishes
 from lidar_synth.lab.town.meshes import Mesh, boxes, merge
 from lidar_synth.lab.town.objects import Prototype, assemble
 
-FINISHES = read_finishes(TABLES["finishes"]["vehicle"])
+_FINISHES = {kind: read_finishes(rows) for kind, rows in TABLES["finishes"].items()}
+FINISHES = _FINISHES["vehicle"]
 
 
 @dataclass(frozen=True)
@@ -241,5 +242,6 @@ def vehicles() -> dict[str, Prototype]:
     kinds = {}
     for kind, (name, still, moving) in TABLES["vehicles"].items():
         mesh = meshes[kind] if kind in meshes else assemble(kind)
-        kinds[kind] = Prototype(mesh, FINISHES, name, (still, moving))
+        finishes = _FINISHES.get(kind, FINISHES)
+        kinds[kind] = Prototype(mesh, finishes, name, (still, moving))
     return kinds
