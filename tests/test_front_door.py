@@ -147,7 +147,8 @@ def test_labelled_scans_are_compared_and_mixed(tmp_path: Path) -> None:
     }
     settings = read_settings(out / "mix.yaml")
     assert settings["synthetic"] == str(out / "bank")
-    assert settings["as_sensor"] == str(out / "sensor.yaml")
+    sensor = str(out / "sensor.yaml")
+    assert settings["as_sensor"] == {"sensor": sensor, "like": str(root)}
     assert settings["ratio"] == {0: 1.0, 10: 0.0}
     assert "ratio={0: 1.0, 10: 0.0}, epoch_size=100" in (out / "loop.py").read_text()
     lidar_synth.mix(root, settings.pop("synthetic"), **settings)

@@ -8,8 +8,8 @@ import typer
 _ARMS = (
     "a training to compare, repeatable: real | longer | exchange | town | skin | "
     "generator | pretrain | pretrain-skin | pretrain-generator | alone | "
-    "pretrain-learnt | quarter | quarter-town | persons [exchange, pretrain-generator, quarter]; of "
-    "detectors: real | gt_sampling | objects | half | first | quarter | town"
+    "pretrain-learnt | quarter | quarter-town | persons [exchange, pretrain-generator, quarter]; "
+    "of detectors: real | gt_sampling | objects | half | first | quarter | town"
 )
 
 

@@ -24,7 +24,7 @@ from lidar_synth.generate.checkpoint import read_header
 from lidar_synth.generate.loading import find_model, load_generator
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
-from lidar_synth.geometry.transfer import Response, Transfer
+from lidar_synth.geometry.transfer import Measurement, Response, Transfer
 from lidar_synth.lab.evaluate.leakage import town
 from lidar_synth.lab.spread import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
@@ -142,8 +142,10 @@ def learnt_town(task: PoolTask) -> Iterator[Scan]:
 
 
 def _as_sensor(scans: Iterable[Scan], sensor: Sensor) -> Iterator[Scan]:
-    """The scans as a sensor would measure them."""
-    change = Transfer(sensor)
+    """The scans as a sensor would measure them; reflectance is matched in each training, to its
+    labelled scans."""
+    unchanged = Response((0.0, 1.0), (0.0, 1.0))
+    change = Transfer(sensor, measurement=Measurement(response=unchanged))
     for index, scan in enumerate(scans):
         yield change(scan, keyed_rng(0, index))
 

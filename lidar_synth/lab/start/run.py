@@ -135,6 +135,10 @@ class StartPlan:
         sensor = self.found.source.sensor
         if not self.cast and not sensor.same_grid(_model_sensor()):
             settings["as_sensor"] = self.sensor_name()
+            plain = not self.found.options.keys() - {"sensor"}
+            if plain and not sensor.same_lasers(_model_sensor()):
+                like = str(self.found.source.root)
+                settings["as_sensor"] = {"sensor": self.sensor_name(), "like": like}
         return settings
 
     @property
