@@ -483,6 +483,7 @@ def refusals() -> list[tuple[str, dict[str, Any], str]]:
             "names and points",
         ),
         ("paste", {"real": [cast([car(8, 2)])], "count": 0}, "count 0"),
+        ("paste", {"real": [cast([car(8, 2)])], "clear": "all"}, "clear='all'"),
         (
             "paste",
             {"real": [cast([car(8, 2)])], "fields": plain},

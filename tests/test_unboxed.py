@@ -23,6 +23,7 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.labels import edit
 from lidar_synth.labels.edit.unboxed import HANDLING, clusters
+from lidar_synth.labels.objects import LABELS
 from lidar_synth.mixing.synthetic import make_synthetic
 from lidar_synth.noise import keyed_rng
 
@@ -145,6 +146,20 @@ def test_mixing_hands_out_no_object_without_a_box(made: object) -> None:
         == 0
         < edit.measure([with_boxes(BOTH, None)]).objects
     )
+
+
+@pytest.mark.parametrize(("name", "left"), [("Car", 1), ("Pedestrian", 3)])
+def test_only_objects_of_the_pasted_classes_are_removed(name: str, left: int) -> None:
+    one = cast([car(8, 7)])
+    assert one.boxes is not None
+    objects = ObjectBank.from_scans([one])
+    label = np.full_like(objects.label, LABELS[name])
+    names = (name,) * len(objects)
+    bank = replace(objects, label=label, boxes=replace(objects.boxes, names=names))
+    scan = PasteObjects(bank, 1, clear="same")(with_boxes(BOTH, None), keyed_rng(0))
+    cars = with_boxes(scan, None)
+    assert edit.measure([cars]).objects == left
+    assert (scan.label == LABELS[name]).any()
 
 
 def test_scans_with_boxes_and_no_labels_pass() -> None:

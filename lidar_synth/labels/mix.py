@@ -42,7 +42,8 @@ class PasteObjects:
         turn: maximum angle, 0 to 180 degrees to either side, by which an object is turned
             about the sensor.
         clear: whether to remove the scan's own objects that have no box, and to fill the
-            holes; a detector would learn that they are background.
+            holes; a detector would learn that they are background. "same": only those of the
+            classes that are pasted, as for a segmenter.
         model: draws the holes, a generator, its name or file; None fills them by geometry,
             see ``edit.remove``.
         threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
@@ -65,7 +66,7 @@ class PasteObjects:
     count: int | Mapping[str, int] = 10
     least: int = 5
     turn: float = 0.0
-    clear: bool = True
+    clear: bool | str = True
     model: str | Path | None = None
     threshold: float = 0.0
 
@@ -75,6 +76,8 @@ class PasteObjects:
         check_count("least", self.least, 1)
         check_share("turn", self.turn, 180)
         check_share("threshold", self.threshold)
+        if self.clear not in (True, False, "same"):
+            raise ConfigError(f"clear={self.clear!r}", 'True, False or "same"')
 
     def bind(self, real: Source | None, fields: frozenset[str]) -> "PasteObjects":
         """The policy with the objects of real scans, if it has no others.
@@ -129,7 +132,8 @@ class PasteObjects:
     def _cleared(self) -> set[int]:
         """Classes of the scan's own objects that are removed."""
         labels = np.unique(self._objects.label)
-        return {*BOXED, *labels[labels < THINGS].tolist()}
+        others = () if self.clear == "same" else BOXED
+        return {*others, *labels[labels < THINGS].tolist()}
 
     @cached_property
     def _groups(self) -> list[tuple[NDArray[np.intp], int]]:

@@ -145,8 +145,9 @@ def mix(
     """
     reals = _open_real(real)
     synthetics = open_synthetic(synth)
+    alike = _agree(Sensor.same_lasers, reals, synthetics)
     if as_sensor == "auto":
-        as_sensor = _transfer(reals, synthetics)
+        as_sensor = _transfer(reals, synthetics, alike)
     as_sensor = read_transfer(as_sensor, synthetics)
     choose("task", task, dict.fromkeys(TASKS))
     own = {}
@@ -162,7 +163,6 @@ def mix(
                     "Then settle the network on the real scans (docs/how-to/mix.md).",
                 )
             count += len(source)
-        alike = _agree(Sensor.same_lasers, reals, synthetics)
         own = segmentation_options(count, epochs, alike)
     given = {"ratio": ratio, "labels": labels, "as_sensor": as_sensor}
     own |= {name: value for name, value in given.items() if value is not None}
@@ -172,15 +172,14 @@ def mix(
     return MixedScans(reals, synthetics, **(own | options))
 
 
-def _transfer(reals: Any, synthetics: Any) -> Transfer | None:
+def _transfer(reals: Any, synthetics: Any, alike: bool) -> Transfer | None:
     """Turns synthetic scans into scans of the real ones' sensor; None if they are. Scans of other
-    lasers get the distribution of the real scans' reflectance."""
+    lasers, not ``alike``, get the distribution of the real scans' reflectance."""
     if _agree(Sensor.same_grid, reals, synthetics):
         return None
     [real, _], *_ = each(reals)
     [made, _], *_ = each(synthetics)
-    like = None if _agree(Sensor.same_lasers, reals, synthetics) else real
-    return make_transfer(sensor_of(real), (0.0, 0.0), like, made)
+    return make_transfer(sensor_of(real), (0.0, 0.0), None if alike else real, made)
 
 
 def _agree(rule: Callable[[Sensor, Sensor], bool], reals: Any, synthetics: Any) -> bool:

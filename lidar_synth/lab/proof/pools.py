@@ -39,8 +39,8 @@ FRAMES = (4, 10, 16)
 """The scans of each street of the town that a pool has."""
 TOWN_SEED = 4242
 """Seed of the towns in pools; the next one is taken where the dataset is that town."""
-PERSONS = {"Pedestrian": 4}
-"""Pedestrians of the town that are pasted into a generated scan, at most."""
+PERSONS = {"Pedestrian": 6, "Person_sitting": 1}
+"""Persons of the town that are pasted into a generated scan, at most."""
 MOST_SKIN_SCANS = 60
 SKIN_STREETS = 16
 SETTINGS = "pool.json"
@@ -108,13 +108,10 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
 
 
 def add_persons(task: PoolTask) -> Iterator[Scan]:
-    """Scans of a generator with pedestrians of the town, which it draws too seldom."""
-    [name] = PERSONS
-    objects = ObjectBank.from_town(
-        task.grid or task.sensor, [name], seed=task.town_seed
-    )
-    # The other objects of the generated scans have no boxes, and stay.
-    paste = PasteObjects(objects, PERSONS, clear=False)
+    """Scans of a generator with persons of the town in the place of its own."""
+    sensor = task.grid or task.sensor
+    objects = ObjectBank.from_town(sensor, PERSONS, scans=80, seed=task.town_seed)
+    paste = PasteObjects(objects, PERSONS, clear="same")
     for index, scan in enumerate(make_generated(task)):
         yield paste(scan, keyed_rng(0, index))
 
