@@ -228,7 +228,7 @@ def _settings(task: PoolTask) -> dict[str, Any]:
         return (
             plain
             | {"model": task.model, "checkpoint": checkpoint}
-            | (streets if header.conditioning else {})
+            | (streets if header.conditioning or task.kind == "persons" else {})
         )
     if task.kind == "skin":
         streets["learnt_from"] = hash_of_names(task.learnt)
