@@ -110,7 +110,7 @@ def refuse_weights(trainer: str) -> None:
     raise ConfigError(
         f"loss_weight for {trainer}, which adds up the losses of all samples of a batch",
         "no loss_weight",
-        "Use a smaller ratio, or one that falls: ratio: {end_on_real: EPOCHS}. Anchor heads "
+        "Use a smaller ratio, or one that falls: ratio: {synthetic_first: EPOCHS}. Anchor heads "
         "(PointPillars, SECOND) of OpenPCDet and MMDetection3D can weigh, and so can your own "
         "loop: batch['loss_weight'].",
     )

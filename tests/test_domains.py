@@ -9,14 +9,23 @@ import pytest
 import torch
 from streets import street
 
-from lidar_synth import MixedScans, MixedStream, Sources, load_sensor, mix
+from lidar_synth import (
+    MixedScans,
+    MixedStream,
+    Sources,
+    load_generator,
+    load_sensor,
+    mix,
+)
+from lidar_synth.datasets.classes import TRAIN_ID
 from lidar_synth.errors import ConfigError
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.transfer import Transfer
 from lidar_synth.labels.augment import drop_reflectance
 from lidar_synth.mixing import (
     ByDomain,
-    EndOnReal,
     SyntheticFirst,
+    defaults,
     make_schedule,
     settle,
 )
@@ -85,15 +94,14 @@ def test_other_weights_of_sources_are_refused(wrong: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "schedule", "expected"),
+    ("schedule", "expected"),
     [
-        ("end_on_real", EndOnReal(8), [8] * 4 + [4] * 2 + [0] * 4),
-        ("synthetic_first", SyntheticFirst(8), [8] * 6 + [4] * 2 + [0] * 2),
-        ("synthetic_first", SyntheticFirst(20), [8] * 15 + [4] * 4 + [0] * 3),
+        (SyntheticFirst(8), [8] * 6 + [4] * 2 + [0] * 2),
+        (SyntheticFirst(20), [8] * 15 + [4] * 4 + [0] * 3),
     ],
 )
 def test_a_named_schedule_ends_on_real_scans(
-    name: str, schedule: SyntheticFirst, expected: list[int]
+    schedule: SyntheticFirst, expected: list[int]
 ) -> None:
     mixed = MixedScans(REAL, SYNTHETIC, schedule, epoch_size=8)
     found = []
@@ -101,16 +109,13 @@ def test_a_named_schedule_ends_on_real_scans(
         mixed.set_epoch(epoch)
         found.append(sum(mixed.domain(i) for i in range(len(mixed))))
     assert found == expected
-    assert make_schedule({name: schedule.epochs}) == schedule
+    assert make_schedule({"synthetic_first": schedule.epochs}) == schedule
 
 
 @pytest.mark.parametrize("wrong", [{"epochs": 3}, {"epochs": 8, "share": 2}])
-@pytest.mark.parametrize("kind", [EndOnReal, SyntheticFirst])
-def test_a_schedule_needs_epochs_and_a_share(
-    kind: type[SyntheticFirst], wrong: dict[str, Any]
-) -> None:
+def test_a_schedule_needs_epochs_and_a_share(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        kind(**wrong)
+        SyntheticFirst(**wrong)
 
 
 def test_a_segmenters_default_takes_synthetic_scans_first(
@@ -126,6 +131,39 @@ def test_a_segmenters_default_takes_synthetic_scans_first(
     assert "measured" not in caplog.text
     given = mix(REAL, SYNTHETIC, 0.25, epochs=8)
     assert len(given) != 100 and given.mixture.ratio(0) == 0.25
+
+
+@pytest.mark.slow
+def test_a_segmenters_default_puts_persons_of_the_town_in_the_place_of_a_models() -> (
+    None
+):
+    generated = load_generator("town").scans(0, [0, 1, 2])
+    person = TRAIN_ID["person"]
+    car = TRAIN_ID["car"]
+
+    def keep(scan: Scan, rng: np.random.Generator) -> Scan:
+        return scan
+
+    made = mix(generated, generated, epochs=8, to_sample=keep)
+    plain = mix(generated, generated, epochs=8, to_sample=keep, labels="generated")
+    for index in range(6):
+        before, after = plain[index], made[index]
+        assert before.id == after.id and after.boxes is None
+        assert (after.label == person).sum() > (before.label == person).sum() + 30
+        # what stands behind a person is hidden
+        assert (after.label == car).sum() > 0.7 * (before.label == car).sum()
+
+
+@pytest.mark.parametrize("embreex", [True, False])
+def test_persons_are_pasted_where_synthetic_scans_come_first(
+    embreex: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if not embreex:
+        monkeypatch.setattr(defaults, "find_spec", lambda name: None)
+    [few, many] = (defaults.segmentation_options(n, 8, True) for n in (4, 41))
+    assert few["labels"] == (defaults.PERSONS if embreex else "generated")
+    assert "labels" not in many
+    assert ("without embreex" in caplog.text) is not embreex
 
 
 QUARTER = [1.0] * 2 + [0.0] * 6
@@ -172,10 +210,10 @@ def test_a_segmenters_default_depends_on_lasers_and_not_on_grids(
 def test_settings_of_trainers_take_a_schedule_by_name() -> None:
     mixed = mix_for_trainer(
         8,
-        {"synthetic": SYNTHETIC, "ratio": {"end_on_real": 4}, "epoch_size": 8},
+        {"synthetic": SYNTHETIC, "ratio": {"synthetic_first": 20}, "epoch_size": 8},
         lambda scan, rng: scan,
     )
-    mixed.set_epoch(3)
+    mixed.set_epoch(19)
     assert [mixed[i] for i in range(8)] != []
     assert sum(mixed.domain(i) for i in range(8)) == 0
 

@@ -33,7 +33,6 @@ FURTHER = {
     "lidar_synth.labels.edit": ("insert", "measure", "move", "remove"),
     "lidar_synth.mixing": (
         "ByDomain",
-        "EndOnReal",
         "MixedScans.batches",
         "MixedScans.domain",
         "MixedScans.loss_weight",

@@ -310,14 +310,14 @@ def test_two_runs_that_share_a_list_have_their_own_epochs(
         ({"ratio": 0.5, "epoch_size": "replace"}, [(2, 2), (2, 2)]),
         (
             {
-                "ratio": {"end_on_real": 4},
+                "ratio": {"synthetic_first": 4},
                 "epoch_size": 8,
                 "loss_weight": {0: 1.0, 2: 0.1},
             },
-            [(0, 8), (0, 8), (4, 4)],
+            [(0, 8), (0, 8), (0, 8), (4, 4)],
         ),
     ],
-    ids=["schedule", "ratio 1", "replace", "end on real"],
+    ids=["schedule", "ratio 1", "replace", "synthetic first"],
 )
 def test_a_list_holds_schedules_and_lengths(
     scans: Path, tmp_path: Path, settings: dict[str, Any], shares: list[tuple[int, int]]

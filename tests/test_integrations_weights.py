@@ -68,7 +68,7 @@ def test_a_model_that_cannot_weigh_is_refused() -> None:
     centers = nn.Module()
     centers.dense_head = nn.Module()
     centers.dense_head.hm_loss_func = AnchorLoss()
-    with pytest.raises(ConfigError, match="end_on_real"):
+    with pytest.raises(ConfigError, match="synthetic_first"):
         weigh_openpcdet(centers)
     with pytest.raises(ConfigError, match="loss_weight"):
         weigh_mmdet3d(SimpleNamespace(bbox_head=SimpleNamespace()), lambda paths: [])

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from lidar_synth import ProofSettings, prove
 from lidar_synth.cli import app
-from lidar_synth.datasets.classes import PANDASET, TRAIN_ID
+from lidar_synth.datasets.classes import PANDASET
 from lidar_synth.datasets.recordings import frames_of
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.generate.checkpoint import VELOCITY, load_checkpoint, save_checkpoint
@@ -245,21 +245,6 @@ def test_the_scans_that_a_generator_learnt_from_are_those_of_its_town(
     other = write_model(tmp_path / "mine.safetensors")
     with pytest.raises(ConfigError, match="did not learn from the town"):
         make_pool(replace(task, folder=tmp_path / "other", model=str(other)))
-
-
-def test_persons_of_the_town_are_added_to_generated_scans_and_no_car_is_lost(
-    tmp_path: Path,
-) -> None:
-    sensor = load_generator("town").sensor
-    task = PoolTask("generator", tmp_path / "generator", sensor, None, 3)
-    plain = pools.read_pool(make_pool(task))
-    crowded = replace(task, kind="persons", folder=tmp_path / "persons")
-    person = TRAIN_ID["person"]
-    car = TRAIN_ID["car"]
-    for before, after in zip(plain, pools.read_pool(make_pool(crowded)), strict=True):
-        assert (after.label == person).sum() > (before.label == person).sum() + 30
-        # what stands behind a person is hidden
-        assert (after.label == car).sum() > 0.7 * (before.label == car).sum()
 
 
 def test_generated_scans_of_other_lasers_get_the_reflectance_of_the_labelled_ones(

@@ -103,7 +103,7 @@ PYTHON = {
 YAML = {
     "{synthetic: BANK, ratoi: 0.5}": "Did you mean 'ratio'",
     "{synthetic: BANK, ratio: half}": "a number from 0 to 1",
-    "{synthetic: BANK, ratio: {end_on_reel: 40}}": "Did you mean 'end_on_real'",
+    "{synthetic: BANK, ratio: {synthetic_frist: 40}}": "Did you mean 'synthetic_first'",
     "{synthetic: BANK, labels: generatd}": "Did you mean 'generated'",
     "{synthetic: BANK, as_sensor: os1_12}": "Did you mean 'os1_128'",
     "{synthetic: BANK, unboxed: clos}": "Did you mean 'close'",

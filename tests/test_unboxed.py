@@ -157,8 +157,8 @@ def test_only_objects_of_the_pasted_classes_are_removed(name: str, left: int) ->
     names = (name,) * len(objects)
     bank = replace(objects, label=label, boxes=replace(objects.boxes, names=names))
     scan = PasteObjects(bank, 1, clear="same")(with_boxes(BOTH, None), keyed_rng(0))
-    cars = with_boxes(scan, None)
-    assert edit.measure([cars]).objects == left
+    assert scan.boxes is None, "a segmenter's scan stays without boxes"
+    assert edit.measure([scan]).objects == left
     assert (scan.label == LABELS[name]).any()
 
 

@@ -7,7 +7,7 @@ keep the labels of their model; if it gives none, they are ignored.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +34,17 @@ class PasteObjects:
     """``paste``: pastes objects of a bank with their boxes, for training detectors.
 
     Args:
-        bank: the objects, or their file; None collects the objects in the boxes of
-            the mixture's real scans, all of which are read.
+        bank: the objects, or their file; "town" takes ``ObjectBank.from_town``; None
+            collects the objects in the boxes of the mixture's real scans, all of which are
+            read.
         count: maximum number of objects to place in a scan, in total or as ``{name of the
             boxes: number}``; they are sampled at random.
         least: minimum number of visible points of an object.
         turn: maximum angle, 0 to 180 degrees to either side, by which an object is turned
             about the sensor.
         clear: whether to remove the scan's own objects that have no box, and to fill the
-            holes; a detector would learn that they are background. "same": only those of the
-            classes that are pasted, as for a segmenter.
+            holes; a detector would learn that they are background. "same", for a segmenter:
+            only those of the classes that are pasted, and a scan without boxes gets none.
         model: draws the holes, a generator, its name or file; None fills them by geometry,
             see ``edit.remove``.
         threshold: minimum confidence of the scan's own labels, 0 to 1; labels below it
@@ -103,6 +104,7 @@ class PasteObjects:
         return bound
 
     def __call__(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        boxed = scan.boxes is not None or self.clear != "same"
         if self.clear:  # before labels of low confidence are ignored
             model = open_model(self.model)
             seed = int(rng.integers(1 << 32))
@@ -113,7 +115,7 @@ class PasteObjects:
             angles = np.radians(rng.uniform(-self.turn, self.turn, len(picks)))
             candidates = map(self._object, picks.tolist(), angles.tolist())
             scan = paste(scan, candidates, count=count, least=self.least)
-        return scan
+        return scan if boxed else replace(scan, boxes=None)
 
     @property
     def _limits(self) -> Mapping[str, int]:
@@ -126,6 +128,8 @@ class PasteObjects:
             return self.bank
         if self.bank is None:
             return _collect_objects(None, self.least)
+        if self.bank == "town":
+            return _objects_of_town(tuple(self._limits))
         return ObjectBank.load(self.bank)
 
     @cached_property
@@ -334,6 +338,13 @@ def _no_labels(given: str, policy: str) -> ConfigError:
         f"Give {policy}(real=scans). KITTI-360 and KITTI have no labels: use labels='paste' "
         "with boxes, or labels='generated'.",
     )
+
+
+@lru_cache(maxsize=2)
+def _objects_of_town(names: tuple[str, ...]) -> ObjectBank:
+    """Objects of the town with boxes of these names; "" = any."""
+    bank: ObjectBank = ObjectBank.from_town(classes=None if "" in names else names)
+    return bank
 
 
 def _collect_objects(real: Source | None, least: int) -> ObjectBank:

@@ -7,25 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS
+from lidar_synth.datasets.classes import GROUND, IGNORE, LABELS, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.labels.boxes import grow_box, turn_boxes, turn_points
 from lidar_synth.labels.ground import ground_under
 
-THINGS = len(
-    (
-        "car",
-        "bicycle",
-        "motorcycle",
-        "truck",
-        "other-vehicle",
-        "person",
-        "bicyclist",
-        "motorcyclist",
-    )
-)
+THINGS = TRAIN_ID["road"]
 """Train ids below this one have instances."""
 
 LOWEST = 0.1

@@ -12,7 +12,6 @@ from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import Mixture, PlannedSource
 from lidar_synth.mixing.scans import MixedScans
 from lidar_synth.mixing.schedules import (
-    EndOnReal,
     Linear,
     SyntheticFirst,
     make_schedule,
@@ -24,7 +23,6 @@ from lidar_synth.mixing.synthetic import Held, Synthetic, make_synthetic
 __all__ = [
     "ByDomain",
     "Collate",
-    "EndOnReal",
     "Held",
     "Item",
     "Linear",

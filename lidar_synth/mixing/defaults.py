@@ -1,22 +1,25 @@
 """What ``mix(epochs=...)`` does unless it is told otherwise: the recipe that gained most on real
 scans, by task.
 
-Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, where
-labelled scans are few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter
-of the epochs, then real scans alone, which gained less there but showed no loss on the street of
-the labels (docs/research/proof.md).
+Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, with
+persons of the town in the place of the synthetic scans' own, where labelled scans are few and of
+the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then real scans
+alone, which gained less there but showed no loss on the street of the labels
+(docs/research/proof.md).
 Detection: the same schedule, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).
 """
 
 import logging
 from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import Any
 
 from lidar_synth.errors import ConfigError
 from lidar_synth.labels.bank import ObjectBank
 from lidar_synth.labels.compose import Compose
 from lidar_synth.labels.mix import PasteObjects
+from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.schedules import SyntheticFirst
 
 log = logging.getLogger(__name__)
@@ -30,6 +33,17 @@ LEAST = 100
 """Minimum number of samples of an epoch; as many as there are real scans, if these are more."""
 PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects of a bank that are pasted into a scan."""
+
+
+PERSONS: Labels = {
+    "paste": {
+        "bank": "town",
+        "count": {"Pedestrian": 6, "Person_sitting": 1},
+        "clear": "same",
+    }
+}
+"""Persons of the town in the place of a scan's own: from those that a model draws, a segmenter does
+not learn to find real ones."""
 
 
 def augment_boxes(banks: Iterable[ObjectBank]) -> Compose:
@@ -74,11 +88,14 @@ def segmentation_options(real: int, epochs: int, same_sensor: bool) -> dict[str,
             f"no gain has been measured with more than {MEASURED} labelled scans ({real} here): "
             "compare with `lidar-synth prove` (docs/how-to/choose.md)"
         )
-    first = SyntheticFirst(epochs)
-    return {
-        "ratio": quarter_of(epochs) if ends_on_real(real, same_sensor) else first,
-        "epoch_size": "replace" if real >= LEAST else LEAST,
-    }
+    size = "replace" if real >= LEAST else LEAST
+    if ends_on_real(real, same_sensor):
+        return {"ratio": quarter_of(epochs), "epoch_size": size}
+    labels = PERSONS
+    if find_spec("embreex") is None:
+        log.warning("without embreex no persons are pasted: a segmenter will find few")
+        labels = "generated"
+    return {"ratio": SyntheticFirst(epochs), "labels": labels, "epoch_size": size}
 
 
 def detection_options(real: Any, epochs: Any) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class MixedScans(Dataset[Any]):
         real: indexable source of ``Scan``, or ``Sources`` of several; None with ratio 1.
         synth: a generator, a bank, a rolling bank, scans by index, or ``Sources`` of several.
         ratio: share of synthetic samples in [0, 1]: a number, a list with one for each epoch,
-            ``{epoch: share}``, ``Linear(first, last, epochs)``, ``EndOnReal(epochs)`` or a
+            ``{epoch: share}``, ``Linear(first, last, epochs)``, ``SyntheticFirst(epochs)`` or a
             function of the epoch.
         labels: label policy of the synthetic scans: a policy of ``lidar_synth.labels`` such as
             ``PasteObjects(bank, count=8)``, a name of ``lidar_synth.labels.POLICIES``, ``{name:

@@ -141,36 +141,7 @@ class SyntheticFirst:
         return self.share if epoch < self.constant_from else 0.0
 
 
-@dataclass(frozen=True)
-class EndOnReal(SyntheticFirst):
-    """Synthetic scans alone at first, then beside real ones, and real scans alone at the end.
-
-    Args:
-        epochs: number of epochs of the training, at least 4.
-        share: of synthetic samples in the third quarter, in [0, 1].
-
-    Raises:
-        ConfigError: on fewer epochs, or another share.
-
-    Example:
-        >>> from lidar_synth.mixing import EndOnReal
-        >>> ratio = EndOnReal(epochs=8)
-        >>> [ratio(epoch) for epoch in range(8)]
-        [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
-    """
-
-    @property
-    def constant_from(self) -> int:
-        """The epoch from which on the share is constant."""
-        return 3 * self.epochs // 4
-
-    def __call__(self, epoch: int) -> float:
-        if epoch < self.epochs // 2:
-            return 1.0
-        return self.share if epoch < self.constant_from else 0.0
-
-
-BY_NAME = {"synthetic_first": SyntheticFirst, "end_on_real": EndOnReal}
+BY_NAME = {"synthetic_first": SyntheticFirst}
 """Schedules by their names in settings, ``{name: epochs}``."""
 
 
@@ -181,9 +152,8 @@ def make_schedule(
 
     Args:
         ratio: one share for all epochs; a list with one for each; ``{epoch: share}``, each from its
-            epoch on; ``Linear(first, last, epochs)``; ``SyntheticFirst(epochs)``,
-            ``EndOnReal(epochs)``, in YAML ``{synthetic_first: epochs}``, ``{end_on_real:
-            epochs}``; or any function of the epoch.
+            epoch on; ``Linear(first, last, epochs)``; ``SyntheticFirst(epochs)``, in YAML
+            ``{synthetic_first: epochs}``; or any function of the epoch.
 
     Raises:
         ConfigError: on a share outside [0, 1], or no share for epoch 0.

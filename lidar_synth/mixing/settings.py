@@ -121,8 +121,9 @@ def mix(
             pastes objects of the real scans into all scans, which it turns, mirrors and scales.
         epochs: of the training. With it the recipe that gained on real scans is the default. With
             up to 40 real scans of the synthetic scans' lasers: synthetic scans alone in three
-            quarters of the epochs, then half, real ones alone in the last twentieth. Otherwise:
-            synthetic scans alone in a quarter of the epochs, then real ones alone.
+            quarters of the epochs, then half, real ones alone in the last twentieth; persons of
+            the town take the place of the synthetic scans' own, unless ``labels`` are given.
+            Otherwise: synthetic scans alone in a quarter of the epochs, then real ones alone.
         as_sensor: ``"auto"`` turns synthetic scans into scans of the real scans' sensor if theirs
             is another, and where its lasers are others gives them the distribution of
             reflectance of ten real scans; None leaves them as they are; otherwise as for
@@ -235,7 +236,7 @@ def mix_for_trainer(
             f"loss_weight: {settings['loss_weight']} for this trainer, which adds up the losses "
             "of all samples of a batch",
             "no key loss_weight",
-            "Use a smaller ratio, or one that falls: ratio: {end_on_real: EPOCHS}.",
+            "Use a smaller ratio, or one that falls: ratio: {synthetic_first: EPOCHS}.",
         )
     if settings.get("synthetic") is None:
         raise ConfigError(

@@ -13,8 +13,8 @@ from typing import Any
 
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.lab.town.returns import CALIBRATED_ON
-from lidar_synth.labels.policies import LabelPolicy, make_policy
-from lidar_synth.mixing.defaults import quarter_of
+from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
+from lidar_synth.mixing.defaults import PERSONS, quarter_of
 from lidar_synth.mixing.schedules import SyntheticFirst, make_schedule
 
 REAL = "real"
@@ -36,7 +36,7 @@ class ArmStage:
     share: float = 1.0
     ratio: float = 0.0
     pool: str = ""
-    labels: str = "generated"
+    labels: Labels = "generated"
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,20 @@ EPOCHS = 40
 """Epochs of the training whose schedule gives the stages."""
 
 
-def _stages(pool: str, given: Any) -> tuple[ArmStage, ...]:
+def _stages(
+    pool: str, given: Any, labels: Labels = "generated"
+) -> tuple[ArmStage, ...]:
     """The stages of a training of ``EPOCHS`` epochs with a ratio as of ``mix``."""
     stages = []
     for ratio, epochs in groupby(range(EPOCHS), make_schedule(given)):
         share = len(list(epochs)) / EPOCHS
-        stages.append(ArmStage(share, ratio, pool if ratio else ""))
+        stages.append(ArmStage(share, ratio, pool if ratio else "", labels))
     return tuple(stages)
 
 
-def synthetic_first(pool: str) -> tuple[ArmStage, ...]:
+def synthetic_first(pool: str, labels: Labels = "generated") -> tuple[ArmStage, ...]:
     """Synthetic scans first, then half, real ones at the end."""
-    return _stages(pool, SyntheticFirst(EPOCHS))
+    return _stages(pool, SyntheticFirst(EPOCHS), labels)
 
 
 def _quarter(pool: str) -> tuple[ArmStage, ...]:
@@ -160,7 +162,7 @@ ARMS: dict[str, Arm] = {
     ),
     "persons": Arm(
         "generated scans with pedestrians of the town first, then half your scans",
-        lambda ratio: synthetic_first("persons"),
+        lambda ratio: synthetic_first("generator", PERSONS),
         budget=f"{GENERATOR_BUDGET}; {_TOWN}",
     ),
 }

@@ -30,17 +30,13 @@ from lidar_synth.lab.spread import spread
 from lidar_synth.lab.town import STRETCH_FRAMES, Skin, Town, fit_skin, load_skin
 from lidar_synth.lab.town.catalogue import TABLES_HASH
 from lidar_synth.lab.town.skin.fit import FEWEST_SCANS
-from lidar_synth.labels import ObjectBank
 from lidar_synth.labels.exchange import thin_scan
-from lidar_synth.labels.mix import PasteObjects
 from lidar_synth.noise import keyed_rng
 
 FRAMES = (4, 10, 16)
 """The scans of each street of the town that a pool has."""
 TOWN_SEED = 4242
 """Seed of the towns in pools; the next one is taken where the dataset is that town."""
-PERSONS = {"Pedestrian": 6, "Person_sitting": 1}
-"""Persons of the town that are pasted into a generated scan, at most."""
 MOST_SKIN_SCANS = 60
 SKIN_STREETS = 16
 SETTINGS = "pool.json"
@@ -107,15 +103,6 @@ def make_generated(task: PoolTask) -> Iterator[Scan]:
     yield from _as_sensor(made, task.sensor)
 
 
-def add_persons(task: PoolTask) -> Iterator[Scan]:
-    """Scans of a generator with persons of the town in the place of its own."""
-    sensor = task.grid or task.sensor
-    objects = ObjectBank.from_town(sensor, PERSONS, scans=80, seed=task.town_seed)
-    paste = PasteObjects(objects, PERSONS, clear="same")
-    for index, scan in enumerate(make_generated(task)):
-        yield paste(scan, keyed_rng(0, index))
-
-
 def learnt_town(task: PoolTask) -> Iterator[Scan]:
     """Scans of the town that the generator learnt from, evenly spread, turned into scans of the
     user's sensor where the generator's is another one.
@@ -152,10 +139,9 @@ POOLS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
     "skin": make_skinned_town,
     "generator": make_generated,
     "learnt": learnt_town,
-    "persons": add_persons,
 }
 """Makers of pools by name."""
-OF_GENERATOR = {"generator", "learnt", "persons"}
+OF_GENERATOR = {"generator", "learnt"}
 """Pools that depend on the generator."""
 
 
@@ -228,7 +214,7 @@ def _settings(task: PoolTask) -> dict[str, Any]:
         return (
             plain
             | {"model": task.model, "checkpoint": checkpoint}
-            | (streets if header.conditioning or task.kind == "persons" else {})
+            | (streets if header.conditioning else {})
         )
     if task.kind == "skin":
         streets["learnt_from"] = hash_of_names(task.learnt)

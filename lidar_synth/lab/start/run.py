@@ -129,6 +129,8 @@ class StartPlan:
             settings = dict(DEFAULTS[self.task])
         if self.ends_on_real:
             settings["ratio"] = quarter_of(EPOCHS)
+            if self.task == "segmentation":
+                settings["labels"] = "generated"
         if len(self.found.source) < LEAST:
             settings["epoch_size"] = LEAST
         settings = {"synthetic": str(self.synthetic), **settings, "seed": 0}
@@ -146,11 +148,7 @@ class StartPlan:
         """The arm of the comparison."""
         arms = ("first", "quarter")
         if self.task == "segmentation":
-            arms = (
-                ("pretrain", "quarter-town")
-                if self.cast
-                else ("pretrain-generator", "quarter")
-            )
+            arms = ("pretrain", "quarter-town") if self.cast else ("persons", "quarter")
         return arms[self.ends_on_real]
 
     def sensor_name(self) -> str:

@@ -14,6 +14,7 @@ import yaml
 
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.files.disk import write_file
+from lidar_synth.mixing.defaults import PERSONS
 
 _MMDET3D = """# python HERE/lists.py, and then tools/train.py HERE/mixed.py of MMDetection3D
 _base_ = ["BASE"]
@@ -150,7 +151,7 @@ _WORDS = re.compile(r"\b(?:ROOT|MIX|HERE)\b|OPTIONS")
 DEFAULTS: dict[str, dict[str, Any]] = {
     "segmentation": {
         "ratio": {"synthetic_first": 40},
-        "labels": "generated",
+        "labels": PERSONS,
         "epoch_size": "replace",
     },
     "detection": {
