@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mixtures import SENSOR, Endless, Scans, as_is
+from streets import street
 from torch.utils.data import DataLoader
 
+from lidar_synth import mix
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.mixing import MixedScans
 
@@ -89,6 +91,14 @@ def test_unlabelled_real_scans_in_an_unlabelled_mixture_are_not(
     real = Scans("r", 12)
     real[:] = [replace(scan, label=None) for scan in real]
     assert not logged(MixedScans(real, Endless(), 0.5, labels="none"), caplog)
+
+
+def test_unlabelled_real_scans_of_a_detector_are_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    real = [replace(street(i), label=None, instance=None) for i in range(4)]
+    train = mix(real, [street(9), street(8)], 0.5, task="detection", epochs=8)
+    assert not logged(train, caplog)
 
 
 def test_a_sampler_made_anew_for_each_epoch_does_not_hide_a_repetition() -> None:

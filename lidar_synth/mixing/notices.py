@@ -45,11 +45,13 @@ class Notices:
 
     Args:
         images: whether batches are range images, in which the number of points has no meaning.
+        boxes: whether scans are mixed for their boxes, so that real ones need no labels.
     """
 
-    def __init__(self, images: bool = False) -> None:
+    def __init__(self, images: bool = False, boxes: bool = False) -> None:
         self._real_boxes = self._told = False
-        self._unlabelled: str | None = None  # a real scan without labels
+        # a real scan without labels; "" if that is no matter, or told
+        self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
         self._sizes: tuple[list[int], list[int]] = (
@@ -77,7 +79,7 @@ class Notices:
                 self._unlabelled,
             )
             self._labelled = False
-            self._unlabelled = ""  # so that it is told once
+            self._unlabelled = ""
         if self._images or len(self._sizes[kind]) >= FEW:
             return
         self._sizes[kind].append(len(scan))

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from lidar_synth.errors import ConfigError
 from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Scan, identity_of
 from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.labels.own import RemoveLabels
+from lidar_synth.labels.own import KeepBoxes, RemoveLabels
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
@@ -197,7 +197,8 @@ class MixedScans(Dataset[Any]):
         self._without_unboxed = (
             _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
         )
-        self._notices = Notices(images=collate == "range")
+        policies = set(map(type, self._policies))
+        self._notices = Notices(collate == "range", KeepBoxes in policies)
         every = frozenset({*POINT_FIELDS, "boxes"})
         common = every.intersection(*(s.fields | rings for s in self.synthetic))
         self._augment = _make_augment(augment, scans, common)
@@ -205,7 +206,7 @@ class MixedScans(Dataset[Any]):
         self._to_sample = to_sample
         self._real_as_is = real_as_is
         if isinstance(collate, str):
-            if any(isinstance(policy, RemoveLabels) for policy in self._policies):
+            if RemoveLabels in policies:
                 unlabelled = "allow"
             sensor = sensors[0] if sensors else None
             collate = Collate(collate, sensor, unlabelled)
