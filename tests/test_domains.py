@@ -187,6 +187,8 @@ def test_a_segmenters_default_needs_labels() -> None:
     for real in (blank, Sources(REAL, blank)):
         with pytest.raises(ConfigError, match=r"without labels.*ratio=1\.0"):
             mix(real, SYNTHETIC, epochs=8)
+    with pytest.raises(ConfigError, match="synthetic scans only have"):
+        mix(REAL, blank, epochs=8)
     alone = mix(blank, SYNTHETIC, ratio=1.0, epoch_size=400)
     assert sum(alone.domain(i) for i in range(400)) == 400
 

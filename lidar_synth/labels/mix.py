@@ -22,7 +22,13 @@ from lidar_synth.labels.edit.redraw import open_model
 from lidar_synth.labels.edit.unboxed import remove_unboxed
 from lidar_synth.labels.exchange import swap_bands, swap_sector, thin_scan
 from lidar_synth.labels.objects import THINGS, Object, instances_of, objects_of
-from lidar_synth.labels.own import check_count, check_own, check_share, keep_own
+from lidar_synth.labels.own import (
+    check_count,
+    check_own,
+    check_share,
+    keep_own,
+    require_label,
+)
 from lidar_synth.labels.pasting import paste
 
 TRIES = 5
@@ -86,10 +92,12 @@ class PasteObjects:
         Raises:
             ConfigError: if there are no boxes, or none of a given name; if the synthetic
                 scans have neither labels nor boxes, so that their own objects cannot be
-                found.
+                found, or with "same" no labels.
             FileError, DataError: if a file of objects cannot be read.
         """
         check_own(self.threshold, fields)
+        if self.clear == "same":
+            require_label("paste", fields)
         bound = self
         if self.bank is None:
             bound = replace(self, bank=_collect_objects(real, self.least))
