@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidar_synth.geometry.overlap import overlapping_pairs
+from lidar_synth.geometry.scan import Boxes
 from lidar_synth.lab.town.bodies import PHASES, cyclist, motorcyclist, sitter, walker
 from lidar_synth.lab.town.bodywork import GLASS
+from lidar_synth.lab.town.boxes import box_values
 from lidar_synth.lab.town.course import Course, Relief
 from lidar_synth.lab.town.ground import KINDS, NAMES, TownGround
 from lidar_synth.lab.town.materials import MATERIALS, Finish, Finishes
@@ -21,6 +24,7 @@ from lidar_synth.lab.town.meshes import (
     merge,
     tube,
 )
+from lidar_synth.lab.town.movers import place_movers
 from lidar_synth.lab.town.plants import (
     CORE,
     LEAF,
@@ -310,6 +314,18 @@ def test_movers_do_not_collide() -> None:
             np.abs(t[:, None] - t) < half_t[:, None] + half_t
         )
         assert not (overlap & ~np.eye(len(s), dtype=bool)).any()
+
+
+@pytest.mark.parametrize("stretch", [1, 7])
+def test_nothing_moves_or_stands_in_a_parked_vehicle(stretch: int) -> None:
+    """In stretch 1 bicycles are parked in rows, in stretch 7 cars on a side street with traffic."""
+    world = build_world(7, stretch, 0.4)
+    for time in (0.0, 2.0, 4.0):
+        movers = place_movers(world.movers, world.scene, time, (0, 0), 200)
+        objects = [*world.scene.placed, *movers]
+        rows = np.array([box_values(o, o.pose) for o in objects], np.float32)
+        names = tuple(o.prototype.name for o in objects)
+        assert overlapping_pairs(Boxes(rows, names)) == []
 
 
 def test_surfaces_are_frozen_into_columns() -> None:

@@ -243,6 +243,7 @@ def _put_street_furniture(
             elif 0.14 <= draw < 0.25:
                 _park_cycles(
                     s,
+                    high,
                     front,
                     side,
                     draw < 0.22,
@@ -277,13 +278,14 @@ def _put_bins(
 
 def _park_cycles(
     s: float,
+    high: float,
     front: float,
     side: int,
     bicycles: bool,
     scene: Scene,
     rng: Rng,
 ) -> None:
-    """Put up to four bicycles side by side or in a row, or a motorcycle."""
+    """Put up to four bicycles side by side or in a row, as far as ``high``, or a motorcycle."""
     away = -side * np.pi / 2
     if not bicycles:
         kind = vehicles()["motorcycle"]
@@ -293,10 +295,12 @@ def _park_cycles(
         return
     row = rng.random() < 0.6
     kind = vehicles()["bicycle"]
-    for k in range(int(rng.integers(1, 5))):
+    apart = 1.9 if row else 0.7
+    for place in s + apart * np.arange(rng.integers(1, 5)):
         colour = pick_colour("paints", rng)
         yaw = away + np.pi / 2 + rng.normal(0, 0.1) if row else away
-        scene.park(kind, colour, s + 0.7 * k, side * (front - 0.45), yaw)
+        if place < high:
+            scene.park(kind, colour, place, side * (front - 0.45), yaw)
 
 
 def _put_small_object(

@@ -179,12 +179,13 @@ class Traffic:
         for k in range(rng.poisson(1.2 if self._street.kind == "junction" else 0.5)):
             shapes, colour = self._sample_mover()
             t = side * (edge + 4.2 + 7.5 * k)
-            self._add(shapes, colour, Line(False, c.s - aside, t, -side, 0.0), 0.4)
+            line = Line(False, c.s - aside, t, -side, 0.0)
+            self._add(shapes, colour, line, 0.4, solid=True)
         if rng.random() < 0.7:
             shapes, colour = self._sample_mover()
             start = side * (edge + rng.uniform(5, 40))
             line = Line(False, c.s + aside, start, side, rng.uniform(4, 9))
-            self._add(shapes, colour, line, 0.5)
+            self._add(shapes, colour, line, 0.5, solid=True)
 
     def _add_pedestrians(self) -> None:
         """Add pedestrians on pavements, on squares and crossing the street."""
