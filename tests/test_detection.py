@@ -1,6 +1,8 @@
 """``prove --task detection``: places, arms, intervals and the page of a comparison of detectors."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import torch
 from streets import street
 from typer.testing import CliRunner
 
-from lidar_synth import Scan
+from lidar_synth import Boxes, Scan
 from lidar_synth.cli import app
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats.npz import write_scan
@@ -210,6 +212,23 @@ def test_a_dry_run_says_what_would_be_trained(places: Path, tmp_path: Path) -> N
     assert "seed 1: 2 labelled scans, tested on place" in result.output
     assert "the town first, then half, real scans last, GT sampling" in result.output
     assert not out.exists()
+
+
+def test_a_scan_with_boxes_along_the_way_of_a_car_is_named(
+    places: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scan = street(5)
+    assert scan.boxes is not None
+    trail = Boxes(np.repeat(scan.boxes.values, 2, 0), ("Car",) * 6)
+    trail.values[::2, 0] += 1
+    write_scan(tmp_path / "trail" / "0.npz", replace(scan, boxes=trail))
+    for folder in places.iterdir():
+        shutil.copytree(folder, tmp_path / folder.name)
+    command = ["prove", str(tmp_path), "--task", "detection", "--dry-run"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    [warning] = caplog.messages
+    assert "trail/0: 6 of 6 boxes overlap one of their class" in warning
 
 
 def test_options_of_the_other_task_are_refused(places: Path, tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from lidar_synth import Layout, Town, layout_of, load_layout, load_sensor
 from lidar_synth.datasets.classes import BOXED, LABELS
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.layout import CODES, Outline, layout_image, select_known_boxes
-from lidar_synth.geometry.layout.layout import overlaps
 from lidar_synth.geometry.layout.raster import depth_of
+from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.layouts import layout_agreement, rays_of_boxes
@@ -59,7 +59,7 @@ def some_layout(seed: int, count: int = 12, walls: bool = True) -> Layout:
         ).astype(np.float32)
         boxes = Boxes(more, ("Car",) * len(more))
         if (
-            not overlaps(boxes, 0.0)
+            not overlapping_pairs(boxes, 0.0)
             and not Boxes(widen_boxes(more, 1.0), boxes.names)
             .contain(np.zeros((1, 3), "f4"))
             .any()
@@ -427,9 +427,9 @@ def test_touching_boxes_are_accepted_and_stacked_ones_refused() -> None:
             [9, 0, 3, 4, 2, 1.5, 0],
         ]
     )
-    assert overlaps(Boxes(rows, ("Car",) * 3)) == []
+    assert overlapping_pairs(Boxes(rows, ("Car",) * 3)) == []
     rows[1, 1] = 1.2
-    assert overlaps(Boxes(rows, ("Car",) * 3)) == [(0, 1)]
+    assert overlapping_pairs(Boxes(rows, ("Car",) * 3)) == [(0, 1)]
 
 
 def test_many_boxes_in_one_place_are_refused_soon() -> None:
@@ -448,4 +448,4 @@ def test_turned_boxes_overlap_as_their_footprints_do() -> None:
             [12 + apart, 0, -0.7, 4, 2, 1.6, np.pi / 2],
         ]
         boxes = Boxes(np.array(values, np.float32), ("Car", "Car"))
-        assert overlaps(boxes) == ([(0, 1)] if meet else [])
+        assert overlapping_pairs(boxes) == ([(0, 1)] if meet else [])

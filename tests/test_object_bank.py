@@ -14,13 +14,13 @@ from pasting import assert_nothing_shares_a_ray
 from lidar_synth.datasets.classes import IGNORE, TRAIN_ID
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.formats import KITTIObject, SemanticKITTI
+from lidar_synth.geometry.overlap import count_overlapping, find_overlapping
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import presets
 from lidar_synth.lab.town import Town
 from lidar_synth.labels import ObjectBank, instances_of, objects_of, paste
 from lidar_synth.labels.boxes import (
     box_frame,
-    find_overlapping,
     grow_box,
     join_boxes,
     turn_boxes,
@@ -258,6 +258,17 @@ def test_boxes_overlap_where_a_point_lies_in_both(seed: int) -> None:
     assert (
         find_overlapping(values[0], smaller) <= both
     ).all()  # a corner may lie between the grid's points
+
+
+def test_a_car_with_a_box_at_each_place_of_its_way_is_counted() -> None:
+    """Four boxes 2 m apart along a way, a car parked 2.2 m beside it, and a van at the same place
+    as that car."""
+    rows = [[x, 0, 0, 4, 2, 1.5, 0] for x in (0, 2, 4, 6)]
+    rows += [[2, 2.2, 0, 4, 2, 1.5, 0]] * 2
+    names = ("Car",) * 5 + ("Van",)
+    boxes = Boxes(np.array(rows, np.float32), names)
+    assert count_overlapping(boxes) == 4
+    assert count_overlapping(boxes[[0, 2, 4, 5]]) == 0
 
 
 def test_boxes_grow_no_more_than_they_have_to() -> None:

@@ -1,4 +1,4 @@
-"""Geometry of boxes: a box's own frame, movement, enlargement and overlap."""
+"""Geometry of boxes: a box's own frame, movement and enlargement."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.geometry.scan import Boxes
-
-_CORNERS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.float32) / 2
 
 
 def box_frame(
@@ -84,41 +82,6 @@ def join_boxes(several: Sequence[Boxes]) -> Boxes:
         if f.name != "names"
     }
     return Boxes(names=names, **arrays)
-
-
-def find_overlapping(
-    box: NDArray[np.float32], others: NDArray[np.float32]
-) -> NDArray[np.bool_]:
-    """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
-
-    Separating axis theorem: two rectangles are disjoint if a side of one of them separates their
-        corners.
-    """
-    far: NDArray[np.bool_] = (
-        np.hypot(*(others[:, :2] - box[:2]).T)
-        > (np.hypot(*others[:, 3:5].T) + np.hypot(*box[3:5])) / 2
-    )
-    if far.all():
-        return ~far
-    corners = _footprints(np.concatenate([box[None], others]))
-    own = corners[0]
-    other = corners[1:]
-    axes = np.stack([corners[:, 0] - corners[:, 1], corners[:, 1] - corners[:, 2]], 1)
-    ours = np.concatenate([np.broadcast_to(axes[0], (len(others), 2, 2)), axes[1:]], 1)
-    a = ours @ own.T
-    b = ours @ other.transpose(0, 2, 1)
-    apart = (a.max(2) < b.min(2)) | (b.max(2) < a.min(2))
-    return np.asarray(~apart.any(1))
-
-
-def _footprints(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(M, 4, 2) corners in the ground plane."""
-    local = _CORNERS * values[:, None, 3:5]
-    c = np.cos(values[:, 6:])
-    s = np.sin(values[:, 6:])
-    x = local[..., 0] * c - local[..., 1] * s
-    y = local[..., 0] * s + local[..., 1] * c
-    return np.asarray(np.stack([x, y], -1) + values[:, None, :2], np.float32)
 
 
 def widen_boxes(values: NDArray[np.float32], margin: float) -> NDArray[np.float32]:

@@ -13,8 +13,8 @@ from lidar_synth.geometry.layout.layout import (
     Layout,
     Outline,
     around_sensor,
-    overlaps,
 )
+from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes, Scan
 
 KINDS = {
@@ -92,7 +92,7 @@ def select_known_boxes(scan: Scan) -> Boxes:
     ]
     later: set[int] = set()
     # in order, so that the first of a pair is kept or dropped already
-    for first, second in overlaps(boxes):
+    for first, second in overlapping_pairs(boxes):
         if first not in later:
             later.add(second)
     return boxes[[i for i in range(len(boxes)) if i not in later]] if later else boxes

@@ -7,12 +7,12 @@ that generates the scan of it, and its boxes are the boxes of that scan.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.overlap import overlapping_pairs
 from lidar_synth.geometry.scan import Boxes
 
 OUTLINES = ("building", "vegetation", "fence")
@@ -47,9 +47,6 @@ box."""
 
 NARROW = 1.3
 """Maximum width of a motorcyclist's box, metres."""
-
-OVERLAP = 0.2
-"""Metres by which two boxes may reach into each other: annotated boxes of parked cars touch."""
 
 _FAR = 1e3
 
@@ -159,7 +156,7 @@ class Layout:
                 f"box {int(around.argmax())} around the sensor",
                 "boxes beside the sensor",
             )
-        for i, j in overlaps(self.boxes):
+        for i, j in overlapping_pairs(self.boxes):
             names = f"{self.boxes.names[i]} and {self.boxes.names[j]}"
             raise self._error(
                 f"boxes {i} and {j} ({names}) that overlap",
@@ -190,44 +187,3 @@ def around_sensor(boxes: Boxes) -> NDArray[np.bool_]:
         boxes, values=boxes.values * np.array([1, 1, 0, 1, 1, 1, 1], np.float32)
     )
     return level.contain(np.zeros((1, 3), np.float32))[:, 0]
-
-
-def overlaps(boxes: Boxes, margin: float = OVERLAP) -> list[tuple[int, int]]:
-    """Pairs of boxes that reach more than ``margin`` metres into each other, by their footprints
-    and heights."""
-    values = boxes.values.astype(np.float64)
-    half = np.maximum(values[:, 3:6] - margin, 1e-3) / 2
-    c = np.cos(values[:, 6])
-    s = np.sin(values[:, 6])
-    # (M, 2 axes, x and y)
-    axes = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)
-    found = []
-    for i in range(len(values)):
-        gap = values[i + 1 :, :3] - values[i, :3]
-        near = np.hypot(*gap[:, :2].T) < np.hypot(*half[i, :2]) + np.hypot(
-            *half[i + 1 :, :2].T
-        )
-        near &= np.abs(gap[:, 2]) < half[i, 2] + half[i + 1 :, 2]
-        others = i + 1 + np.flatnonzero(near)
-        meet = _footprints_meet(
-            axes[i], half[i, :2], axes[others], half[others, :2], gap[near, :2]
-        )
-        found += [(i, int(j)) for j in others[meet]]
-    return found
-
-
-def _footprints_meet(
-    axes_a: NDArray[Any],
-    half_a: NDArray[Any],
-    axes_b: NDArray[Any],
-    half_b: NDArray[Any],
-    gap: NDArray[Any],
-) -> NDArray[np.bool_]:
-    """(K,) separating axis theorem for a rectangle with unit axes (2, 2) and half sides
-    (2,) and K others, (K, 2, 2) and (K, 2), with centres ``gap`` (K, 2) apart."""
-    axes = np.concatenate([np.broadcast_to(axes_a, axes_b.shape), axes_b], 1)
-    distance = np.abs(np.einsum("kax,kx->ka", axes, gap))
-    reach_a = np.abs(axes @ axes_a.T) @ half_a
-    reach_b = np.einsum("kab,kb->ka", np.abs(axes @ axes_b.swapaxes(1, 2)), half_b)
-    meet: NDArray[np.bool_] = (distance < reach_a + reach_b).all(1)
-    return meet

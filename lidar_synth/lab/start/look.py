@@ -12,6 +12,7 @@ from lidar_synth.datasets.classes import NAMES
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.formats import ScanFiles, layout_of, open_scans
 from lidar_synth.geometry.agreement import agreement
+from lidar_synth.geometry.overlap import count_overlapping
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.fitting import SensorFit, fit_sensor
 from lidar_synth.lab.proof.places import by_drive, names_of
@@ -33,6 +34,7 @@ class Findings:
         labelled: how many of them have labels.
         classes: names of the labels, the most frequent first.
         boxes: {class: number of boxes in the scans that were looked at}.
+        overlapping: how many of them overlap another of their class.
         known: how the sensor is known.
         fit: the fit, if the sensor was not known.
     """
@@ -44,6 +46,7 @@ class Findings:
     labelled: int
     classes: tuple[str, ...]
     boxes: dict[str, int]
+    overlapping: int
     known: str
     fit: SensorFit | None
 
@@ -66,6 +69,8 @@ class Findings:
         more = ", ..." if len(self.classes) > 5 else ""
         labels = f"{len(self.classes)} classes ({few}{more})" if few else "none"
         boxes = ", ".join(f"{name} {count}" for name, count in self.boxes.items())
+        if self.overlapping:
+            boxes += f"; {self.overlapping} overlap one of their class"
         doubts = " ".join(self.fit.uncertain) if self.fit else ""
         return [
             f"scans    {len(source)} of layout {self.layout} in {drives} "
@@ -122,6 +127,7 @@ def look(
         sum(_has_labels(scan) for scan in scans),
         _classes(scans),
         _boxes(scans),
+        sum(count_overlapping(scan.boxes) for scan in scans if scan.boxes is not None),
         known,
         fit,
     )

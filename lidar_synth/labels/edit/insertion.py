@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from lidar_synth.datasets.classes import GROUND, TRAIN_ID
 from lidar_synth.errors import DataError
+from lidar_synth.geometry.overlap import find_overlapping
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
-from lidar_synth.labels.boxes import find_overlapping, grow_box, join_boxes, turn_points
+from lidar_synth.labels.boxes import grow_box, join_boxes, turn_points
 from lidar_synth.labels.edit.compose import next_instance, replace_returns
 from lidar_synth.labels.edit.rays import ScanRays, rays_of_scan
 from lidar_synth.labels.edit.removal import remove, select_boxes

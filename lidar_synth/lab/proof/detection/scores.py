@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.overlap import footprints
+from lidar_synth.geometry.scan import Scan
 from lidar_synth.lab.proof.detection.bev import REACH, Found
 from lidar_synth.lab.proof.detection.boxes import (
     LEAST,
@@ -166,20 +167,14 @@ def footprint_ious(
     lengths = np.hypot(a[:, 3], a[:, 4])
     others = np.hypot(b[:, 3], b[:, 4])
     near = _distances(a, b) < (lengths[:, None] + others) / 2
-    first = _footprints(a)
-    second = _footprints(b)
+    first = footprints(a).astype(np.float64)
+    second = footprints(b).astype(np.float64)
     for i, j in np.argwhere(near):
         common = _common_area(first[i], second[j])
         ious[i, j] = common / (
             float(a[i, 3]) * a[i, 4] + float(b[j, 3]) * b[j, 4] - common
         )
     return ious
-
-
-def _footprints(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(M, 4, 2) corners, counter-clockwise."""
-    boxes = Boxes(values, ("",) * len(values))
-    return boxes.corners()[:, :4, :2].astype(np.float64)
 
 
 def _clip(

@@ -1,6 +1,7 @@
 """``prove_detection``: trainings of a detector on a few real scans, tested on places left out."""
 
 import json
+import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -20,6 +21,7 @@ from lidar_synth.files.parsing import read_sealed, seal
 from lidar_synth.formats import open_scans
 from lidar_synth.formats.npz import write_scan
 from lidar_synth.generate.devices import check_device
+from lidar_synth.geometry.overlap import count_overlapping
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.proof.arms import EPOCHS
 from lidar_synth.lab.proof.detection.arms import (
@@ -29,7 +31,7 @@ from lidar_synth.lab.proof.detection.arms import (
     make_mixture,
 )
 from lidar_synth.lab.proof.detection.bev import Found, view
-from lidar_synth.lab.proof.detection.boxes import with_points
+from lidar_synth.lab.proof.detection.boxes import detected, with_points
 from lidar_synth.lab.proof.detection.network import (
     Detector,
     detect,
@@ -46,7 +48,11 @@ from lidar_synth.lab.town import STRETCH_FRAMES, Town
 from lidar_synth.lab.train.segmentation import endless_batches
 from lidar_synth.labels import ObjectBank
 
+log = logging.getLogger(__name__)
+
 RATE = 3e-3
+MOST_OVERLAPPING = 0.1
+"""Share of a scan's boxes that may overlap another of their class without a warning."""
 MOMENTS = (3, 10, 17)
 """The scans of each stretch of the town in its pool."""
 
@@ -299,7 +305,7 @@ def prove_detection(
     settings = settings or DetectionSettings()
     source = open_scans(scans) if isinstance(scans, str | Path) else scans
     work = DetectionWork(source, settings, out, Path(pools or out / "town"), device)
-    truths = {i: Truth.of(source[i]) for i in range(len(source))}
+    truths = _truths(source)
     claim(out / "study.json", _identity(work))
     for seed in range(settings.seeds):
         for arm in settings.compared:
@@ -310,6 +316,22 @@ def prove_detection(
     return report(work, truths)
 
 
+def _truths(source: Source) -> dict[int, Truth]:
+    """{index of a scan: its boxes}; warns of scans in which many overlap."""
+    truths = {}
+    for index in range(len(source)):
+        scan = source[index]
+        truths[index] = Truth.of(scan)
+        boxes = detected(scan)
+        count = count_overlapping(boxes)
+        if count > MOST_OVERLAPPING * len(boxes):
+            log.warning(
+                f"{scan.id}: {count} of {len(boxes)} boxes overlap one of their class; if moving "
+                "objects have a box at each place of their way, leave this scan out"
+            )
+    return truths
+
+
 def describe(work: DetectionWork) -> str:
     """What would be trained and tested, in words.
 
@@ -317,8 +339,7 @@ def describe(work: DetectionWork) -> str:
         ConfigError, DataError: as ``prove_detection``.
     """
     settings = work.settings
-    for index in range(len(work.source)):
-        Truth.of(work.source[index])
+    _truths(work.source)
     counts = [f"{name} ({len(part)})" for name, part in work.places.items()]
     trainings = settings.seeds * len(settings.compared)
     lines = [
