@@ -29,7 +29,7 @@ from lidar_synth.geometry.projection import project
 from lidar_synth.lab.evaluate.segmentation import class_ious
 from lidar_synth.lab.evaluate.segmenter import CircularConv, _Wrapped
 from lidar_synth.lab.proof import ARMS, CommandTrainer, ProofSettings
-from lidar_synth.lab.proof.arms import options_of, policy_of, rows
+from lidar_synth.lab.proof.arms import Row, options_of, policy_of, rows
 from lidar_synth.lab.proof.budget import estimate_minutes, within
 from lidar_synth.lab.proof.command import describe
 from lidar_synth.lab.proof.drawing import ticks
@@ -121,7 +121,9 @@ def test_labelled_scans_come_from_many_places_and_not_from_the_one_left_out(
 def test_an_arm_trains_for_its_iterations_with_its_shares(
     name: str, tmp_path: Path
 ) -> None:
-    task = job(name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].swept else None)
+    task = job(
+        name, tmp_path, iterations=21, ratio=0.5 if ARMS[name].ratio is None else None
+    )
     mixtures = list(task.mixtures(collate="range"))
     stages = task.row.stages()
     assert sum(count for _, count in mixtures) == task.iterations
@@ -538,7 +540,7 @@ def test_a_command_names_its_job(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ARMS)
 def test_a_job_is_plain_values(name: str, tmp_path: Path) -> None:
-    task = job(name, tmp_path, ratio=0.25 if ARMS[name].swept else None)
+    task = job(name, tmp_path, ratio=0.25 if ARMS[name].ratio is None else None)
     values = describe(task)
     assert yaml.safe_load(yaml.safe_dump(values)) == values
     assert [stage["iterations"] for stage in values["stages"]] == [
@@ -550,7 +552,7 @@ def test_real_scans_without_instances_exchange_no_objects() -> None:
     """PolarMix turns whole objects, which SemanticKITTI's labels without instances lack."""
     scan = Town(1, scans=1)[0]
     bare = [replace(scan, instance=None, boxes=None)]
-    [stage] = ARMS["exchange"].stages(0.5)
+    [stage] = Row("exchange").stages()
     assert options_of(stage, bare) == {"objects": 0}
     policy = policy_of(stage, bare, frozenset({"label"}))
     assert len(policy(bare[0], keyed_rng(0))) > 0

@@ -1,12 +1,12 @@
-"""The trainings that are compared. Each is an *arm*: one or more stages, each with a mixture of its
-own.
+"""The trainings that are compared. Each is an *arm*: a mixture whose share of synthetic scans
+follows a schedule, as of ``mix``.
 
 All arms have the same network, batch size, augmentation and optimiser, and the same number of
-iterations, except where an arm's ``iterations`` says so. The learning rate has one cycle over all
-stages, as in a trainer that knows nothing of them. To add an arm, enter it in ``ARMS``.
+iterations, except where an arm's ``iterations`` says so. The learning rate has one cycle over the
+whole training, as in a trainer that knows nothing of the schedule. To add an arm, enter it in
+``ARMS``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -39,131 +39,87 @@ class ArmStage:
     labels: Labels = "generated"
 
 
+_TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
+GENERATOR_BUDGET = "what the generator was trained on"
+_BUDGETS = {
+    "town": _TOWN,
+    "skin": f"{_TOWN}; scans of the training places without labels, to learn the skin",
+    "generator": GENERATOR_BUDGET,
+    "learnt": GENERATOR_BUDGET,
+}
+"""What the scans of a pool use besides the labelled scans."""
+
+EPOCHS = 40
+"""Epochs of the training whose schedule gives the stages."""
+FIRST = SyntheticFirst(EPOCHS)
+QUARTER = quarter_of(EPOCHS)
+
+
 @dataclass(frozen=True)
 class Arm:
     """One of the compared trainings.
 
     Args:
         title: its row in tables.
-        stages: from the share of synthetic samples to the stages.
-        swept: whether the share matters, so that the arm is trained once for each of the given
-            shares.
+        pool: of the synthetic scans: a name of ``POOLS``, ``REAL``, or "" without any.
+        ratio: share of synthetic samples, as ``mix`` takes it for ``EPOCHS`` epochs; None where it
+            matters, so that the arm is trained once for each of the given shares.
+        labels: label policy of the synthetic scans.
         iterations: factor of the number of iterations.
-        synthetic: whether it uses scans that were not recorded.
-        budget: what it uses besides the labelled scans.
+        extra: what it uses besides the labelled scans and its pool.
     """
 
     title: str
-    stages: Callable[[float], tuple[ArmStage, ...]]
-    swept: bool = False
+    pool: str = ""
+    ratio: Any = 0.0
+    labels: Labels = "generated"
     iterations: float = 1.0
-    synthetic: bool = True
-    budget: str = ""
+    extra: str = ""
+
+    @property
+    def budget(self) -> str:
+        """What it uses besides the labelled scans."""
+        return "; ".join(filter(None, (_BUDGETS.get(self.pool), self.extra)))
 
     def pools(self) -> set[str]:
         """Names of the pools whose scans it needs."""
-        return {stage.pool for stage in self.stages(0.5)} - {"", REAL}
-
-
-_TOWN = f"labels of the town, which cost nothing ({CALIBRATED_ON})"
-GENERATOR_BUDGET = "what the generator was trained on"
-_SKIN = f"{_TOWN}; scans of the training places without labels, to learn the skin"
-
-EPOCHS = 40
-"""Epochs of the training whose schedule gives the stages."""
-
-
-def _stages(
-    pool: str, given: Any, labels: Labels = "generated"
-) -> tuple[ArmStage, ...]:
-    """The stages of a training of ``EPOCHS`` epochs with a ratio as of ``mix``."""
-    stages = []
-    for ratio, epochs in groupby(range(EPOCHS), make_schedule(given)):
-        share = len(list(epochs)) / EPOCHS
-        stages.append(ArmStage(share, ratio, pool if ratio else "", labels))
-    return tuple(stages)
-
-
-def synthetic_first(pool: str, labels: Labels = "generated") -> tuple[ArmStage, ...]:
-    """Synthetic scans first, then half, real ones at the end."""
-    return _stages(pool, SyntheticFirst(EPOCHS), labels)
-
-
-def _quarter(pool: str) -> tuple[ArmStage, ...]:
-    """Synthetic scans for a quarter, then real ones alone."""
-    return _stages(pool, quarter_of(EPOCHS))
+        return {self.pool} - {"", REAL}
 
 
 ARMS: dict[str, Arm] = {
-    "real": Arm("real scans only", lambda ratio: (ArmStage(),), synthetic=False),
-    "longer": Arm(
-        "real scans only, twice as long",
-        lambda ratio: (ArmStage(),),
-        iterations=2,
-        synthetic=False,
-    ),
+    "real": Arm("real scans only"),
+    "longer": Arm("real scans only, twice as long", iterations=2),
     "exchange": Arm(
-        "real scans, PolarMix and LaserMix",
-        lambda ratio: (ArmStage(1, 0.5, REAL, "polarmix_or_lasermix"),),
-        synthetic=False,
+        "real scans, PolarMix and LaserMix", REAL, 0.5, "polarmix_or_lasermix"
     ),
-    "town": Arm(
-        "with scans of the town",
-        lambda ratio: (ArmStage(1, ratio, "town"),),
-        swept=True,
-        budget=_TOWN,
-    ),
-    "skin": Arm(
-        "with scans of the town in your skin",
-        lambda ratio: (ArmStage(1, ratio, "skin"),),
-        swept=True,
-        budget=_SKIN,
-    ),
-    "generator": Arm(
-        "with generated scans",
-        lambda ratio: (ArmStage(1, ratio, "generator"),),
-        swept=True,
-        budget=GENERATOR_BUDGET,
-    ),
-    "pretrain": Arm(
-        "the town first, then half your scans",
-        lambda ratio: synthetic_first("town"),
-        budget=_TOWN,
-    ),
+    "town": Arm("with scans of the town", "town", None),
+    "skin": Arm("with scans of the town in your skin", "skin", None),
+    "generator": Arm("with generated scans", "generator", None),
+    "pretrain": Arm("the town first, then half your scans", "town", FIRST),
     "pretrain-skin": Arm(
-        "the town in your skin first, then half your scans",
-        lambda ratio: synthetic_first("skin"),
-        budget=_SKIN,
+        "the town in your skin first, then half your scans", "skin", FIRST
     ),
     "pretrain-generator": Arm(
-        "generated scans first, then half your scans",
-        lambda ratio: synthetic_first("generator"),
-        budget=GENERATOR_BUDGET,
+        "generated scans first, then half your scans", "generator", FIRST
     ),
-    "alone": Arm(
-        "generated scans alone, your scans without labels",
-        lambda ratio: (ArmStage(1, 1, "generator"),),
-        budget=GENERATOR_BUDGET,
-    ),
+    "alone": Arm("generated scans alone, your scans without labels", "generator", 1.0),
     "quarter": Arm(
-        "generated scans for a quarter, then your scans alone",
-        lambda ratio: _quarter("generator"),
-        budget=GENERATOR_BUDGET,
+        "generated scans for a quarter, then your scans alone", "generator", QUARTER
     ),
     "quarter-town": Arm(
-        "the town for a quarter, then your scans alone",
-        lambda ratio: _quarter("town"),
-        budget=_TOWN,
+        "the town for a quarter, then your scans alone", "town", QUARTER
     ),
     "pretrain-learnt": Arm(
         "the scans that the generator learnt from first, then half your scans",
-        lambda ratio: synthetic_first("learnt"),
-        budget=GENERATOR_BUDGET,
+        "learnt",
+        FIRST,
     ),
     "persons": Arm(
         "generated scans with pedestrians of the town first, then half your scans",
-        lambda ratio: synthetic_first("generator", PERSONS),
-        budget=f"{GENERATOR_BUDGET}; {_TOWN}",
+        "generator",
+        FIRST,
+        PERSONS,
+        extra=_TOWN,
     ),
 }
 """Arms by name."""
@@ -204,8 +160,15 @@ class Row:
         )
 
     def stages(self) -> tuple[ArmStage, ...]:
-        """The stages of the training."""
-        return self.arm.stages(0.5 if self.ratio is None else self.ratio)
+        """The parts of the training, each with one mixture."""
+        arm = self.arm
+        schedule = make_schedule(arm.ratio if self.ratio is None else self.ratio)
+        stages = []
+        for ratio, epochs in groupby(range(EPOCHS), schedule):
+            share = len(list(epochs)) / EPOCHS
+            pool = arm.pool if ratio else ""
+            stages.append(ArmStage(share, ratio, pool, arm.labels))
+        return tuple(stages)
 
 
 def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
@@ -228,7 +191,7 @@ def rows(names: tuple[str, ...], ratios: tuple[float, ...]) -> list[Row]:
     return [
         Row(name, r)
         for name in ordered
-        for r in (sorted(set(ratios)) if ARMS[name].swept else (None,))
+        for r in (sorted(set(ratios)) if ARMS[name].ratio is None else (None,))
     ]
 
 

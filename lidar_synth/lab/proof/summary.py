@@ -182,7 +182,7 @@ def _arm(
         "arm": row.name,
         "ratio": row.ratio,
         "title": row.title,
-        "synthetic": row.arm.synthetic,
+        "synthetic": bool(row.arm.pools()),
         "miou": _mean(scores[row]),
         "difference": None if first else _mean(difference),
         "interval": None if first else interval(difference),
@@ -250,7 +250,7 @@ def _chosen_elsewhere(
 ) -> dict[str, Any] | None:
     """The gain in each place of the arm with synthetic scans that is best in the other places."""
     base = scores[plan.rows[0]]
-    rows = [row for row in plan.rows if row.arm.synthetic]
+    rows = [row for row in plan.rows if row.arm.pools()]
     if not rows or len(base) < 3:
         return None
     gains = np.stack([scores[row] - base for row in rows])
@@ -272,10 +272,8 @@ def _over_best_real(
 ) -> dict[str, Any] | None:
     """The best arm with synthetic scans against the best arm with real scans only and as many
     iterations."""
-    real = [
-        row for row in plan.rows if not row.arm.synthetic and row.arm.iterations == 1
-    ]
-    synthetic = [row for row in plan.rows if row.arm.synthetic]
+    real = [row for row in plan.rows if not row.arm.pools() and row.arm.iterations == 1]
+    synthetic = [row for row in plan.rows if row.arm.pools()]
     if not synthetic:
         return None
     best, other = (
