@@ -37,6 +37,8 @@ NAMES = {
     "Person_sitting": "pedestrian",
     "Cyclist": "bicycle",
     "Motorcyclist": "motorcycle",
+    "Bicycle": "bicycle",
+    "Motorcycle": "motorcycle",
     "Tram": None,
     "Misc": None,
     **{name: name for name in CLASSES},

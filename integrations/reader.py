@@ -60,6 +60,8 @@ CLASSES = (
     "Tram",
     "Misc",
     "Motorcyclist",
+    "Bicycle",
+    "Motorcycle",
 )
 NUMBERS = {"seed": "<u8", "index": "<u8", "crc": "<u4"}  # one for each scan
 LEVELS = {"reflectance": 255, "confidence": 15}  # steps from 0 to 1

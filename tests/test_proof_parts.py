@@ -136,7 +136,7 @@ def test_an_arm_trains_for_its_iterations_with_its_shares(
     assert (batch["label"] != 255).any()
 
 
-@pytest.mark.parametrize("name", ["pretrain", "persons"])
+@pytest.mark.parametrize("name", ["pretrain", "recipe"])
 def test_the_reference_trainer_learns_and_repeats_itself(
     name: str, tmp_path: Path, one_thread: None
 ) -> None:
@@ -450,7 +450,7 @@ for i in range(len(held_out)):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pretrain", "persons"])
+@pytest.mark.parametrize("name", ["pretrain", "recipe"])
 def test_a_command_trains_on_the_mixture_of_its_file(name: str, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(TRAINER)
     task = job(name, tmp_path)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from lidar_synth import Boxes, ObjectBank, PasteObjects, Scan, Town, load_sensor
+from lidar_synth.bank.boxes import decode_boxes, encode_boxes
+from lidar_synth.datasets.classes import LABELS
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.geometry.projection import locate
 from lidar_synth.lab.town.pasted import TownObjects
@@ -165,6 +167,30 @@ def test_classes_are_chosen_by_name(bank: TownObjects) -> None:
     assert set(cars.boxes.names) == {"Car"}
     with pytest.raises(ConfigError, match=r"Zeppelin.*Car"):
         ObjectBank.from_town(SENSOR, ["Zeppelin"], scans=1)
+
+
+def test_cycles_are_taken_by_name_and_pasted_with_their_labels(
+    bank: TownObjects,
+) -> None:
+    wanted = {"Bicycle": 1, "Motorcycle": 1, "Motorcyclist": 1}
+    assert not {*wanted} & {*bank.boxes.names}  # KITTI has no such boxes
+    cycles = ObjectBank.from_town(SENSOR, wanted, scans=3, seed=5)
+    assert {*cycles.boxes.names} == {*wanted}
+    scan = Town(3, SENSOR, 1)[0]
+    policy = PasteObjects(cycles, wanted, turn=180, clear="same")
+    seen = set()
+    for number in range(8):
+        pasted = policy(scan, keyed_rng(number))
+        assert pasted.boxes is not None
+        assert decode_boxes(encode_boxes(pasted.boxes)).names == pasted.boxes.names
+        for name, instance in zip(
+            pasted.boxes.names, pasted.boxes.instance, strict=True
+        ):
+            if name in wanted:
+                label = pasted.fields()["label"][pasted.instance == instance]
+                assert {*label.tolist()} == {LABELS[name]}
+                seen.add(name)
+    assert seen == {*wanted}
 
 
 def test_a_room_too_small_gets_no_object(bank: TownObjects) -> None:

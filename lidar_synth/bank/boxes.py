@@ -26,6 +26,8 @@ NAMES = (
     "Tram",
     "Misc",
     "Motorcyclist",
+    "Bicycle",
+    "Motorcycle",
 )
 """Classes in the order of their codes; new ones are appended."""
 

@@ -66,6 +66,8 @@ LABELS = {
     "Person_sitting": TRAIN_ID["person"],
     "Cyclist": TRAIN_ID["bicyclist"],
     "Motorcyclist": TRAIN_ID["motorcyclist"],
+    "Bicycle": TRAIN_ID["bicycle"],
+    "Motorcycle": TRAIN_ID["motorcycle"],
 }
 """Train id of the points in a box, by the class of the box; those of KITTI's ``Misc`` are
 unknown."""

@@ -18,7 +18,7 @@ To add a condition: write its class and enter it in ``CONDITIONS``; enter its en
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ GAP = 2
 """Cells of a gap in the labels of a scan that is closed."""
 
 
-class Condition(Protocol):
+class Condition:
     """One kind of condition.
 
     Attributes:
@@ -58,12 +58,12 @@ class Condition(Protocol):
 
     name: str
     field: str
-    turns: bool
-    blank: int
+    turns = True
+    blank = 0
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """The shape of one condition."""
-        ...
+        raise NotImplementedError
 
     def read(
         self,
@@ -73,16 +73,15 @@ class Condition(Protocol):
         options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The condition that a real scan provides, with the given shape."""
-        ...
+        raise NotImplementedError
 
     def check(self, values: Tensor) -> None:
         """Raise a DataError on invalid values."""
-        ...
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
         """Conditions (B, ...) that tell less, for training: u (B,) uniform numbers, ``views`` of a
         camera image."""
-        ...
+        return values
 
 
 def bridge_gaps(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -106,12 +105,11 @@ def bridge_gaps(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return out
 
 
-class SemanticMap:
+class SemanticMap(Condition):
     """The classes of a scan on the model's grid."""
 
     name = "semantic"
     field = "label"
-    turns = True
     blank = IGNORE
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
@@ -155,18 +153,13 @@ class SemanticMap:
                 "file ids to train ids.",
             )
 
-    def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
-        """Unchanged."""
-        return values
 
-
-class CameraImage:
+class CameraImage(Condition):
     """The image of a forward-facing camera."""
 
     name = "camera"
     field = "camera"
     turns = False
-    blank = 0
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """(3, h, w)."""
@@ -196,9 +189,6 @@ class CameraImage:
                 f"the image {scan.image_path} cannot be read ({error})", "a PNG or JPEG"
             ) from error
         return resize_image(image, shape, options, f"the image {scan.image_path}")
-
-    def check(self, values: Tensor) -> None:
-        """Accept all values, since every byte is a valid colour."""
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:
         """One view of each image."""
@@ -261,13 +251,11 @@ def _resize_views(
     return side_by_side.to(torch.uint8).numpy()
 
 
-class LayoutImage:
+class LayoutImage(Condition):
     """The image of a layout on the model's grid."""
 
     name = "layout"
     field = "layout"
-    turns = True
-    blank = 0
 
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """(5, H, W)."""

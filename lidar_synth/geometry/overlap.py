@@ -57,9 +57,5 @@ def count_overlapping(boxes: Boxes) -> int:
     """Number of boxes that overlap another of their class, as objects do not: a moving car that has
     a box at each of its places does."""
     names = boxes.names
-    pairs = [
-        pair
-        for pair in overlapping_pairs(boxes)
-        if len({*(names[i] for i in pair)}) == 1
-    ]
-    return len({i for pair in pairs for i in pair})
+    same = [{i, j} for i, j in overlapping_pairs(boxes) if names[i] == names[j]]
+    return len(set().union(*same))

@@ -181,7 +181,9 @@ class ObjectBank:
 
         Args:
             sensor: of the scans that objects are pasted into.
-            classes: names of boxes; by default all that the town has.
+            classes: names of boxes; by default all that the town has of KITTI's. Parked cycles and
+                motorcyclists, for whom KITTI has no name, are ``Bicycle``, ``Motorcycle`` and
+                ``Motorcyclist``.
             scans: moments of the town whose objects are taken, about 12 each.
             seed: of the town.
             skin: the look of a real sensor's returns, as ``load_skin`` takes it.

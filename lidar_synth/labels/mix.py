@@ -5,7 +5,7 @@ scan. Inserted points are not marked; they have confidence 1. The remaining synt
 keep the labels of their model; if it gives none, they are ignored.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -29,7 +29,7 @@ from lidar_synth.labels.own import (
     keep_own,
     require_label,
 )
-from lidar_synth.labels.pasting import paste
+from lidar_synth.labels.pasting import paste, paste_groups
 
 TRIES = 5
 """Number of candidates that are tried for each object to be placed."""
@@ -118,12 +118,17 @@ class PasteObjects:
             seed = int(rng.integers(1 << 32))
             scan = remove_unboxed(scan, model, seed, self._cleared)
         scan = keep_own(scan, rng, self.threshold)
+        scan = paste_groups(scan, self._candidates(rng), self.least)
+        return scan if boxed else replace(scan, boxes=None)
+
+    def _candidates(
+        self, rng: np.random.Generator
+    ) -> Iterator[tuple[Iterator[Object], int]]:
+        """(objects to try, number to place) pairs."""
         for indices, count in self._groups:
             picks = rng.choice(indices, min(TRIES * count, len(indices)), replace=False)
             angles = np.radians(rng.uniform(-self.turn, self.turn, len(picks)))
-            candidates = map(self._object, picks.tolist(), angles.tolist())
-            scan = paste(scan, candidates, count=count, least=self.least)
-        return scan if boxed else replace(scan, boxes=None)
+            yield map(self._object, picks.tolist(), angles.tolist()), count
 
     @property
     def _limits(self) -> Mapping[str, int]:

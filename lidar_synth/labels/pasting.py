@@ -52,15 +52,24 @@ def paste(
     Raises:
         DataError: on objects recorded by a coarser sensor.
     """
+    return paste_groups(scan, [(objects, count)], least)
+
+
+def paste_groups(
+    scan: Scan, groups: Iterable[tuple[Iterable[Object], int | None]], least: int
+) -> Scan:
+    """``paste`` of groups of candidates, each with the maximum number of them to place."""
     placed: list[Object] = []
-    for candidate in objects:
-        if count is not None and len(placed) >= count:
-            break
-        if candidate.cast is None:
-            refuse_coarser(candidate.scan.sensor, scan.sensor)
-        fitted = _fit(scan, candidate, placed)
-        if fitted is not None:
-            placed.append(fitted)
+    for objects, count in groups:
+        most = None if count is None else len(placed) + count
+        for candidate in objects:
+            if len(placed) == most:
+                break
+            if candidate.cast is None:
+                refuse_coarser(candidate.scan.sensor, scan.sensor)
+            fitted = _fit(scan, candidate, placed)
+            if fitted is not None:
+                placed.append(fitted)
     placed.sort(key=lambda o: float(np.hypot(o.box[0], o.box[1])))
     seen, pasted = show_objects(scan, placed, least)
     return merge_scans(_own(scan, seen, least), pasted)

@@ -2,9 +2,9 @@
 scans, by task.
 
 Segmentation: synthetic scans first, then half of each batch, real scans alone at the end, with
-persons of the town in the place of the synthetic scans' own, where labelled scans are few and of
-the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then real scans
-alone, which gained less there but showed no loss on the street of the labels
+persons and cycles of the town in the place of the synthetic scans' own, where labelled scans are
+few and of the synthetic scans' lasers; otherwise synthetic scans for a quarter of the epochs, then
+real scans alone, which gained less there but showed no loss on the street of the labels
 (docs/research/proof.md).
 Detection: the same schedule, with objects of the real scans pasted into all scans
 (docs/research/detectors.md).
@@ -35,15 +35,23 @@ PASTED = {"Car": 6, "Pedestrian": 4, "Cyclist": 4}
 """Maximum number of objects of a bank that are pasted into a scan."""
 
 
-PERSONS: Labels = {
+TOWN_OBJECTS: Labels = {
     "paste": {
         "bank": "town",
-        "count": {"Pedestrian": 6, "Person_sitting": 1},
+        "count": {
+            "Pedestrian": 6,
+            "Person_sitting": 1,
+            "Cyclist": 2,
+            "Motorcyclist": 2,
+            "Bicycle": 4,
+            "Motorcycle": 3,
+        },
+        "turn": 180,
         "clear": "same",
     }
 }
-"""Persons of the town in the place of a scan's own: from those that a model draws, a segmenter does
-not learn to find real ones."""
+"""Persons and cycles of the town in the place of a scan's own: from those that a model draws, a
+segmenter does not learn to find real ones."""
 
 
 def augment_boxes(banks: Iterable[ObjectBank]) -> Compose:
@@ -91,9 +99,11 @@ def segmentation_options(real: int, epochs: int, same_sensor: bool) -> dict[str,
     size = "replace" if real >= LEAST else LEAST
     if ends_on_real(real, same_sensor):
         return {"ratio": quarter_of(epochs), "epoch_size": size}
-    labels = PERSONS
+    labels = TOWN_OBJECTS
     if find_spec("embreex") is None:
-        log.warning("without embreex no persons are pasted: a segmenter will find few")
+        log.warning(
+            "without embreex no persons or cycles are pasted: few will be found"
+        )
         labels = "generated"
     return {"ratio": SyntheticFirst(epochs), "labels": labels, "epoch_size": size}
 

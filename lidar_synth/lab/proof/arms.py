@@ -14,7 +14,7 @@ from typing import Any
 from lidar_synth.errors import ConfigError, suggest
 from lidar_synth.lab.town.returns import CALIBRATED_ON
 from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
-from lidar_synth.mixing.defaults import PERSONS, quarter_of
+from lidar_synth.mixing.defaults import TOWN_OBJECTS, quarter_of
 from lidar_synth.mixing.schedules import SyntheticFirst, make_schedule
 
 REAL = "real"
@@ -114,11 +114,11 @@ ARMS: dict[str, Arm] = {
         "learnt",
         FIRST,
     ),
-    "persons": Arm(
-        "generated scans with pedestrians of the town first, then half your scans",
+    "recipe": Arm(
+        "generated scans with persons and cycles of the town first, then half your scans",
         "generator",
         FIRST,
-        PERSONS,
+        TOWN_OBJECTS,
         extra=_TOWN,
     ),
 }

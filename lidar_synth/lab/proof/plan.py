@@ -21,7 +21,7 @@ from lidar_synth.lab.spread import spread
 Pair = tuple[str, int]
 """The place that is left out, and the seed."""
 
-FORMAT = "lidar-synth-proof/6"
+FORMAT = "lidar-synth-proof/7"
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class ProofSettings:
     """
 
     labelled: int | None = None
-    arms: tuple[str, ...] = ("exchange", "persons", "quarter")
+    arms: tuple[str, ...] = ("exchange", "recipe", "quarter")
     ratios: tuple[float, ...] = (0.5,)
     iterations: int = 1000
     batch: int = 4

@@ -14,7 +14,7 @@ import yaml
 
 from lidar_synth.errors import ConfigError, choose
 from lidar_synth.files.disk import write_file
-from lidar_synth.mixing.defaults import PERSONS
+from lidar_synth.mixing.defaults import TOWN_OBJECTS
 
 _MMDET3D = """# python HERE/lists.py, and then tools/train.py HERE/mixed.py of MMDetection3D
 _base_ = ["BASE"]
@@ -151,7 +151,7 @@ _WORDS = re.compile(r"\b(?:ROOT|MIX|HERE)\b|OPTIONS")
 DEFAULTS: dict[str, dict[str, Any]] = {
     "segmentation": {
         "ratio": {"synthetic_first": 40},
-        "labels": PERSONS,
+        "labels": TOWN_OBJECTS,
         "epoch_size": "replace",
     },
     "detection": {

@@ -38,6 +38,9 @@ NEAR = 3.0
 FAR = 60.0
 """Distances of objects from the sensor, metres."""
 
+CYCLES = {11: "Bicycle", 15: "Motorcycle", 32: "Motorcyclist"}
+"""Names of objects for which KITTI has none, by SemanticKITTI's class; only taken if asked for."""
+
 
 class _Alone(Snapshot):
     """One object and nothing else, its mesh stretched to the size of a box (7,)."""
@@ -204,18 +207,25 @@ class TownObjects(ObjectBank):
 
 
 def _choose(
-    pairs: list[tuple[TownShape, Array]], classes: Any
-) -> list[tuple[TownShape, Array]]:
-    """The objects of some classes; None for all."""
-    names = {shape.prototype.name for shape, _ in pairs}
-    wanted = names if classes is None else set(classes)
-    if unknown := sorted(wanted - names):
+    found: list[tuple[TownShape, Array]], classes: Any
+) -> list[tuple[str, TownShape, Array]]:
+    """The objects of some classes by name; None for all that KITTI has a name for."""
+    named = [(name, *pair) for pair in found for name in _names(pair[0].prototype)]
+    known = {name for name, _, _ in named}
+    wanted = known - {*CYCLES.values()} if classes is None else {*classes}
+    if unknown := sorted(wanted - known):
         raise ConfigError(
             f"classes {unknown} of the town",
-            f"some of {', '.join(sorted(names))}",
+            f"some of {', '.join(sorted(known))}",
             "Use more scans if a rare class is missing.",
         )
-    return [pair for pair in pairs if pair[0].prototype.name in wanted]
+    return [one for one in named if one[0] in wanted]
+
+
+def _names(prototype: Prototype) -> list[str]:
+    """The names of an object's box: KITTI's, and that of ``CYCLES``."""
+    names = (prototype.name, CYCLES.get(prototype.raw[0]))
+    return [name for name in names if name]
 
 
 def collect_objects(
@@ -235,10 +245,8 @@ def collect_objects(
     chosen = _choose(pairs, classes)
     if not chosen:
         raise DataError(f"no object in {scans} scans of the town", "objects")
-    values = np.array([box for _, box in chosen], np.float32)
-    shapes = tuple(shape for shape, _ in chosen)
-    boxes = Boxes(values, tuple(shape.prototype.name for shape in shapes))
-    return make_bank(boxes, shapes, found)
+    names, shapes, values = zip(*chosen, strict=True)
+    return make_bank(Boxes(np.array(values, np.float32), names), shapes, found)
 
 
 def _at(
@@ -252,7 +260,7 @@ def _at(
     to_sensor = np.linalg.inv(pose)
     for placed in (*world.scene.placed, *movers):
         box = box_values(placed, to_sensor @ placed.pose)
-        if placed.prototype.name and NEAR < np.hypot(box[0], box[1]) < FAR:
+        if _names(placed.prototype) and NEAR < np.hypot(box[0], box[1]) < FAR:
             columns: list[Any] = [c[placed.surfaces] for c in world.surfaces]
             own = SurfaceTable(*columns)
             yield TownShape(placed.prototype, own, skin), box

@@ -55,16 +55,18 @@ class ScanRays(NamedTuple):
     def leaving(self, box: NDArray[np.float32]) -> NDArray[np.float64]:
         """(E,) horizontal distance at which each ray leaves a box (7,), metres; 0 = it does not
         pass through."""
+        left = np.zeros(len(self.azimuth))
+        near = self._towards(box)
         c = np.cos(float(box[6]))
         s = np.sin(float(box[6]))
-        dx = np.cos(self.azimuth)
-        dy = -np.sin(self.azimuth)
+        dx = np.cos(self.azimuth[near])
+        dy = -np.sin(self.azimuth[near])
         origin = (
             -box[0] * c - box[1] * s,
             box[0] * s - box[1] * c,
-            self.height - box[2],
+            self.height[near] - box[2],
         )
-        along = (dx * c + dy * s, dy * c - dx * s, self.slope)
+        along = (dx * c + dy * s, dy * c - dx * s, self.slope[near])
         enter = np.zeros(len(dx))
         leave = np.full(len(dx), np.inf)
         for o, d, size in zip(origin, along, box[3:6], strict=True):
@@ -73,7 +75,16 @@ class ScanRays(NamedTuple):
             b = (size / 2 - o) / d
             enter = np.maximum(enter, np.minimum(a, b))
             leave = np.minimum(leave, np.maximum(a, b))
-        return np.where(enter <= leave, leave, 0.0)
+        left[near] = np.where(enter <= leave, leave, 0.0)
+        return left
+
+    def _towards(self, box: NDArray[np.float32]) -> NDArray[np.intp]:
+        """The rays that may pass through a box (7,), by their azimuth."""
+        away = float(np.hypot(box[0], box[1]))
+        radius = float(np.hypot(box[3], box[4])) / 2
+        half = np.arcsin(radius / away) if radius < away else np.pi
+        apart = np.abs(self.azimuth + np.arctan2(box[1], box[0]))
+        return np.flatnonzero((apart <= half) | (apart >= 2 * np.pi - half))
 
 
 def rays_of_scan(scan: Scan) -> ScanRays:
