@@ -55,7 +55,7 @@ BOXED = tuple(
     TRAIN_ID[name]
     for name in ("car", "truck", "other-vehicle", "person", "bicyclist", "motorcyclist")
 )
-"""Train ids of the objects that have boxes, of the classes in ``LABELS``."""
+"""Train ids of the objects that always have boxes: parked cycles may stand in a scan without."""
 
 LABELS = {
     "Car": TRAIN_ID["car"],

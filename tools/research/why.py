@@ -25,7 +25,7 @@ from typer import run
 
 from lidar_synth import ProofSettings, Scan, load_generator
 from lidar_synth.geometry.transfer import Transfer
-from lidar_synth.lab.proof.arms import ARMS, Arm, ArmStage, synthetic_first
+from lidar_synth.lab.proof.arms import ARMS, EPOCHS, FIRST, Arm
 from lidar_synth.lab.proof.pools import (
     FRAMES,
     POOLS,
@@ -65,13 +65,11 @@ TOWNS: dict[str, Callable[[PoolTask], Iterator[Scan]]] = {
 }
 for name, make in TOWNS.items():
     POOLS[name] = make
-    ARMS[name] = Arm(
-        f"the town ({name}) first, then half",
-        lambda ratio, name=name: synthetic_first(name),
-    )
+    ARMS[name] = Arm(f"the town ({name}) first, then half", name, FIRST)
 ARMS["half"] = Arm(
     "generated scans for half, then real scans alone",
-    lambda ratio: (ArmStage(0.5, 1, "generator"), ArmStage(0.5)),
+    "generator",
+    {0: 1.0, EPOCHS // 2: 0.0},
 )
 
 
