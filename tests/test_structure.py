@@ -170,8 +170,8 @@ def test_every_module_is_imported_by_something() -> None:
 
 LIMITS = {
     "plugin": (168_255, 6.0, 130),
-    "laboratory": (135_235, 6.0, 130),
-    "tools": (39_903, 5.8, 130),
+    "laboratory": (135_204, 6.0, 130),
+    "tools": (39_893, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -5,8 +5,6 @@ The columns are halved by the first convolution and by the pooling before each g
 modules; the decoder doubles them again and adds the encoder's features of the same width.
 """
 
-from collections.abc import Mapping
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -117,12 +115,3 @@ class SqueezeSeg(nn.Module):
         """(B, channels, H, W), W a multiple of 16, to logits (B, classes, H, W)."""
         logits: Tensor = self.segmentation_head(self.decode(x))
         return logits
-
-    def load_parts(self, parts: Mapping[str, Mapping[str, Tensor]]) -> None:
-        """Load the archive's state dictionaries by the name of their file.
-
-        Raises:
-            RuntimeError: on missing or unexpected names, and other shapes.
-        """
-        for name, state in parts.items():
-            self.get_submodule(name).load_state_dict(state)
