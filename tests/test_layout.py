@@ -415,7 +415,9 @@ def test_an_unknown_class_is_refused() -> None:
         Layout(Boxes(np.float32([[9, 0, -1, 1, 1, 1, 0]]), ("Bicycle",)))
 
 
-def test_the_classes_with_boxes_are_those_of_layouts() -> None:
+def test_the_classes_with_boxes_are_those_of_the_boxes_of_detectors() -> None:
+    parked = {LABELS["Bicycle"], LABELS["Motorcycle"]}
+    assert set(BOXED) == set(LABELS.values()) - parked
     assert set(BOXED) == {LABELS[name] for name in CODES if name in LABELS}
 
 
