@@ -86,11 +86,9 @@ def register() -> Any:
                 return super().__getitem__(sample)
             points = points_of(sample)
             label = class_ids(sample, self._ids)[:, None]
-            return (
-                (points[:, :3], label, points[:, 3])
-                if self.return_ref
-                else (points[:, :3], label)
-            )
+            if self.return_ref:
+                return (points[:, :3], label, points[:, 3])
+            return (points[:, :3], label)
 
     MixedPointCloud.__name__ = NAME
     return register_dataset(MixedPointCloud)

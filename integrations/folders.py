@@ -89,7 +89,8 @@ def export_mixture(
         if layout == "semantic_kitti"
         else KITTIObjectWriter(root)
     )
-    rows, written = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"], 0
+    rows = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"]
+    written = 0
     for position in tqdm(range(count), unit="scan", disable=not progress):
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")

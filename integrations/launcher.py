@@ -131,11 +131,9 @@ def _kept(move: Any) -> Any:
     def moved(self: Any, *args: Any, **options: Any) -> Any:
         left = [value for value in args if not _on_gpu(value)]
         named = {key: value for key, value in options.items() if not _on_gpu(value)}
-        return (
-            move(self, *left, **named)
-            if left or set(named) - {"non_blocking"}
-            else self
-        )
+        if left or set(named) - {"non_blocking"}:
+            return move(self, *left, **named)
+        return self
 
     return moved
 

@@ -195,11 +195,9 @@ class MixedData(lightning.LightningDataModule):  # type: ignore[misc]
 
     def state_dict(self) -> dict[str, Any]:
         """The progress of training, after the last batch that Lightning counts as processed."""
-        return (
-            make_state(self.train.mixture, 0, 0)
-            if self._batches is None
-            else self._batches.state_dict()
-        )
+        if self._batches is None:
+            return make_state(self.train.mixture, 0, 0)
+        return self._batches.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Resume from a checkpoint.

@@ -179,7 +179,8 @@ def require_ids(learning_map: Mapping[int, int], table: NDArray[Any]) -> None:
 def points_of(scan: Scan) -> NDArray[np.float32]:
     """(N, 4) float32 x, y, z, reflectance, as a copy, because trainers rotate points in place."""
     points = np.empty((len(scan), 4), np.float32)
-    points[:, :3], points[:, 3] = scan.points, scan.reflectance
+    points[:, :3] = scan.points
+    points[:, 3] = scan.reflectance
     return points
 
 

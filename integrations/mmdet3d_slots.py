@@ -256,11 +256,9 @@ def is_mixed(source: str | Path) -> bool:
 
 def scan_of(source: str, number: int) -> Scan:
     """The scan that a URL names."""
-    return (
-        open_folder(Path(source)).scan(number)
-        if is_mixed(source)
-        else _opened(source)[number]
-    )
+    if is_mixed(source):
+        return open_folder(Path(source)).scan(number)
+    return _opened(source)[number]
 
 
 def require_boxes(scan: Scan) -> Boxes:

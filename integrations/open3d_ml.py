@@ -79,11 +79,9 @@ def dataset_class() -> Any:
 
         def get_split(self, split: str) -> Any:
             """A split; the training split is mixed."""
-            return (
-                mixed_split(self, split)
-                if split in ("train", "training")
-                else super().get_split(split)
-            )
+            if split in ("train", "training"):
+                return mixed_split(self, split)
+            return super().get_split(split)
 
     stock.DATASET._register_module(MixedSemanticKITTI)
     return MixedSemanticKITTI

@@ -304,11 +304,9 @@ def _loader(load: Any) -> SimpleNamespace:
 
     def load_source(name: str, path: str) -> Any:
         loaded = load(name, path)
-        return (
-            SimpleNamespace(Parser=make_parser(loaded))
-            if name == "parserModule"
-            else loaded
-        )
+        if name == "parserModule":
+            return SimpleNamespace(Parser=make_parser(loaded))
+        return loaded
 
     return SimpleNamespace(load_source=load_source)
 

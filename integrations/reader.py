@@ -153,15 +153,13 @@ class Bank:
         with _reading(self.root / "index.json", REPAIR):
             self._sources = values["sources"]
             self._shards = values["shards"]
-            self.sensor, self.fields = (
-                self._sources[0]["sensor"],
-                tuple(self._sources[0]["fields"]),
-            )
+            self.sensor = self._sources[0]["sensor"]
+            self.fields = tuple(self._sources[0]["fields"])
             self.shape = _shape(self.sensor)
             self._directions = _directions(self.sensor, self.shape)
-            lasers = {"elevations", "heights"} <= set(
-                self.sensor
-            ) and "beams" not in self.sensor  # rays start there
+            # rays start at their lasers
+            known = {"elevations", "heights"} <= set(self.sensor)
+            lasers = known and "beams" not in self.sensor
             self._starts = np.asarray(
                 self.sensor["heights"] if lasers else [0.0] * self.shape[0], np.float32
             )
@@ -184,7 +182,8 @@ class Bank:
 
     def __getitem__(self, number: int) -> Scan:
         """The returns of ``image(number)`` through the centres of their cells, row by row."""
-        images, (_, entry, position) = self.image(number), self._place(number)
+        images = self.image(number)
+        _, entry, position = self._place(number)
         metres = images.pop("range")
         seen = metres > 0
         points = metres[seen][:, None] * self._directions[seen]
@@ -533,11 +532,9 @@ class MixedEpochs:
             raise IndexError(f"sample {index} of {len(self)}")
         synthetic, number = self._order()[index].tolist()
         if not synthetic:
-            return (
-                self.real[number]
-                if hasattr(self.real, "__getitem__")
-                else self.real(number)
-            )
+            if hasattr(self.real, "__getitem__"):
+                return self.real[number]
+            return self.real(number)
         scan = self._labelled(self.bank[number])
         return scan if self.to_sample is None else self.to_sample(scan)
 

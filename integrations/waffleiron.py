@@ -142,9 +142,8 @@ def register() -> Any:
     def load_state(self: Any, *args: Any, **options: Any) -> None:
         try:
             load(self, *args, **options)
-        except (
-            RuntimeError
-        ) as error:  # its last line, when all is loaded, names a GPU; a CPU has none
+        # Its last line, when all is loaded, names a GPU; a CPU has none.
+        except RuntimeError as error:
             if os.environ.get(CPU) != "1" or "accelerator device" not in str(error):
                 raise
 

@@ -38,13 +38,18 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.loading import find_model
 from lidar_synth.generate.models import build_network
-from lidar_synth.generate.regrid import PLACED, check_movable, fit_grid, regrid
 from lidar_synth.geometry.normalize import CHANNELS, NORMALISATIONS
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor, sensor_yaml
 from lidar_synth.lab.evaluate.leakage import measured, overlap, town
 from lidar_synth.lab.train.adaptation import card
+from lidar_synth.lab.train.adaptation.regrid import (
+    PLACED,
+    check_movable,
+    fit_grid,
+    regrid,
+)
 from lidar_synth.lab.train.adaptation.stages import TOWN_SEED
 from lidar_synth.lab.train.held_out import read_history
 

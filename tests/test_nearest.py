@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidar_synth.labels.nearest import VOXEL, NearestLabels, index_cloud
+from lidar_synth.lab.kitti360.nearest import VOXEL, NearestLabels, index_cloud
 
 SIZE = 4.0
 LOW = np.zeros(3)

@@ -5,6 +5,7 @@ import graphlib
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import pytest
@@ -150,28 +151,38 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_every_module_is_imported_by_something() -> None:
+def unused(importers: Collection[str], folders: Iterable[str]) -> set[str]:
+    """The modules of the package that no module of ``importers``, and no file of the folders
+    beside it, imports."""
     known = modules()
-    outside = [
-        p
-        for folder in ("integrations", "tools")
-        for p in (PACKAGE.parent / folder).rglob("*.py")
-    ]
-    used = set().union(
-        *(imports_of(path, known) - {name} for name, path in known.items())
-    )
-    used |= set().union(*(imports_of(path, known) for path in outside))
-    # Loaded by name, with the command.
-    used |= {name for name in known if name.startswith("lidar_synth.lab.cli.")}
+    used = set().union(*(imports_of(known[name], known) - {name} for name in importers))
+    for folder in folders:
+        for path in (PACKAGE.parent / folder).rglob("*.py"):
+            used |= imports_of(path, known)
+    # Loaded by name.
     used |= {f"lidar_synth.labels.{home.split('.')[0]}" for home in POLICIES.values()}
     packages = {name for name, path in known.items() if path.name == "__init__.py"}
-    assert known.keys() - used - packages == PUBLIC
+    return known.keys() - used - packages
+
+
+def test_every_module_is_imported_by_something() -> None:
+    commands = {name for name in modules() if name.startswith("lidar_synth.lab.cli.")}
+    assert unused(modules(), ["integrations", "tools"]) - commands == PUBLIC
+
+
+def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
+    plugin = {name for name in modules() if not name.startswith("lidar_synth.lab.")}
+    assert unused(plugin, ["integrations"]) & plugin == PUBLIC | {
+        "lidar_synth.generate.flow.distill",  # the paper's method
+        "lidar_synth.generate.flow.timesteps",
+        "lidar_synth.geometry.projection.batch",  # for trainers on a GPU
+    }
 
 
 LIMITS = {
-    "plugin": (168_255, 6.0, 130),
-    "laboratory": (135_204, 6.0, 130),
-    "tools": (39_893, 5.8, 130),
+    "plugin": (165_010, 6.0, 130),
+    "laboratory": (138_690, 6.0, 130),
+    "tools": (39_903, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when
 the code has become smaller."""

@@ -178,7 +178,8 @@ def main(
     """Runs all steps."""
     start = time.monotonic()
     command("doctor")
-    bank, town = str(out / "bank"), str(out / "town")
+    bank = str(out / "bank")
+    town = str(out / "town")
     words = f"--model town --count {scans} --seed {seed} --shard-size 16"
     command("bake", bank, *words.split())
     command("verify", bank, "--deep")

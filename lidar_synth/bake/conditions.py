@@ -239,11 +239,9 @@ def conditions(
     Raises:
         FileError, DataError: if one cannot be read.
     """
-    return (
-        None
-        if source is None
-        else [source.read(index % len(source)) for index in indices]
-    )
+    if source is None:
+        return None
+    return [source.read(index % len(source)) for index in indices]
 
 
 def condition_names(

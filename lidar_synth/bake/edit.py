@@ -135,11 +135,9 @@ def drop(
     with _making(
         out, "drop", [bank], hash_of_names(map(str, sorted(left_out))), why
     ) as complete:
-        return (
-            Bank(out).index
-            if complete
-            else _link_kept(bank, left_out, why, out, progress)
-        )
+        if complete:
+            return Bank(out).index
+        return _link_kept(bank, left_out, why, out, progress)
 
 
 def _link_kept(

@@ -87,11 +87,9 @@ def read_record(plan: BakePlan, number: int) -> Entry | None:
             return entry
     index = _index(plan.out)
     there = None if index is None else index.by_file.get(wanted.file)
-    return (
-        there
-        if there is not None and replace(there, bytes=0, sha256="") == wanted
-        else None
-    )
+    if there is not None and replace(there, bytes=0, sha256="") == wanted:
+        return there
+    return None
 
 
 def find_finished(plan: BakePlan, number: int) -> Entry | None:

@@ -75,9 +75,8 @@ def _work_off(
     ray: Any, start: Any, waiting: deque[int], workers: int, progress: Progress
 ) -> None:
     """Assign shards to actors until all are written."""
-    running: dict[
-        Any, tuple[Any, int | None]
-    ] = {}  # pending result: (its actor, the shard it writes)
+    # pending result: (its actor, the shard it writes)
+    running: dict[Any, tuple[Any, int | None]] = {}
     losses = 0  # since the last finished shard
 
     def begin() -> None:

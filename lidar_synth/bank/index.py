@@ -268,11 +268,9 @@ class Entry:
     def to_dict(self) -> dict[str, Any]:
         """The entry as plain values."""
         values = asdict(self)
-        return (
-            values
-            if self.dropped
-            else {name: value for name, value in values.items() if name != "dropped"}
-        )
+        if self.dropped:
+            return values
+        return {name: value for name, value in values.items() if name != "dropped"}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Entry":
@@ -485,9 +483,8 @@ def _from_json(text: str | bytes) -> Any:
             represent.
     """
     values = json.loads(text)
-    json.dumps(
-        values, ensure_ascii=False
-    ).encode()  # JSON permits half of a surrogate pair, UTF-8 does not
+    # JSON permits half of a surrogate pair, UTF-8 does not.
+    json.dumps(values, ensure_ascii=False).encode()
     level = [values]
     for _ in range(_DEPTH):
         level = [

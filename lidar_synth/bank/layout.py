@@ -261,7 +261,8 @@ def _locate_chunks(dataset: h5py.Dataset, scans: int) -> Chunks:
     def note(chunk: h5py.h5d.StoreInfo) -> None:
         position = chunk.chunk_offset[0]
         found.offset[position] = chunk.byte_offset
-        found.size[position], found.skipped[position] = chunk.size, chunk.filter_mask
+        found.size[position] = chunk.size
+        found.skipped[position] = chunk.filter_mask
 
     dataset.id.chunk_iter(note)
     return found

@@ -93,11 +93,9 @@ class ShardReader:
             DataError: if it is not text.
         """
         with self._reading(f"the condition of scan {position}"):
-            return (
-                None
-                if self._layout.conditions is None
-                else self._condition(position).decode()
-            )
+            if self._layout.conditions is None:
+                return None
+            return self._condition(position).decode()
 
     def chunks(self, position: int) -> tuple[dict[str, bytes], int]:
         """The compressed chunks of one scan and its CRC, after the checks of ``read``; raises as
@@ -236,11 +234,9 @@ class ShardReader:
         return places
 
     def _condition(self, position: int) -> bytes:
-        return (
-            b""
-            if self._layout.conditions is None
-            else bytes(self._layout.conditions[position])
-        )
+        if self._layout.conditions is None:
+            return b""
+        return bytes(self._layout.conditions[position])
 
     @contextmanager
     def _reading(self, what: str) -> Iterator[None]:

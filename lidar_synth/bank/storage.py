@@ -343,8 +343,6 @@ def open_storage(root: str | Path, name: str, size: int) -> Storage:
     Raises:
         FileError, LibraryError: if it cannot be opened.
     """
-    return (
-        LocalFile(root / name)
-        if isinstance(root, Path)
-        else RemoteFile(f"{root}/{name}", size)
-    )
+    if isinstance(root, Path):
+        return LocalFile(root / name)
+    return RemoteFile(f"{root}/{name}", size)

@@ -207,7 +207,8 @@ def _describe(plan: "BakePlan") -> None:
     typer.echo(
         f"  fields: range, {', '.join(plan.facts.fields)}; label policy {plan.facts.label_policy}"
     )
-    size, minutes = expected.bytes / 1e6, expected.seconds / 60
+    size = expected.bytes / 1e6
+    minutes = expected.seconds / 60
     disk = f"{size:.3g} MB" if size < 1000 else f"{size / 1e3:.3g} GB"
     time = f"{minutes:.1f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"
     typer.echo(f"  about {disk}, {expected.bytes / job.count / 1e3:.0f} kB per scan")

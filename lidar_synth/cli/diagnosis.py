@@ -185,9 +185,8 @@ def _library(name: str, minimum: str, extra: str | None) -> Finding:
             buys,
             wheel,
         )
-    except (
-        Exception
-    ) as error:  # a broken installation may raise anything; it is reported
+    # A broken installation may raise anything; it is reported.
+    except Exception as error:
         if name == "open3d" and (packages := missing_packages()):
             line = "apt-get install -y --no-install-recommends " + " ".join(packages)
             return Finding(

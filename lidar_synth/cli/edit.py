@@ -191,11 +191,9 @@ def _number(scan: int, count: int) -> int:
 def _named(scan: "Scan", names: list[str]) -> list[int]:
     """The numbers of the boxes with some names; none in a scan without boxes, as in KITTI's
     ``testing``."""
-    return (
-        []
-        if scan.boxes is None
-        else [i for i, name in enumerate(scan.boxes.names) if name in names]
-    )
+    if scan.boxes is None:
+        return []
+    return [i for i, name in enumerate(scan.boxes.names) if name in names]
 
 
 def _pose(text: str) -> list[float]:

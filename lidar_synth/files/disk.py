@@ -68,9 +68,8 @@ def write_file(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)
-        with part.open(
-            "xb"
-        ) as file:  # always a new file, never the target of a link with this name
+        # always a new file, never the target of a link with this name
+        with part.open("xb") as file:
             if callable(content):
                 content(file)
             else:
@@ -427,11 +426,9 @@ def png_size(path: Path) -> tuple[int, int] | None:
     if len(header) < 24 or header[:8] != b"\x89PNG\r\n\x1a\n":
         return None
     width, height = np.frombuffer(header[16:], ">u4").tolist()
-    return (
-        (width, height)
-        if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE
-        else None
-    )
+    if 1 <= min(width, height) <= max(width, height) <= LARGEST_IMAGE:
+        return (width, height)
+    return None
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -159,11 +159,8 @@ def parse_yaml(text: str, where: str) -> Any:
     try:
         fault = _yaml_fault(yaml.parse(text, Loader=yaml.SafeLoader))
         values = None if fault else yaml.safe_load(text)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        OverflowError,
-    ) as error:  # a date such as 2001-99-99 is a ValueError
+    # a date such as 2001-99-99 is a ValueError
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise ConfigError(
             f"{where} is not YAML ({' '.join(str(error).split())})"
         ) from error
@@ -190,11 +187,12 @@ def _yaml_fault(events: Iterable[Any]) -> str:
                 opened.append((event.anchor, count))
             elif event.anchor is not None:
                 sizes[event.anchor] = 1
+            # Python prints no number of 4300 digits.
             if (
                 isinstance(event, yaml.ScalarEvent)
                 and event.style is None
                 and len(event.value) > LONGEST_PLAIN
-            ):  # Python prints no number of 4300 digits
+            ):
                 return f"a value of {len(event.value)} characters without quotes"
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, first = opened.pop()

@@ -289,11 +289,9 @@ class _OpenMachine(_Machine):
 
 def _key(value: Any) -> Any:
     """A key for a dictionary: a plain value as it is, and text for a class or an object."""
-    return (
-        value
-        if value is None or isinstance(value, str | int | float | bytes)
-        else _text(value)
-    )
+    if value is None or isinstance(value, str | int | float | bytes):
+        return value
+    return _text(value)
 
 
 def _text(value: Any) -> str:

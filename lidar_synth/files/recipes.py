@@ -86,13 +86,9 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 def command_of(values: Collection[str]) -> str:
     """The command that runs a recipe with these keys: "bake", "distill" or "train"."""
-    return (
-        "bake"
-        if "recipe" not in values
-        else "distill"
-        if "teacher" in values
-        else "train"
-    )
+    if "recipe" not in values:
+        return "bake"
+    return "distill" if "teacher" in values else "train"
 
 
 def published() -> Iterator[Listed]:

@@ -238,11 +238,9 @@ def _above(folders: Sequence[Path]) -> Description | None:
         path = folder / NAME
         # other programs have files of this name
         if path.is_file() and _FORMATS in read_start(path, LONGEST):
-            return (
-                None
-                if _is_dataset(folder) or any(folder.glob("*.bin"))
-                else _current(path)
-            )
+            if _is_dataset(folder) or any(folder.glob("*.bin")):
+                return None
+            return _current(path)
     return None
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import read_text, write_file
 from lidar_synth.formats.calibration import Calibration
-from lidar_synth.geometry.scan import FARTHEST, Boxes
+from lidar_synth.geometry.scan import FARTHEST, Boxes, wrap_angle
 
 _FIELDS = "15 fields: a name and 14 numbers"
 
@@ -147,7 +147,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     alpha = np.where(
         boxes.alpha > -10,
         boxes.alpha,
-        _wrap(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])),
+        wrap_angle(rotation_y - np.arctan2(seen[:, 0], seen[:, 2])),
     )
     lines = []
     listed = np.flatnonzero((image_box >= 0).all(axis=1))
@@ -193,10 +193,6 @@ def _in_image(
             image_box[i] = *seen_low, *seen_high
             truncation[i] = 1 - np.prod(seen_high - seen_low) / np.prod(high - low)
     return image_box, truncation
-
-
-def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _two(value: float) -> str:

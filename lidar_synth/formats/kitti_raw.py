@@ -29,7 +29,7 @@ from lidar_synth.files.disk import (
 from lidar_synth.formats.calibration import Calibration, homogeneous, read_image_size
 from lidar_synth.formats.points import read_points
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan
+from lidar_synth.geometry.scan import FARTHEST, Boxes, Scan, wrap_angle
 from lidar_synth.geometry.sensor import Sensor
 
 DRIVES = "*_drive_*/velodyne_points/data"
@@ -181,7 +181,7 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                     length,
                     width,
                     height,
-                    (yaw + np.pi) % (2 * np.pi) - np.pi,
+                    wrap_angle(yaw),
                 )
                 hidden = int(pose.findtext("occlusion", "-1"))
                 whole = pose.findtext("truncation") == "0"
@@ -195,11 +195,8 @@ def read_tracklets(path: Path) -> dict[int, Boxes]:
                         instance,
                     )
                 )
-    except (
-        ElementTree.ParseError,
-        ValueError,
-        LookupError,
-    ) as error:  # LookupError: an unknown encoding
+    # LookupError: an unknown encoding
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DataError(f"{path}: {error}", "KITTI's tracklet_labels.xml") from error
     boxes = {}
     for frame, found in sorted(rows.items()):

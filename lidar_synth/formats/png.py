@@ -25,12 +25,11 @@ from lidar_synth.datasets.colours import COLOURS
 from lidar_synth.errors import DataError, FileError
 from lidar_synth.files.disk import SKIP_HINT, list_files, write_file
 from lidar_synth.files.parsing import parse_json, read_picture
-from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.description import check_provenance
 from lidar_synth.formats.npz import range_image
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import Picture, Writer, project_scan
+from lidar_synth.formats.writer import Writer, project_scan
 from lidar_synth.geometry.projection import unproject
 from lidar_synth.geometry.scan import REAL, SYNTHETIC, RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor, load_sensor
@@ -172,13 +171,7 @@ class PNGWriter(Writer):
         # One flat folder per channel, which other programs can read as a list of images.
         return f"range/{(name or f'{index:06d}').replace('/', '_')}.png"
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         image = project_scan(scan)
         scale = image.sensor.range_max / STEPS
         facts = {

@@ -243,7 +243,8 @@ class SemanticKITTIWriter(Writer):
 
     def _keeps(self, index: int, name: str) -> bool:
         """Whether a scan of SemanticKITTI keeps its sequence and its frame."""
-        path, (sequence, frame) = self.path(index, name), name.split("/")
+        path = self.path(index, name)
+        sequence, frame = name.split("/")
         return (
             path.parents[1].name == sequence
             and frame.isdigit()

@@ -45,7 +45,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, NOTES, Picture, Writer, clear_notes
+from lidar_synth.formats.writer import DETAILS, NOTES, Writer, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -143,13 +143,7 @@ class WebDatasetWriter(Writer):
             }
         return _key(index, name) in self._there or super().complete(index, name)
 
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
+    def _write_file(self, path: Path, scan: Scan) -> None:
         write_file(
             path, lambda file: _write_tar(file, _encode(self._key_of(path), scan))
         )
@@ -343,10 +337,8 @@ def _open(path: Path) -> Iterator[tarfile.TarFile]:
             tarfile.open(fileobj=file, mode="r:", tarinfo=TarMember) as tar,
         ):
             yield tar
-    except (
-        tarfile.TarError,
-        ValueError,
-    ) as error:  # ValueError: of numbers in pax headers
+    # ValueError: of numbers in pax headers
+    except (tarfile.TarError, ValueError) as error:
         if isinstance(error, LidarSynthError):
             raise
         raise DataError(

@@ -172,7 +172,6 @@ class Writer(ABC):
             if name not in self.keeps and getattr(scan, name) is not None
         ]
 
-    @abstractmethod
     def _put(
         self,
         scan: Scan,
@@ -181,6 +180,11 @@ class Writer(ABC):
         camera: Calibration | None,
     ) -> None:
         """Write the files of a scan, ``path`` last."""
+        self._write_file(path, scan)
+
+    def _write_file(self, path: Path, scan: Scan) -> None:
+        """Write a scan into one file, without picture and camera."""
+        raise NotImplementedError
 
     def complete(self, index: int, name: str | None = None) -> bool:
         """Whether the scan has already been written completely."""
@@ -209,19 +213,6 @@ class FileWriter(Writer):
 
     def _place(self, index: int, name: str | None) -> str:
         return f"{name or f'{index:06d}'}{self.suffix}"
-
-    def _put(
-        self,
-        scan: Scan,
-        path: Path,
-        picture: Picture | None,
-        camera: Calibration | None,
-    ) -> None:
-        self._write_file(path, scan)
-
-    def _write_file(self, path: Path, scan: Scan) -> None:
-        """Write a scan, without picture and camera."""
-        raise NotImplementedError
 
 
 def check_facts(scan: Scan, where: str) -> None:

@@ -382,11 +382,8 @@ def _read(path: Path, tensors: bool = True) -> _Content:
         digest = _verified(values)
         weights = values.pop("weights", None)
         return _Content(Header.from_dict(values), digest, weights, stored)
-    except (
-        ValueError,
-        AttributeError,
-        RecursionError,
-    ) as error:  # a ConfigError is a ValueError
+    # a ConfigError is a ValueError
+    except (ValueError, AttributeError, RecursionError) as error:
         raise DataError(f"{path}: {error}") from error
 
 

@@ -115,11 +115,9 @@ class Generator:
     def sensor(self) -> Sensor:
         """The sensor that defines the grid of the range images."""
         held = self.header.sensor
-        return (
-            held
-            if self.columns in (None, held.columns)
-            else replace(held, columns=self.columns)
-        )
+        if self.columns in (None, held.columns):
+            return held
+        return replace(held, columns=self.columns)
 
     @property
     def tensors(self) -> TensorFormat:

@@ -207,10 +207,8 @@ def _add_priors(normal: Floats, right: Floats, model: Model, scale: float) -> No
     scans = len(model.motion)
     sigma = np.full(len(right), np.inf)
     now = np.zeros(len(right))
-    sigma[1 : 2 * beams : 2], now[1 : 2 * beams : 2] = (
-        PRIOR_HEIGHT,
-        model.heights - np.median(model.heights),
-    )
+    sigma[1 : 2 * beams : 2] = PRIOR_HEIGHT
+    now[1 : 2 * beams : 2] = model.heights - np.median(model.heights)
     motion = slice(2 * beams + 6, None)
     sigma[motion] = np.tile(np.repeat([PRIOR_SPEED, PRIOR_TURN], 3), scans)
     now[motion] = model.motion.ravel()

@@ -84,11 +84,9 @@ class Normalisation:
         """The divisor: ``scale``, or its default."""
         if self.scale is not None:
             return self.scale
-        return (
-            float(np.log2(self.range_max + self.offset))
-            if self.kind == "log"
-            else self.range_max
-        )
+        if self.kind == "log":
+            return float(np.log2(self.range_max + self.offset))
+        return self.range_max
 
     def inside(self, distance: torch.Tensor) -> torch.Tensor:
         """Whether each range (any shape, metres) is a return, that is, inside the limits."""

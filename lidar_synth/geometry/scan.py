@@ -29,6 +29,11 @@ FARTHEST = 1e5
 """Maximum coordinate, and size of a box, metres; no LiDAR measures farther."""
 
 
+def wrap_angle(angle: Any) -> Any:
+    """An angle, or an array of them, in [-pi, pi), radians."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 @dataclass
 class Boxes:
     """Oriented 3-D boxes of one scan.

@@ -224,20 +224,16 @@ class Sensor:
     @property
     def up(self) -> float:
         """The upper edge of row 0, degrees."""
-        return (
-            float(self.fov_up)
-            if self.fov_up is not None
-            else float(np.degrees(self.edges[0]))
-        )
+        if self.fov_up is not None:
+            return float(self.fov_up)
+        return float(np.degrees(self.edges[0]))
 
     @property
     def down(self) -> float:
         """The lower edge of the last row, degrees."""
-        return (
-            float(self.fov_down)
-            if self.fov_down is not None
-            else float(np.degrees(self.edges[-1]))
-        )
+        if self.fov_down is not None:
+            return float(self.fov_down)
+        return float(np.degrees(self.edges[-1]))
 
     @cached_property
     def edges(self) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.scan import Boxes, wrap_angle
 
 
 def box_frame(
@@ -44,7 +44,7 @@ def move_boxes(boxes: Boxes, values: NDArray[np.float32]) -> Boxes:
     """The boxes with new values (M, 7): without their boxes in the camera image, and with yaw in
     [-pi, pi)."""
     values = values.astype(np.float32)
-    values[:, 6] = (values[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    values[:, 6] = wrap_angle(values[:, 6])
     return Boxes(
         values,
         boxes.names,
@@ -66,10 +66,8 @@ def turn_points(points: NDArray[np.float32], angle: float) -> NDArray[np.float32
     c = np.cos(angle)
     s = np.sin(angle)
     out = points.copy()
-    out[:, 0], out[:, 1] = (
-        points[:, 0] * c - points[:, 1] * s,
-        points[:, 0] * s + points[:, 1] * c,
-    )
+    out[:, 0] = points[:, 0] * c - points[:, 1] * s
+    out[:, 1] = points[:, 0] * s + points[:, 1] * c
     return out
 
 

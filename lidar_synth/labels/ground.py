@@ -163,11 +163,9 @@ def _around(points, box, reach):  # type: ignore[no-untyped-def]
             across = y * c - x * s
             if abs(along) <= box[3] / 2 + reach and abs(across) <= box[4] / 2 + reach:
                 near[count] = i
-                local[count, 0], local[count, 1], local[count, 2] = (
-                    along,
-                    across,
-                    points[i, 2],
-                )
+                local[count, 0] = along
+                local[count, 1] = across
+                local[count, 2] = points[i, 2]
                 count += 1
     return near[:count], local[:count]
 

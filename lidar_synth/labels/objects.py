@@ -144,15 +144,13 @@ def _instance(scan: Scan, box: Boxes) -> NDArray[np.bool_]:
 def _cut(scan: Scan, box: Boxes) -> Object | None:
     """The object in one box; None if it contains no points."""
     mine = np.flatnonzero(find_returns(scan, box))
-    return (
-        _object(
+    if len(mine):
+        return _object(
             scan,
             mine,
             replace(box, values=grow_box(box.values[0], scan.points[mine])[None]),
         )
-        if len(mine)
-        else None
-    )
+    return None
 
 
 def _standing(scan: Scan, box: Boxes) -> NDArray[np.bool_]:

@@ -126,13 +126,15 @@ def _close_gaps(front: NDArray[np.float32], height: NDArray[np.float32]) -> None
         before = np.roll(front, 1, axis)
         after = np.roll(front, -1, axis)
         if axis == 0:
-            before[0], after[-1] = np.inf, np.inf
+            before[0] = np.inf
+            after[-1] = np.inf
         farther = np.maximum(before, after)
         gap = np.isinf(front) & np.isfinite(farther)
         heights = np.where(
             before >= after, np.roll(height, 1, axis), np.roll(height, -1, axis)
         )
-        front[gap], height[gap] = farther[gap], heights[gap]
+        front[gap] = farther[gap]
+        height[gap] = heights[gap]
 
 
 def _outline(

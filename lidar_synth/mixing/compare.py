@@ -416,7 +416,8 @@ def make_up_scan(sensor: Sensor, fields: frozenset[str]) -> Scan:
         sensor: defines the grid.
         fields: the fields of ``POINT_FIELDS`` that the scan has.
     """
-    rng, (rows, columns) = keyed_rng(0), sensor.shape
+    rng = keyed_rng(0)
+    rows, columns = sensor.shape
     down = np.sin(np.maximum(-sensor.row_elevations(), 0.02))[:, None]
     distance = np.clip(1.7 / down, sensor.range_min, 0.5 * sensor.range_max).astype(
         np.float32

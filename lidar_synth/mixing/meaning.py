@@ -139,11 +139,9 @@ def table_of(scan: Scan) -> Table:
 
 def spread(length: int, count: int) -> list[int]:
     """Up to ``count`` indices from the first to the last of a source."""
-    return (
-        sorted({int(index) for index in np.linspace(0, length - 1, count)})
-        if length
-        else []
-    )
+    if length:
+        return sorted({int(index) for index in np.linspace(0, length - 1, count)})
+    return []
 
 
 def rows_in_use(scans: Sequence[Scan]) -> int:

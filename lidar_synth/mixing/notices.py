@@ -54,10 +54,8 @@ class Notices:
         self._unlabelled: str | None = "" if boxes else None
         self._labelled = False  # whether a synthetic scan had labels
         self._images = images
-        self._sizes: tuple[list[int], list[int]] = (
-            [],
-            [],
-        )  # points of real and of synthetic scans
+        # points of real and of synthetic scans
+        self._sizes: tuple[list[int], list[int]] = ([], [])
 
     def real(self, scan: Scan) -> None:
         """Note whether real scans have boxes and labels, and their numbers of points."""

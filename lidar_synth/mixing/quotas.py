@@ -156,11 +156,9 @@ class Mixture:
                 samples reaches.
         """
         if self.epoch_size != "add":
-            return (
-                self.real_length
-                if self.epoch_size == "replace"
-                else int(self.epoch_size)
-            )
+            if self.epoch_size == "replace":
+                return self.real_length
+            return int(self.epoch_size)
         share, epoch = max(
             (share_of(self.ratio, epoch), -epoch) for epoch in self._deciding
         )
@@ -229,11 +227,9 @@ def synthetic_before(mixture: Mixture, epoch: int) -> Fraction:
     for earlier in range(len(sums) - 1, changing):
         sums[earlier + 1] = sums[earlier] + exact_synthetic(mixture, earlier)
     total = sums[changing]
-    return (
-        total
-        if epoch == changing
-        else total + (epoch - changing) * exact_synthetic(mixture, changing)
-    )
+    if epoch == changing:
+        return total
+    return total + (epoch - changing) * exact_synthetic(mixture, changing)
 
 
 def count_before(mixture: Mixture, epoch: int) -> tuple[int, ...]:

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,18 +11,18 @@ import numpy as np
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from lidar_synth.errors import ConfigError
-from lidar_synth.geometry.scan import POINT_FIELDS, REAL, SYNTHETIC, Scan, identity_of
-from lidar_synth.geometry.sensor import Sensor, load_sensor
-from lidar_synth.labels.own import KeepBoxes, RemoveLabels
-from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
+from lidar_synth.geometry.scan import REAL, SYNTHETIC, Scan, identity_of
+from lidar_synth.geometry.sensor import Sensor
+from lidar_synth.labels.policies import Labels
 from lidar_synth.mixing.batches import AHEAD, MixedBatches
 from lidar_synth.mixing.collate import Collate, Form, Unlabelled
 from lidar_synth.mixing.compare import check_alike
 from lidar_synth.mixing.domains import make_weight
 from lidar_synth.mixing.epochs import CurrentEpoch, Position
-from lidar_synth.mixing.items import Item, copy_scan, to_item
+from lidar_synth.mixing.items import Item, to_item
 from lidar_synth.mixing.loader import MixedLoader
-from lidar_synth.mixing.notices import Notices, report_repeats
+from lidar_synth.mixing.making import SampleMaker, ToSample, make_transfer
+from lidar_synth.mixing.notices import report_repeats
 from lidar_synth.mixing.plan import MixingPlan
 from lidar_synth.mixing.quotas import EpochSize, Mixture, PlannedSource
 from lidar_synth.mixing.schedules import (
@@ -43,9 +42,6 @@ log = logging.getLogger(__name__)
 
 Ratio = float | Sequence[float] | Mapping[int, float] | Schedule
 """The share of synthetic samples in [0, 1], see ``make_schedule``."""
-
-ToSample = Callable[[Scan, np.random.Generator], Any]
-"""Makes a sample from a scan; the random generator is keyed by (seed, epoch, position)."""
 
 _LATEST: WeakValueDictionary[str, Any] = WeakValueDictionary()
 """By the hash of epoch 0: the mixture that was made last. One that is made anew before each epoch
@@ -165,15 +161,15 @@ class MixedScans(Dataset[Any]):
         self.synthetic = tuple(source for source, _ in synthetics)
         self.synthetic_weight = make_weight(loss_weight)
         self._loss_weights = (*loss_weights_of(real), *loss_weights_of(synth))
-        self._transfer = _make_transfer(as_sensor)
-        suffix = "" if self._transfer is None else f" as {self._transfer.identity}"
+        self._real_as_is = real_as_is
+        transfer = make_transfer(as_sensor)
         self.mixture = Mixture(
             tuple(
                 PlannedSource(len(source), weight, identity_of(source))
                 for source, weight in reals
             ),
             tuple(
-                _plan_synthetic(source, weight, suffix, bool(locality))
+                _plan_synthetic(source, weight, transfer, bool(locality))
                 for source, weight in synthetics
             ),
             make_schedule(ratio),
@@ -182,31 +178,20 @@ class MixedScans(Dataset[Any]):
             reuse,
             balanced or locality is not None,
         )
-        sources = self.synthetic if real_as_is else self.real + self.synthetic
-        target = None if self._transfer is None else self._transfer.target
-        sensors = check_together(
-            sources,
-            [None] * (len(sources) - len(synthetics)) + [target] * len(synthetics),
+        sensors = self._sensors(transfer)
+        self._maker = SampleMaker(
+            self.synthetic,
+            None if real_as_is else real,
+            transfer,
+            labels,
+            unboxed,
+            augment,
+            augment_real,
+            to_sample,
+            images=collate == "range",
         )
-        scans = None if real_as_is else real
-        rings = frozenset() if target is None else frozenset({"ring"})
-        self._policies = [
-            make_policy(labels, real=scans, fields=s.fields | rings)
-            for s in self.synthetic
-        ]
-        self._without_unboxed = (
-            _make_handling(unboxed) if isinstance(unboxed, str) else unboxed
-        )
-        policies = set(map(type, self._policies))
-        self._notices = Notices(collate == "range", KeepBoxes in policies)
-        every = frozenset({*POINT_FIELDS, "boxes"})
-        common = every.intersection(*(s.fields | rings for s in self.synthetic))
-        self._augment = _make_augment(augment, scans, common)
-        self._augment_real = augment_real
-        self._to_sample = to_sample
-        self._real_as_is = real_as_is
         if isinstance(collate, str):
-            if RemoveLabels in policies:
+            if self._maker.removes_labels:
                 unlabelled = "allow"
             sensor = sensors[0] if sensors else None
             collate = Collate(collate, sensor, unlabelled)
@@ -218,7 +203,14 @@ class MixedScans(Dataset[Any]):
         self.set_epoch(0)
         self._untold = self._take_earlier()
         if real_as_is and compare:
-            check_alike(self.real, self.synthetic, self._finish)
+            check_alike(self.real, self.synthetic, self._maker.synthetic)
+
+    def _sensors(self, transfer: "Transfer | None") -> list[Sensor]:
+        """The sensors of the scans, which fit together."""
+        real = () if self._real_as_is else self.real
+        target = None if transfer is None else transfer.target
+        targets = [None] * len(real) + [target] * len(self.synthetic)
+        return check_together((*real, *self.synthetic), targets)
 
     def _take_earlier(self) -> bool:
         """Take the pass of the latest mixture with the same plan, if there is one."""
@@ -406,12 +398,8 @@ class MixedScans(Dataset[Any]):
             >>> domains.count(0), domains.count(1)
             (3, 3)
         """
-        plan = self.plan(index.epoch if isinstance(index, Position) else None)
-        return (
-            SYNTHETIC
-            if plan[index if index >= 0 else index + len(plan)][0] >= plan.reals
-            else REAL
-        )
+        plan, position = self._planned_at(index)
+        return SYNTHETIC if plan[position][0] >= plan.reals else REAL
 
     def loss_weight(self, index: int) -> float:
         """The weight in the loss of the sample at ``index`` in the current epoch.
@@ -424,8 +412,12 @@ class MixedScans(Dataset[Any]):
             >>> sorted(train.loss_weight(i) for i in range(len(train)))
             [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
         """
+        return self._weight_of(*self._planned_at(index))
+
+    def _planned_at(self, index: int) -> tuple[MixingPlan, int]:
+        """The plan and the position in it of an index, which may count from the end."""
         plan = self.plan(index.epoch if isinstance(index, Position) else None)
-        return self._weight_of(plan, index if index >= 0 else index + len(plan))
+        return plan, index if index >= 0 else index + len(plan)
 
     def _weight_of(self, plan: MixingPlan, position: int) -> float:
         source = plan[position][0]
@@ -462,14 +454,8 @@ class MixedScans(Dataset[Any]):
         real = self.real[source][index]
         if self._real_as_is:
             return real
-        if real.domain != REAL:  # scans of the town, for instance, count as real here
-            real = replace(real, domain=REAL)
-        self._notices.real(real)
-        real = copy_scan(real)  # a source may keep its scans in memory
         rng = keyed_rng(self.seed, epoch, position)
-        if self._augment is not None and self._augment_real:
-            real = self._augment(real, rng)
-        return self._weighed(self._to_sample(real, rng), plan, position)
+        return self._weighed(self._maker.real(real, rng), plan, position)
 
     def finish(self, scan: Scan, epoch: int, position: int) -> Any:
         """Make the sample of a synthetic scan at its position: sensor, label policy, augmentation,
@@ -479,21 +465,8 @@ class MixedScans(Dataset[Any]):
         """
         plan = self.plan(epoch)
         rng = keyed_rng(self.seed, epoch, position)
-        sample = self._finish(plan[position][0] - plan.reals, scan, rng)
-        return self._weighed(sample, plan, position)
-
-    def _finish(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
-        scan = copy_scan(scan) if self._transfer is None else self._transfer(scan, rng)
-        given = scan
-        if scan.boxes is not None:  # before labels of low confidence are ignored
-            scan = self._without_unboxed(scan)
-        scan = self._policies[source](scan, rng)
-        self._notices.synthetic(given, scan)
-        if scan.boxes is not None:
-            scan = self._without_unboxed(scan)
-        if self._augment is not None:
-            scan = self._augment(scan, rng)
-        return self._to_sample(scan, rng)
+        source = plan[position][0] - plan.reals
+        return self._weighed(self._maker.synthetic(source, scan, rng), plan, position)
 
     def batches(
         self,
@@ -558,38 +531,13 @@ def _check_lengths(reals: Iterable[tuple[Any, float | None]]) -> None:
 
 
 def _plan_synthetic(
-    source: Any, weight: float | None, suffix: str, by_shard: bool
+    source: Any, weight: float | None, transfer: "Transfer | None", by_shard: bool
 ) -> PlannedSource:
-    """What the plan has to know of a synthetic source; ``suffix`` names the sensor it is turned
-    into."""
+    """What the plan has to know of a synthetic source."""
+    suffix = "" if transfer is None else f" as {transfer.identity}"
     return PlannedSource(
         source.length,
         weight,
         source.identity + suffix,
         getattr(source, "shard_size", 1) if by_shard else 1,
     )
-
-
-def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy | None:
-    """The augmentation of scans that all have ``fields``; None without one."""
-    if given is None:
-        return None
-    # It loads the corruptions.
-    from lidar_synth.labels.compose import make_augmentation
-
-    return make_augmentation(given, scans, fields)
-
-
-def _make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
-    # only where a mixture turns its scans
-    from lidar_synth.geometry.transfer import Transfer
-
-    if given is None or isinstance(given, Transfer):
-        return given
-    return Transfer(load_sensor(given))
-
-
-def _make_handling(name: str) -> Callable[[Scan], Scan]:
-    from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
-
-    return make_handling(name)

@@ -35,11 +35,9 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             return torch.distributed.get_rank(), torch.distributed.get_world_size()
         launched = "RANK" in os.environ and "WORLD_SIZE" in os.environ
-        return (
-            (int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
-            if launched
-            else (0, 1)
-        )
+        if launched:
+            return (int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+        return (0, 1)
     if rank is None or world_size is None or not 0 <= rank < world_size:
         raise ConfigError(
             f"rank {rank} of {world_size}", "both, 0 <= rank < world_size"
@@ -50,11 +48,9 @@ def place(rank: int | None, world_size: int | None) -> tuple[int, int]:
 def count_accelerated() -> int:
     """Number of processes of an ``Accelerator`` that is set up, 0 without one."""
     state = sys.modules.get("accelerate.state")
-    return (
-        int(state.PartialState().num_processes)
-        if state and state.is_initialized()
-        else 0
-    )
+    if state and state.is_initialized():
+        return int(state.PartialState().num_processes)
+    return 0
 
 
 class Divided:

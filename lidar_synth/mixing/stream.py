@@ -81,13 +81,11 @@ class MixedStream(Divided, IterableDataset[Any]):
         self.divide(rank, world_size)
         self._process = os.getpid()  # the process that has iterated last
         self._start = shared_integers(0, 0)  # epoch and position of the loaded state
-        self._given = (
-            0  # samples that this process has yielded since it began to iterate
-        )
+        # samples that this process has yielded since it began to iterate
+        self._given = 0
         self._begun: tuple[int, int] | None = None  # epoch and position where it began
-        self._resume: dict[
-            str, Any
-        ] = {}  # the state from which the process that loaded it has to resume
+        # the state from which the process that loaded it has to resume
+        self._resume: dict[str, Any] = {}
         self._loaded_by = 0  # that process
 
     def __repr__(self) -> str:
@@ -130,11 +128,9 @@ class MixedStream(Divided, IterableDataset[Any]):
         workers = self._place()["workers"]
         batches = islice(self._batches(begin, position), worker, None, workers)
         # First: the number of the epoch's first sample.
-        epoch, first, announced = (
-            begin,
-            -position,
-            0,
-        )
+        epoch = begin
+        first = -position
+        announced = 0
         for number in islice(chain.from_iterable(batches), self._given, None):
             if guarded:
                 check_pass(begin, self.scans.epoch)
@@ -271,11 +267,9 @@ class MixedStream(Divided, IterableDataset[Any]):
                     f"{done} batches done of {len(steps)}",
                     "a number of batches of this epoch",
                 )
-            return (
-                (epoch, steps[done].start)
-                if done < len(steps)
-                else after_epoch(self.scans.mixture, epoch)
-            )
+            if done < len(steps):
+                return (epoch, steps[done].start)
+            return after_epoch(self.scans.mixture, epoch)
         epochs, position = divmod(
             position + done * self.batch_size * self.world_size, len(self.scans)
         )

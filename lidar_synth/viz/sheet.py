@@ -24,7 +24,9 @@ from lidar_synth.viz.images import View, picture, views
 from lidar_synth.viz.render import Camera, bird, render
 from lidar_synth.viz.scales import DOMAINS, EMPTY, Rgb, Scale, make_scales
 
-BACK, INK, DIM = tuple(EMPTY / 255), "#e8eaf0", "#9aa0ad"
+BACK = tuple(EMPTY / 255)
+INK = "#e8eaf0"
+DIM = "#9aa0ad"
 _DPI = 100
 
 

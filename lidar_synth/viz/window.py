@@ -14,7 +14,9 @@ from lidar_synth.geometry.scan import Scan
 from lidar_synth.viz.render import Orbit, box_segments
 from lidar_synth.viz.scales import EMPTY, Scale, make_scales, point_values
 
-_LEFT, _RIGHT = 263, 262  # GLFW's key codes
+# GLFW's key codes
+_LEFT = 263
+_RIGHT = 262
 
 
 def import_open3d() -> ModuleType:

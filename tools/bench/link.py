@@ -76,10 +76,12 @@ def answer(folder: str, rate: float, delay: float, port: Any, ready: Event) -> N
                 self.send_error(404)
                 return
             size = path.stat().st_size
-            first, last = 0, size - 1
+            first = 0
+            last = size - 1
             if asked := self.headers.get("Range"):
                 begin, _, end = asked.removeprefix("bytes=").partition("-")
-                first, last = int(begin), min(int(end or last), last)
+                first = int(begin)
+                last = min(int(end or last), last)
             self.send_response(206 if asked else 200)
             self.send_header("Content-Range", f"bytes {first}-{last}/{size}")
             self.send_header("Accept-Ranges", "bytes")
@@ -109,7 +111,8 @@ def answer(folder: str, rate: float, delay: float, port: Any, ready: Event) -> N
 def served(folder: Path, rate: float, delay: float) -> Iterator[str]:
     """The URL of a folder behind a link."""
     context = get_context("spawn")
-    port, ready = context.Value("i"), context.Event()
+    port = context.Value("i")
+    ready = context.Event()
     given = (str(folder), rate * MEGABIT, delay / 1e3, port, ready)
     process = context.Process(target=answer, args=given, daemon=True)
     process.start()

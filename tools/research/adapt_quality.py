@@ -37,7 +37,6 @@ from lidar_synth.formats import WRITERS
 from lidar_synth.generate.checkpoint import CODEC, load_checkpoint
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
-from lidar_synth.generate.regrid import regrid
 from lidar_synth.geometry.projection import project
 from lidar_synth.geometry.scan import RangeImage, Scan
 from lidar_synth.geometry.sensor import Sensor
@@ -45,6 +44,7 @@ from lidar_synth.lab.evaluate.distances import frechet_distance
 from lidar_synth.lab.evaluate.neighbours import nearest_training
 from lidar_synth.lab.evaluate.segmentation import class_ious, load_judge
 from lidar_synth.lab.evaluate.street_judge import load_archive
+from lidar_synth.lab.train.adaptation.regrid import regrid
 from lidar_synth.noise import uniform
 
 LAST_LEARNT = 30

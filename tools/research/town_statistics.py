@@ -68,13 +68,9 @@ def gather(scans: Iterable[Scan], count: int, name: str) -> dict[str, np.ndarray
 
 def number(value: float) -> str:
     """A number with three significant digits; large numbers as integers."""
-    return (
-        f"{value:,.0f}"
-        if abs(value) >= 1000
-        else f"{value:.1f}"
-        if abs(value) >= 10
-        else f"{value:.3f}"
-    )
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}"
 
 
 def of_gaps(image: RangeImage) -> dict[str, float]:

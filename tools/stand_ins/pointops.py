@@ -45,8 +45,6 @@ def knn_query(
             near = torch.cdist(new_xyz[chunk], xyz[start:end]).topk(
                 count, largest=False
             )
-            index[chunk, :count], distance[chunk, :count] = (
-                (near.indices + start).int(),
-                near.values,
-            )
+            index[chunk, :count] = (near.indices + start).int()
+            distance[chunk, :count] = near.values
     return index, distance

@@ -66,14 +66,14 @@ class NeighbourhoodAttention(nn.Module):
         numbers = torch.arange(grid[0] * grid[1], device="cpu").view(grid)
         tokens = _tiles(numbers, tile, tile)
         buffers = {
-            "tokens": tokens,  # (tiles, n) tokens whose queries are in each tile; each token once
-            "keys": _tiles(
-                _padded(numbers, window), span, tile
-            ),  # (tiles, m) tokens of each tile and its margin
-            "place": tokens.flatten().argsort(),  # (N,) position of each token in ``tokens``
-            "mask": _in_window(
-                tile, window
-            ),  # (n, m) whether a key is in a query's window
+            # (tiles, n) tokens whose queries are in each tile; each token once
+            "tokens": tokens,
+            # (tiles, m) tokens of each tile and its margin
+            "keys": _tiles(_padded(numbers, window), span, tile),
+            # (N,) position of each token in ``tokens``
+            "place": tokens.flatten().argsort(),
+            # (n, m) whether a key is in a query's window
+            "mask": _in_window(tile, window),
         }
         for name, buffer in buffers.items():
             self.register_buffer(name, buffer, persistent=False)

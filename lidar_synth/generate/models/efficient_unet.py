@@ -162,7 +162,8 @@ class EfficientUNet(Network):
         ratio = 2 * torch.log((1 - known) / known)
         x = y.double() / ((1 - time) ** 2 + time**2).sqrt()
         found = self.predict(x.to(y.dtype), ratio.flatten().to(y.dtype)).double()
-        signal, noise = ratio.sigmoid().sqrt(), (-ratio).sigmoid().sqrt()
+        signal = ratio.sigmoid().sqrt()
+        noise = (-ratio).sigmoid().sqrt()
         if self.predicts == "eps":
             found = (x - noise * found) / signal
         elif self.predicts == "v":

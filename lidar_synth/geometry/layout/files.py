@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lidar_synth.errors import ConfigError
 from lidar_synth.files.parsing import read_yaml
 from lidar_synth.geometry.layout.layout import Layout, Outline
-from lidar_synth.geometry.scan import Boxes
+from lidar_synth.geometry.scan import Boxes, wrap_angle
 
 SIZES = {
     "Car": (4.3, 1.8, 1.5),
@@ -121,7 +121,7 @@ def _box(given: _Object, ground: float, path: Path) -> tuple[float, ...]:
             f"{path}: an object of class {given.kind!r}", f"one of {', '.join(SIZES)}"
         )
     length, width, height = given.size or SIZES[given.kind]
-    yaw = (np.radians(given.heading) + np.pi) % (2 * np.pi) - np.pi
+    yaw = wrap_angle(np.radians(given.heading))
     return (
         *given.at,
         ground + given.above + height / 2,

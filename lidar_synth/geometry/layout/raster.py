@@ -55,11 +55,11 @@ def layout_image(layout: Layout, sensor: Sensor) -> NDArray[np.uint8]:
     )
     image = np.zeros((len(CHANNELS), rows, columns), np.uint8)
     steps = np.rint(depth / DEPTH_STEP).astype(np.uint16)
-    image[0], image[1], image[2] = code, steps >> 8, steps & 255
-    image[3], image[4] = (
-        np.clip(np.rint(chord / CHORD_STEP), 0, 255),
-        np.clip(np.rint(along * 255), 0, 255),
-    )
+    image[0] = code
+    image[1] = steps >> 8
+    image[2] = steps & 255
+    image[3] = np.clip(np.rint(chord / CHORD_STEP), 0, 255)
+    image[4] = np.clip(np.rint(along * 255), 0, 255)
     return image
 
 
@@ -187,10 +187,8 @@ def _cross_walls(dx, dy, walls, which, at):  # type: ignore[no-untyped-def]
     for k in range(len(walls)):
         x1, y1, low1, high1, x2, y2, low2, high2 = walls[k]
         # The side of the direction on which each end is.
-        first, second = (
-            dx * y1 - dy * x1,
-            dx * y2 - dy * x2,
-        )
+        first = dx * y1 - dy * x1
+        second = dx * y2 - dy * x2
         if (first < 0) == (second < 0) or first == second:
             continue
         share = first / (first - second)
@@ -198,9 +196,7 @@ def _cross_walls(dx, dy, walls, which, at):  # type: ignore[no-untyped-def]
         if rho > 0:
             which[count] = k
             at[count, 0] = rho
-            at[count, 1], at[count, 2] = (
-                low1 + share * (low2 - low1),
-                high1 + share * (high2 - high1),
-            )
+            at[count, 1] = low1 + share * (low2 - low1)
+            at[count, 2] = high1 + share * (high2 - high1)
             count += 1
     return count

@@ -109,7 +109,8 @@ def project_batch(
             f"offsets {offsets.tolist()} for {len(points)} points",
             "rising from 0 to the number of points",
         )
-    (height, width), batch = sensor.shape, len(offsets) - 1
+    height, width = sensor.shape
+    batch = len(offsets) - 1
     cell, distance = _cells(points[:, :3], grid_of(sensor))
     cloud = torch.repeat_interleave(
         torch.arange(batch, device=points.device), offsets.diff().to(points.device)

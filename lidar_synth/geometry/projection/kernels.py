@@ -242,11 +242,9 @@ def nearest_points(points, grid, image, index):  # type: ignore[no-untyped-def]
     for start in range(0, len(points), _BLOCK):
         n = min(_BLOCK, len(points) - start)
         for i in range(n):
-            x[i], y[i], z[i] = (
-                points[start + i, 0],
-                points[start + i, 1],
-                points[start + i, 2],
-            )
+            x[i] = points[start + i, 0]
+            y[i] = points[start + i, 1]
+            z[i] = points[start + i, 2]
         _locate_block(x[:n], y[:n], z[:n], grid, cell, distance)
         _scatter(cell[:n], distance[:n], start, image, index)
     _mark_empty(image, index)

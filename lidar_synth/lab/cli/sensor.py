@@ -84,7 +84,8 @@ def _values(found: "SensorFit") -> dict[str, object]:
     """What the fit found, and how sure it is, as plain values."""
     import numpy as np
 
-    sensor, (x, y, z) = found.sensor, found.mount[:3, 3]
+    sensor = found.sensor
+    x, y, z = found.mount[:3, 3]
     elevations = sensor.elevations or ()
     tilt = float(np.degrees(np.arccos(np.clip(found.mount[2, 2], -1, 1))))
     return {

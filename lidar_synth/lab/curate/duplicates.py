@@ -60,8 +60,6 @@ def compare_all(
         better = similarity > np.where(
             twin[a : a + BLOCK] < 0, -0.5, best[a : a + BLOCK]
         )
-        best[a : a + BLOCK][better], twin[a : a + BLOCK][better] = (
-            similarity[better],
-            found[better] + b,
-        )
+        best[a : a + BLOCK][better] = similarity[better]
+        twin[a : a + BLOCK][better] = found[better] + b
     return best, twin

@@ -75,11 +75,9 @@ def _isolated(image: RangeImage, scan: Scan) -> float:
 
 
 def _confidence(image: RangeImage, scan: Scan) -> float:
-    return (
-        float(image.channels["confidence"][image.mask].mean())
-        if image.mask.any()
-        else 0.0
-    )
+    if image.mask.any():
+        return float(image.channels["confidence"][image.mask].mean())
+    return 0.0
 
 
 MEASURES: dict[str, ScanMeasure] = {

@@ -134,7 +134,9 @@ def _sketches(signatures: Signatures, own: NDArray[np.int64]) -> NDArray[np.int8
         return values
 
     some = own[np.linspace(0, len(own) - 1, min(len(own), _SAMPLE)).astype(np.int64)]
-    total, squares = np.zeros(DIMENSIONS), 0.0  # sums of integers below 2^53
+    # sums of integers below 2^53
+    total = np.zeros(DIMENSIONS)
+    squares = 0.0
     for part in _parts(len(some)):
         values = project(some[part]).astype(np.float64)
         total += values.sum(0)

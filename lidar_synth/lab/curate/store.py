@@ -170,11 +170,9 @@ def _rows(bank: Bank, store: Store, span: range) -> NDArray[Any]:
     rows = np.empty(len(span), store.dtype)
     for row, number in zip(rows, span, strict=True):
         found = features(bank.image(number))
-        row["ranges"], row["classes"], row["signature"] = (
-            found.ranges,
-            found.classes,
-            found.signature,
-        )
+        row["ranges"] = found.ranges
+        row["classes"] = found.classes
+        row["signature"] = found.signature
         row["numbers"] = [found.numbers[name] for name in store.names]
     return rows
 

@@ -86,11 +86,9 @@ def load_published(measure: Measure, path: Path, cache: Path | None = None) -> P
 
     def features(scans: Sequence[Scan], generated: bool) -> NDArray[np.floating]:
         own: NDArray[np.floating] = extract(scans, generated=generated)
-        return (
-            own
-            if join is None
-            else np.concatenate([own, np.stack([join(scan) for scan in scans])], axis=1)
-        )
+        if join is None:
+            return own
+        return np.concatenate([own, np.stack([join(scan) for scan in scans])], axis=1)
 
     if cache is None:
         return features

@@ -77,11 +77,9 @@ def recordings_of(source: ScanFiles, layout: str, path: Path | str) -> Recording
         return town(made.get("seed", 0))
     if isinstance(source, BankScans):  # includes the training data of its model
         return all_frames(FILES, [str(path)]) | _of_bank(source.bank)
-    return (
-        frames_of(layout, source.ids)
-        if layout in PLACES
-        else all_frames(FILES, [str(path)])
-    )
+    if layout in PLACES:
+        return frames_of(layout, source.ids)
+    return all_frames(FILES, [str(path)])
 
 
 def measured(

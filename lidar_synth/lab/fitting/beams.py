@@ -269,11 +269,9 @@ def _some_points(cloud: Cloud, count: int, seed: int) -> Cloud:
 def _without_gaps(cloud: Cloud) -> Cloud:
     """The cloud with rings of the file numbered 0, 1, ...: files may count from 1, and lasers may
     be dead."""
-    return (
-        replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1])
-        if cloud.kept
-        else cloud
-    )
+    if cloud.kept:
+        return replace(cloud, ring=np.unique(cloud.ring, return_inverse=True)[1])
+    return cloud
 
 
 def _grow(
@@ -369,7 +367,9 @@ def _choose_parts(
         part = min(scores, key=lambda name: scores[name] / GAIN[name])
         if scores[part] >= GAIN[part] * now:
             break
-        (model, _), parts, now = trials[part], parts | {part}, scores[part]
+        model, _ = trials[part]
+        parts = parts | {part}
+        now = scores[part]
     return model, parts
 
 

@@ -220,7 +220,8 @@ def _described(
         description=f"fitted to {len(scans)} scans",
     )
     mount = np.eye(4)
-    mount[:3, :3], mount[:3, 3] = model.turn, model.offset
+    mount[:3, :3] = model.turn
+    mount[:3, 3] = model.offset
     splits = np.cumsum([len(scan) for scan in scans])[:-1]
     return SensorFit(
         sensor,

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from lidar_synth.lab.fitting import SensorFit
 from lidar_synth.viz.sheet import BACK, DIM, INK, new_figure, style_axes
 
-_LINE, _POINT = "#5ad1c8", "#ffb454"
+_LINE = "#5ad1c8"
+_POINT = "#ffb454"
 
 
 def fit_figure(fit: SensorFit) -> Figure:

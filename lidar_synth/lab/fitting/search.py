@@ -206,11 +206,9 @@ def _measure_concentration(ordered: NDArray[np.int32]) -> float:
 
 def _sharpness_within(points: Floats, sectors: int, place: Floats) -> float:
     limit = np.array([*REACH, TILT, TILT])
-    return (
-        sector_sharpness(points, place, sectors)
-        if (np.abs(place) <= limit).all()
-        else 0.0
-    )
+    if (np.abs(place) <= limit).all():
+        return sector_sharpness(points, place, sectors)
+    return 0.0
 
 
 def _best_on_grid(points: Floats, count: int) -> list[Floats]:

@@ -37,7 +37,6 @@ from lidar_synth.datasets.recordings import (
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
-from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
@@ -51,6 +50,7 @@ from lidar_synth.generate.models.lidm.diffusion import schedule_times
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
+from lidar_synth.lab.importers.torch_files import MISFITS, load_pickle, state_of
 
 STEPS = 50
 """Steps of the checkpoint's uniform time grid: LiDM samples in 50."""
@@ -274,7 +274,8 @@ def _sensor(data: Mapping[str, Any]) -> Sensor:
     sensor = presets()["hdl64e_kitti" if _semantic_kitti(data) else "hdl64e_kitti360"]
     low, high = dataset["depth_range"]
     sensor = replace(sensor, range_min=float(low), range_max=float(high))
-    (rows, columns), (up, down) = dataset["size"], dataset["fov"]
+    rows, columns = dataset["size"]
+    up, down = dataset["fov"]
     if (rows, columns, up, down) == (*sensor.shape, sensor.up, sensor.down):
         return sensor
     return Sensor(
@@ -470,8 +471,6 @@ def _arranged(ours: str, tensor: Tensor, part: NetworkSpec) -> Tensor:
             .reshape(tensor.shape)
         )
     linear = (".qkv.", ".out.", ".enter.", ".leave.")
-    return (
-        tensor.flatten(1)
-        if tensor.ndim > 2 and any(name in ours for name in linear)
-        else tensor
-    )
+    if tensor.ndim > 2 and any(name in ours for name in linear):
+        return tensor.flatten(1)
+    return tensor

@@ -147,11 +147,9 @@ def _codec(key: str, levels: int, attending: Collection[int]) -> tuple[str, ...]
         return (f"{where}.{name}.{number}",)
     if kind == "middle":
         place = f"{where}.{MIDDLE[int(number)]}"
-        return (
-            _attention(place, inside)
-            if int(number) == 1
-            else (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
-        )
+        if int(number) == 1:
+            return _attention(place, inside)
+        return (f"{place}.{_renamed(inside, CODEC_RESIDUAL)}",)
     side = "down" if where == "encoder" else "up"
     # Our decoder numbers its levels in the order of computation.
     level = int(number) if side == "down" else levels - 1 - int(number)

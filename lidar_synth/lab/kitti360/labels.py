@@ -339,11 +339,9 @@ def _read_record(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     record = parse_json(read_text(path), str(path), "the record of a window")
-    return (
-        record
-        if isinstance(record, dict) and isinstance(record.get("fitting"), list)
-        else {}
-    )
+    if isinstance(record, dict) and isinstance(record.get("fitting"), list):
+        return record
+    return {}
 
 
 def _points(root: Path, drive: str, frame: int) -> NDArray[np.float32]:

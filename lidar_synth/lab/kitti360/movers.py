@@ -25,10 +25,8 @@ MOVED = 0.5
 
 _SPACING = 0.03  # of the points of one object, metres
 # Frames, and metres per frame, above which the same instance number is another object.
-_GAP, _JUMP = (
-    10,
-    15.0,
-)
+_GAP = 10
+_JUMP = 15.0
 
 
 @dataclass

@@ -19,8 +19,8 @@ from lidar_synth.formats.kitti360_boxes import WorldBoxes
 from lidar_synth.formats.kitti360_poses import ego_motion, undo_ego_motion
 from lidar_synth.lab.kitti360.accumulated import Window, cloud_values, read_cloud
 from lidar_synth.lab.kitti360.movers import FLOOR, MARGIN, Movers, find_inside
+from lidar_synth.lab.kitti360.nearest import Chunk, index_cloud
 from lidar_synth.lab.kitti360.registration import apply, find_surfaces, register
-from lidar_synth.labels.nearest import Chunk, index_cloud
 
 RADIUS = 0.3
 """Maximum distance of a neighbour, metres."""
@@ -57,16 +57,13 @@ _WIDEST = 3000.0  # metres around the frames of a window
 _CHUNK = 1 << 20  # points of a cloud read at a time
 _HEIGHTS = (-50.0, 60.0)  # metres relative to the car
 # Points that measure the fit, and their distance from the sensor, metres.
-_PROBES, _PROBED = (
-    1000,
-    (3.0, 25.0),
-)
+_PROBES = 1000
+_PROBED = (3.0, 25.0)
 # Height in the sensor's frame, metres, above which a point does not lie on the road.
 _UPRIGHT = -1.0
-_CLOSE, _ABOUT = (
-    0.2,
-    1.0,
-)  # metres: a probe on the clouds, and a probe that the clouds reach at all
+# metres: a probe on the clouds, and a probe that the clouds reach at all
+_CLOSE = 0.2
+_ABOUT = 1.0
 _FEW = 50  # probes that the clouds reach, below which a frame has too little structure to be judged
 _COVERED = 0.2  # minimum share of the points within reach that have neighbours, in such a frame
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_synth.labels.nearest import NearestLabels, index_cloud
+from lidar_synth.lab.kitti360.nearest import NearestLabels, index_cloud
 
 _SIDE = 0.5  # metres, of a cube
 _FEWEST = 6  # points of a cube that show its shape
@@ -24,15 +24,11 @@ _THIN = 0.08  # metres, standard deviation up to which a cube says where points 
 _NOISE = 0.03  # metres, of points across a surface
 _MOST = 4_000_000  # points of a cloud that are used
 # Metres between a point and its cube, for three steps each.
-_WIDE, _CLOSE = (
-    (2.0, 1.5, 1.0, 0.7),
-    (0.7, 0.5),
-)
+_WIDE = (2.0, 1.5, 1.0, 0.7)
+_CLOSE = (0.7, 0.5)
 # Steps, and metres (or radians times 10 m) below which there is no further one.
-_STEPS, _STILL = (
-    3,
-    2e-3,
-)
+_STEPS = 3
+_STILL = 2e-3
 # of errors of a pose: metres and radians
 _PRIOR = np.array([1.0] * 3 + [0.05] * 3) ** -2
 _SEARCHED = np.arange(-1.5, 1.51, 0.25)  # metres along the least certain direction

@@ -153,11 +153,9 @@ class Row:
     @property
     def title(self) -> str:
         """The row in tables."""
-        return (
-            self.arm.title
-            if self.ratio is None
-            else f"{self.arm.title}, {100 * self.ratio:g} %"
-        )
+        if self.ratio is None:
+            return self.arm.title
+        return f"{self.arm.title}, {100 * self.ratio:g} %"
 
     def stages(self) -> tuple[ArmStage, ...]:
         """The parts of the training, each with one mixture."""

@@ -121,11 +121,9 @@ def protocol(values: Values) -> list[str]:
 def _sentences(text: str) -> tuple[str, str, str]:
     """The first sentence of a text, and the rest."""
     match = re.search(r"\. (?=[A-Z])", text)
-    return (
-        (text, "", "")
-        if match is None
-        else (text[: match.start() + 1], " ", text[match.end() :])
-    )
+    if match is None:
+        return (text, "", "")
+    return (text[: match.start() + 1], " ", text[match.end() :])
 
 
 def _table(values: Values) -> str:
@@ -218,11 +216,9 @@ def make_cell(text: str, kind: str = "") -> str:
 
 def _sign(row: Values) -> str:
     ends = row["interval"]
-    return (
-        ""
-        if ends is None or ends[0] <= 0 <= ends[1]
-        else ("plus" if ends[0] > 0 else "minus")
-    )
+    if ends is None or ends[0] <= 0 <= ends[1]:
+        return ""
+    return "plus" if ends[0] > 0 else "minus"
 
 
 def escape(text: str) -> str:

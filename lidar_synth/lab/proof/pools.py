@@ -118,7 +118,8 @@ def learnt_town(task: PoolTask) -> Iterator[Scan]:
             "one that did, such as town",
             "Leave out the arm pretrain-learnt.",
         )
-    interval, motion = data["interval"], data["motion"]
+    interval = data["interval"]
+    motion = data["motion"]
     made = Town(data["seed"], generator.sensor, data["town"], interval, motion=motion)
     yield from _as_sensor(
         (made[i] for i in spread(range(len(made)), task.count)), task.sensor

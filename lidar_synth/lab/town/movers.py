@@ -124,7 +124,8 @@ def ego_pose(
         sway: (roll, pitch) of the body on its suspension, radians.
     """
     pose = scene.poses(*ego_place(street, time), 4.0)
-    (c, d), (s, z) = np.cos(sway), np.sin(sway)
+    c, d = np.cos(sway)
+    s, z = np.sin(sway)
     rolled = np.array([(1, 0, 0), (0, c, -s), (0, s, c)])
     pitched = np.array([(d, 0, z), (0, 1, 0), (-z, 0, d)])
     pose[:3, :3] = pose[:3, :3] @ pitched @ rolled

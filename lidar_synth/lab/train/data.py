@@ -172,11 +172,9 @@ class Batches:
     def conditions(self, positions: Sequence[int]) -> Tensor | None:
         """The conditions (B, ...) of the scans at these positions, without dropout and
         augmentation; None if unconditional."""
-        return (
-            None
-            if self.conditioning is None
-            else self._stored(self.scans_at(positions))
-        )
+        if self.conditioning is None:
+            return None
+        return self._stored(self.scans_at(positions))
 
     def _stored(self, scans: Sequence[int], mirrored: Tensor | None = None) -> Tensor:
         """The cached conditions (B, ...) of these scans; features of some mirrored images."""

@@ -95,11 +95,9 @@ class _Float32(TorchFunctionMode):
         args: Any = (),
         kwargs: Any = None,
     ) -> Any:
-        return (
-            args[0].clone()
-            if func is Tensor.bfloat16
-            else func(*args, **(kwargs or {}))
-        )
+        if func is Tensor.bfloat16:
+            return args[0].clone()
+        return func(*args, **(kwargs or {}))
 
 
 def _matrices(network: nn.Module) -> list[Tensor]:

@@ -72,11 +72,9 @@ class StagedRuns:
 def iterations_of(config: Run) -> int:
     """The iterations of the run in a folder; ``ENDLESS`` before its rate falls, or if there is
     none."""
-    return (
-        read_beginning(config).recipe.iterations
-        if (config.output / STATE).is_file()
-        else ENDLESS
-    )
+    if (config.output / STATE).is_file():
+        return read_beginning(config).recipe.iterations
+    return ENDLESS
 
 
 def set_iterations(config: Config, iterations: int) -> Config:

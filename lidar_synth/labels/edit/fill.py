@@ -107,9 +107,8 @@ def _ring(  # type: ignore[no-untyped-def]
         )
         a = _edge(known, rho, left, n)
         b = _edge(known, rho, right, m)
-        turn = (
-            length + 1 + 2 * _SMOOTH
-        ) * step  # from the middle to the middle of the averaged rays
+        # from the middle to the middle of the averaged rays
+        turn = (length + 1 + 2 * _SMOOTH) * step
         levels = _level(known, ground, left, n), _level(known, ground, right, m)
         flat = levels[0] and levels[1]
         mixed = levels[0] != levels[1]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidar_synth.datasets.classes import GROUND, TRAIN_ID
 from lidar_synth.errors import DataError
 from lidar_synth.geometry.overlap import find_overlapping
-from lidar_synth.geometry.scan import Boxes, Scan
+from lidar_synth.geometry.scan import Boxes, Scan, wrap_angle
 from lidar_synth.geometry.transfer.casting import Hits, first_hits
 from lidar_synth.geometry.transfer.rays import rays_from
 from lidar_synth.geometry.transfer.surfaces import ScanSurfaces, estimate, rings_of
@@ -348,10 +348,7 @@ def _mirrored(old: NDArray[np.float64], x: float, y: float, yaw: float) -> bool:
     """
     recorded = np.arctan2(-old[1], -old[0]) - old[6]
     seen = np.arctan2(-y, -x) - yaw
-    off = [
-        abs((seen - side + np.pi) % (2 * np.pi) - np.pi)
-        for side in (recorded, -recorded)
-    ]
+    off = [abs(wrap_angle(seen - side)) for side in (recorded, -recorded)]
     if min(off) > np.radians(TURN):
         raise DataError(
             f"an object seen from {np.degrees(off[0]):.0f} degrees beside the side that was "

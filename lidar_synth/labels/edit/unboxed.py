@@ -171,11 +171,9 @@ def make_handling(name: str, model: Model = None) -> Callable[[Scan], Scan]:
         ConfigError: on another name.
     """
     choose("unboxed", name, HANDLING)
-    return (
-        partial(remove_unboxed, model=model)
-        if name == "close" and model is not None
-        else HANDLING[name]
-    )
+    if name == "close" and model is not None:
+        return partial(remove_unboxed, model=model)
+    return HANDLING[name]
 
 
 def _outside(scan: Scan, classes: Iterable[int]) -> NDArray[np.bool_]:

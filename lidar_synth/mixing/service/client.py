@@ -44,9 +44,8 @@ class Client:
         self.timeout = timeout
         self._slots = slots
         self._secret = plan.secret
-        self._connections: dict[
-            tuple[int, int], Connection
-        ] = {}  # by process and thread
+        # by process and thread
+        self._connections: dict[tuple[int, int], Connection] = {}
         context = get_context("spawn")
         started, end = context.Pipe(duplex=False)
         self._process = context.Process(
@@ -54,7 +53,8 @@ class Client:
         )
         self._process.start()
         end.close()
-        self._owner, self.pid = os.getpid(), self._process.pid or 0
+        self._owner = os.getpid()
+        self.pid = self._process.pid or 0
         self._end = weakref.finalize(self, _end, self._process, self._owner)
         self._address = self._await_address(started)
 

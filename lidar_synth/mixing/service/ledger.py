@@ -179,11 +179,9 @@ class Ledger:
             yield slot
 
     def _use(self, slot: Slot) -> float:
-        return (
-            self._outlook.next_use(slot.number, slot.served)
-            if slot.number >= 0
-            else NEVER
-        )
+        if slot.number >= 0:
+            return self._outlook.next_use(slot.number, slot.served)
+        return NEVER
 
     def _room(self, use: float) -> Slot | None:
         """The slot to overwrite for a scan with this use: the oldest that is not needed, or the one

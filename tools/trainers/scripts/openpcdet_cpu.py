@@ -122,7 +122,8 @@ class Overlaps:
         count = 0
         for i in range(len(boxes)):
             if left[i]:
-                keep[count], count = i, count + 1
+                keep[count] = i
+                count = count + 1
                 left &= ~near[i]
         return count
 

@@ -106,7 +106,8 @@ def _strides(
     first = [(1, 4)] * max(0, (columns - rows + 1) // 2)
     columns -= 2 * len(first)
     while columns < 0:
-        first[-1], columns = (1, 2), columns + 1
+        first[-1] = (1, 2)
+        columns = columns + 1
     return first + [
         (1 + (i < rows), 1 + (i < columns)) for i in range(max(rows, columns))
     ]

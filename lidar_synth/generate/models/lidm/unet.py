@@ -249,11 +249,9 @@ class UNet(Network):
         )
         if cond is None:
             return y, None
-        return (
-            (torch.cat((y, cond.to(y.dtype)), 1), None)
-            if self.condition_channels
-            else (y, cond.to(dtype))
-        )
+        if self.condition_channels:
+            return (torch.cat((y, cond.to(y.dtype)), 1), None)
+        return (y, cond.to(dtype))
 
 
 class Downsample(nn.Module):

@@ -178,13 +178,11 @@ class VQVAE(Autoencoder):
             self.shift
         )
         output = self._decode(self.codebook(z)[0])
-        return (
-            torch.where(
+        if self.mask:
+            return torch.where(
                 output[:, self.channels :] < 0, -1.0, output[:, : self.channels]
             )
-            if self.mask
-            else output
-        )
+        return output
 
     def forward(self, x: Tensor) -> Reconstruction:
         """Encode and decode images (B, C, H, W).

@@ -122,7 +122,9 @@ class SurfaceAutoencoder(BoundedAutoencoder):
         """Random numbers per cell that sampling an image takes."""
         self.widths = tuple(self.resolution[1] // merged for merged in (1, 2))
         """Columns that images can be decoded to."""
-        cells, rows, (outer, inner) = PATCH[0] * PATCH[1], self.resolution[0], widths
+        cells = PATCH[0] * PATCH[1]
+        rows = self.resolution[0]
+        outer, inner = widths
         # Not a convolution: oneDNN's with this kernel and stride gives wrong values in bfloat16
         # (torch 2.13).
         stem = nn.Linear((channels + 1) * cells, encoder_widths[0])
@@ -143,7 +145,8 @@ class SurfaceAutoencoder(BoundedAutoencoder):
                 surfaces, -1
             )
             start[:, 0] = torch.linspace(1.2, 4.0, surfaces + 2)[1:-1]
-            start[:, 3], start[:, 6] = -3, -1.5
+            start[:, 3] = -3
+            start[:, 6] = -1.5
         # As ``measure_noise`` finds them in scans.
         self.register_buffer("roughness", torch.full((codes,), 0.1))
         self.register_buffer("relief", torch.zeros(codes, len(SPANS)))

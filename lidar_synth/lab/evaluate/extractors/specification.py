@@ -73,11 +73,9 @@ class ExtractorSpec(NamedTuple):
         None without."""
         named = os.environ.get(FOLDER_VARIABLE)
         folder = folder or (Path(named) if named else None)
-        return (
-            next((p for p in self.paths(folder) if p.exists()), None)
-            if folder
-            else None
-        )
+        if folder:
+            return next((p for p in self.paths(folder) if p.exists()), None)
+        return None
 
     def is_published(self, path: Path) -> bool:
         """Whether a file has the hash of the published one."""

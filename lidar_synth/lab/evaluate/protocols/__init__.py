@@ -181,11 +181,9 @@ class Protocol(_Data):
     def limit(self) -> int | None:
         """Most real scans that any figure without features takes; None = all."""
         taken = [m.real for m in self.measures.values() if m.kind != FEATURES]
-        return (
-            None
-            if None in taken
-            else max((t for t in taken if t is not None), default=None)
-        )
+        if None in taken:
+            return None
+        return max((t for t in taken if t is not None), default=None)
 
 
 def alike(a: Sensor, b: Sensor) -> bool:

@@ -55,7 +55,9 @@ def group_points(points: Tensor, grid: PillarGrid, most: int | None = None) -> P
     place, pillar = flat.unique(return_inverse=True)  # type: ignore[no-untyped-call]
     if most is not None:
         kept = _rank(pillar) < most
-        points, cells, pillar = points[kept], cells[kept], pillar[kept]
+        points = points[kept]
+        cells = cells[kept]
+        pillar = pillar[kept]
     count = pillar.bincount(minlength=len(place))
     xyz = points[:, :3]
     mean = xyz.new_zeros(len(place), 3).index_add_(0, pillar, xyz) / count[:, None]
@@ -159,7 +161,8 @@ def suppress(
     left = np.argsort(-scores, kind="stable")[:before]
     kept: list[int] = []
     while len(left) and len(kept) < after:
-        best, left = left[0], left[1:]
+        best = left[0]
+        left = left[1:]
         kept.append(int(best))
         left = left[footprint_ious(boxes[[best]], boxes[left])[0] <= common]
     return kept

@@ -211,7 +211,8 @@ class Skin:
         uniform: Floats,
     ) -> Dressed:
         """``apply`` with features and random numbers (N,) that are at hand."""
-        a, (mean, residual, distance) = self.arrays, self._maps
+        a = self.arrays
+        mean, residual, distance = self._maps
         cuts = np.ascontiguousarray(a["mean_town"][:, _part_quantiles()])
         return Dressed(
             *_dress(

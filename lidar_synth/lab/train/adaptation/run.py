@@ -18,9 +18,14 @@ from lidar_synth.generate.checkpoint import (
 )
 from lidar_synth.generate.codec import Latent
 from lidar_synth.generate.loading import find_model
-from lidar_synth.generate.regrid import attach_codec, check_movable, fit_grid, regrid
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.train.adaptation.card import figures, provenance_of, write_card
+from lidar_synth.lab.train.adaptation.regrid import (
+    attach_codec,
+    check_movable,
+    fit_grid,
+    regrid,
+)
 from lidar_synth.lab.train.adaptation.scans import Split, label, prepare, split
 from lidar_synth.lab.train.adaptation.stages import (
     AdaptationStage,
@@ -73,7 +78,8 @@ class AdaptPlan:
 
     def __str__(self) -> str:
         """The plan in words."""
-        own, (rows, columns) = self.source.sensor, self.sensor.shape
+        own = self.source.sensor
+        rows, columns = self.sensor.shape
         budgets = StagedRuns(self.work, shares(self.stages)).budgets(self.minutes)
         lines = [
             f"{self.name} -> {self.out}",

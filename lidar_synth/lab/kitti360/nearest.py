@@ -292,11 +292,9 @@ def _count_votes(  # type: ignore[no-untyped-def]
                     plain += near
                     weight += confidence[found[i, b]] * near
             if a == 0 or weight > best:
-                best, value[i], trust[i], distance[i] = (
-                    weight,
-                    own,
-                    weight / plain,
-                    np.sqrt(squared[i, a]),
-                )
+                best = weight
+                value[i] = own
+                trust[i] = weight / plain
+                distance[i] = np.sqrt(squared[i, a])
         if total > 0:
             share[i] = best / total

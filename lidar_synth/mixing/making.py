@@ -1,0 +1,117 @@
+"""How a scan becomes a sample of a mixture: sensor, label policy, augmentation, trainer's form."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidar_synth.geometry.scan import POINT_FIELDS, REAL, Scan
+from lidar_synth.geometry.sensor import Sensor, load_sensor
+from lidar_synth.labels.own import KeepBoxes, RemoveLabels
+from lidar_synth.labels.policies import LabelPolicy, Labels, make_policy
+from lidar_synth.mixing.items import copy_scan
+from lidar_synth.mixing.notices import Notices
+
+if TYPE_CHECKING:
+    from lidar_synth.geometry.transfer import Transfer
+
+ToSample = Callable[[Scan, np.random.Generator], Any]
+"""Makes a sample from a scan; the random generator is keyed by (seed, epoch, position)."""
+
+
+class SampleMaker:
+    """Makes the samples of a mixture from its scans.
+
+    Args:
+        sources: the synthetic sources.
+        scans: the real scans that label policies and augmentations may draw from, or None.
+        transfer: turns synthetic scans into scans of another sensor, or None.
+        labels, unboxed, augment, augment_real, to_sample: as for ``MixedScans``.
+        images: whether batches are range images.
+
+    Attributes:
+        removes_labels: whether synthetic scans have no labels.
+
+    Raises:
+        ConfigError: on a policy that a source cannot support.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Any],
+        scans: Any,
+        transfer: "Transfer | None",
+        labels: Labels,
+        unboxed: str | Callable[[Scan], Scan],
+        augment: Any,
+        augment_real: bool,
+        to_sample: ToSample,
+        *,
+        images: bool,
+    ) -> None:
+        rings = frozenset() if transfer is None else frozenset({"ring"})
+        fields = [source.fields | rings for source in sources]
+        self._transfer = transfer
+        self._policies = [make_policy(labels, real=scans, fields=f) for f in fields]
+        policies = set(map(type, self._policies))
+        self.removes_labels = RemoveLabels in policies
+        self._notices = Notices(images, KeepBoxes in policies)
+        self._without_unboxed = _make_handling(unboxed)
+        common = frozenset({*POINT_FIELDS, "boxes"}).intersection(*fields)
+        self._augment = _make_augment(augment, scans, common)
+        self._augment_real = augment_real
+        self._to_sample = to_sample
+
+    def real(self, scan: Scan, rng: np.random.Generator) -> Any:
+        """The sample of a real scan."""
+        if scan.domain != REAL:  # scans of the town, for instance, count as real here
+            scan = replace(scan, domain=REAL)
+        self._notices.real(scan)
+        scan = copy_scan(scan)  # a source may keep its scans in memory
+        if self._augment is not None and self._augment_real:
+            scan = self._augment(scan, rng)
+        return self._to_sample(scan, rng)
+
+    def synthetic(self, source: int, scan: Scan, rng: np.random.Generator) -> Any:
+        """The sample of a scan of a synthetic source, given by its number."""
+        scan = copy_scan(scan) if self._transfer is None else self._transfer(scan, rng)
+        given = scan
+        if scan.boxes is not None:  # before labels of low confidence are ignored
+            scan = self._without_unboxed(scan)
+        scan = self._policies[source](scan, rng)
+        self._notices.synthetic(given, scan)
+        if scan.boxes is not None:
+            scan = self._without_unboxed(scan)
+        if self._augment is not None:
+            scan = self._augment(scan, rng)
+        return self._to_sample(scan, rng)
+
+
+def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
+    """The transfer to a sensor; None if none is given."""
+    # only where a mixture turns its scans
+    from lidar_synth.geometry.transfer import Transfer
+
+    if given is None or isinstance(given, Transfer):
+        return given
+    return Transfer(load_sensor(given))
+
+
+def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy | None:
+    """The augmentation of scans that all have ``fields``; None without one."""
+    if given is None:
+        return None
+    # It loads the corruptions.
+    from lidar_synth.labels.compose import make_augmentation
+
+    return make_augmentation(given, scans, fields)
+
+
+def _make_handling(given: str | Callable[[Scan], Scan]) -> Callable[[Scan], Scan]:
+    if not isinstance(given, str):
+        return given
+    from lidar_synth.labels.edit.unboxed import make_handling  # loads networks
+
+    return make_handling(given)
