@@ -54,9 +54,8 @@ TESTS = (
 
 def lowest() -> dict[str, str]:
     """{distribution: lowest version} of pyproject.toml."""
-    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
-        "dependencies"
-    ]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = project["dependencies"]
     found = [re.match(r"([\w-]+)>=([\d.]+)", text) for text in declared]
     assert all(found), declared
     return {match[1]: match[2] for match in found if match}

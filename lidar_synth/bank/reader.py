@@ -147,9 +147,8 @@ class Bank:
 
     def facts_of(self, number: int) -> Facts:
         """The facts of the source that a scan comes from."""
-        return self.index.sources[
-            self.index.shards[_place(self.index, number)[0]].source
-        ]
+        shard, _ = _place(self.index, number)
+        return self.index.sources[self.index.shards[shard].source]
 
     def condition(self, number: int) -> str | None:
         """The name of the scan that conditioned scan ``number``; None for an unconditional one."""

@@ -297,9 +297,8 @@ class RangedFile(io.RawIOBase):
         size = min(len(buffer), max(self._file.size - self._position, 0))
         for first, content in self._spans:
             if first <= start and start + size <= first + len(content):
-                buffer[:size] = memoryview(content)[
-                    start - first : start - first + size
-                ]
+                offset = start - first
+                buffer[:size] = memoryview(content)[offset : offset + size]
                 break
         else:
             if size:

@@ -226,9 +226,9 @@ def fill_poses(
         if np.linalg.norm(poses[last][:3, 3] - poses[first][:3, 3]) <= STILL:
             share = (frame - first) / (last - first)
             filled[frame] = poses[first if share < 0.5 else last].copy()
-            filled[frame][:3, 3] = (1 - share) * poses[first][:3, 3] + share * poses[
-                last
-            ][:3, 3]
+            start = poses[first][:3, 3]
+            end = poses[last][:3, 3]
+            filled[frame][:3, 3] = (1 - share) * start + share * end
     return filled
 
 

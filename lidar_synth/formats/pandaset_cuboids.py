@@ -84,9 +84,8 @@ def read_cuboids(path: Path, pose: NDArray[np.float64], other_sensor: int) -> Bo
     names = ["Cyclist" if pair == CYCLIST else BOXES[pair[0]] for pair in pairs]
     kept = np.array([name is not None for name in names], bool)
     kept &= table.get("cuboids.sensor_id", np.full(len(labels), -1)) != other_sensor
-    values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)[
-        kept
-    ]
+    values = np.stack([table[name] for name in numbers], axis=-1).astype(np.float64)
+    values = values[kept]
     # PandaSet's yaw turns a box whose length is along y.
     with np.errstate(invalid="ignore"):  # Boxes refuses what is not finite
         heading = (

@@ -159,9 +159,8 @@ class WebDatasetWriter(Writer):
     def finish(self) -> None:
         parts: dict[int, list[Path]] = defaultdict(list)
         for path in sorted((self.root / NOTES).rglob(f"*{SUFFIX}")):
-            parts[
-                int(path.relative_to(self.root / NOTES).parts[0]) // self.shard_size
-            ].append(path)
+            number = int(path.relative_to(self.root / NOTES).parts[0])
+            parts[number // self.shard_size].append(path)
         for number, paths in parts.items():
             shard = self.root / f"scans-{number:06d}{SUFFIX}"
             members = _merge(shard, {self._key_of(path): path for path in paths})

@@ -114,9 +114,8 @@ class Header:
             )
         shape = (self.tensors.size, *self.sensor.shape)
         # The network that takes range images has the grid of the sensor.
-        arguments = self.networks[
-            CODEC if CODEC in self.networks else VELOCITY
-        ].arguments
+        name = CODEC if CODEC in self.networks else VELOCITY
+        arguments = self.networks[name].arguments
         given = (
             arguments.get("channels", shape[0]),
             *arguments.get("resolution", shape[1:]),

@@ -361,9 +361,8 @@ def one_view(image: Tensor, views: int) -> Tensor:
     width = image.shape[3] // views
     kept = views // 2
     out = torch.zeros_like(image)
-    out[..., kept * width : (kept + 1) * width] = image[
-        ..., kept * width : (kept + 1) * width
-    ]
+    view = slice(kept * width, (kept + 1) * width)
+    out[..., view] = image[..., view]
     return out
 
 

@@ -155,9 +155,8 @@ def _shade(picture: Rgb, buffer: NDArray[np.float32], strength: float = 40.0) ->
     for reach in (1, 3):
         padded = np.pad(logs, reach, constant_values=np.inf)
         for dy, dx in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            neighbour = padded[reach + dy :, reach + dx :][
-                : buffer.shape[0], : buffer.shape[1]
-            ]
+            moved = padded[reach + dy :, reach + dx :]
+            neighbour = moved[: buffer.shape[0], : buffer.shape[1]]
             # Steps of more than 2 % in depth all count as edges; an empty neighbour does not
             # darken.
             behind += np.clip(np.where(filled, logs, 0) - neighbour, 0, 0.03)

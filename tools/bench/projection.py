@@ -38,9 +38,8 @@ def random_points(sensor: Sensor, count: int = 120_000) -> np.ndarray:
     distance = rng.uniform(3, 70, len(elevation))
     x = np.cos(azimuth) * np.cos(elevation)
     y = np.sin(azimuth) * np.cos(elevation)
-    return np.c_[
-        np.stack([x, y, np.sin(elevation)], 1) * distance[:, None], rng.random(len(x))
-    ].astype(np.float32)
+    points = np.stack([x, y, np.sin(elevation)], 1) * distance[:, None]
+    return np.c_[points, rng.random(len(x))].astype(np.float32)
 
 
 def sort_and_scatter(

@@ -251,13 +251,10 @@ def _slope(
     ``end``."""
     if steps < 1:
         raise ConfigError(f"{steps} steps of the teacher", "at least 1")
-    weights = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)[
-        :, None
-    ]
+    shares = torch.linspace(0, 1, steps + 1, dtype=start.dtype, device=start.device)
+    times = torch.lerp(start[None], end[None], shares[:, None])
     with torch.no_grad():
-        y_end = solve(
-            teacher, y, torch.lerp(start[None], end[None], weights), "euler", cond
-        )
+        y_end = solve(teacher, y, times, "euler", cond)
         return (y_end - y) / per_sample(end - start, y)
 
 

@@ -87,9 +87,8 @@ def select_known_boxes(scan: Scan) -> Boxes:
     range, of overlapping ones the first, and none around the sensor."""
     assert scan.boxes is not None
     boxes = scan.boxes[np.hypot(*scan.boxes.values[:, :2].T) <= scan.sensor.range_max]
-    boxes = boxes[
-        np.isin(np.array(boxes.names, "U32"), CLASSES) & ~around_sensor(boxes)
-    ]
+    known = np.isin(np.array(boxes.names, "U32"), CLASSES)
+    boxes = boxes[known & ~around_sensor(boxes)]
     later: set[int] = set()
     # in order, so that the first of a pair is kept or dropped already
     for first, second in overlapping_pairs(boxes):

@@ -164,9 +164,8 @@ def _start_candidates(points: NDArray[np.float32]) -> list[NDArray[np.intp]]:
         limits = np.maximum(limits, np.float32(MIN_DECREASE_ALL_AROUND))
     steps = np.empty(count, np.float32)
     steps_at(azimuth, places, STRAYS, steps)
-    candidates = places[
-        (steps > limits) & (azimuth[places - 1] - azimuth[places] > limits)
-    ]
+    back = azimuth[places - 1] - azimuth[places]
+    candidates = places[(steps > limits) & (back > limits)]
     if not len(candidates):
         return []
     return np.split(candidates, np.flatnonzero(np.diff(candidates) > STRAYS) + 1)

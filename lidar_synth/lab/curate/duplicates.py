@@ -52,9 +52,9 @@ def compare_all(
             signatures[first : first + BLOCK].astype(np.float32) for first in (a, b)
         )
         products = later @ earlier.T
-        products[
-            np.arange(a, a + len(later))[:, None] <= np.arange(b, b + len(earlier))
-        ] = -1
+        rows = np.arange(a, a + len(later))
+        columns = np.arange(b, b + len(earlier))
+        products[rows[:, None] <= columns] = -1
         found = products.argmax(1)
         similarity = products[np.arange(len(later)), found].clip(max=1)
         better = similarity > np.where(

@@ -156,9 +156,8 @@ def _nearest(sketches: NDArray[np.int8], steps: "tqdm[Any]") -> NDArray[np.int32
     """(N, CANDIDATES) numbers of the nearest earlier sketches, -1 where there are fewer."""
     count = len(sketches)
     cells = min(count, int(CELLS_PER_ROOT * count**0.5) + 1)
-    centres = sketches[
-        np.sort(keyed_rng(count, cells).choice(count, cells, replace=False))
-    ]
+    chosen = keyed_rng(count, cells).choice(count, cells, replace=False)
+    centres = sketches[np.sort(chosen)]
     probes = np.empty((count, min(PROBES, cells)), np.min_scalar_type(cells))
     for part in _parts(count, PAIRS // cells + 1):
         keys = _keys(sketches[part], centres, np.arange(cells))

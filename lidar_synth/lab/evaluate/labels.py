@@ -53,9 +53,8 @@ def class_histogram(
             f"scan {scan.id!r} with no labelled return from {near:g} m to {far:g} m",
             "labelled returns",
         )
-    index = (scan.label[kept].astype(np.int64) * bins + cell[kept, 0]) * bins + cell[
-        kept, 1
-    ]
+    row, column = cell[kept].T
+    index = (scan.label[kept].astype(np.int64) * bins + row) * bins + column
     where, amounts = np.unique(index, return_counts=True)
     return Sparse(where.astype(np.int32), amounts.astype(np.uint16))
 

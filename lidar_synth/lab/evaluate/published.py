@@ -47,9 +47,8 @@ def read_published() -> tuple[tuple[PublishedTable, ...], Mapping[str, str]]:
         .read_text(encoding="utf-8")
     )
     values = yaml.safe_load(text)
-    return tuple(PublishedTable(**table) for table in values["tables"]), values[
-        "sources"
-    ]
+    tables = tuple(PublishedTable(**table) for table in values["tables"])
+    return tables, values["sources"]
 
 
 def compare_published(scores: Sequence[Score]) -> str:

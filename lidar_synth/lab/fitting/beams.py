@@ -180,9 +180,8 @@ def rings_in_order(points: NDArray[np.float32]) -> NDArray[np.int16] | None:
             np.float64
         )
     )
-    middle = np.sort([np.median(part) for part in np.split(elevation, bounds[1:-1])])[
-        ::-1
-    ]
+    parts = np.split(elevation, bounds[1:-1])
+    middle = np.sort([np.median(part) for part in parts])[::-1]
     try:
         lasers = Sensor("rings", 2, 0.0, 1.0, elevations=tuple(middle))
     except ConfigError:  # two rings with the same elevation

@@ -129,13 +129,11 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
     the grid."""
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
     part = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-    dense = points[
-        (part * _NARROW / 2).astype(np.int64) % max(len(points) // GRID_POINTS, 1) == 0
-    ]
+    every = max(len(points) // GRID_POINTS, 1)
+    dense = points[(part * _NARROW / 2).astype(np.int64) % every == 0]
     if len(points) > POINTS:
-        points = points[
-            np.random.default_rng(seed).choice(len(points), POINTS, replace=False)
-        ]
+        rng = np.random.default_rng(seed)
+        points = points[rng.choice(len(points), POINTS, replace=False)]
     best = FLAT
     found = np.zeros(5)
     for start in _best_on_grid(dense, starts):
@@ -221,9 +219,8 @@ def _best_on_grid(points: Floats, count: int) -> list[Floats]:
         np.array(place)
         for place in itertools.product(sides, sides, heights, tilts, tilts)
     ]
-    return sorted(places, key=lambda place: -sector_sharpness(points, place, _NARROW))[
-        :count
-    ]
+    places = sorted(places, key=lambda at: -sector_sharpness(points, at, _NARROW))
+    return places[:count]
 
 
 def climb(

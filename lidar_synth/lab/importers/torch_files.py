@@ -239,9 +239,8 @@ class _Plain:
         if name == "torch._tensor._rebuild_from_type_v2":
             return self.value(Call(_text_of(call.args[0]), call.args[2]), level)
         if name in _NUMBERS:
-            return np.frombuffer(bytes_of(call.args[1]), dtype_of(call.args[0]))[
-                0
-            ].item()
+            content = bytes_of(call.args[1])
+            return np.frombuffer(content, dtype_of(call.args[0]))[0].item()
         # its state is no part of its items; Python 2 lists the items
         if name == "collections.OrderedDict":
             pairs = dict(call.args[0]) if call.args else {}

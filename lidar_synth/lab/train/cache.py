@@ -197,6 +197,5 @@ def cache_latents(
         return {"latents": made.float().cpu().numpy().astype(np.float16)}
 
     facts = {"codec": codec_hash}
-    return make_arrays(layout, make, "latents", place, facts, ranks, progress)[
-        "latents"
-    ]
+    arrays = make_arrays(layout, make, "latents", place, facts, ranks, progress)
+    return arrays["latents"]

@@ -130,9 +130,9 @@ class Overlaps:
     def areas(self, boxes: Any, others: Any, out: Any) -> None:
         """Fill (N, M) with the areas of intersection in square metres."""
         ratio = self.ratios(boxes, others)
-        both = (boxes[:, 3] * boxes[:, 4])[:, None] + (others[:, 3] * others[:, 4])[
-            None
-        ]
+        ours = boxes[:, 3] * boxes[:, 4]
+        theirs = others[:, 3] * others[:, 4]
+        both = ours[:, None] + theirs
         out.copy_(ratio * both / (1 + ratio))
 
 

@@ -257,9 +257,8 @@ def surfaces_of(
     parts = each.reshape(len(x), surfaces + PER_CELL, -1, merged).unbind(3)
     each = torch.stack(parts).mean(0) if merged > 1 else parts[0]
     choice, offsets = torch.split(each, [surfaces, PER_CELL], 1)
-    distance, down, across, spread, returned, median, dim, blank = numbers[
-        ..., None
-    ].unbind(2)
+    described = numbers[..., None].unbind(2)
+    distance, down, across, spread, returned, median, dim, blank = described
     cell = torch.arange(each.shape[2], device=x.device)
     columns = columns // merged
     i = cell // columns - (rows - 1) / 2

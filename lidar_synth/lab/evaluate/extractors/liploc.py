@@ -37,9 +37,9 @@ def picture(depth: Tensor) -> Tensor:
     resized = F.interpolate(
         grey[None, None], (SIZE, SIZE), mode="bilinear", antialias=True
     )[0]
-    return (resized - torch.tensor(MEAN)[:, None, None]) / torch.tensor(DEVIATION)[
-        :, None, None
-    ]
+    mean = torch.tensor(MEAN)[:, None, None]
+    deviation = torch.tensor(DEVIATION)[:, None, None]
+    return (resized - mean) / deviation
 
 
 def _load_state(network: nn.Module, content: Any, where: str) -> None:

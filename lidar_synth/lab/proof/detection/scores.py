@@ -230,7 +230,6 @@ def average_precision(
     if not boxes:
         return float("nan")
     right = np.cumsum(hits[np.argsort(-confidence, kind="stable")])
-    precision = np.maximum.accumulate((right / np.arange(1, len(right) + 1))[::-1])[
-        ::-1
-    ]
+    exact = right / np.arange(1, len(right) + 1)
+    precision = np.maximum.accumulate(exact[::-1])[::-1]
     return float((precision * np.diff(right, prepend=0)).sum() / boxes)
