@@ -7,7 +7,7 @@ ground by a plane ``a x + b y + c z + d = 0`` in the rectified camera frame, who
 
 import pickle
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -188,49 +188,55 @@ def write_gt_database(
     """
     root = Path(root)
     found = dict[str, list[dict[str, Any]]]()
-    nuscenes = layout == "nuscenes"
-    shown = replace(objects.boxes, occlusion=objects.boxes.occlusion.clip(min=0))
-    level = np.zeros(len(shown), np.int32) if nuscenes else difficulty(shown)
-    names = (
-        nuscenes_names(objects.boxes.names, "the bank of objects")
-        if nuscenes
-        else objects.boxes.names
-    )
-    boxes = (turned_boxes(objects.boxes) if nuscenes else objects.boxes).values
+    names: Sequence[str | None] = objects.boxes.names
+    if layout == "nuscenes":
+        names = nuscenes_names(objects.boxes.names, "the bank of objects")
+        level = np.zeros(len(objects.boxes), np.int32)
+    else:
+        clipped = objects.boxes.occlusion.clip(min=0)
+        level = difficulty(replace(objects.boxes, occlusion=clipped))
     for i, name in enumerate(names):
         if name is None:
             continue
-        part = slice(objects.start[i], objects.start[i + 1])
-        box = boxes[i].copy()
-        points = objects.points[part].copy()
-        points = turned_points(points) if nuscenes else points
-        if origin == "bottom":
-            box[2] -= box[5] / 2
-            points[:, 2] += box[5] / 2
+        box, values = _gt_object(objects, i, origin, layout)
         scan = re.sub(r"\W+", "_", str(objects.scan[i]))
         path = f"{folder}/{scan}_{name}_{objects.number[i]}.bin"
-        values = [points, objects.reflectance[part]]
-        if nuscenes:
-            values = [
-                points,
-                objects.reflectance[part] * INTENSITY_MAX,
-                np.zeros(len(points), np.float32),
-            ]
-            box = np.append(box, np.zeros(2, np.float32))
-        write_file(root / path, np.column_stack(values).astype("<f4").tobytes())
+        write_file(root / path, values.astype("<f4").tobytes())
         facts = {
             "name": name,
             "path": path,
             "image_idx": scan,
             "gt_idx": int(objects.number[i]),
             "box3d_lidar": box,
-        }
-        facts |= {
-            "num_points_in_gt": len(points),
+            "num_points_in_gt": len(values),
             "difficulty": int(level[i]),
             "group_id": i,
             "score": -1.0,
+            "bbox": objects.boxes.image_box[i],
         }
-        found.setdefault(name, []).append(facts | {"bbox": objects.boxes.image_box[i]})
+        found.setdefault(name, []).append(facts)
     write_file(root / infos, pickle.dumps(found))
     return root / infos
+
+
+def _gt_object(
+    objects: ObjectBank, number: int, origin: Origin, layout: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The box of an object, (7,) or nuScenes' (9,), and the values of its points, (N, 4) or (N, 5),
+    as a trainer's database has them."""
+    part = slice(objects.start[number], objects.start[number + 1])
+    boxes = objects.boxes[[number]]
+    points = objects.points[part].copy()
+    reflectance = objects.reflectance[part]
+    if layout == "nuscenes":
+        boxes = turned_boxes(boxes)
+        points = turned_points(points)
+    box = boxes.values[0].copy()
+    if origin == "bottom":
+        box[2] -= box[5] / 2
+        points[:, 2] += box[5] / 2
+    if layout != "nuscenes":
+        return box, np.column_stack([points, reflectance])
+    time = np.zeros(len(points), np.float32)
+    values = np.column_stack([points, reflectance * INTENSITY_MAX, time])
+    return np.append(box, np.zeros(2, np.float32)), values

@@ -1,9 +1,8 @@
 """Export of a mixture as SemanticKITTI's or KITTI's folders, which every trainer reads.
 
 The folders are complete: labels for every scan (some trainers read a missing ``.label`` as "car"),
-    and for detectors
-label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader and converter read
-them.
+and for detectors label_2, calib, image_2, planes and ImageSets, so that a trainer's stock loader
+and converter read them.
 """
 
 from dataclasses import replace
@@ -84,42 +83,33 @@ def export_mixture(
             **({} if validation is None else {"validation": len(held)}),
         },
     )
-    writer: Writer = (
-        SemanticKITTIWriter(root)
-        if layout == "semantic_kitti"
-        else KITTIObjectWriter(root)
-    )
+    kitti = layout == "kitti"
+    writer: Writer = KITTIObjectWriter(root) if kitti else SemanticKITTIWriter(root)
     rows = [f"frame,domain,id # plan {mixed.plan(epoch).hash}"]
     written = 0
     for position in tqdm(range(count), unit="scan", disable=not progress):
         scan = _sample(mixed, epoch, position)
         rows.append(f"{position:06d},{scan.domain},{scan.id}")
         written += _write(writer, scan, position, camera)
-    first = 0 if layout == "semantic_kitti" else count
-    others: Writer = (
-        SemanticKITTIWriter(root, sequence="08")
-        if layout == "semantic_kitti"
-        else writer
-    )
+    first = count if kitti else 0
+    others = writer if kitti else SemanticKITTIWriter(root, sequence="08")
     for number in tqdm(
         range(len(held)), "validation", unit="scan", disable=not progress
     ):
-        written += _write(
-            others,
-            replace(held[number], id=f"validation {number}"),
-            first + number,
-            camera,
-        )
+        scan = replace(held[number], id=f"validation {number}")
+        written += _write(others, scan, first + number, camera)
     writer.finish()
-    if layout == "kitti" and validation is not None:
-        for split, frames in {
-            "train": range(count),
-            "val": range(count, count + len(held)),
-        }.items():
-            listed = "".join(f"{frame:06d}\n" for frame in frames)
-            write_file(root / "ImageSets" / f"{split}.txt", listed.encode())
+    if kitti and validation is not None:
+        _write_split(root, "train", range(count))
+        _write_split(root, "val", range(count, count + len(held)))
     write_file(root / MANIFEST, "".join(f"{row}\n" for row in rows).encode())
     return written
+
+
+def _write_split(root: Path, split: str, frames: range) -> None:
+    """Write KITTI's list of the frames of a split."""
+    listed = "".join(f"{frame:06d}\n" for frame in frames)
+    write_file(root / "ImageSets" / f"{split}.txt", listed.encode())
 
 
 def _write(writer: Writer, scan: Scan, number: int, camera: Calibration) -> int:

@@ -1,6 +1,6 @@
 """``fit_sensor``: from a few scans to a ``Sensor``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -185,35 +185,30 @@ def _described(
     ring = nearest_beams(points, model.tangents, model.heights)
     off = residuals(points, ring, model.tangents, model.heights)
     usable = np.hypot(points[:, 0], points[:, 1]) > NEAREST
-    _check(model, ring[usable], off[usable])
+    used = ring[usable]
+    _check(model, used, off[usable])
     rows = len(model.tangents)
-    number = np.bincount(ring[usable], minlength=rows)
-    order = np.split(np.argsort(ring[usable], kind="stable"), np.cumsum(number)[:-1])
+    number = np.bincount(used, minlength=rows)
     degrees = np.abs(np.degrees(off))[usable]
-    within = np.array(
-        [np.mean(degrees[part] < CLOSE) if len(part) else 0.0 for part in order]
-    )
+    within = _by_ring(np.mean, degrees < CLOSE, used, number)
     azimuths = _azimuths(scans, cloud, points, ring, rows)
-    distance = np.sqrt(
-        points[:, 0] ** 2
-        + points[:, 1] ** 2
-        + (points[:, 2] - model.heights[ring]) ** 2
-    )
     nearest, farthest = range_limits(np.linalg.norm(points[usable], axis=1))
-    elevations = tuple(np.degrees(np.arctan(model.tangents)).round(4).tolist())
+    step = None
+    if not model.motion.any():
+        starts = np.stack([0 * used, 0 * used, model.heights[used]], 1)
+        step = range_step(np.linalg.norm(points[usable] - starts, axis=1), used, rows)
+    elevations = np.degrees(np.arctan(model.tangents)).round(4)
     sensor = Sensor(
         name=name,
         columns=columns or _columns(azimuths),
         # Other scans can have nearer and farther points than these.
         range_min=min(nearest, 1.0),
         range_max=float(5 * np.ceil(farthest / 5)),
-        elevations=elevations,
+        elevations=tuple(elevations.tolist()),
         heights=tuple(model.heights.round(4).tolist()) if model.heights.any() else None,
         firings=azimuths.firings,
         azimuths=_offsets(azimuths),
-        range_step=None
-        if model.motion.any()
-        else range_step(distance[usable], ring[usable], rows),
+        range_step=step,
         reflectance_levels=reflectance_levels(
             np.concatenate([scan.reflectance for scan in scans])
         ),
@@ -223,12 +218,11 @@ def _described(
     mount[:3, :3] = model.turn
     mount[:3, 3] = model.offset
     splits = np.cumsum([len(scan) for scan in scans])[:-1]
+    near = 1 - float(usable.mean())
     return SensorFit(
         sensor,
         number,
-        spread=np.array(
-            [np.median(degrees[part]) if len(part) else 0.0 for part in order]
-        ),
+        spread=_by_ring(np.median, degrees, used, number),
         within=within,
         mount=mount,
         motion=model.motion,
@@ -238,13 +232,20 @@ def _described(
         azimuths=azimuths,
         rings=tuple(np.split(ring.astype(np.int16), splits)),
         off=tuple(np.split(np.degrees(off).astype(np.float32), splits)),
-        uncertain=tuple(
-            doubts(
-                np.array(elevations), number, within, 1 - float(usable.mean()), azimuths
-            )
-        ),
-        vendor=name_vendor(np.array(elevations), number),
+        uncertain=tuple(doubts(elevations, number, within, near, azimuths)),
+        vendor=name_vendor(elevations, number),
     )
+
+
+def _by_ring(
+    measure: Callable[[NDArray[Any]], Any],
+    values: NDArray[Any],
+    ring: NDArray[np.int64],
+    number: NDArray[np.int64],
+) -> Floats:
+    """(R,) a measure of the values of each ring, which has ``number`` of them; 0 without any."""
+    parts = np.split(values[np.argsort(ring, kind="stable")], np.cumsum(number)[:-1])
+    return np.array([measure(part) if len(part) else 0.0 for part in parts])
 
 
 def _highest_first(model: Model) -> Model:
