@@ -192,13 +192,7 @@ def _instances(boxes: Boxes, seen: Scan, camera: Calibration) -> list[dict[str, 
     for i, name in enumerate(boxes.names):
         label = CLASSES.index(name) if name in CLASSES else -1
         # Place, length, height, width, turn.
-        box = [
-            *floor[i],
-            size[i, 2],
-            size[i, 0],
-            size[i, 1],
-            turn[i],
-        ]
+        box = [*floor[i], size[i, 2], size[i, 0], size[i, 1], turn[i]]
         facts = {
             "bbox": boxes.image_box[i],
             "bbox_label": label,

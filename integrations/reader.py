@@ -46,10 +46,7 @@ TYPES = {
     "boxes": "<i4",
 }
 # Of a scan: class + 1, instance, x, y, z, l, w, h in 0.1 mm, yaw in 10 microradians; 0 = unused.
-BOXES = (
-    256,
-    9,
-)
+BOXES = (256, 9)
 CLASSES = (
     "Car",
     "Van",

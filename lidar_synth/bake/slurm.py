@@ -18,10 +18,7 @@ from lidar_synth.bake.shard import Progress, bake_shard
 from lidar_synth.errors import ConfigError, FileError, LibraryError
 
 # Submitit's default of 5 minutes may be too short for a shard.
-_OPTIONS = {
-    "cluster": "slurm",
-    "timeout_min": 240,
-}
+_OPTIONS = {"cluster": "slurm", "timeout_min": 240}
 _TIMEOUTS = 1000  # how often a job may run out of time and resume
 _POLL = 1  # seconds between two checks of the jobs
 

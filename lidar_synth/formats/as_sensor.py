@@ -151,10 +151,7 @@ def read_transfer(given: Any, scans: Any) -> Any:
     mount = values["mount"]
     numbers = isinstance(mount, list | tuple) and [
         type(v) in (int, float) for v in mount
-    ] == [
-        True,
-        True,
-    ]
+    ] == [True, True]
     if (
         values.keys() != {"sensor", "mount", "like"}
         or not isinstance(values["sensor"], str)

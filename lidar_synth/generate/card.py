@@ -5,11 +5,7 @@ from lidar_synth.files.hub import front_matter
 from lidar_synth.files.markdown import escape_markdown, list_facts
 from lidar_synth.generate.checkpoint import Header
 
-TASKS = {
-    "semantic": "image-to-3d",
-    "camera": "image-to-3d",
-    "layout": "other",
-}
+TASKS = {"semantic": "image-to-3d", "camera": "image-to-3d", "layout": "other"}
 """{condition: the hub's category of the task}; without one, "unconditional-image-generation"."""
 
 

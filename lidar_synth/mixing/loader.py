@@ -38,10 +38,7 @@ class MixedLoader(DataLoader[Any]):
         self._mixed = dataset
         self._batches: MixedBatches = dataset.batches(batch_size, drop_last=drop_last)
         # Its epoch, and number of its batches done.
-        self._pass: tuple[int, int] = (
-            dataset.epoch,
-            0,
-        )
+        self._pass: tuple[int, int] = (dataset.epoch, 0)
         options.setdefault("collate_fn", dataset.collate)
         super().__init__(
             dataset, batch_sampler=self._batches, num_workers=num_workers, **options

@@ -73,13 +73,7 @@ def prepare(
     frame = Path(os.environ.get("LIDAR_SYNTH_REAL_SCANS", "")) / "nuscenes"
     if (frame / "info.json").is_file():
         data += ["--frame", frame]
-    command = [
-        python,
-        SCRIPTS / "mmdet3d_prepare.py",
-        trial.folder,
-        *configs,
-        *data,
-    ]
+    command = [python, SCRIPTS / "mmdet3d_prepare.py", trial.folder, *configs, *data]
     trial.run("prepare", command, env=env)
     shutil.copytree(trial.data.semantic_kitti, trial.folder / "data" / "semantickitti")
     names = {'"bank"': repr(str(trial.data.bank))}

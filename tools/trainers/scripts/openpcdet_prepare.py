@@ -103,10 +103,7 @@ def add_camera(folder: Path) -> None:
         {"token": "camera", "channel": "CAM_FRONT", "modality": "camera"}
     )
     # Z ahead, x right, y down.
-    pose = {
-        "translation": [1.7, 0, 1.5],
-        "rotation": [0.5, -0.5, 0.5, -0.5],
-    }
+    pose = {"translation": [1.7, 0, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5]}
     lens = {"camera_intrinsic": [[1266, 0, 800], [0, 1266, 450], [0, 0, 1]]}
     tables["calibrated_sensor"].append(
         {"token": "camera", "sensor_token": "camera", **pose, **lens}
