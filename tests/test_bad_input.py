@@ -27,12 +27,12 @@ from limits import in_limits, needs_limits
 from lidar_synth.bank import ShardReader
 from lidar_synth.errors import ConfigError, DataError, FileError
 from lidar_synth.files.disk import write_file
+from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.formats import READERS, WRITERS, NuScenes, SemanticKITTI, open_scans
 from lidar_synth.formats.kitti_raw import KITTIRaw
 from lidar_synth.formats.points import read_points
 from lidar_synth.generate.checkpoint import load_checkpoint
 from lidar_synth.lab.evaluate.extractors.archive import Archive
-from lidar_synth.lab.importers.torch_files import load_pickle
 
 RAW = ["kitti360", "semantic_kitti", "kitti_object", "kitti_raw", "folder"]
 """Layouts that hold KITTI's .bin files."""

@@ -173,6 +173,7 @@ def test_every_module_is_imported_by_something() -> None:
 def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
     plugin = {name for name in modules() if not name.startswith("lidar_synth.lab.")}
     assert unused(plugin, ["integrations"]) & plugin == PUBLIC | {
+        "lidar_synth.files.torch_files",  # every parser stands in files
         "lidar_synth.generate.flow.distill",  # the paper's method
         "lidar_synth.generate.flow.timesteps",
         "lidar_synth.geometry.projection.batch",  # for trainers on a GPU
@@ -180,8 +181,8 @@ def test_what_only_the_laboratory_imports_is_part_of_it() -> None:
 
 
 LIMITS = {
-    "plugin": (165_030, 5.95, 130),
-    "laboratory": (138_690, 6.01, 130),
+    "plugin": (166_230, 5.95, 130),
+    "laboratory": (137_470, 6.01, 130),
     "tools": (39_914, 5.8, 130),
 }
 """Most tokens, tokens a code line, and tokens of nine in ten functions, by shelf. Lower them when

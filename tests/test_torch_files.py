@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
-from lidar_synth.lab.importers.torch_files import load_pickle, state_of
+from lidar_synth.files.torch_files import load_pickle, state_of
 
 FORMATS = {"zip": True, "legacy": False}
 """By name: ``_use_new_zipfile_serialization`` of ``torch.save``."""

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from fuzzing.weights import in_order
 from lidar_synth import ObjectBank, Town, load_layout, load_skin
 from lidar_synth.files.parsing import seal
+from lidar_synth.files.torch_files import load_pickle, state_of
 from lidar_synth.generate.checkpoint import load_checkpoint, save_checkpoint
 from lidar_synth.generate.flow.timesteps import TrajectoryCosts
 from lidar_synth.geometry.layout import layout_image
@@ -40,7 +41,6 @@ from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
 from lidar_synth.lab.evaluate.extractors.bonnetal import PARTS, read_segmenter
 from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
 from lidar_synth.lab.importers import IMPORTERS
-from lidar_synth.lab.importers.torch_files import load_pickle, state_of
 from lidar_synth.lab.proof.study import read_outcome, to_values
 from lidar_synth.lab.proof.trial import TrialOutcome
 from lidar_synth.lab.town.skin import skin as skins

@@ -133,7 +133,7 @@ def _place_in(points: Floats, starts: int, seed: int) -> tuple[float, Floats]:
     dense = points[(part * _NARROW / 2).astype(np.int64) % every == 0]
     if len(points) > POINTS:
         rng = np.random.default_rng(seed)
-        points = points[rng.choice(len(points), POINTS, replace=False)]
+        points = rng.choice(points, POINTS, replace=False)
     best = FLAT
     found = np.zeros(5)
     for start in _best_on_grid(dense, starts):

@@ -37,6 +37,7 @@ from lidar_synth.datasets.recordings import (
 from lidar_synth.errors import ConfigError, DataError
 from lidar_synth.files.disk import sha256
 from lidar_synth.files.parsing import read_yaml
+from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.generate.checkpoint import (
     CODEC,
     ENCODER,
@@ -50,7 +51,6 @@ from lidar_synth.generate.models.lidm.diffusion import schedule_times
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
 from lidar_synth.lab.importers.lidm_names import COND_STAGE, UNET, UNET_EMA, peer_names
-from lidar_synth.lab.importers.torch_files import MISFITS, load_pickle, state_of
 
 STEPS = 50
 """Steps of the checkpoint's uniform time grid: LiDM samples in 50."""

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.efficient_unet import LIMIT, PREDICTIONS
 from lidar_synth.generate.models.positions import BASES
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.lab.importers.r2flow import check_octaves, describe_source, sensor_of
-from lidar_synth.lab.importers.torch_files import MISFITS, load_pickle, state_of
 
 STEPS = 256
 """Steps of the checkpoint's time grid."""

@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from lidar_synth.datasets.recordings import KITTI360, KITTI360_SPLITS, all_frames
 from lidar_synth.errors import DataError
 from lidar_synth.files.disk import sha256
+from lidar_synth.files.torch_files import MISFITS, load_pickle, state_of
 from lidar_synth.generate.checkpoint import VELOCITY, Header, NetworkSpec
 from lidar_synth.generate.flow.solvers import uniform_grid
 from lidar_synth.generate.models import assemble
 from lidar_synth.generate.models.positions import BASES, LEARNED
 from lidar_synth.geometry.normalize import Normalisation
 from lidar_synth.geometry.sensor import Sensor, presets
-from lidar_synth.lab.importers.torch_files import MISFITS, load_pickle, state_of
 
 HEADS = (2, 4, 8, 16)
 MAPPING_DEPTH = 2

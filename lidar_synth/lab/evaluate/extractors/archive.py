@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lidar_synth.errors import DataError, FileError, LidarSynthError
 from lidar_synth.files.disk import read_file
 from lidar_synth.files.parsing import LONGEST_YAML, TarMember, parse_yaml
-from lidar_synth.lab.importers.torch_files import unpickle
+from lidar_synth.files.torch_files import unpickle
 
 MOST_BYTES = 2 << 30
 """Maximum size of a file of an archive."""

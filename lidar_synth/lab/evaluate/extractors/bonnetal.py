@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_synth.errors import ConfigError
+from lidar_synth.files.torch_files import MISFITS
 from lidar_synth.geometry.scan import Scan
 from lidar_synth.geometry.sensor import Sensor
 from lidar_synth.lab.evaluate.extractors.archive import Archive, load_weights
@@ -27,7 +28,6 @@ from lidar_synth.lab.evaluate.extractors.inputs import (
 from lidar_synth.lab.evaluate.extractors.per_scan import PerScan, some
 from lidar_synth.lab.evaluate.extractors.pooling import mean_over_bands, subsample
 from lidar_synth.lab.evaluate.extractors.squeezeseg import SqueezeSeg
-from lidar_synth.lab.importers.torch_files import MISFITS
 
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head")
 OWN_GRID = "bonnetal"

@@ -9,9 +9,9 @@ import numpy as np
 from tqdm import tqdm
 
 from lidar_synth.errors import DataError
+from lidar_synth.files.torch_files import load_pickle
 from lidar_synth.geometry.scan import Scan, Source
 from lidar_synth.lab.evaluate.extractors.archive import load_weights
-from lidar_synth.lab.importers.torch_files import load_pickle
 from lidar_synth.lab.proof.detection.bev import Found
 from lidar_synth.lab.proof.detection.boxes import (
     CLASSES,

@@ -83,8 +83,8 @@ def find_features(
         sensor: whose firings give the distance between neighbours.
     """
     firings = sensor.firings or sensor.columns
-    per_radian = np.float32(firings / (2 * np.pi))
-    turn = np.arctan2(points[:, 1], points[:, 0]) * per_radian
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    turn = azimuth * np.float32(firings / (2 * np.pi))
     level = np.hypot(points[:, 0], points[:, 1])
     distance = np.sqrt(np.einsum("ij,ij->i", points, points))
     rows = np.ascontiguousarray(ring, np.int32)
@@ -92,24 +92,11 @@ def find_features(
     mean, residual, gap = _along(
         rows, turn, distance, np.ascontiguousarray(reflectance, np.float32), firings
     )
-    kind, below = _across(
-        rows,
-        turn,
-        distance,
-        level,
-        z,
-        sensor.shape[0],
-        firings,
-    )
+    height = sensor.shape[0]
+    kind, below = _across(rows, turn, distance, level, z, height, firings)
     cell = _cells(distance, kind, z - ground_height(z, level, kind))
-    return RayFeatures(
-        mean,
-        residual,
-        _roughness(rows, residual),
-        cell,
-        below,
-        gap,
-    )
+    rough = _roughness(rows, residual)
+    return RayFeatures(mean, residual, rough, cell, below, gap)
 
 
 def ground_height(z: Floats, level: Floats, kind: Ints) -> np.float32:
