@@ -5,9 +5,8 @@
         --config_path config/mixed.yaml
 
 with ``pc_dataset_type: "SemKITTI_mixed"`` in that configuration. Cylinder3D rotates points in
-    place, so that every
-sample is a copy. It does not call ``set_epoch``, so that the launcher replaces its loader by one
-that does. It counts epochs from 0 also when it starts from saved weights.
+place, so that every sample is a copy. It does not call ``set_epoch``, so that the launcher replaces
+its loader by one that does. It counts epochs from 0 also when it starts from saved weights.
 """
 
 from functools import cache

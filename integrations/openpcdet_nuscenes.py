@@ -19,9 +19,8 @@ class MixedNuScenes(MixedDetection, NuScenesDataset):  # type: ignore[misc]
     """nuScenes mixed with synthetic scans at the ratio of its settings, see ``MixedDetection``.
 
     A synthetic scan becomes what OpenPCDet makes of the first key frame of a scene, which has no
-        earlier sweeps: the
-    scan itself in place of each, at time 0. The velocity of its boxes is unknown, which nuScenes
-    writes as NaN.
+    earlier sweeps: the scan itself in place of each, at time 0. The velocity of its boxes is
+    unknown, which nuScenes writes as NaN.
     """
 
     def __init__(

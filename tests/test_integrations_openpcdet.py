@@ -4,7 +4,7 @@
 is a checkout.
 
 It need not be built: ``openpcdet_cpu`` compiles what OpenPCDet has for a CPU, and says what these
-    tests do not show.
+tests do not show.
 """
 
 import importlib
@@ -438,7 +438,7 @@ def test_its_own_script_trains_evaluates_and_resumes_from_our_launcher(
     middle of an epoch.
 
     This does not show: OpenPCDet's GPU kernels of the overlaps of boxes, of which those for a CPU
-        are used.
+    are used.
     """
     arguments = small(made, tmp_path)
     batches, said = trained(tmp_path, tmp_path / "whole", arguments)

@@ -329,7 +329,7 @@ def test_its_own_script_trains_evaluates_and_resumes_with_the_hook_first(
     the start of one.
 
     This does not show: pointops and pointgroup_ops, which SparseUNet does not use, and mixed
-        precision.
+    precision.
     """
     values = {"stock": str(STOCK), "epochs": 3}
     said = train(made, SEGMENTATION, tmp_path, **values)
@@ -362,7 +362,7 @@ def test_sonata_pretrains_on_scans_without_labels(made: Path, tmp_path: Path) ->
     """Its stock configuration with the data of ours and a smaller network.
 
     This does not show: flash attention, and pointops, for which tools/stand_ins has a function of
-        torch.
+    torch.
     """
     values = {
         "synthetic": str(synthetic(tmp_path / "bare", 2 * REAL, labels=False)),

@@ -4,10 +4,9 @@ is returned.
     python tools/damage_bank.py [--model town] [--flips 1000] [--cuts 200]
 
 Random bits are flipped and the file is truncated at random lengths. After each damage all scans are
-    read twice: through
-the index, and from the shard alone, without the size and hash of the index. Every scan that a
-reader returns has to equal the one that was written, and ``verify`` has to find all damage. At the
-end ``repair`` generates the shard again.
+read twice: through the index, and from the shard alone, without the size and hash of the index.
+Every scan that a reader returns has to equal the one that was written, and ``verify`` has to find
+all damage. At the end ``repair`` generates the shard again.
 """
 
 import sys

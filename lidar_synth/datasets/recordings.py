@@ -2,11 +2,10 @@
 
 A frame is identified by dataset, drive and number. Names of splits are not sufficient: the training
 data of LiDM (``lidm/train``) and the test data of R2Flow (``r2flow/test``) share two drives of
-KITTI-360. Neither are names of
-datasets: the sequences of SemanticKITTI are those of KITTI's odometry benchmark, which are parts of
-    KITTI's raw
-drives. Both are therefore represented as raw drives, by the table in the odometry devkit's readme
-(``ODOMETRY``). KITTI-360 was recorded two years later and has no frames in common with them.
+KITTI-360. Neither are names of datasets: the sequences of SemanticKITTI are those of KITTI's
+odometry benchmark, which are parts of KITTI's raw drives. Both are therefore represented as raw
+drives, by the table in the odometry devkit's readme (``ODOMETRY``). KITTI-360 was recorded two
+years later and has no frames in common with them.
 
 KITTI's object set was also sampled from the raw drives, in random order. Only its devkit (mapping/)
 contains the mapping, so that the object set counts as a dataset of its own.

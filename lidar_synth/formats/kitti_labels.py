@@ -134,8 +134,7 @@ def write_label_2(path: Path, boxes: Boxes, camera: Calibration) -> None:
     which boxes are listed.
 
     An unknown alpha is computed: rotation_y minus the direction of the box from the *sensor*. (The
-        devkit says the
-    camera, but KITTI's own files agree with the sensor, up to rounding.)
+    devkit says the camera, but KITTI's own files agree with the sensor, up to rounding.)
 
     Raises:
         FileError: if it cannot be written.

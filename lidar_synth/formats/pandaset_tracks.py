@@ -24,11 +24,10 @@ def _mounts() -> dict[str, Matrix]:
     up)}.
 
     Pandar64: fitted on frame 002/00, where the vehicle stands, such that elevations lie on the
-        beams: at (0.001,
-    0.7752, 1.8589) m, Rx(-0.0157) Ry(0.0005) rad from the poses' frame. PandarGT: parallel to the
-    Pandar64, 0.562 m ahead of it and 0.282 m below, fitted on 002/00 and 002/40 such that its lines
-    of points stay straight where the range jumps (by PandaSet's own calibration 0.606 m and 0.302
-    m).
+    beams: at (0.001, 0.7752, 1.8589) m, Rx(-0.0157) Ry(0.0005) rad from the poses' frame. PandarGT:
+    parallel to the Pandar64, 0.562 m ahead of it and 0.282 m below, fitted on 002/00 and 002/40
+    such that its lines of points stay straight where the range jumps (by PandaSet's own calibration
+    0.606 m and 0.302 m).
     """
     about_x = -0.0157
     about_y = 0.0005

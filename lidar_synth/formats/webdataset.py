@@ -45,7 +45,7 @@ from lidar_synth.formats.calibration import Calibration
 from lidar_synth.formats.npz import decode_scan
 from lidar_synth.formats.points import check_scan
 from lidar_synth.formats.source import OnBad, ScanFiles
-from lidar_synth.formats.writer import DETAILS, NOTES, Writer, clear_notes
+from lidar_synth.formats.writer import DETAILS, NOTES, FileWriter, clear_notes
 from lidar_synth.geometry.scan import Boxes, Scan
 from lidar_synth.geometry.sensor import Sensor
 
@@ -98,7 +98,7 @@ class WebDataset(ScanFiles):
         return _decode(*self._places[index], self._given)
 
 
-class WebDatasetWriter(Writer):
+class WebDatasetWriter(FileWriter):
     """Writes WebDataset's .tar files. Each scan is written to a file of its own; ``finish`` merges
     them in order.
 

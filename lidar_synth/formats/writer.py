@@ -172,6 +172,7 @@ class Writer(ABC):
             if name not in self.keeps and getattr(scan, name) is not None
         ]
 
+    @abstractmethod
     def _put(
         self,
         scan: Scan,
@@ -180,11 +181,6 @@ class Writer(ABC):
         camera: Calibration | None,
     ) -> None:
         """Write the files of a scan, ``path`` last."""
-        self._write_file(path, scan)
-
-    def _write_file(self, path: Path, scan: Scan) -> None:
-        """Write a scan into one file, without picture and camera."""
-        raise NotImplementedError
 
     def complete(self, index: int, name: str | None = None) -> bool:
         """Whether the scan has already been written completely."""
@@ -207,12 +203,26 @@ class Writer(ABC):
 
 
 class FileWriter(Writer):
-    """A writer of one file per scan, ``<name><suffix>`` under the output folder."""
+    """A writer of one file per scan, ``<name><suffix>`` under the output folder, without picture
+    and camera."""
 
     suffix: str
 
     def _place(self, index: int, name: str | None) -> str:
         return f"{name or f'{index:06d}'}{self.suffix}"
+
+    def _put(
+        self,
+        scan: Scan,
+        path: Path,
+        picture: Picture | None,
+        camera: Calibration | None,
+    ) -> None:
+        self._write_file(path, scan)
+
+    @abstractmethod
+    def _write_file(self, path: Path, scan: Scan) -> None:
+        """Write a scan."""
 
 
 def check_facts(scan: Scan, where: str) -> None:

@@ -14,9 +14,10 @@ that network. A model that was also trained with blank conditions (``dropout``) 
 ``flow.guidance.guide``.
 
 To add a condition: write its class and enter it in ``CONDITIONS``; enter its encoder in
-    ``models.NETWORKS``.
+``models.NETWORKS``.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ GAP = 2
 """Cells of a gap in the labels of a scan that is closed."""
 
 
-class Condition:
+class Condition(ABC):
     """One kind of condition.
 
     Attributes:
@@ -61,10 +62,11 @@ class Condition:
     turns = True
     blank = 0
 
+    @abstractmethod
     def shape(self, encoder: nn.Module) -> tuple[int, ...]:
         """The shape of one condition."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read(
         self,
         scan: Scan,
@@ -73,9 +75,8 @@ class Condition:
         options: Mapping[str, Any],
     ) -> NDArray[np.uint8]:
         """The condition that a real scan provides, with the given shape."""
-        raise NotImplementedError
 
-    def check(self, values: Tensor) -> None:
+    def check(self, values: Tensor) -> None:  # noqa: B027 - not every kind has invalid values
         """Raise a DataError on invalid values."""
 
     def reduced(self, values: Tensor, u: Tensor, views: int) -> Tensor:

@@ -1,11 +1,10 @@
 """The joint fit of beams, mounting and motion.
 
 A laser with elevation e at height h above the sensor's origin measures points with z = h + rho
-tan(e), where rho is the
-horizontal distance from the axis: a line per beam. A tilt or an offset of the given frame, and the
-    motion during a turn
-that motion compensation has added, bend these lines; both are linear in the residual while they are
-small, so Gauss-Newton steps with robust (Cauchy) weights find them together with the beams.
+tan(e), where rho is the horizontal distance from the axis: a line per beam. A tilt or an offset of
+the given frame, and the motion during a turn that motion compensation has added, bend these lines;
+both are linear in the residual while they are small, so Gauss-Newton steps with robust (Cauchy)
+weights find them together with the beams.
 """
 
 from dataclasses import dataclass, replace

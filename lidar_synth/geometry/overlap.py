@@ -20,7 +20,7 @@ def find_overlapping(
     """(M,) True for each of the others (M, 7) whose footprint overlaps that of a box (7,).
 
     Separating axis theorem: two rectangles are disjoint if a side of one of them separates their
-        corners.
+    corners.
     """
     far: NDArray[np.bool_] = (
         np.hypot(*(others[:, :2] - box[:2]).T)

@@ -91,12 +91,12 @@ class SampleMaker:
 
 def make_transfer(given: "Transfer | Sensor | str | Path | None") -> "Transfer | None":
     """The transfer to a sensor; None if none is given."""
+    if given is None:
+        return None
     # only where a mixture turns its scans
     from lidar_synth.geometry.transfer import Transfer
 
-    if given is None or isinstance(given, Transfer):
-        return given
-    return Transfer(load_sensor(given))
+    return given if isinstance(given, Transfer) else Transfer(load_sensor(given))
 
 
 def _make_augment(given: Any, scans: Any, fields: frozenset[str]) -> LabelPolicy | None:

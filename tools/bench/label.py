@@ -4,15 +4,14 @@ memory.
     python tools/bench/label.py [--scans 200] [--seed 3] [--interval 0.4] [--points 10000000]
 
 Right: a town is exported with accumulated clouds, which hold every second frame and have errors of
-    the poses
-(lidar_synth/lab/town/accumulate.py); labels are recovered and compared with the known ones, for
-frames that the clouds hold and for frames that they do not hold. The target is 97 % of the labelled
-points and 90 % of moving cars.
+the poses (lidar_synth/lab/town/accumulate.py); labels are recovered and compared with the known
+ones, for frames that the clouds hold and for frames that they do not hold. The target is 97 % of
+the labelled points and 90 % of moving cars.
 
 Speed: processor time of the whole run, with reading and writing. The target is 20 scans per second
-    on 2 cores. Windows
-of KITTI-360 have about 10 million points, those of the town 300,000; so a window is filled up to
-``--points`` by copies of its points, moved by a few centimetres, and its scans are labelled again.
+on 2 cores. Windows of KITTI-360 have about 10 million points, those of the town 300,000; so a
+window is filled up to ``--points`` by copies of its points, moved by a few centimetres, and its
+scans are labelled again.
 """
 
 import os

@@ -3,10 +3,9 @@
     python tools/bench/mixing.py [--real SEMANTICKITTI_ROOT] [--scans 32] [--rounds 40]
 
 Targets: at ratio 0 at least 97 % of the dataset alone; from a bank at ratio 0.5 at least 90 % of
-    real scans only, with
-the same output. Without ``--real``, the real scans are the town's, written as SemanticKITTI; the
-bank holds scans of the town. One process, so that workers hide nothing; processor time, so that
-other programs do not count. The caches of the file system are warm.
+real scans only, with the same output. Without ``--real``, the real scans are the town's, written as
+SemanticKITTI; the bank holds scans of the town. One process, so that workers hide nothing;
+processor time, so that other programs do not count. The caches of the file system are warm.
 """
 
 import tempfile

@@ -42,8 +42,7 @@ def streets(
     """One scan of each of ``count`` stretches of a town, from the stretch ``first`` on.
 
     Of three moments of a stretch, the one with most pedestrians and cyclists near the vehicle is
-        taken: with one at
-    random, thirty scans have two cyclists.
+    taken: with one at random, thirty scans have two cyclists.
 
     Args:
         folder: where they are kept.

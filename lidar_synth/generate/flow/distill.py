@@ -20,8 +20,7 @@ training, and distils the timesteps of its 2-RF model. Here the pairs are genera
 from any teacher.
 
 To add a strategy: write its function and enter it in ``STRATEGIES``; the tests run over the
-    dictionary. One student for
-several numbers of steps is trained by ``every_piece``.
+dictionary. One student for several numbers of steps is trained by ``every_piece``.
 """
 
 from collections.abc import Callable, Sequence

@@ -4,7 +4,7 @@ The time grid is any descending sequence of times, evenly spaced or not; a disti
 own.
 
 To add a solver: write its step and enter it in ``SOLVERS`` with its order; the tests measure the
-    order.
+order.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -7,10 +7,8 @@ straight step from t_i to t_j with the velocity at t_i is ::
     C[i, j] = E_trajectories m(y_i + (t_j - t_i) v_i, y_j),        i < j
 
 and the timesteps of an N-step student are the path of exactly N intervals from 0 to M with the
-least total cost, shared
-by all trajectories: C is averaged first, then dynamic programming in O(N M^2) finds the path.
-    Trajectories are
-streamed, so that only C is kept in memory.
+least total cost, shared by all trajectories: C is averaged first, then dynamic programming in O(N
+M^2) finds the path. Trajectories are streamed, so that only C is kept in memory.
 """
 
 from collections import deque

@@ -2,9 +2,8 @@
 class.
 
 To add one: write its file with a subclass of ``Network`` (or ``Encoder``), and enter the class in
-    ``NETWORKS``. Its
-arguments have to be plain values, since a checkpoint stores them; its class attributes state what a
-training run provides beyond them.
+``NETWORKS``. Its arguments have to be plain values, since a checkpoint stores them; its class
+attributes state what a training run provides beyond them.
 """
 
 from collections.abc import Iterator, Mapping

@@ -3,13 +3,11 @@
 Each token attends to a window of tokens around it. Columns wrap around, since the image is a full
 turn. At the top and at the bottom the window is shifted inwards so that it keeps its size (Hassani
 et al., "Neighborhood Attention Transformer", CVPR 2023). Attention does not depend on the order of
-the keys, so that shifting the window is equivalent
-to padding: with m rows to each side, the row that lies j rows above the top is replaced by row 2m +
-    1 - j. For three
-rows, row 2 is placed above row 0; the window of row 0 is then {2, 0, 1}. Columns are padded
-circularly. After padding, all windows have the same form, and a tile of queries with its margin of
-keys is ordinary attention under one constant mask. Padding and tiling are computed once, on token
-indices.
+the keys, so that shifting the window is equivalent to padding: with m rows to each side, the row
+that lies j rows above the top is replaced by row 2m + 1 - j. For three rows, row 2 is placed above
+row 0; the window of row 0 is then {2, 0, 1}. Columns are padded circularly. After padding, all
+windows have the same form, and a tile of queries with its margin of keys is ordinary attention
+under one constant mask. Padding and tiling are computed once, on token indices.
 """
 
 import torch

@@ -60,8 +60,8 @@ class Mount:
         """Boxes of the recording sensor's frame in the target's frame.
 
         Boxes have a yaw only: with a pitch, sizes stay, and a box no longer contains exactly the
-            same points. What
-        concerns the camera stays, because the camera does not move with the sensor.
+        same points. What concerns the camera stays, because the camera does not move with the
+        sensor.
         """
         if self == Mount():
             return boxes

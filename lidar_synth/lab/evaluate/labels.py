@@ -1,10 +1,8 @@
 """Bird's-eye histograms by class, for scans with labels: what S-JSD and S-MMD compare.
 
 SPIRAL (Zhu et al., NeurIPS 2025, https://arxiv.org/abs/2505.22643) compares one bird's-eye
-histogram per class. Its
-code could not be read: its grid and its normalisation are not known. Here the grid is R2Flow's, and
-    a scan's histograms
-of all classes together sum to 1.
+histogram per class. Its code could not be read: its grid and its normalisation are not known. Here
+the grid is R2Flow's, and a scan's histograms of all classes together sum to 1.
 """
 
 import numpy as np

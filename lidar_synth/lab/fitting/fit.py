@@ -195,8 +195,9 @@ def _described(
     nearest, farthest = range_limits(np.linalg.norm(points[usable], axis=1))
     step = None
     if not model.motion.any():
-        starts = np.stack([0 * used, 0 * used, model.heights[used]], 1)
-        step = range_step(np.linalg.norm(points[usable] - starts, axis=1), used, rows)
+        x, y, z = points[usable].T
+        distance = np.sqrt(x**2 + y**2 + (z - model.heights[used]) ** 2)
+        step = range_step(distance, used, rows)
     elevations = np.degrees(np.arctan(model.tangents)).round(4)
     sensor = Sensor(
         name=name,

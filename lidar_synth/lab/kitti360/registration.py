@@ -2,13 +2,11 @@
 
 The clouds are divided into cubes. The points of a cube have a mean m and a covariance; along its
 axes a in which their standard deviation s is small (across a wall or the road, across a pole), the
-cube says where a point p near it should
-lie: (p - m) a / s is small. Along the others it says nothing. This is the normal distributions
-    transform (Magnusson
-2009) without those axes. The sum of robust squares of these residuals is minimised by Gauss-Newton
-steps over a rotation and a translation, with smaller and smaller distances between points and
-cubes. Along a street little tells one place from another, so the least certain direction is
-searched.
+cube says where a point p near it should lie: (p - m) a / s is small. Along the others it says
+nothing. This is the normal distributions transform (Magnusson 2009) without those axes. The sum of
+robust squares of these residuals is minimised by Gauss-Newton steps over a rotation and a
+translation, with smaller and smaller distances between points and cubes. Along a street little
+tells one place from another, so the least certain direction is searched.
 """
 
 from dataclasses import dataclass

@@ -167,8 +167,8 @@ def interval(
     means = np.empty((draws, count))
     for place, values in enumerate(there):
         # The means of drawn seeds of this place, which are used whenever the place is drawn.
-        drawn = rng.integers(0, len(values), (draws, len(values)))
-        means[:, place] = values[drawn].mean(1)
+        seeds = rng.integers(0, len(values), (draws, len(values)))
+        means[:, place] = values[seeds].mean(1)
     drawn = rng.integers(0, count, (draws, count))
     totals = np.zeros(draws)
     for column in range(count):

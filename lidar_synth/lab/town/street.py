@@ -2,8 +2,7 @@
 that cross it.
 
 There are five kinds: ``residential``, ``main`` (main road), ``junction``, ``square``, ``edge``
-    (edge of town).
-Traffic drives on the right: lanes at t < 0 run towards +s.
+(edge of town). Traffic drives on the right: lanes at t < 0 run towards +s.
 """
 
 from dataclasses import dataclass, replace

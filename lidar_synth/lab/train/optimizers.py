@@ -1,8 +1,8 @@
 """How weights are moved by their gradients.
 
 To add one: write a function of (network, rate, betas, weight decay) that returns one or more of
-    torch's optimisers,
-which share the weights among them and all run at the schedule's rate; enter it in ``OPTIMIZERS``.
+torch's optimisers, which share the weights among them and all run at the schedule's rate; enter it
+in ``OPTIMIZERS``.
 """
 
 from collections.abc import Callable

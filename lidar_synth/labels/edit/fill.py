@@ -3,11 +3,10 @@
 A ring is continued over the hole from both sides. If both are one surface, its horizontal distance
 rho is interpolated: on the ground 1 / rho linearly in azimuth, else as on a plane wall, 1 / rho = a
 cos(azimuth) + b sin(azimuth). Otherwise each side is continued to the middle. Deviations from it,
-lost returns, reflectance and labels are copied from the rays
-beside the hole, mirrored at its edge. Nothing but ground can be where the object stood: an estimate
-    just inside is
-moved to where the ray leaves that place; in place of another, the next surface beside the hole that
-is farther away is copied, and without one there is no return.
+lost returns, reflectance and labels are copied from the rays beside the hole, mirrored at its edge.
+Nothing but ground can be where the object stood: an estimate just inside is moved to where the ray
+leaves that place; in place of another, the next surface beside the hole that is farther away is
+copied, and without one there is no return.
 """
 
 import numba

@@ -2,7 +2,7 @@
 ends it.
 
 Every wait ends: with an answer, with a closed connection because the process died, or with the
-    timeout.
+timeout.
 """
 
 import os

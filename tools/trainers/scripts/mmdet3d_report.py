@@ -2,7 +2,7 @@
 their files.
 
 Imported by a configuration: ``custom_imports = dict(imports=["mmdet3d_report", ...])``, with the
-    hook ``Report``.
+hook ``Report``.
 """
 
 from pathlib import Path

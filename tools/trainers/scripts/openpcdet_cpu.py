@@ -123,7 +123,7 @@ class Overlaps:
         for i in range(len(boxes)):
             if left[i]:
                 keep[count] = i
-                count = count + 1
+                count += 1
                 left &= ~near[i]
         return count
 

@@ -107,7 +107,7 @@ def _strides(
     columns -= 2 * len(first)
     while columns < 0:
         first[-1] = (1, 2)
-        columns = columns + 1
+        columns += 1
     return first + [
         (1 + (i < rows), 1 + (i < columns)) for i in range(max(rows, columns))
     ]

@@ -2,11 +2,10 @@
 
 The architecture is that of latent diffusion (Rombach et al., CVPR 2022) with circular columns (Ran
 et al., "Towards Realistic Scene Generation with LiDAR Diffusion Models", CVPR 2024), and with
-LiDAR-Flow's addition, which the paper
-describes in one sentence: "integrates positional embeddings into latent features". Here, a learned
-    table with one
-vector per cell is added to the features after the first convolution and before the first block, so
-that every level and every skip connection has access to a cell's position.
+LiDAR-Flow's addition, which the paper describes in one sentence: "integrates positional embeddings
+into latent features". Here, a learned table with one vector per cell is added to the features after
+the first convolution and before the first block, so that every level and every skip connection has
+access to a cell's position.
 
 A condition is given in one of two forms: maps on the grid of the state, which are concatenated with
 it (``condition_channels``), or tokens, to which every cell attends at every level with attention

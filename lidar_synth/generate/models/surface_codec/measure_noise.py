@@ -3,12 +3,10 @@ of a patch share.
 
 The decoder predicts the distribution of every cell by itself. Neighbouring cells of a wall have the
 same error of the range and similar reflectances, leaves do not. Both follow from pairs of
-neighbouring cells of real images that show one
-surface: of Laplace distributed errors e, mean |e1 - e2| = 1.5 b, where b is the scale of what
-    differs; the correlation
-of reflectances is that of their normal scores. The relief of plants follows from the correlation of
-errors at two
-distances along a row: at the longer one, only the wider field is correlated.
+neighbouring cells of real images that show one surface: of Laplace distributed errors e, mean |e1 -
+e2| = 1.5 b, where b is the scale of what differs; the correlation of reflectances is that of their
+normal scores. The relief of plants follows from the correlation of errors at two distances along a
+row: at the longer one, only the wider field is correlated.
 """
 
 from collections.abc import Iterable

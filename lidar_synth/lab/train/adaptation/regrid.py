@@ -1,10 +1,9 @@
 """A model moved to the grid of another sensor, as the start of a training on its scans.
 
 Nearly all weights are convolutions and attention, which have no place. What belongs to places is
-    interpolated: learned
-biases by row (of a beam's elevation, which on a road gives the range), and the table of positions,
-whose columns wrap around. Ray angles are those of the new sensor. The moved model generates no good
-scans until it has been trained.
+interpolated: learned biases by row (of a beam's elevation, which on a road gives the range), and
+the table of positions, whose columns wrap around. Ray angles are those of the new sensor. The moved
+model generates no good scans until it has been trained.
 """
 
 from collections.abc import Mapping
